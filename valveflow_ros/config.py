@@ -1,0 +1,375 @@
+"""The one table of parameters: names, defaults, units, ranges, sentences.
+
+The node declares its ROS parameters from this table, ``config/monitor.yaml``
+and the documentation are made from it, the command line reads a file against
+it, and the engine gets its settings from it. Values are checked one by one
+against their range and then together.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from valveflow_ros.errors import ParameterError
+
+Value = bool | int | float | str
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One row of the table.
+
+    Attributes
+    ----------
+    low, high : float, optional
+        Inclusive range of a number.
+    choices : tuple of str
+        The allowed words of a text; empty means any text.
+    live : bool
+        Whether it may be changed while the monitor runs.
+    """
+
+    name: str
+    default: Value
+    unit: str
+    sentence: str
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+    live: bool = False
+
+    def check(self, value: object) -> Value:
+        """Return ``value`` in this row's type, or raise `ParameterError`.
+
+        A whole number is taken where a real one is wanted; NaN never passes.
+        """
+        if isinstance(self.default, bool):
+            if isinstance(value, bool):
+                return value
+            raise ParameterError(self.name, f'must be true or false, not {value!r}')
+        if isinstance(self.default, str):
+            return self._check_text(value)
+        return self._check_number(value)
+
+    def _check_text(self, value: object) -> str:
+        if not isinstance(value, str):
+            raise ParameterError(self.name, f'must be a text, not {value!r}')
+        if '\x00' in value or '\n' in value or len(value) > 500:
+            raise ParameterError(
+                self.name, 'must be one line of at most 500 characters without zero bytes'
+            )
+        if self.choices and value not in self.choices:
+            allowed = ', '.join(self.choices)
+            raise ParameterError(self.name, f"must be one of {allowed}, not '{value}'")
+        return value
+
+    def _check_number(self, value: object) -> int | float:
+        whole = isinstance(self.default, int)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            kind = 'whole number' if whole else 'number'
+            raise ParameterError(self.name, f'must be a {kind}, not {value!r}')
+        if whole and value != value // 1:
+            raise ParameterError(self.name, f'must be a whole number, not {value!r}')
+        low, high = self.low, self.high
+        if low is None or high is None:
+            raise ParameterError(self.name, 'has no range in the table')
+        if not low <= value <= high:
+            unit = f' {self.unit}' if self.unit else ''
+            raise ParameterError(
+                self.name, f'must be from {low:g} to {high:g}{unit}, not {value!r}'
+            )
+        return int(value) if whole else float(value)
+
+
+_OPENING_UNITS = ('%', 'percent', 'fraction')
+_PRESSURE_UNITS = ('MPa', 'kPa', 'Pa', 'bar', 'psi')
+_TEMPERATURE_UNITS = ('degC', 'K', 'degF')
+_POWER_UNITS = ('MW', 'kW', 'W')
+
+_UNIT_AND_INPUTS = (
+    Parameter('unit_tag', 'unit', '', 'Tag of the unit; frame_id and hardware_id of messages.'),
+    Parameter('autostart', True, '', 'Configure and activate the node by itself at start.'),
+    Parameter(
+        'stamp_source',
+        'source',
+        '',
+        'Time of a plain Float64: the stamp its publisher gave it (source), its receipt '
+        '(receive) or ROS time (ros_time; always so when use_sim_time is set).',
+        choices=('source', 'receive', 'ros_time'),
+    ),
+    Parameter(
+        'input_reliability',
+        'best_effort',
+        '',
+        'Reliability asked of input topics; best_effort matches every publisher.',
+        choices=('best_effort', 'reliable'),
+    ),
+    Parameter(
+        'valve_opening_unit', '%', '', 'Unit the gateway sends valve_opening in.',
+        choices=_OPENING_UNITS,
+    ),
+    Parameter(
+        'main_steam_pressure_unit', 'MPa', '',
+        'Unit the gateway sends main_steam_pressure in; absolute pressure.',
+        choices=_PRESSURE_UNITS,
+    ),
+    Parameter(
+        'main_steam_temperature_unit', 'degC', '',
+        'Unit the gateway sends main_steam_temperature in.', choices=_TEMPERATURE_UNITS,
+    ),
+    Parameter(
+        'generated_power_unit', 'MW', '', 'Unit the gateway sends generated_power in.',
+        choices=_POWER_UNITS,
+    ),
+    Parameter(
+        'valve_command_unit', '%', '', 'Unit the gateway sends valve_command in.',
+        choices=_OPENING_UNITS,
+    ),
+)  # fmt: skip
+
+_PLAUSIBLE = (
+    Parameter('valve_opening_low', -2.0, '%', 'Lower values are impossible and rejected.',
+              -50.0, 50.0),
+    Parameter('valve_opening_high', 105.0, '%', 'Higher values are impossible and rejected.',
+              50.0, 1000.0),
+    Parameter('main_steam_pressure_low', 0.05, 'MPa', 'Lower values are rejected.', 0.0, 50.0),
+    Parameter('main_steam_pressure_high', 40.0, 'MPa', 'Higher values are rejected.', 0.1, 100.0),
+    Parameter('main_steam_temperature_low', 50.0, 'degC', 'Lower values are rejected.',
+              -50.0, 700.0),
+    Parameter('main_steam_temperature_high', 750.0, 'degC', 'Higher values are rejected.',
+              50.0, 1000.0),
+    Parameter('generated_power_low', -100.0, 'MW', 'Lower values are rejected.', -1e4, 1e4),
+    Parameter('generated_power_high', 2500.0, 'MW', 'Higher values are rejected.', 1.0, 1e5),
+)  # fmt: skip
+
+_TIME_BASE = (
+    Parameter('sample_period', 1.0, 's', 'Step of the sample table.', 0.01, 3600.0),
+    Parameter('hold_limit', 10.0, 's',
+              'A value is held at most this long; older it is stale and the sample is bad.',
+              0.01, 86400.0),
+    Parameter('lateness', 2.0, 's',
+              'How long a row waits for slower topics before it is closed.', 0.0, 3600.0),
+    Parameter('clock_jump', 60.0, 's',
+              'A stamp further ahead than this needs two more like it before it is believed; '
+              'stamps further behind than this, twenty in a row, restart the table.',
+              1.0, 1e6),
+    Parameter('window_days', 10.0, 'd', 'Length of the rolling window.', 0.02, 60.0),
+)  # fmt: skip
+
+_MODEL = (
+    Parameter('pressure_exponent', 1.125, '', 'Exponent m of u = V p^m, eq. (1) of the paper.',
+              0.5, 2.0),
+    Parameter('time_constant', 80.0, 's',
+              'Largest time constant T expected; with delay it sets the transient 5 T + tau '
+              'that does not count after a move begins.', 0.1, 3600.0),
+    Parameter('delay', 10.0, 's', 'Largest delay tau expected.', 0.0, 3600.0),
+    Parameter('block', 10.0, 's', 'Length of the means the segmenter works on.', 0.01, 7200.0),
+    Parameter('longest_segment', 1800.0, 's',
+              'A segment that lasts longer is cut here and goes on without a transient.',
+              60.0, 864000.0),
+    Parameter('steady_min', 120.0, 's', 'Shortest steady-state segment.', 0.0, 864000.0),
+    Parameter('slope_min', 120.0, 's', 'Shortest slope-response segment.', 0.0, 864000.0),
+    Parameter('input_noise', 0.0, '% MPa^m',
+              "Noise of u about its line, block means; 0 takes it from the data.", 0.0, 1e6),
+    Parameter('power_noise', 0.0, 'MW',
+              'Noise of power about its line, block means; 0 takes it from the data.', 0.0, 1e6),
+    Parameter('break_limit', 4.5, 'sd',
+              'A line ends where two block means in a row leave it by more than this.', 1.0, 50.0),
+    Parameter('steady_limit', 2.5, 'sd',
+              'A segment counts as steady while u drifts less than this many noise sd.',
+              0.1, 50.0),
+    Parameter('slope_limit', 8.0, 'sd',
+              'A segment counts as slope response when u moves more than this many noise sd.',
+              1.0, 1000.0),
+    Parameter('temperature_spread_limit', 15.0, 'K',
+              'Spread of the main steam temperature over the special samples (central 95 %) '
+              "beyond which the paper's condition of an unchanged temperature is flagged.",
+              0.1, 500.0),
+)  # fmt: skip
+
+_FIT = (
+    Parameter('max_pieces', 10, '', 'Largest number of pieces tried, R_max of the paper.', 1, 20),
+    Parameter('min_piece_share', 0.01, '',
+              'Smallest share of the special samples in a piece.', 0.0, 0.2),
+    Parameter('refine', True, '',
+              'Refine the curve together with time constants and delays on all samples.'),
+    Parameter('refit_period', 600.0, 's', 'Time between refits; 0 refits on request only.',
+              0.0, 864000.0, live=True),
+    Parameter('refit_segments', 20, '',
+              'Refit after this many new special segments; 0 waits for the period.',
+              0, 100000, live=True),
+    Parameter('refit_timeout', 120.0, 's', 'A refit that takes longer is ended.', 1.0, 3600.0),
+    Parameter('min_fit_samples', 600, '', 'Fewest special samples a fit needs.', 10, 10_000_000),
+)  # fmt: skip
+
+_ALARM = (
+    Parameter('alarm_limit_sd', 4.0, 'sd',
+              'Limit of the residual alarm in standard deviations of clean residuals.',
+              1.0, 100.0, live=True),
+    Parameter('alarm_limit', 0.0, 'MW',
+              'Limit of the residual alarm in MW; 0 uses alarm_limit_sd.', 0.0, 1e5, live=True),
+    Parameter('alarm_average', 300.0, 's', 'Time the residual is averaged over.', 1.0, 86400.0),
+    Parameter('alarm_on_delay', 120.0, 's', 'The limit must be exceeded this long.',
+              0.0, 86400.0, live=True),
+    Parameter('alarm_off_delay', 300.0, 's', 'The return must last this long.', 0.0, 86400.0,
+              live=True),
+    Parameter('alarm_dead_band', 0.3, '', 'The return is judged at limit x (1 - dead band).',
+              0.0, 0.9, live=True),
+    Parameter('alarm_latch', True, '',
+              'An alarm stays until it has returned and was acknowledged.', live=True),
+)  # fmt: skip
+
+_RECORD = (
+    Parameter('record', True, '', 'Record inputs and outputs to MCAP.'),
+    Parameter('record_directory', '', '',
+              'Folder of the recordings; empty means valveflow_recordings where the node starts.'),
+    Parameter('record_flush', 0.5, 's', 'Longest time a message waits before it is on disk.',
+              0.05, 60.0),
+    Parameter('record_rotation', 3600.0, 's', 'A new file begins after this time.', 1.0, 864000.0),
+    Parameter('record_queue', 200_000, '', 'Messages that may wait for the disk.', 100, 10_000_000),
+    Parameter('diagnostics_period', 1.0, 's', 'Time between messages on /diagnostics.', 0.1, 60.0,
+              live=True),
+)  # fmt: skip
+
+TABLE: tuple[Parameter, ...] = (
+    *_UNIT_AND_INPUTS,
+    *_PLAUSIBLE,
+    *_TIME_BASE,
+    *_MODEL,
+    *_FIT,
+    *_ALARM,
+    *_RECORD,
+)
+PARAMETERS: dict[str, Parameter] = {row.name: row for row in TABLE}
+
+
+class Settings(Mapping[str, Value]):
+    """A complete, checked set of parameter values; unchanging.
+
+    Parameters
+    ----------
+    values : mapping, optional
+        What differs from the defaults.
+
+    Raises
+    ------
+    ParameterError
+        A name is unknown, a value does not fit its row, or two values are at odds.
+    """
+
+    __slots__ = ('_values',)
+
+    def __init__(self, values: Mapping[str, object] | None = None) -> None:
+        merged: dict[str, Value] = {row.name: row.default for row in TABLE}
+        for name, value in (values or {}).items():
+            merged[name] = parameter(name).check(value)
+        _check_together(merged)
+        self._values = merged
+
+    def __getitem__(self, name: str) -> Value:
+        """Return one value."""
+        return self._values[name]
+
+    def __iter__(self) -> Any:
+        """Iterate over the names in the table's order."""
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        """Return the number of parameters."""
+        return len(self._values)
+
+    def real(self, name: str) -> float:
+        """Return a number as float."""
+        return float(self._values[name])
+
+    def whole(self, name: str) -> int:
+        """Return a whole number."""
+        return int(self._values[name])
+
+    def flag(self, name: str) -> bool:
+        """Return a switch."""
+        return bool(self._values[name])
+
+    def text(self, name: str) -> str:
+        """Return a text."""
+        return str(self._values[name])
+
+    def changed(self, values: Mapping[str, object]) -> Settings:
+        """Return a copy with some values replaced, checked anew."""
+        return Settings({**self._values, **values})
+
+    @property
+    def settle_s(self) -> float:
+        """The transient after a move begins, 5 T + tau (Table I of the paper)."""
+        return 5.0 * self.real('time_constant') + self.real('delay')
+
+
+def parameter(name: str) -> Parameter:
+    """Return the row called ``name``; the error names the nearest one."""
+    row = PARAMETERS.get(name)
+    if row is None:
+        near = difflib.get_close_matches(name, PARAMETERS, n=1)
+        hint = f", did you mean '{near[0]}'" if near else ''
+        raise ParameterError(name, f'does not exist{hint}')
+    return row
+
+
+def _check_together(values: Mapping[str, Value]) -> None:
+    """Refuse values that are each in range and yet at odds."""
+    for signal in ('valve_opening', 'main_steam_pressure', 'main_steam_temperature',
+                   'generated_power'):  # fmt: skip
+        low, high = float(values[f'{signal}_low']), float(values[f'{signal}_high'])
+        if not low < high:
+            raise ParameterError(
+                f'{signal}_low', f'({low:g}) must be below {signal}_high ({high:g})'
+            )
+    period = float(values['sample_period'])
+    for name in ('hold_limit', 'block', 'alarm_average'):
+        if float(values[name]) < period:
+            raise ParameterError(
+                name, f'({float(values[name]):g} s) must not be below sample_period ({period:g} s)'
+            )
+    if float(values['longest_segment']) < 6.0 * float(values['block']):
+        raise ParameterError('longest_segment', 'must be at least six times block')
+    if float(values['slope_limit']) <= float(values['steady_limit']):
+        raise ParameterError('slope_limit', 'must be above steady_limit')
+
+
+def as_yaml(rows: Iterable[Parameter] = TABLE, values: Mapping[str, Value] | None = None) -> str:
+    """Write a commented ROS 2 parameter file for any node name.
+
+    Parameters
+    ----------
+    rows : iterable of Parameter
+        Which rows to write.
+    values : mapping, optional
+        Values other than the defaults.
+    """
+    lines = ['/**:', '  ros__parameters:']
+    for row in rows:
+        about = row.sentence
+        if row.low is not None and row.high is not None:
+            about += f' Range {row.low:g} to {row.high:g}'
+            about += f' {row.unit}.' if row.unit else '.'
+        if row.choices:
+            about += f' One of {", ".join(row.choices)}.'
+        if row.live:
+            about += ' May be changed while running.'
+        lines.append(f'    # {about}')
+        value = row.default if values is None else values.get(row.name, row.default)
+        lines.append(f'    {row.name}: {_yaml_scalar(value)}')
+    return '\n'.join(lines) + '\n'
+
+
+def _yaml_scalar(value: Value) -> str:
+    if isinstance(value, bool):
+        return 'true' if value else 'false'
+    if isinstance(value, str):
+        return "'" + value.replace("'", "''") + "'"
+    if isinstance(value, float):
+        text = repr(value)
+        return text if '.' in text or 'e' in text else text + '.0'
+    return str(value)

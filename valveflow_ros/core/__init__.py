@@ -1,0 +1,1 @@
+"""The engine: pure, without clock, files, threads or ROS."""

@@ -1,0 +1,194 @@
+"""The residual alarm: ISA-18.2 states with delays, dead band, latch and acknowledgement."""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.jit import JIT
+from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
+
+
+class AlarmState(enum.IntEnum):
+    """States of an alarm (ANSI/ISA-18.2, figure of alarm state transitions)."""
+
+    NORMAL = 0
+    UNACKNOWLEDGED = 1
+    ACKNOWLEDGED = 2
+    RETURNED_UNACKNOWLEDGED = 3
+    SHELVED = 4
+    SUPPRESSED = 5
+    OUT_OF_SERVICE = 6
+
+
+class Priority(enum.IntEnum):
+    """How soon somebody has to look; residual alarms ask for maintenance, not for a trip."""
+
+    LOW = 1
+    MEDIUM = 2
+    HIGH = 3
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmChange:
+    """One change of an alarm's state."""
+
+    time_ns: int
+    name: str
+    state: AlarmState
+    previous: AlarmState
+    priority: Priority
+    value: float
+    limit: float
+    unit: str
+    sentence: str
+    occurrence: int
+    raised_ns: int
+    model_id: str
+
+
+# Places in the alarm's memory.
+_ACTIVE, _SINCE, _COUNTING = range(3)
+
+
+@numba.njit(**JIT)
+def _watch(
+    time_ns: IntArray,
+    value: FloatArray,
+    limit: float,
+    dead_band: float,
+    on_ns: int,
+    off_ns: int,
+    memory: IntArray,
+) -> int:
+    """Run until the condition turns; return the row after the turn, or 0.
+
+    NaN leaves everything as it is: bad data neither raise nor clear.
+    """
+    for t in range(value.size):
+        v = abs(value[t])
+        if math.isnan(v):
+            continue
+        if memory[_ACTIVE] == 0:
+            beyond = v > limit
+            delay = on_ns
+        else:
+            beyond = v < limit * (1.0 - dead_band)
+            delay = off_ns
+        if not beyond:
+            memory[_COUNTING] = 0
+            continue
+        if memory[_COUNTING] == 0:
+            memory[_COUNTING] = 1
+            memory[_SINCE] = time_ns[t]
+        if time_ns[t] - memory[_SINCE] >= delay:
+            memory[_ACTIVE] = 1 - memory[_ACTIVE]
+            memory[_COUNTING] = 0
+            return t + 1
+    return 0
+
+
+class ResidualAlarm:
+    """Judge the running mean of the residual against a limit.
+
+    Parameters
+    ----------
+    settings : Settings
+        Delays, dead band, latch.
+    """
+
+    NAME = 'residual'
+
+    def __init__(self, settings: Settings) -> None:
+        self._memory = np.zeros(3, dtype=np.int64)
+        self._occurrence = 0
+        self._raised_ns = 0
+        self.state = AlarmState.NORMAL
+        self.configure(settings)
+
+    def configure(self, settings: Settings) -> None:
+        """Take new delays, dead band and latch; states and counters stay."""
+        self._dead_band = settings.real('alarm_dead_band')
+        self._on_ns = round(settings.real('alarm_on_delay') * NS_PER_S)
+        self._off_ns = round(settings.real('alarm_off_delay') * NS_PER_S)
+        self._latch = settings.flag('alarm_latch')
+
+    @property
+    def active(self) -> bool:
+        """Tell whether the condition holds now."""
+        return bool(self._memory[_ACTIVE])
+
+    @property
+    def standing(self) -> bool:
+        """Tell whether the alarm is anything but normal."""
+        return self.state != AlarmState.NORMAL
+
+    def feed(
+        self, time_ns: IntArray, average_mw: FloatArray, limit_mw: float, model_id: str
+    ) -> list[tuple[int, AlarmChange]]:
+        """Judge rows; return changes, each with the number of rows up to it."""
+        changes: list[tuple[int, AlarmChange]] = []
+        done = 0
+        while done < len(time_ns):
+            turned = _watch(
+                time_ns[done:], average_mw[done:], limit_mw, self._dead_band,
+                self._on_ns, self._off_ns, self._memory,
+            )  # fmt: skip
+            if not turned:
+                break
+            done += turned
+            change = self._turn(int(time_ns[done - 1]), float(average_mw[done - 1]), limit_mw,
+                                model_id)  # fmt: skip
+            if change is not None:
+                changes.append((done, change))
+        return changes
+
+    def acknowledge(self, time_ns: int, value: float, limit: float, model_id: str
+                    ) -> AlarmChange | None:  # fmt: skip
+        """Acknowledge; None when there is nothing to acknowledge."""
+        if self.state == AlarmState.UNACKNOWLEDGED:
+            return self._enter(AlarmState.ACKNOWLEDGED, time_ns, value, limit, model_id)
+        if self.state == AlarmState.RETURNED_UNACKNOWLEDGED:
+            return self._enter(AlarmState.NORMAL, time_ns, value, limit, model_id)
+        return None
+
+    def _turn(self, time_ns: int, value: float, limit: float, model_id: str
+              ) -> AlarmChange | None:  # fmt: skip
+        """The condition has begun or ended."""
+        if self.active:
+            if self.state == AlarmState.ACKNOWLEDGED:
+                return None
+            self._occurrence += 1
+            self._raised_ns = time_ns
+            return self._enter(AlarmState.UNACKNOWLEDGED, time_ns, value, limit, model_id)
+        latched = self._latch and self.state == AlarmState.UNACKNOWLEDGED
+        after = AlarmState.RETURNED_UNACKNOWLEDGED if latched else AlarmState.NORMAL
+        return self._enter(after, time_ns, value, limit, model_id)
+
+    def _enter(self, state: AlarmState, time_ns: int, value: float, limit: float, model_id: str
+               ) -> AlarmChange:  # fmt: skip
+        previous, self.state = self.state, state
+        return AlarmChange(
+            time_ns, self.NAME, state, previous, Priority.MEDIUM, value, limit, 'MW',
+            _sentence(state, value, limit), self._occurrence, self._raised_ns, model_id,
+        )  # fmt: skip
+
+
+def _sentence(state: AlarmState, value: float, limit: float) -> str:
+    """Say what happened in words an operator can act on."""
+    side = 'more' if value > 0.0 else 'less'
+    if state == AlarmState.UNACKNOWLEDGED:
+        return (
+            f'The unit gives {abs(value):.1f} MW {side} than the valve curve says '
+            f'(limit {limit:.1f} MW): check what changed, or re-identify.'
+        )
+    if state == AlarmState.ACKNOWLEDGED:
+        return f'Acknowledged; the unit still gives {abs(value):.1f} MW {side} than expected.'
+    if state == AlarmState.RETURNED_UNACKNOWLEDGED:
+        return 'The unit follows the valve curve again; acknowledge to clear the alarm.'
+    return 'The unit follows the valve curve.'

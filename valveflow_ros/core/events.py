@@ -1,0 +1,60 @@
+"""What the engine says: events, each with the time of the row at which it happened."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+from valveflow_ros.core.alarms import AlarmChange
+from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.fit import FitTask
+from valveflow_ros.core.prediction import PredictionBlock
+from valveflow_ros.records import SpecialSegment
+
+
+class JournalKind(enum.IntEnum):
+    """Why the engine's state changed other than by a row; the same numbers stand in the message."""
+
+    FIT_REQUESTED = 1
+    FIT_ADOPTED = 2
+    FIT_REFUSED = 3
+    ACKNOWLEDGE = 4
+    SET_REFERENCE = 5
+    RESET = 6
+    DIAGNOSE = 7
+
+
+@dataclass(frozen=True, slots=True)
+class JournalEntry:
+    """One decision, at the boundary after ``rows`` rows; a replay repeats it there."""
+
+    time_ns: int
+    kind: JournalKind
+    request_ns: int
+    rows: int
+    model_id: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentClosed:
+    """A special segment has ended."""
+
+    segment: SpecialSegment
+
+
+@dataclass(frozen=True, slots=True)
+class FitRequested:
+    """A fit is wanted; somebody has to compute ``task`` and hand the outcome back."""
+
+    task: FitTask
+
+
+@dataclass(frozen=True, slots=True)
+class CurveAdopted:
+    """A new curve predicts from the next row on."""
+
+    characteristic: Characteristic
+
+
+Event = PredictionBlock | SegmentClosed | FitRequested | CurveAdopted | AlarmChange | JournalEntry

@@ -1,0 +1,355 @@
+"""The streaming piecewise linear representation of u and power, row by row.
+
+Rows are averaged over short blocks. A straight line of u grows from the last
+break; the block that leaves it, twice in a row or by a mean over a minute, is
+the next break. After a break the first 5 T + tau are transient, eq. (13) of
+the paper, and do not count; from then on a line of the power grows as well,
+and leaving that one is a break too. What lies between the end of the transient
+and the next break is judged by `judge`.
+
+All state lives in three arrays, so that it can be copied, saved and compared.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from valveflow_ros.core.jit import JIT
+from valveflow_ros.core.line import (
+    LINE_SIZE,
+    N,
+    line_add,
+    line_ahead,
+    line_fit,
+    line_reset,
+)
+from valveflow_ros.core.noise import BINS, WARM_UP, WINDOW, noise_add, noise_level
+from valveflow_ros.records import ByteArray, FloatArray, IntArray
+
+# Integer state.
+ROW, ROWS_IN_BLOCK, BLOCKS, FIRST_ROW, FRESH, RUN_U, RUN_Y, STRETCHES, IN_STRETCH, LAST_NS = (
+    range(10)
+)
+INT_STATE = 10
+
+# Rows of `lines`: of u up to now, of u up to a minute ago, of the power, of a stretch of each.
+LINE_U, LINE_U_BEHIND, LINE_Y, STRETCH_U, STRETCH_Y = range(5)
+LINES = 5
+
+# Rows of `blocks`: means of u, power and temperature of the segment that is open.
+BLOCK_U, BLOCK_Y, BLOCK_T = range(3)
+
+# Settings as the kernel wants them.
+(
+    BLOCK_ROWS,
+    SETTLE,
+    LONGEST,
+    STEADY_MIN,
+    SLOPE_MIN,
+    TRIM,
+    BREAK,
+    STEADY,
+    SLOPE,
+    NOISE_U,
+    NOISE_Y,
+    PERIOD_NS,
+) = range(12)
+SETTINGS_SIZE = 12
+
+_BEHIND = 6  # blocks whose mean is held against the line before them
+_BEHIND_LIMIT = 2.5  # in sd of that mean, were the blocks half as many and independent
+_LEAST = 6  # blocks before a line is believed
+_ROUGH = 2.0  # a segment rougher than this many noise sd is no straight line
+
+# What a finished segment is described by.
+(
+    SEG_FIRST,
+    SEG_END,
+    SEG_KIND,
+    SEG_U_MEAN,
+    SEG_U_SLOPE,
+    SEG_U_RMS,
+    SEG_Y_MEAN,
+    SEG_Y_SLOPE,
+    SEG_Y_RMS,
+    SEG_T,
+) = range(10)
+SEG_SIZE = 10
+
+# What a row is, as far as can be told when it arrives.
+TRANSIENT, SETTLED_STEADY, SETTLED_SLOPE, NO_DATA = range(4)
+
+
+@numba.njit(**JIT)
+def noise_now(histograms: FloatArray, setting: FloatArray) -> tuple[float, float]:
+    """Return the noise sd of u and of the power, the given one before the learnt one."""
+    u = setting[NOISE_U] if setting[NOISE_U] > 0.0 else noise_level(histograms[0])
+    y = setting[NOISE_Y] if setting[NOISE_Y] > 0.0 else noise_level(histograms[1])
+    # Exact straight lines have no noise; rounding must not look like a break.
+    return max(u, 1e-6), max(y, 1e-6)
+
+
+@numba.njit(**JIT)
+def _learn(state: IntArray, lines: FloatArray, histograms: FloatArray, u: float, y: float) -> None:
+    """Put one block into the running stretch and close it when it is long enough."""
+    line_add(lines[STRETCH_U], u)
+    line_add(lines[STRETCH_Y], y)
+    state[IN_STRETCH] += 1
+    if state[IN_STRETCH] == WINDOW:
+        noise_add(histograms[0], line_fit(lines[STRETCH_U])[2])
+        noise_add(histograms[1], line_fit(lines[STRETCH_Y])[2])
+        state[STRETCHES] += 1
+        state[IN_STRETCH] = 0
+        line_reset(lines[STRETCH_U])
+        line_reset(lines[STRETCH_Y])
+
+
+@numba.njit(**JIT)
+def _begin(
+    state: IntArray, lines: FloatArray, blocks: FloatArray, drop: int, fresh: bool, settle: int
+) -> None:
+    """Begin a segment ``drop`` blocks after the old one's first, keeping the blocks behind."""
+    keep = state[BLOCKS] - drop
+    for k in range(keep):
+        for row in range(3):
+            blocks[row, k] = blocks[row, drop + k]
+    state[BLOCKS] = 0
+    state[FRESH] = 1 if fresh else 0
+    state[RUN_U] = 0
+    state[RUN_Y] = 0
+    for row in range(3):
+        line_reset(lines[row])
+    for k in range(keep):
+        _grow(state, lines, blocks, settle)
+
+
+@numba.njit(**JIT)
+def _grow(state: IntArray, lines: FloatArray, blocks: FloatArray, settle: int) -> None:
+    """Let the lines take the block that stands at the end of ``blocks``."""
+    k = state[BLOCKS]
+    line_add(lines[LINE_U], blocks[BLOCK_U, k])
+    if k >= _BEHIND:
+        line_add(lines[LINE_U_BEHIND], blocks[BLOCK_U, k - _BEHIND])
+    if k >= settle * state[FRESH]:
+        line_add(lines[LINE_Y], blocks[BLOCK_Y, k])
+    state[BLOCKS] = k + 1
+
+
+@numba.njit(**JIT)
+def _leaves(line: FloatArray, value: float, noise: float, limit: float, run: int) -> int:
+    """Return the signed count of blocks in a row that left the line (0: it stays)."""
+    if line[N] < _LEAST:
+        return 0
+    ahead, factor = line_ahead(line, 1.0)
+    off = (value - ahead) / (noise * factor)
+    if abs(off) <= limit:
+        return 0
+    step = 1 if off > 0.0 else -1
+    if abs(off) > 2.0 * limit:
+        step *= 2
+    return run + step if run * step >= 0 else step
+
+
+@numba.njit(**JIT)
+def _drifts(lines: FloatArray, blocks: FloatArray, k: int, noise: float) -> bool:
+    """Tell whether the last minute's mean left the line through what came before."""
+    behind = lines[LINE_U_BEHIND]
+    if behind[N] < 2 * _BEHIND:
+        return False
+    off = 0.0
+    for step in range(_BEHIND):
+        ahead, _ = line_ahead(behind, step + 1.0)
+        off += blocks[BLOCK_U, k - _BEHIND + step] - ahead
+    _, factor = line_ahead(behind, (_BEHIND + 1) / 2.0)
+    leverage = factor * factor - 1.0
+    # Neighbouring blocks are correlated: six of them are taken for two.
+    sd = noise * math.sqrt(0.5 + _BEHIND * leverage / 2.0)
+    return abs(off / _BEHIND) > _BEHIND_LIMIT * sd
+
+
+@numba.njit(**JIT)
+def judge(
+    blocks: FloatArray,
+    first: int,
+    end: int,
+    noise_u: float,
+    noise_y: float,
+    setting: FloatArray,
+    found: FloatArray,
+) -> int:
+    """Judge the blocks ``[first, end)``: 0 none, 1 steady state, 2 slope response."""
+    line = np.zeros((3, LINE_SIZE))
+    for k in range(first, end):
+        for row in range(3):
+            line_add(line[row], blocks[row, k])
+    mean_u, slope_u, rms_u = line_fit(line[BLOCK_U])
+    mean_y, slope_y, rms_y = line_fit(line[BLOCK_Y])
+    n = end - first
+    move_u = abs(slope_u) * n / noise_u
+    move_y = abs(slope_y) * n / noise_y
+    found[SEG_U_MEAN], found[SEG_U_SLOPE], found[SEG_U_RMS] = mean_u, slope_u, rms_u
+    found[SEG_Y_MEAN], found[SEG_Y_SLOPE], found[SEG_Y_RMS] = mean_y, slope_y, rms_y
+    found[SEG_T] = line_fit(line[BLOCK_T])[0]
+    if rms_u > _ROUGH * noise_u or rms_y > _ROUGH * noise_y:
+        return 0
+    if move_u <= setting[STEADY] and move_y <= setting[STEADY] + 0.5:
+        return 1 if n >= setting[STEADY_MIN] else 0
+    if move_u >= setting[SLOPE]:
+        return 2 if n >= setting[SLOPE_MIN] else 0
+    return 0
+
+
+@numba.njit(**JIT)
+def _close(
+    state: IntArray,
+    blocks: FloatArray,
+    end: int,
+    noise_u: float,
+    noise_y: float,
+    setting: FloatArray,
+    found: FloatArray,
+) -> bool:
+    """Judge what is open, up to block ``end``; True when it is a special segment."""
+    first = int(setting[SETTLE]) if state[FRESH] else 0
+    least = min(setting[STEADY_MIN], setting[SLOPE_MIN])
+    if end - first < max(least, 3):
+        return False
+    kind = judge(blocks, first, end, noise_u, noise_y, setting, found)
+    if kind == 0:
+        return False
+    rows = int(setting[BLOCK_ROWS])
+    found[SEG_FIRST] = state[FIRST_ROW] + first * rows
+    found[SEG_END] = state[FIRST_ROW] + end * rows
+    found[SEG_KIND] = kind
+    return True
+
+
+@numba.njit(**JIT)
+def _take_block(
+    state: IntArray,
+    lines: FloatArray,
+    blocks: FloatArray,
+    histograms: FloatArray,
+    setting: FloatArray,
+    found: FloatArray,
+) -> bool:
+    """Take the block at the end of ``blocks``; True when that closed a special segment."""
+    settle = int(setting[SETTLE])
+    rows = int(setting[BLOCK_ROWS])
+    k = state[BLOCKS]
+    u, y = blocks[BLOCK_U, k], blocks[BLOCK_Y, k]
+    _learn(state, lines, histograms, u, y)
+    if state[STRETCHES] < WARM_UP and (setting[NOISE_U] <= 0.0 or setting[NOISE_Y] <= 0.0):
+        # Without a noise level nothing can be judged: let the line start later.
+        state[FIRST_ROW] += rows
+        return False
+    noise_u, noise_y = noise_now(histograms, setting)
+    state[RUN_U] = _leaves(lines[LINE_U], u, noise_u, setting[BREAK], state[RUN_U])
+    state[RUN_Y] = _leaves(lines[LINE_Y], y, noise_y, setting[BREAK], state[RUN_Y])
+    back = -1
+    if abs(state[RUN_U]) >= 2:
+        back = 1
+    elif abs(state[RUN_Y]) >= 2:
+        back = 1
+    elif _drifts(lines, blocks, k, noise_u):
+        back = _BEHIND
+    if back < 0:
+        _grow(state, lines, blocks, settle)
+        if state[BLOCKS] < int(setting[LONGEST]) + settle * state[FRESH]:
+            return False
+        closed = _close(state, blocks, state[BLOCKS], noise_u, noise_y, setting, found)
+        state[FIRST_ROW] += state[BLOCKS] * rows
+        _begin(state, lines, blocks, state[BLOCKS], False, settle)
+        return closed
+    at = max(k - back, 0)
+    closed = _close(
+        state, blocks, max(at - int(setting[TRIM]), 0), noise_u, noise_y, setting, found
+    )
+    state[FIRST_ROW] += at * rows
+    state[BLOCKS] = k + 1
+    _begin(state, lines, blocks, at, True, settle)
+    return closed
+
+
+@numba.njit(**JIT)
+def _kind_now(
+    state: IntArray, lines: FloatArray, histograms: FloatArray, setting: FloatArray
+) -> int:
+    """Say what the newest row is, from what is known by now."""
+    if state[BLOCKS] < int(setting[SETTLE]) * state[FRESH] or state[BLOCKS] < _LEAST:
+        return TRANSIENT
+    if state[RUN_U] != 0 or state[RUN_Y] != 0:
+        return TRANSIENT
+    noise_u, _ = noise_now(histograms, setting)
+    slope = line_fit(lines[LINE_U])[1]
+    moved = abs(slope) * state[BLOCKS] / noise_u
+    return SETTLED_SLOPE if moved >= setting[SLOPE] else SETTLED_STEADY
+
+
+@numba.njit(**JIT)
+def run(
+    time_ns: IntArray,
+    u: FloatArray,
+    y: FloatArray,
+    temperature: FloatArray,
+    state: IntArray,
+    sums: FloatArray,
+    lines: FloatArray,
+    blocks: FloatArray,
+    histograms: FloatArray,
+    setting: FloatArray,
+    kinds: ByteArray,
+    found: FloatArray,
+) -> tuple[int, bool]:
+    """Run over rows until they end or a special segment closes.
+
+    Returns the rows consumed and whether ``found`` holds a segment. ``sums``
+    (3,) are the running sums of the block that is filling, ``kinds`` gets one
+    code a row.
+    """
+    rows = int(setting[BLOCK_ROWS])
+    gap_ns = int(1.5 * setting[PERIOD_NS])
+    settle = int(setting[SETTLE])
+    for i in range(u.size):
+        usable = math.isfinite(u[i]) and math.isfinite(y[i])
+        jumped = time_ns[i] - state[LAST_NS] > gap_ns or time_ns[i] <= state[LAST_NS]
+        if (jumped or not usable) and state[ROW] > state[FIRST_ROW]:
+            # A gap ends what is open; nothing is known of what happened in it.
+            noise_u, noise_y = noise_now(histograms, setting)
+            closed = False
+            if state[BLOCKS] > 0:
+                closed = _close(state, blocks, state[BLOCKS], noise_u, noise_y, setting, found)
+            _begin(state, lines, blocks, state[BLOCKS], True, settle)
+            state[FIRST_ROW] = state[ROW]
+            state[ROWS_IN_BLOCK] = 0
+            sums[:] = 0.0
+            # The stretch the noise is learnt from must not span a gap either.
+            state[IN_STRETCH] = 0
+            line_reset(lines[STRETCH_U])
+            line_reset(lines[STRETCH_Y])
+            if closed:
+                return i, True
+        state[LAST_NS] = time_ns[i]
+        state[ROW] += 1
+        if not usable:
+            kinds[i] = NO_DATA
+            state[FIRST_ROW] = state[ROW]
+            continue
+        sums[BLOCK_U] += u[i]
+        sums[BLOCK_Y] += y[i]
+        sums[BLOCK_T] += temperature[i]
+        state[ROWS_IN_BLOCK] += 1
+        closed = False
+        if state[ROWS_IN_BLOCK] == rows:
+            for row in range(3):
+                blocks[row, state[BLOCKS]] = sums[row] / rows
+                sums[row] = 0.0
+            state[ROWS_IN_BLOCK] = 0
+            closed = _take_block(state, lines, blocks, histograms, setting, found)
+        kinds[i] = _kind_now(state, lines, histograms, setting)
+        if closed:
+            return i + 1, True
+    return u.size, False

@@ -1,0 +1,50 @@
+"""An autoregressive model of the residual, so that its samples may be counted as independent."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import solve_toeplitz
+
+from valveflow_ros.core.regional_kernel import lagged_products, whiten
+from valveflow_ros.records import ByteArray, FloatArray
+
+ORDER = 4
+
+
+def fit_ar(residual: FloatArray, weight: ByteArray, order: int = ORDER) -> FloatArray:
+    """Estimate AR coefficients by Yule-Walker over the weighted rows, shape (order,).
+
+    Rows with weight 0 neither count nor connect their neighbours. A residual
+    without power gives zeros.
+    """
+    products = lagged_products(residual, weight, order)
+    if not products[0] > 0.0:
+        return np.zeros(order)
+    # A touch of white noise keeps the system solvable for a residual that hardly varies.
+    products[0] *= 1.0 + 1e-9
+    return np.asarray(solve_toeplitz(products[:order], products[1:]))
+
+
+def whitened(columns: FloatArray, weight: ByteArray, ar: FloatArray) -> FloatArray:
+    """Return the innovations of each column, shape (rows left, columns)."""
+    columns = np.atleast_2d(columns.T).T
+    out = np.empty((columns.shape[0], columns.shape[1]))
+    rows = 0
+    buffer = np.empty(columns.shape[0])
+    for k in range(columns.shape[1]):
+        rows = whiten(np.ascontiguousarray(columns[:, k]), weight, ar, buffer)
+        out[:rows, k] = buffer[:rows]
+    return out[:rows]
+
+
+def inflation(residual: FloatArray, weight: ByteArray, longest_lag: int) -> float:
+    """Return how many times the variance of a long mean exceeds that of white noise.
+
+    Bartlett-weighted sum of autocorrelations up to ``longest_lag``; at least 1.
+    """
+    products = lagged_products(residual, weight, longest_lag)
+    if not products[0] > 0.0:
+        return 1.0
+    k = np.arange(1, longest_lag + 1)
+    tapered = (1.0 - k / (longest_lag + 1.0)) * products[1:] / products[0]
+    return float(max(1.0, 1.0 + 2.0 * tapered.sum()))

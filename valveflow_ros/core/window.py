@@ -1,0 +1,157 @@
+"""The rolling window of rows and special segments, in bounded memory."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from valveflow_ros.core.segmenter import FoundSegment
+from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SegmentKind
+
+_FIRST_ROOM = 16384
+
+
+@dataclass(frozen=True, slots=True)
+class WindowContents:
+    """A copy of what the window holds.
+
+    Attributes
+    ----------
+    time_ns : int64 (n,)
+    u, power_mw, temperature_degc : float64 (n,)
+        NaN in ``u`` or ``power_mw`` where a row has no usable data.
+    spans : int64 (k, 3)
+        Special segments as (first row, end row, kind), rows counted within these arrays.
+    """
+
+    time_ns: IntArray
+    u: FloatArray
+    power_mw: FloatArray
+    temperature_degc: FloatArray
+    spans: IntArray
+
+    def special_rows(self) -> IntArray:
+        """Return the rows that lie in special segments, in order of time."""
+        if not len(self.spans):
+            return np.empty(0, dtype=np.int64)
+        return np.concatenate([np.arange(a, b, dtype=np.int64) for a, b, _ in self.spans])
+
+    def count(self, kind: SegmentKind) -> int:
+        """Return the number of segments of a kind."""
+        return int((self.spans[:, 2] == kind).sum())
+
+
+class RollingWindow:
+    """Rows of the last days, and the special segments among them.
+
+    Parameters
+    ----------
+    window_s, period_s : float
+        Length of the window and step of the rows; together they bound the memory.
+    """
+
+    def __init__(self, window_s: float, period_s: float) -> None:
+        self._window_ns = round(window_s * NS_PER_S)
+        self._rows = max(16, int(np.ceil(window_s / period_s)) + 1)
+        self._room = min(_FIRST_ROOM, self._rows * 5 // 4 + 16)
+        self._time_ns = np.empty(self._room, dtype=np.int64)
+        self._data = np.empty((3, self._room))
+        self._end = 0
+        self._base = 0
+        self._segments: deque[FoundSegment] = deque()
+
+    def __len__(self) -> int:
+        """Return the number of rows held."""
+        return self._end
+
+    @property
+    def rows_seen(self) -> int:
+        """Return the number of rows ever appended; the next row's absolute number."""
+        return self._base + self._end
+
+    @property
+    def segments(self) -> int:
+        """Return the number of special segments inside the window."""
+        return len(self._segments)
+
+    @property
+    def special_samples(self) -> int:
+        """Return the number of samples in those segments."""
+        return sum(s.segment.samples for s in self._segments)
+
+    def append(
+        self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray, temperature_degc: FloatArray
+    ) -> None:
+        """Append rows; rows that have left the window are forgotten."""
+        done = 0
+        while done < len(time_ns):
+            if self._end == self._room:
+                self._make_room()
+            take = min(self._room - self._end, len(time_ns) - done)
+            part, place = slice(done, done + take), slice(self._end, self._end + take)
+            self._time_ns[place] = time_ns[part]
+            self._data[0, place] = u[part]
+            self._data[1, place] = power_mw[part]
+            self._data[2, place] = temperature_degc[part]
+            self._end += take
+            done += take
+        self._forget()
+
+    def add_segment(self, found: FoundSegment) -> None:
+        """Remember a special segment that has closed."""
+        self._segments.append(found)
+
+    def tail(self, rows: int) -> tuple[FloatArray, FloatArray]:
+        """Return copies of ``u`` and power of the last ``rows`` rows (fewer if fewer are held)."""
+        first = max(0, self._end - rows)
+        return self._data[0, first : self._end].copy(), self._data[1, first : self._end].copy()
+
+    def contents(self) -> WindowContents:
+        """Return a copy of the rows inside the window and their segments."""
+        if self._end == 0:
+            empty = np.empty(0)
+            none = np.empty((0, 3), dtype=np.int64)
+            return WindowContents(np.empty(0, dtype=np.int64), empty, empty, empty, none)
+        oldest = self._time_ns[self._end - 1] - self._window_ns
+        first = int(np.searchsorted(self._time_ns[: self._end], oldest, side='right'))
+        offset = self._base + first
+        spans = [
+            (s.first_row - offset, s.end_row - offset, int(s.segment.kind))
+            for s in self._segments
+            if s.first_row >= offset
+        ]
+        return WindowContents(
+            self._time_ns[first : self._end].copy(),
+            self._data[0, first : self._end].copy(),
+            self._data[1, first : self._end].copy(),
+            self._data[2, first : self._end].copy(),
+            np.array(spans, dtype=np.int64).reshape(-1, 3),
+        )
+
+    def _make_room(self) -> None:
+        """Grow until the window fits, then drop the oldest rows a fifth at a time."""
+        limit = self._rows * 5 // 4 + 16
+        if self._room < limit:
+            self._room = min(limit, 2 * self._room)
+            time_ns = np.empty(self._room, dtype=np.int64)
+            data = np.empty((3, self._room))
+            time_ns[: self._end] = self._time_ns[: self._end]
+            data[:, : self._end] = self._data[:, : self._end]
+            self._time_ns, self._data = time_ns, data
+            return
+        drop = self._end - self._rows
+        self._time_ns[: self._rows] = self._time_ns[drop : self._end].copy()
+        self._data[:, : self._rows] = self._data[:, drop : self._end].copy()
+        self._base += drop
+        self._end = self._rows
+
+    def _forget(self) -> None:
+        """Let go of segments that began before the window or whose rows are gone."""
+        oldest = int(self._time_ns[self._end - 1]) - self._window_ns
+        while self._segments and (
+            self._segments[0].segment.start_ns <= oldest
+            or self._segments[0].first_row < self._base
+        ):
+            self._segments.popleft()

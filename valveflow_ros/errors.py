@@ -1,0 +1,47 @@
+"""Everything that can go wrong for a person, each as one sentence.
+
+Every error the project raises on purpose derives from `ValveflowError`, and
+``str(error)`` is a sentence that says what was wrong, where, and what to do.
+The command line prints it and exits with status 1; the node logs it and goes
+on. Errors of other libraries are translated at the edge where they arise.
+"""
+
+
+class ValveflowError(Exception):
+    """Root of all errors raised on purpose; its text is one sentence for a person."""
+
+
+class InputError(ValveflowError):
+    """An argument, option, column, unit or value given by a person cannot be used."""
+
+
+class ParameterError(InputError):
+    """A parameter is unknown, of the wrong type, out of range, or at odds with another."""
+
+    def __init__(self, name: str, problem: str) -> None:
+        self.name = name
+        self.problem = problem
+        super().__init__(f"Parameter '{name}' {problem}.")
+
+
+class RecordingError(ValveflowError):
+    """A file or folder cannot be read or written."""
+
+    def __init__(self, path: object, problem: str) -> None:
+        self.path = str(path)
+        self.problem = problem
+        super().__init__(f"{self.path}: {problem}.")
+
+
+class DataError(ValveflowError):
+    """The data are readable but do not carry what was asked of them."""
+
+
+class TooFewSamplesError(DataError):
+    """Fewer samples, or fewer distinct openings, than the task needs."""
+
+    def __init__(self, what: str, have: int, need: int, advice: str = '') -> None:
+        self.have = have
+        self.need = need
+        tail = f' {advice}' if advice else ''
+        super().__init__(f'{what}: {have} found, at least {need} needed.{tail}')

@@ -1,0 +1,226 @@
+"""The words every part of the house shares: signals, qualities, readings, samples, segments.
+
+Records are frozen and slotted; arrays inside them are never written after the
+record was made. Units stand in the names; times are int64 nanoseconds since
+the Unix epoch.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+ByteArray = NDArray[np.uint8]
+
+NS_PER_S = 1_000_000_000
+
+
+class Signal(enum.IntEnum):
+    """The five inputs, in the order in which tables hold them."""
+
+    VALVE_OPENING = 0
+    MAIN_STEAM_PRESSURE = 1
+    MAIN_STEAM_TEMPERATURE = 2
+    GENERATED_POWER = 3
+    VALVE_COMMAND = 4
+
+
+class Quality(enum.IntEnum):
+    """How far a value can be trusted; the same numbers stand in the messages."""
+
+    GOOD = 0
+    UNCERTAIN = 1
+    BAD = 2
+
+
+@dataclass(frozen=True, slots=True)
+class SignalInfo:
+    """What a signal is called at the border and the unit the engine works in."""
+
+    signal: Signal
+    topic: str
+    column: str
+    unit: str
+    required: bool
+
+
+SIGNALS: tuple[SignalInfo, ...] = (
+    SignalInfo(Signal.VALVE_OPENING, 'valve_opening', 'valve_opening_percent', '%', True),
+    SignalInfo(
+        Signal.MAIN_STEAM_PRESSURE, 'main_steam_pressure', 'main_steam_pressure_mpa', 'MPa', True
+    ),
+    SignalInfo(
+        Signal.MAIN_STEAM_TEMPERATURE,
+        'main_steam_temperature',
+        'main_steam_temperature_degc',
+        'degC',
+        True,
+    ),
+    SignalInfo(Signal.GENERATED_POWER, 'generated_power', 'generated_power_mw', 'MW', True),
+    SignalInfo(Signal.VALVE_COMMAND, 'valve_command', 'valve_command_percent', '%', False),
+)
+N_SIGNALS = len(SIGNALS)
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """Single values as they arrived, in order of arrival.
+
+    Attributes
+    ----------
+    time_ns : int64 (n,)
+        The value's own time, nanoseconds since the Unix epoch.
+    signal : int8 (n,)
+        Which `Signal` it is.
+    value : float64 (n,)
+        In the engine's unit (%, MPa absolute, degC, MW); NaN means bad.
+    quality : uint8 (n,)
+        A `Quality` as the sender gave it; `GOOD` where the sender gives none.
+    """
+
+    time_ns: IntArray
+    signal: NDArray[np.int8]
+    value: FloatArray
+    quality: ByteArray
+
+    def __len__(self) -> int:
+        """Return the number of readings."""
+        return len(self.time_ns)
+
+    @classmethod
+    def of(cls, rows: list[tuple[int, int, float, int]]) -> Readings:
+        """Build from rows ``(time_ns, signal, value, quality)``."""
+        return cls(
+            np.array([r[0] for r in rows], dtype=np.int64),
+            np.array([r[1] for r in rows], dtype=np.int8),
+            np.array([r[2] for r in rows], dtype=np.float64),
+            np.array([r[3] for r in rows], dtype=np.uint8),
+        )
+
+    def part(self, start: int, end: int) -> Readings:
+        """Return the readings ``[start, end)`` without copying."""
+        cut = slice(start, end)
+        return Readings(self.time_ns[cut], self.signal[cut], self.value[cut], self.quality[cut])
+
+
+@dataclass(frozen=True, slots=True)
+class SampleTable:
+    """Rows on one time grid, the only form in which data reach the engine.
+
+    Attributes
+    ----------
+    time_ns : int64 (n,)
+        Strictly increasing.
+    values : float64 (n, 5)
+        Columns in the order of `Signal`, engine units; NaN where there is no usable value.
+    quality : uint8 (n, 5)
+        A `Quality` per value; `BAD` exactly where the value is NaN.
+    """
+
+    time_ns: IntArray
+    values: FloatArray
+    quality: ByteArray
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.time_ns)
+
+    def column(self, signal: Signal) -> FloatArray:
+        """Return one signal's values, shape (n,)."""
+        return self.values[:, signal]
+
+    def part(self, start: int, end: int) -> SampleTable:
+        """Return the rows ``[start, end)`` without copying."""
+        cut = slice(start, end)
+        return SampleTable(self.time_ns[cut], self.values[cut], self.quality[cut])
+
+    @classmethod
+    def from_columns(
+        cls,
+        time_ns: IntArray,
+        columns: dict[Signal, FloatArray],
+        quality: dict[Signal, ByteArray] | None = None,
+    ) -> SampleTable:
+        """Build from one array a signal; a signal left out is NaN and `BAD`."""
+        n = len(time_ns)
+        values = np.full((n, N_SIGNALS), np.nan)
+        codes = np.full((n, N_SIGNALS), int(Quality.BAD), dtype=np.uint8)
+        for signal, column in columns.items():
+            values[:, signal] = column
+            codes[:, signal] = Quality.GOOD
+            if quality is not None and signal in quality:
+                codes[:, signal] = quality[signal]
+        codes[~np.isfinite(values)] = Quality.BAD
+        values[codes == Quality.BAD] = np.nan
+        return cls(np.asarray(time_ns, dtype=np.int64), values, codes)
+
+    @classmethod
+    def concatenate(cls, tables: list[SampleTable]) -> SampleTable:
+        """Join tables that follow each other in time."""
+        if not tables:
+            return cls.from_columns(np.empty(0, dtype=np.int64), {})
+        return cls(
+            np.concatenate([t.time_ns for t in tables]),
+            np.concatenate([t.values for t in tables]),
+            np.concatenate([t.quality for t in tables]),
+        )
+
+
+def table_to_readings(table: SampleTable) -> Readings:
+    """Turn rows into single readings, row by row.
+
+    The optional signal of a row comes first, so that who waits for the
+    required ones has it. Values that are NaN in an optional column are left
+    out (the signal is absent); a NaN in a required column stays, as a reading
+    of bad quality.
+    """
+    n = len(table)
+    order = np.array(sorted(range(N_SIGNALS), key=lambda s: SIGNALS[s].required), dtype=np.int8)
+    time_ns = np.repeat(table.time_ns, N_SIGNALS)
+    signal = np.tile(order, n)
+    value = table.values[:, order].ravel()
+    quality = table.quality[:, order].ravel()
+    required = np.array([info.required for info in SIGNALS])
+    keep = np.isfinite(value) | required[signal]
+    return Readings(time_ns[keep], signal[keep], value[keep], quality[keep])
+
+
+class SegmentKind(enum.IntEnum):
+    """The two kinds of special segments (Section III.A of the paper)."""
+
+    STEADY = 1
+    SLOPE = 2
+
+
+@dataclass(frozen=True, slots=True)
+class SpecialSegment:
+    """A stretch of samples that carries static information only.
+
+    ``u`` is the integrated input V p^(9/8) in % MPa^(9/8), eq. (1).
+    """
+
+    number: int
+    kind: SegmentKind
+    start_ns: int
+    end_ns: int
+    samples: int
+    u_start: float
+    u_end: float
+    u_rate_per_s: float
+    u_rms: float
+    power_start_mw: float
+    power_end_mw: float
+    power_rms_mw: float
+    temperature_mean_degc: float
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """How many readings or rows met a named fate; nothing is dropped uncounted."""
+
+    by_reason: dict[str, int] = field(default_factory=dict)
