@@ -57,10 +57,8 @@ class Parameter:
     def _check_text(self, value: object) -> str:
         if not isinstance(value, str):
             raise ParameterError(self.name, f'must be a text, not {value!r}')
-        if '\x00' in value or '\n' in value or len(value) > 500:
-            raise ParameterError(
-                self.name, 'must be one line of at most 500 characters without zero bytes'
-            )
+        if not value.isprintable() or len(value) > 500:
+            raise ParameterError(self.name, 'must be one line of at most 500 printable characters')
         if self.choices and value not in self.choices:
             allowed = ', '.join(self.choices)
             raise ParameterError(self.name, f"must be one of {allowed}, not '{value}'")
@@ -173,7 +171,7 @@ _MODEL = (
     Parameter('steady_min', 120.0, 's', 'Shortest steady-state segment.', 0.0, 864000.0),
     Parameter('slope_min', 120.0, 's', 'Shortest slope-response segment.', 0.0, 864000.0),
     Parameter('input_noise', 0.0, '% MPa^m',
-              "Noise of u about its line, block means; 0 takes it from the data.", 0.0, 1e6),
+              'Noise of u about its line, block means; 0 takes it from the data.', 0.0, 1e6),
     Parameter('power_noise', 0.0, 'MW',
               'Noise of power about its line, block means; 0 takes it from the data.', 0.0, 1e6),
     Parameter('break_limit', 4.5, 'sd',
@@ -192,6 +190,10 @@ _MODEL = (
 
 _FIT = (
     Parameter('max_pieces', 10, '', 'Largest number of pieces tried, R_max of the paper.', 1, 20),
+    Parameter('selection_rule', 'prediction_error', '',
+              'How the number of pieces is chosen: a knee must pay for itself in the whitened '
+              "prediction error (needs refine), or the paper's turning angle, eq. (24).",
+              choices=('prediction_error', 'paper')),
     Parameter('min_piece_share', 0.01, '',
               'Smallest share of the special samples in a piece.', 0.0, 0.2),
     Parameter('refine', True, '',
@@ -228,11 +230,14 @@ _RECORD = (
               'Folder of the recordings; empty means valveflow_recordings where the node starts.'),
     Parameter('record_flush', 0.5, 's', 'Longest time a message waits before it is on disk.',
               0.05, 60.0),
-    Parameter('record_rotation', 3600.0, 's', 'A new file begins after this time.', 1.0, 864000.0),
+    Parameter('record_rotation', 3600.0, 's', 'A new file begins after this time.',
+              1.0, 864000.0),
     Parameter('record_queue', 200_000, '', 'Messages that may wait for the disk.', 100, 10_000_000),
     Parameter('diagnostics_period', 1.0, 's', 'Time between messages on /diagnostics.', 0.1, 60.0,
               live=True),
 )  # fmt: skip
+
+_MOST_ROWS = 20_000_000  # about 0.8 GB of window
 
 TABLE: tuple[Parameter, ...] = (
     *_UNIT_AND_INPUTS,
@@ -311,7 +316,7 @@ def parameter(name: str) -> Parameter:
     """Return the row called ``name``; the error names the nearest one."""
     row = PARAMETERS.get(name)
     if row is None:
-        near = difflib.get_close_matches(name, PARAMETERS, n=1)
+        near = difflib.get_close_matches(str(name), PARAMETERS, n=1)
         hint = f", did you mean '{near[0]}'" if near else ''
         raise ParameterError(name, f'does not exist{hint}')
     return row
@@ -332,8 +337,20 @@ def _check_together(values: Mapping[str, Value]) -> None:
             raise ParameterError(
                 name, f'({float(values[name]):g} s) must not be below sample_period ({period:g} s)'
             )
-    if float(values['longest_segment']) < 6.0 * float(values['block']):
+    if values['selection_rule'] == 'prediction_error' and not values['refine']:
+        raise ParameterError('selection_rule', 'must be paper when refine is false')
+    longest, window_s = float(values['longest_segment']), 86400.0 * float(values['window_days'])
+    if longest < 6.0 * float(values['block']):
         raise ParameterError('longest_segment', 'must be at least six times block')
+    for name in ('steady_min', 'slope_min'):
+        if float(values[name]) > longest:
+            raise ParameterError(name, 'must not be above longest_segment')
+    if window_s < longest:
+        raise ParameterError('window_days', f'must hold at least longest_segment ({longest:g} s)')
+    if window_s / period > _MOST_ROWS:
+        raise ParameterError(
+            'window_days', f'holds more than {_MOST_ROWS:,} rows at this sample_period'
+        )
     if float(values['slope_limit']) <= float(values['steady_limit']):
         raise ParameterError('slope_limit', 'must be above steady_limit')
 
@@ -370,6 +387,7 @@ def _yaml_scalar(value: Value) -> str:
     if isinstance(value, str):
         return "'" + value.replace("'", "''") + "'"
     if isinstance(value, float):
-        text = repr(value)
-        return text if '.' in text or 'e' in text else text + '.0'
+        # YAML 1.1 takes a number with an exponent but without a point for a text.
+        mantissa, exponent, power = repr(value).partition('e')
+        return (mantissa if '.' in mantissa else mantissa + '.0') + exponent + power
     return str(value)

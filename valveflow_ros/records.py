@@ -8,7 +8,7 @@ the Unix epoch.
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 ByteArray = NDArray[np.uint8]
+BoolArray = NDArray[np.bool_]
 
 NS_PER_S = 1_000_000_000
 
@@ -217,10 +218,3 @@ class SpecialSegment:
     power_end_mw: float
     power_rms_mw: float
     temperature_mean_degc: float
-
-
-@dataclass(frozen=True, slots=True)
-class Counts:
-    """How many readings or rows met a named fate; nothing is dropped uncounted."""
-
-    by_reason: dict[str, int] = field(default_factory=dict)

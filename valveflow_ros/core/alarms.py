@@ -6,11 +6,10 @@ import enum
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.jit import JIT
+from valveflow_ros.core.jit import jit
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
 
 
@@ -53,10 +52,10 @@ class AlarmChange:
 
 
 # Places in the alarm's memory.
-_ACTIVE, _SINCE, _COUNTING = range(3)
+_ACTIVE, _SINCE, _COUNTING, _LAST_NS = range(4)
 
 
-@numba.njit(**JIT)
+@jit
 def _watch(
     time_ns: IntArray,
     value: FloatArray,
@@ -64,13 +63,19 @@ def _watch(
     dead_band: float,
     on_ns: int,
     off_ns: int,
+    gap_ns: int,
     memory: IntArray,
 ) -> int:
     """Run until the condition turns; return the row after the turn, or 0.
 
-    NaN leaves everything as it is: bad data neither raise nor clear.
+    NaN leaves everything as it is: bad data neither raise nor clear. A delay
+    does not run through a gap in time, where nobody was watching.
     """
     for t in range(value.size):
+        step_ns = time_ns[t] - memory[_LAST_NS]
+        memory[_LAST_NS] = time_ns[t]
+        if step_ns > gap_ns or step_ns <= 0:
+            memory[_COUNTING] = 0
         v = abs(value[t])
         if math.isnan(v):
             continue
@@ -105,7 +110,7 @@ class ResidualAlarm:
     NAME = 'residual'
 
     def __init__(self, settings: Settings) -> None:
-        self._memory = np.zeros(3, dtype=np.int64)
+        self._memory = np.zeros(4, dtype=np.int64)
         self._occurrence = 0
         self._raised_ns = 0
         self.state = AlarmState.NORMAL
@@ -117,6 +122,7 @@ class ResidualAlarm:
         self._on_ns = round(settings.real('alarm_on_delay') * NS_PER_S)
         self._off_ns = round(settings.real('alarm_off_delay') * NS_PER_S)
         self._latch = settings.flag('alarm_latch')
+        self._gap_ns = round(1.5 * settings.real('sample_period') * NS_PER_S)
 
     @property
     def active(self) -> bool:
@@ -137,19 +143,18 @@ class ResidualAlarm:
         while done < len(time_ns):
             turned = _watch(
                 time_ns[done:], average_mw[done:], limit_mw, self._dead_band,
-                self._on_ns, self._off_ns, self._memory,
+                self._on_ns, self._off_ns, self._gap_ns, self._memory,
             )  # fmt: skip
             if not turned:
                 break
             done += turned
-            change = self._turn(int(time_ns[done - 1]), float(average_mw[done - 1]), limit_mw,
-                                model_id)  # fmt: skip
-            if change is not None:
-                changes.append((done, change))
+            at_ns, value = int(time_ns[done - 1]), float(average_mw[done - 1])
+            changes.append((done, self._turn(at_ns, value, limit_mw, model_id)))
         return changes
 
-    def acknowledge(self, time_ns: int, value: float, limit: float, model_id: str
-                    ) -> AlarmChange | None:  # fmt: skip
+    def acknowledge(
+        self, time_ns: int, value: float, limit: float, model_id: str
+    ) -> AlarmChange | None:
         """Acknowledge; None when there is nothing to acknowledge."""
         if self.state == AlarmState.UNACKNOWLEDGED:
             return self._enter(AlarmState.ACKNOWLEDGED, time_ns, value, limit, model_id)
@@ -157,12 +162,9 @@ class ResidualAlarm:
             return self._enter(AlarmState.NORMAL, time_ns, value, limit, model_id)
         return None
 
-    def _turn(self, time_ns: int, value: float, limit: float, model_id: str
-              ) -> AlarmChange | None:  # fmt: skip
-        """The condition has begun or ended."""
+    def _turn(self, time_ns: int, value: float, limit: float, model_id: str) -> AlarmChange:
+        """Change state because the condition has begun or ended."""
         if self.active:
-            if self.state == AlarmState.ACKNOWLEDGED:
-                return None
             self._occurrence += 1
             self._raised_ns = time_ns
             return self._enter(AlarmState.UNACKNOWLEDGED, time_ns, value, limit, model_id)
@@ -170,8 +172,9 @@ class ResidualAlarm:
         after = AlarmState.RETURNED_UNACKNOWLEDGED if latched else AlarmState.NORMAL
         return self._enter(after, time_ns, value, limit, model_id)
 
-    def _enter(self, state: AlarmState, time_ns: int, value: float, limit: float, model_id: str
-               ) -> AlarmChange:  # fmt: skip
+    def _enter(
+        self, state: AlarmState, time_ns: int, value: float, limit: float, model_id: str
+    ) -> AlarmChange:
         previous, self.state = self.state, state
         return AlarmChange(
             time_ns, self.NAME, state, previous, Priority.MEDIUM, value, limit, 'MW',
@@ -187,6 +190,8 @@ def _sentence(state: AlarmState, value: float, limit: float) -> str:
             f'The unit gives {abs(value):.1f} MW {side} than the valve curve says '
             f'(limit {limit:.1f} MW): check what changed, or re-identify.'
         )
+    if state == AlarmState.ACKNOWLEDGED and math.isnan(value):
+        return 'Acknowledged; with the new curve there is no residual to tell yet.'
     if state == AlarmState.ACKNOWLEDGED:
         return f'Acknowledged; the unit still gives {abs(value):.1f} MW {side} than expected.'
     if state == AlarmState.RETURNED_UNACKNOWLEDGED:

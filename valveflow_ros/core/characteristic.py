@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import json
-import math
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
 from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import FloatArray
-
-FORMAT = 'valveflow/characteristic'
-VERSION = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,157 +138,26 @@ class Characteristic:
                 f'The curve has no inverse: piece {falling} does not rise '
                 f'(slope {m.slopes()[falling - 1]:.4g} MW per unit of u).'
             )
+        x, u = _rising_points(m)
         power = np.asarray(power_mw, dtype=np.float64)
-        x = np.maximum.accumulate(np.column_stack([m.left, m.right]).ravel())
-        u = np.repeat(m.knots, 2)[1:-1]
         return np.where((power >= x[0]) & (power <= x[-1]), np.interp(power, x, u), np.nan)
 
     def with_id(self) -> Characteristic:
         """Return a copy whose `model_id` is a hash of its numbers."""
-        text = json.dumps(to_json(replace(self, model_id='')), sort_keys=True)
-        return replace(self, model_id=hashlib.sha256(text.encode()).hexdigest()[:12])
+        digest = hashlib.sha256(repr(replace(self, model_id='')).encode()).hexdigest()
+        return replace(self, model_id=digest[:12])
 
 
-def _number(value: float) -> float | None:
-    """JSON has neither NaN nor infinity: absent is null."""
-    return float(value) if math.isfinite(value) else None
+def _rising_points(m: RegionalModel) -> tuple[FloatArray, FloatArray]:
+    """Return (x, u) along which the smallest u that reaches a power lies.
 
-
-def _piece_json(piece: Piece) -> dict[str, Any]:
-    return {
-        'u_from': piece.u_from,
-        'u_to': piece.u_to,
-        'slope': piece.slope,
-        'intercept': piece.intercept,
-        'slope_stderr': _number(piece.slope_stderr),
-        'intercept_stderr': _number(piece.intercept_stderr),
-        'samples': piece.samples,
-    }
-
-
-def to_json(c: Characteristic) -> dict[str, Any]:
-    """Return the content of ``characteristic.json``."""
-    return {
-        'format': FORMAT,
-        'version': VERSION,
-        'model_id': c.model_id,
-        'pressure_exponent': c.pressure_exponent,
-        'pieces': [_piece_json(p) for p in c.pieces],
-        'breakpoint_intervals': [[_number(lo), _number(hi)] for lo, hi in c.breakpoint_intervals],
-        'selection': {
-            'rule': c.choice.rule,
-            'cost': {str(j): v for j, v in c.choice.cost.items()},
-            'turning_angle': {str(j): v for j, v in c.choice.turning_angle.items()},
-            'note': c.choice.note,
-        },
-        'segments': {
-            'steady': c.source.steady,
-            'slope_response': c.source.slope_response,
-            'samples': c.source.samples,
-        },
-        'window': {'start_ns': c.source.window_start_ns, 'end_ns': c.source.window_end_ns},
-        'temperature': {
-            'mean_degc': _number(c.source.temperature_mean_degc),
-            'spread_k': _number(c.source.temperature_spread_k),
-            'flag': c.source.temperature_flag,
-        },
-        'dynamics': [
-            {
-                'power_from': d.power_from,
-                'power_to': d.power_to,
-                'time_constant_s': d.time_constant_s,
-                'delay_s': d.delay_s,
-                'time_constant_stderr_s': _number(d.time_constant_stderr_s),
-                'delay_stderr_s': _number(d.delay_stderr_s),
-            }
-            for d in c.dynamics
-        ],
-        'residuals': {
-            'rmse_mw': c.residuals.rmse_mw,
-            'average_sd_mw': c.residuals.average_sd_mw,
-            'average_s': c.residuals.average_s,
-            'input_noise': c.residuals.input_noise,
-            'power_noise_mw': c.residuals.power_noise_mw,
-        },
-        'partition': {'pieces': [_piece_json(p) for p in c.partition_pieces]},
-        'notes': list(c.notes),
-        'optimal': True,
-    }
-
-
-def _piece_from(raw: dict[str, Any]) -> Piece:
-    def real(key: str) -> float:
-        return math.nan if raw[key] is None else float(raw[key])
-
-    return Piece(
-        real('u_from'), real('u_to'), real('slope'), real('intercept'),
-        real('slope_stderr'), real('intercept_stderr'), int(raw['samples']),
-    )  # fmt: skip
-
-
-def from_json(raw: object) -> Characteristic:
-    """Read the content of ``characteristic.json``.
-
-    Raises
-    ------
-    DataError
-        It is not one, or not one this version can read.
+    At a jump up the knot answers for all powers inside it; after a jump down a
+    piece counts only from where it goes beyond what was reached before.
     """
-    if not isinstance(raw, dict) or raw.get('format') != FORMAT:
-        raise DataError(f"This is no flow characteristic: 'format' must be '{FORMAT}'.")
-    if raw.get('version') != VERSION:
-        raise DataError(
-            f'The characteristic has version {raw.get("version")}, this program reads {VERSION}.'
-        )
-    try:
-        return _read(raw)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise DataError(f'The characteristic is not complete: {error!r} is in the way.') from error
-
-
-def _read(raw: dict[str, Any]) -> Characteristic:
-    def nan_if_null(value: object) -> float:
-        return math.nan if value is None else float(value)  # type: ignore[arg-type]
-
-    pieces = tuple(_piece_from(p) for p in raw['pieces'])
-    knots = np.array([pieces[0].u_from, *(p.u_to for p in pieces)])
-    numbers = [*knots, *(p.slope for p in pieces), *(p.intercept for p in pieces)]
-    if not (np.all(np.isfinite(numbers)) and np.all(np.diff(knots) > 0.0)):
-        raise ValueError('breakpoints must increase and all numbers be finite')
-    window, temperature, segments = raw['window'], raw['temperature'], raw['segments']
-    residuals, selection = raw['residuals'], raw['selection']
-    return Characteristic(
-        pressure_exponent=float(raw['pressure_exponent']),
-        pieces=pieces,
-        breakpoint_intervals=tuple(
-            (nan_if_null(lo), nan_if_null(hi)) for lo, hi in raw['breakpoint_intervals']
-        ),
-        choice=Choice(
-            str(selection['rule']),
-            {int(j): float(v) for j, v in selection['cost'].items()},
-            {int(j): float(v) for j, v in selection['turning_angle'].items()},
-            str(selection.get('note', '')),
-        ),
-        source=Source(
-            int(window['start_ns']), int(window['end_ns']), int(segments['steady']),
-            int(segments['slope_response']), int(segments['samples']),
-            nan_if_null(temperature['mean_degc']), nan_if_null(temperature['spread_k']),
-            bool(temperature['flag']),
-        ),
-        residuals=ResidualStatistics(
-            float(residuals['rmse_mw']), float(residuals['average_sd_mw']),
-            float(residuals['average_s']), float(residuals['input_noise']),
-            float(residuals['power_noise_mw']),
-        ),
-        dynamics=tuple(
-            RegionDynamics(
-                float(d['power_from']), float(d['power_to']), float(d['time_constant_s']),
-                float(d['delay_s']), nan_if_null(d.get('time_constant_stderr_s')),
-                nan_if_null(d.get('delay_stderr_s')),
-            )
-            for d in raw['dynamics']
-        ),
-        partition_pieces=tuple(_piece_from(p) for p in raw.get('partition', {}).get('pieces', [])),
-        notes=tuple(str(n) for n in raw.get('notes', [])),
-        model_id=str(raw.get('model_id', '')),
-    )  # fmt: skip
+    x, u = [float(m.left[0])], [float(m.knots[0])]
+    for k, slope in enumerate(m.slopes()):
+        low = max(float(m.left[k]), x[-1])
+        if m.right[k] > low:
+            x += [low, float(m.right[k])]
+            u += [float(m.knots[k] + (low - m.left[k]) / slope), float(m.knots[k + 1])]
+    return np.array(x), np.array(u)

@@ -13,7 +13,7 @@ from valveflow_ros.records import SpecialSegment
 
 
 class JournalKind(enum.IntEnum):
-    """Why the engine's state changed other than by a row; the same numbers stand in the message."""
+    """Why the engine's state changed other than by a row; numbers as in the message."""
 
     FIT_REQUESTED = 1
     FIT_ADOPTED = 2
@@ -22,6 +22,7 @@ class JournalKind(enum.IntEnum):
     SET_REFERENCE = 5
     RESET = 6
     DIAGNOSE = 7
+    SETTINGS = 8
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,8 @@ from valveflow_ros.core.characteristic import (
 )
 from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.partition import Partition, partition
-from valveflow_ros.core.refine import Refined, Samples, refine
+from valveflow_ros.core.problem import Samples
+from valveflow_ros.core.refine import Refined, refine
 from valveflow_ros.core.selection import Selection, select
 from valveflow_ros.core.whitening import inflation
 from valveflow_ros.core.window import WindowContents
@@ -239,8 +240,10 @@ def _refined(
         settle_s=settings.settle_s,
         group=max(1, round(settings.real('block') / step)),
     )
+    by_paper = settings.text('selection_rule') == 'paper'
+    most = None if by_paper else settings.whole('max_pieces')
     try:
-        result = refine(samples, static.model)
+        result = refine(samples, static.model, most)
     except np.linalg.LinAlgError:
         return replace(static, notes=('The dynamics could not be estimated; curve not refined.',))
     return _from_refined(task, static, result, samples, u_special)
@@ -275,8 +278,13 @@ def _from_refined(
         )
         for i in range(m.regions)
     )  # fmt: skip
+    choice = static.choice
+    if task.settings.text('selection_rule') != 'paper':
+        note = f"The paper's rule (24) takes J = {len(static.pieces)}."
+        choice = replace(choice, rule='prediction_error', note=f'{note} {choice.note}'.strip())
     return replace(
         static,
+        choice=choice,
         pieces=pieces,
         breakpoint_intervals=intervals,
         dynamics=dynamics,
@@ -302,6 +310,6 @@ def _line_errors(m: RegionalModel, covariance: FloatArray) -> tuple[FloatArray, 
 
     def errors(gradient: FloatArray) -> FloatArray:
         variance = np.einsum('ip,pq,iq->i', gradient, covariance, gradient)
-        return np.sqrt(np.maximum(variance, 0.0))
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     return errors(slope_of), errors(intercept_of)

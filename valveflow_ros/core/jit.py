@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
 
 # No fastmath: it lets NaN disappear and reorders the sums that tests compare.
 JIT: dict[str, Any] = {'cache': True, 'nogil': True}
@@ -10,3 +13,34 @@ JIT: dict[str, Any] = {'cache': True, 'nogil': True}
 # Kernels made for SIMD: a division by zero gives inf or NaN instead of an
 # exception, whose test would keep the loop scalar.
 KERNEL_JIT: dict[str, Any] = {**JIT, 'error_model': 'numpy'}
+
+_Function = TypeVar('_Function', bound=Callable[..., Any])
+
+
+def jit(function: _Function) -> _Function:
+    """Compile a loop over arrays, keeping its type for the checker."""
+    return cast(_Function, numba.njit(**JIT)(function))
+
+
+def kernel_jit(function: _Function) -> _Function:
+    """Compile a loop whose divisions may give inf or NaN."""
+    return cast(_Function, numba.njit(**KERNEL_JIT)(function))
+
+
+# A division by zero gives inf or NaN here instead of an exception, whose test
+# would keep a loop from being turned into SIMD instructions.
+_KERNEL_JIT: dict[str, Any] = {**JIT, 'error_model': 'numpy'}
+
+
+def kernel(function: _Function) -> _Function:
+    """Compile a loop made for SIMD: like `jit`, with IEEE division."""
+    return cast(_Function, numba.njit(**_KERNEL_JIT)(function))
+
+
+def inlined(function: _Function) -> _Function:
+    """Compile a part of a `kernel` into its caller.
+
+    A call that hands over records of arrays costs more than a short loop does:
+    every array is passed as seven numbers and its reference count goes up and down.
+    """
+    return cast(_Function, numba.njit(**_KERNEL_JIT, forceinline=True)(function))

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numba
-
-from valveflow_ros.core.jit import JIT
+from valveflow_ros.core.jit import jit
 from valveflow_ros.records import FloatArray
 
 # A line is five running sums over (k, v), k = 0, 1, 2, ... and v taken
@@ -15,13 +13,13 @@ N, ORIGIN, SV, SKV, SVV = range(5)
 LINE_SIZE = 5
 
 
-@numba.njit(**JIT)
+@jit
 def line_reset(line: FloatArray) -> None:
     """Forget all points."""
     line[:] = 0.0
 
 
-@numba.njit(**JIT)
+@jit
 def line_add(line: FloatArray, value: float) -> None:
     """Append the next point."""
     if line[N] == 0.0:
@@ -34,7 +32,7 @@ def line_add(line: FloatArray, value: float) -> None:
     line[SVV] += v * v
 
 
-@numba.njit(**JIT)
+@jit
 def line_fit(line: FloatArray) -> tuple[float, float, float]:
     """Return mean, slope per point, and rms residual (n - 2 degrees of freedom).
 
@@ -56,7 +54,7 @@ def line_fit(line: FloatArray) -> tuple[float, float, float]:
     return mean + line[ORIGIN], slope, math.sqrt(max(rest, 0.0) / (n - 2.0))
 
 
-@numba.njit(**JIT)
+@jit
 def line_ahead(line: FloatArray, steps: float) -> tuple[float, float]:
     """Extrapolate to ``steps`` points after the last one.
 

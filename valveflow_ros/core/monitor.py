@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import enum
+import json
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
-from valveflow_ros.config import Settings
+from valveflow_ros.config import Settings, parameter
 from valveflow_ros.core.alarms import ResidualAlarm
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.events import (
@@ -21,16 +21,22 @@ from valveflow_ros.core.events import (
     SegmentClosed,
 )
 from valveflow_ros.core.fit import FitTask
-from valveflow_ros.core.jit import JIT
 from valveflow_ros.core.prediction import PredictionBlock, Predictor, no_prediction
 from valveflow_ros.core.segmenter import NoiseLevel, Segmented, Segmenter
+from valveflow_ros.core.units import integrated_input
 from valveflow_ros.core.window import RollingWindow
-from valveflow_ros.errors import DataError
+from valveflow_ros.errors import DataError, ParameterError
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SampleTable, Signal
+
+BY_HAND = 'asked for by hand'
 
 
 class CurveStatus(enum.IntEnum):
-    """What can be said of the running curve; the same numbers stand in the message."""
+    """What can be said of the running curve; the same numbers stand in the message.
+
+    `STALE`: there is a curve, but the last fit was refused or the clock went
+    back. `REFUSED`: there is none, and the last fit was refused.
+    """
 
     UNKNOWN = 0
     FRESH = 1
@@ -55,13 +61,21 @@ class Fed:
     events: list[Event]
 
 
-@numba.njit(**JIT)
-def _integrated_input(
-    opening: FloatArray, pressure: FloatArray, exponent: float, out: FloatArray
-) -> None:
-    """Write u = V p^m row by row; a loop, so that blocks of any size round alike."""
-    for t in range(opening.size):
-        out[t] = opening[t] * pressure[t] ** exponent if pressure[t] > 0.0 else math.nan
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """The columns of some rows, all of shape (n,)."""
+
+    time_ns: IntArray
+    u: FloatArray
+    power_mw: FloatArray
+    temperature_degc: FloatArray
+
+    def part(self, start: int, end: int) -> _Rows:
+        """Return the rows ``[start, end)`` without copying."""
+        cut = slice(start, end)
+        return _Rows(
+            self.time_ns[cut], self.u[cut], self.power_mw[cut], self.temperature_degc[cut]
+        )
 
 
 class Monitor:
@@ -74,7 +88,7 @@ class Monitor:
     Notes
     -----
     The state changes by rows and by the calls `adopt`, `refuse`, `acknowledge`,
-    `request_fit` and `restart`, nothing else, and each such call leaves a
+    `request_fit`, `restart` and `reconfigure`, nothing else, and each such call leaves a
     `JournalEntry` with the number of rows before it. Rows and journal together
     give the same events again, bit for bit.
     """
@@ -91,6 +105,7 @@ class Monitor:
         self._last_average = math.nan
         self._pending_ns: int | None = None
         self._last_request_ns: int | None = None
+        self._last_name_ns = 0
         self._segments_at_request = 0
         self._segments_seen = 0
         self._wanted = False
@@ -146,18 +161,33 @@ class Monitor:
         sd = self._predictor.characteristic.residuals.average_sd_mw
         return self.settings.real('alarm_limit_sd') * sd
 
-    def reconfigure(self, settings: Settings) -> None:
-        """Take settings of which only live ones differ."""
+    def reconfigure(self, settings: Settings) -> list[Event]:
+        """Take settings of which only live ones differ.
+
+        Raises
+        ------
+        ParameterError
+            One differs that may not be changed while the monitor runs.
+        """
+        changed = {k: v for k, v in settings.items() if v != self.settings[k]}
+        for name in changed:
+            if not parameter(name).live:
+                raise ParameterError(name, 'cannot be changed while the monitor runs')
+        if not changed:
+            return []
         self.settings = settings
         self._alarm.configure(settings)
+        text = json.dumps(changed, sort_keys=True)
+        return [self._journal(JournalKind.SETTINGS, 0, '', text)]
 
     def feed(self, table: SampleTable) -> Fed:
         """Take rows until they end or a fit is wanted."""
         events: list[Event] = []
+        rows = self._columns(table)
         done = 0
         while done < len(table):
             until, by_time = self._rows_until_due(table.time_ns[done:])
-            taken, closed = self._take(table.part(done, done + until), events)
+            taken, closed = self._take(rows.part(done, done + until), events)
             done += taken
             # Decisions fall only where a segment closes or the period ends, never where
             # a block happens to end: cutting must not matter.
@@ -205,7 +235,7 @@ class Monitor:
             raise DataError('A fit is running already.')
         if not self._window.segments:
             raise DataError('There is no special segment to fit yet.')
-        return self._ask()
+        return self._ask(BY_HAND)
 
     def acknowledge(self) -> list[Event]:
         """Acknowledge the alarm.
@@ -244,41 +274,41 @@ class Monitor:
             self.cause = reason
         return [*events, self._journal(JournalKind.RESET, 0, '', reason)]
 
-    def _take(self, table: SampleTable, events: list[Event]) -> tuple[int, bool]:
+    def _columns(self, table: SampleTable) -> _Rows:
+        """Return the columns the engine works on, u among them."""
+        u = integrated_input(
+            table.column(Signal.VALVE_OPENING),
+            table.column(Signal.MAIN_STEAM_PRESSURE),
+            self.settings.real('pressure_exponent'),
+        )
+        power = np.ascontiguousarray(table.column(Signal.GENERATED_POWER))
+        temperature = np.ascontiguousarray(table.column(Signal.MAIN_STEAM_TEMPERATURE))
+        return _Rows(table.time_ns, u, power, temperature)
+
+    def _take(self, rows: _Rows, events: list[Event]) -> tuple[int, bool]:
         """Run rows up to the next segment's close through everything.
 
         Returns the rows taken and whether a segment closed at the last of them.
         """
-        u = np.empty(len(table))
-        _integrated_input(
-            table.column(Signal.VALVE_OPENING),
-            table.column(Signal.MAIN_STEAM_PRESSURE),
-            self.settings.real('pressure_exponent'),
-            u,
+        segmented = self._segmenter.feed(
+            rows.time_ns, rows.u, rows.power_mw, rows.temperature_degc, most=1
         )
-        power = table.column(Signal.GENERATED_POWER)
-        temperature = table.column(Signal.MAIN_STEAM_TEMPERATURE)
-        segmented = self._segmenter.feed(table.time_ns, u, power, temperature, most=1)
         n = segmented.rows
-        if n == 0:
-            # A gap before the very first row closed a segment.
-            self._close(segmented, events)
-            return 0, True
-        time_ns = table.time_ns[:n]
-        self._window.append(time_ns, u[:n], power[:n], temperature[:n])
-        block = self._predict(time_ns, u[:n], np.ascontiguousarray(power[:n]), segmented)
+        rows = rows.part(0, n)
+        self._window.append(rows.time_ns, rows.u, rows.power_mw, rows.temperature_degc)
+        block = self._predict(rows, segmented)
         self._rows += n
-        self._last_ns = int(time_ns[-1])
+        self._last_ns = int(rows.time_ns[-1])
         self._last_average = float(block.average_mw[-1])
         self._say(block, segmented, events)
         return n, bool(segmented.found)
 
-    def _predict(
-        self, time_ns: IntArray, u: FloatArray, power: FloatArray, segmented: Segmented
-    ) -> PredictionBlock:
+    def _predict(self, rows: _Rows, segmented: Segmented) -> PredictionBlock:
         if self._predictor is None:
-            return no_prediction(time_ns, u, power, segmented.kinds)
-        return self._predictor.predict(time_ns, u, power, segmented.kinds, self.limit_mw())
+            return no_prediction(rows.time_ns, rows.u, rows.power_mw, segmented.kinds)
+        return self._predictor.predict(
+            rows.time_ns, rows.u, rows.power_mw, segmented.kinds, self.limit_mw()
+        )
 
     def _say(self, block: PredictionBlock, segmented: Segmented, events: list[Event]) -> None:
         """Append what the rows brought; a segment can only have closed at the last of them."""
@@ -323,15 +353,17 @@ class Monitor:
         enough = self._window.special_samples >= self.settings.whole('min_fit_samples')
         return enough and self._may_ask()
 
-    def _ask(self) -> list[Event]:
-        self._pending_ns = self._last_ns
+    def _ask(self, text: str = '') -> list[Event]:
+        # Its time names a request; after the clock went back names must not come again.
+        self._pending_ns = max(self._last_ns, self._last_name_ns + 1)
+        self._last_name_ns = self._pending_ns
         self._last_request_ns = self._last_ns
         self._segments_at_request = self._segments_seen
         noise = self._segmenter.noise()
         task = FitTask(
-            self._last_ns, self._window.contents(), self.settings, noise.input, noise.power_mw
+            self._pending_ns, self._window.contents(), self.settings, noise.input, noise.power_mw
         )
-        entry = self._journal(JournalKind.FIT_REQUESTED, self._last_ns, '', '')
+        entry = self._journal(JournalKind.FIT_REQUESTED, self._pending_ns, '', text)
         return [entry, FitRequested(task)]
 
     def _journal(

@@ -11,9 +11,7 @@ from __future__ import annotations
 
 import math
 
-import numba
-
-from valveflow_ros.core.jit import JIT
+from valveflow_ros.core.jit import jit
 from valveflow_ros.records import FloatArray
 
 WINDOW = 42  # block means a stretch
@@ -25,18 +23,21 @@ WARM_UP = 4  # stretches before the noise is believed
 FORGET_AT = 4000.0  # stretches after which old ones count half (about three weeks)
 
 
-@numba.njit(**JIT)
+@jit
 def noise_add(histogram: FloatArray, rms: float) -> None:
-    """Add one stretch's rms; halve everything when there is much of it."""
-    place = 0
-    if rms > 0.0:
-        place = min(max(int((math.log10(rms) - _LOWEST) * _PER_DECADE), 0), BINS - 1)
+    """Add one stretch's rms; halve everything when there is much of it.
+
+    A signal that stood still to the last digit teaches nothing of its noise.
+    """
+    if not 10.0**_LOWEST < rms < 10.0 ** (_LOWEST + BINS / _PER_DECADE):
+        return
+    place = min(max(int((math.log10(rms) - _LOWEST) * _PER_DECADE), 0), BINS - 1)
     histogram[place] += 1.0
     if histogram.sum() >= FORGET_AT:
         histogram *= 0.5
 
 
-@numba.njit(**JIT)
+@jit
 def noise_level(histogram: FloatArray) -> float:
     """Return the noise sd: the quantile, interpolated inside its bin."""
     wanted = QUANTILE * histogram.sum()

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 
 from valveflow_ros.core.align import Aligned, Aligner
 from valveflow_ros.core.events import Event, FitRequested, JournalEntry, JournalKind
 from valveflow_ros.core.fit import FitTask, fit
-from valveflow_ros.core.monitor import Monitor
+from valveflow_ros.core.monitor import BY_HAND, Monitor
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import Readings, SampleTable
 
@@ -18,12 +18,6 @@ CLOCK_BACK = 'The clock went back; rows before that were let go.'
 
 def _quiet(_share: float, _what: str) -> None:
     """Show no progress."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Outcome:
-    task: FitTask
-    due_row: int | None
 
 
 def outcome_of(monitor: Monitor, task: FitTask) -> list[Event]:
@@ -74,12 +68,15 @@ class JournalReplayer:
         Fresh, with the settings of the live run.
     journal : sequence of JournalEntry
         In the order written. Requests the engine makes by itself come anew
-        and are not repeated; outcomes, acknowledgements and requests by hand are.
+        and are not repeated; everything else is.
     """
 
     def __init__(self, monitor: Monitor, journal: Sequence[JournalEntry]) -> None:
         self._monitor = monitor
-        self._due = list(journal)
+        self._due = [
+            entry for entry in journal
+            if entry.kind != JournalKind.FIT_REQUESTED or entry.text == BY_HAND
+        ]  # fmt: skip
         self._tasks: dict[int, FitTask] = {}
 
     def feed(self, table: SampleTable) -> list[Event]:
@@ -99,17 +96,11 @@ class JournalReplayer:
             self._keep(fed.events)
 
     def _keep(self, events: list[Event]) -> None:
-        for event in events:
-            if isinstance(event, FitRequested):
-                self._tasks[event.task.request_ns] = event.task
-                self._strike(JournalKind.FIT_REQUESTED, event.task.request_ns)
-
-    def _strike(self, kind: JournalKind, request_ns: int) -> None:
-        """Take an entry off the list that the engine has made by itself."""
-        for k, entry in enumerate(self._due):
-            if entry.kind == kind and entry.request_ns == request_ns:
-                del self._due[k]
-                return
+        self._tasks.update(
+            (event.task.request_ns, event.task)
+            for event in events
+            if isinstance(event, FitRequested)
+        )
 
     def _repeat_due(self) -> list[Event]:
         events: list[Event] = []
@@ -121,9 +112,7 @@ class JournalReplayer:
         monitor = self._monitor
         if entry.kind == JournalKind.FIT_REQUESTED:
             events = monitor.request_fit()
-            self._tasks.update(
-                (e.task.request_ns, e.task) for e in events if isinstance(e, FitRequested)
-            )
+            self._keep(events)
             return events
         if entry.kind == JournalKind.FIT_ADOPTED:
             return monitor.adopt(entry.request_ns, fit(self._tasks.pop(entry.request_ns)))
@@ -134,4 +123,6 @@ class JournalReplayer:
             return monitor.acknowledge()
         if entry.kind == JournalKind.RESET:
             return monitor.restart(entry.text)
+        if entry.kind == JournalKind.SETTINGS:
+            return monitor.reconfigure(monitor.settings.changed(json.loads(entry.text)))
         return []

@@ -5,18 +5,18 @@ from __future__ import annotations
 import enum
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from valveflow_ros.core.jit import JIT
 from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.jit import jit
 from valveflow_ros.core.regional_kernel import curve, region_of
 from valveflow_ros.core.segmenter_kernel import NO_DATA, SETTLED_SLOPE, SETTLED_STEADY
-from valveflow_ros.records import ByteArray, FloatArray, IntArray
+from valveflow_ros.records import NS_PER_S, ByteArray, FloatArray, IntArray
 
 _LONGEST_DELAY_S = 600.0
-_AGE, _PLACE = range(2)
+_AGE, _PLACE, _LAST_NS = range(3)
 _ANSWER, _AVERAGE = range(2)
 
 
@@ -68,79 +68,98 @@ class PredictionBlock:
         return len(self.time_ns)
 
 
-@numba.njit(**JIT)
+class _Filter(NamedTuple):
+    """The curve, the dynamics and the filter's state."""
+
+    knots: FloatArray
+    left: FloatArray
+    right: FloatArray
+    levels: FloatArray
+    decay: FloatArray
+    delay: FloatArray  # rows
+    settle: int  # rows
+    forget: float
+    gap_ns: int  # rows further apart than this have a gap between them
+    place: IntArray  # rows since the last gap, place in the ring, time of the last row
+    memory: FloatArray  # filter's answer, mean of the residual
+    past: FloatArray  # ring of flows
+
+
+class _Columns(NamedTuple):
+    """What is written for each row."""
+
+    static: FloatArray
+    dynamic: FloatArray
+    residual: FloatArray
+    average: FloatArray
+    state: ByteArray
+
+
+@jit
+def _filter(f: _Filter, x: float) -> None:
+    """Put one flow through the dynamics of its region."""
+    age = f.place[_AGE]
+    room = f.past.size
+    place = f.place[_PLACE]
+    f.past[place] = x
+    if f.decay.size > 0:
+        r = region_of(x, f.levels)
+        whole = int(f.delay[r])
+        part = f.delay[r] - whole
+        near = f.past[(place - min(whole, age)) % room]
+        far = f.past[(place - min(whole + 1, age)) % room]
+        late = near * (1.0 - part) + far * part
+        if age == 0:
+            f.memory[_ANSWER] = x
+        f.memory[_ANSWER] = f.decay[r] * f.memory[_ANSWER] + (1.0 - f.decay[r]) * late
+    f.place[_PLACE] = (place + 1) % room
+    f.place[_AGE] = age + 1
+
+
+@jit
+def _state_of(inside: bool, kind: int) -> int:
+    """Return the `PredictionState` of a row with data."""
+    if not inside:
+        return 4
+    if kind == SETTLED_STEADY:
+        return 2
+    return 3 if kind == SETTLED_SLOPE else 1
+
+
+@jit
 def _predict(
-    u: FloatArray,
-    y: FloatArray,
-    kinds: ByteArray,
-    knots: FloatArray,
-    left: FloatArray,
-    right: FloatArray,
-    levels: FloatArray,
-    decay: FloatArray,
-    delay: FloatArray,
-    settle: int,
-    forget: float,
-    place: IntArray,
-    memory: FloatArray,
-    past: FloatArray,
-    static: FloatArray,
-    dynamic: FloatArray,
-    residual: FloatArray,
-    average: FloatArray,
-    state: ByteArray,
+    time_ns: IntArray, u: FloatArray, y: FloatArray, kinds: ByteArray, f: _Filter, out: _Columns
 ) -> None:
-    """Predict rows; ``past`` is a ring of flows, ``place`` and ``memory`` the filter's state."""
-    room = past.size
-    known = decay.size > 0
+    """Predict rows."""
+    known = f.decay.size > 0
     for t in range(u.size):
-        static[t] = dynamic[t] = residual[t] = np.nan
+        out.static[t] = out.dynamic[t] = out.residual[t] = np.nan
+        out.average[t] = f.memory[_AVERAGE]
+        step_ns = time_ns[t] - f.place[_LAST_NS]
+        f.place[_LAST_NS] = time_ns[t]
+        if step_ns > f.gap_ns or step_ns <= 0:
+            f.place[_AGE] = 0
         if kinds[t] == NO_DATA or not (math.isfinite(u[t]) and math.isfinite(y[t])):
-            place[_AGE] = 0
-            state[t] = 5
-            average[t] = memory[_AVERAGE]
+            f.place[_AGE] = 0
+            out.state[t] = 5
             continue
-        x = curve(u[t], knots, left, right)
-        inside = knots[0] <= u[t] <= knots[-1]
-        age = place[_AGE]
-        past[place[_PLACE]] = x
-        if known:
-            r = region_of(x, levels)
-            whole = int(delay[r])
-            part = delay[r] - whole
-            near = past[(place[_PLACE] - min(whole, age)) % room]
-            far = past[(place[_PLACE] - min(whole + 1, age)) % room]
-            late = near * (1.0 - part) + far * part
-            if age == 0:
-                memory[_ANSWER] = x
-            memory[_ANSWER] = decay[r] * memory[_ANSWER] + (1.0 - decay[r]) * late
-        place[_PLACE] = (place[_PLACE] + 1) % room
-        place[_AGE] = age + 1
-        if inside:
-            static[t] = x
-        judged = False
-        if known and age >= settle:
-            dynamic[t] = memory[_ANSWER]
-            residual[t] = y[t] - dynamic[t]
-            judged = inside
-        elif not known and kinds[t] != 0:
-            residual[t] = y[t] - x
-            judged = inside
+        x = curve(u[t], f.knots, f.left, f.right)
+        inside = f.knots[0] <= u[t] <= f.knots[-1]
+        _filter(f, x)
+        out.state[t] = _state_of(inside, kinds[t])
         if not inside:
-            state[t] = 4
-        elif kinds[t] == SETTLED_STEADY:
-            state[t] = 2
-        elif kinds[t] == SETTLED_SLOPE:
-            state[t] = 3
+            continue
+        out.static[t] = x
+        if known and f.place[_AGE] > f.settle:
+            out.dynamic[t] = f.memory[_ANSWER]
+            out.residual[t] = y[t] - out.dynamic[t]
+        elif not known and kinds[t] != 0:
+            out.residual[t] = y[t] - x
         else:
-            state[t] = 1
-        if judged:
-            if math.isnan(memory[_AVERAGE]):
-                memory[_AVERAGE] = 0.0
-            memory[_AVERAGE] = forget * memory[_AVERAGE] + (1.0 - forget) * residual[t]
-        elif not inside:
-            residual[t] = np.nan
-        average[t] = memory[_AVERAGE]
+            continue
+        mean = 0.0 if math.isnan(f.memory[_AVERAGE]) else f.memory[_AVERAGE]
+        f.memory[_AVERAGE] = f.forget * mean + (1.0 - f.forget) * out.residual[t]
+        out.average[t] = f.memory[_AVERAGE]
 
 
 class Predictor:
@@ -161,25 +180,27 @@ class Predictor:
         self, characteristic: Characteristic, step_s: float, settle_s: float, average_s: float
     ) -> None:
         self.characteristic = characteristic
-        self._model = characteristic.model
-        self._decay = self._model.decays(step_s)
-        self._delay = self._model.delays / step_s
-        self._settle = round(settle_s / step_s)
-        self._forget = math.exp(-step_s / average_s)
-        self._place = np.zeros(2, dtype=np.int64)
-        self._memory = np.array([0.0, math.nan])
-        self._past = np.zeros(int(_LONGEST_DELAY_S / step_s) + 4)
+        m = characteristic.model
+        self._filter = _Filter(
+            m.knots, m.left, m.right, m.levels, m.decays(step_s), m.delays / step_s,
+            settle=round(settle_s / step_s),
+            forget=math.exp(-step_s / average_s),
+            gap_ns=round(1.5 * step_s * NS_PER_S),
+            place=np.zeros(3, dtype=np.int64),
+            memory=np.array([0.0, math.nan]),
+            past=np.zeros(int(_LONGEST_DELAY_S / step_s) + 4),
+        )  # fmt: skip
 
     @property
     def warm_up_rows(self) -> int:
         """Return how many rows bring the filter into its stride."""
-        return 2 * self._settle + 1
+        return 2 * self._filter.settle + 1
 
-    def warm_up(self, u: FloatArray, power_mw: FloatArray) -> None:
+    def warm_up(self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray) -> None:
         """Run over rows of the past; the residual's mean starts afresh afterwards."""
         kinds = np.full(len(u), SETTLED_STEADY, dtype=np.uint8)
-        self.predict(np.zeros(len(u), dtype=np.int64), u, power_mw, kinds, math.nan)
-        self._memory[_AVERAGE] = math.nan
+        self.predict(time_ns, u, power_mw, kinds, math.nan)
+        self._filter.memory[_AVERAGE] = math.nan
 
     def predict(
         self,
@@ -191,16 +212,12 @@ class Predictor:
     ) -> PredictionBlock:
         """Predict rows of shape (n,); ``kinds`` are the segmenter's."""
         n = len(u)
-        static, dynamic, residual, average = (np.empty(n) for _ in range(4))
-        state = np.empty(n, dtype=np.uint8)
-        m = self._model
-        _predict(
-            u, power_mw, kinds, m.knots, m.left, m.right, m.levels, self._decay, self._delay,
-            self._settle, self._forget, self._place, self._memory, self._past,
-            static, dynamic, residual, average, state,
-        )  # fmt: skip
+        out = _Columns(
+            np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n, dtype=np.uint8)
+        )
+        _predict(time_ns, u, power_mw, kinds, self._filter, out)
         return PredictionBlock(
-            time_ns, u, power_mw, static, dynamic, residual, average, state, limit_mw,
+            time_ns, u, power_mw, *out, limit_mw,
             self.characteristic.model_id,
         )  # fmt: skip
 

@@ -9,14 +9,13 @@ regions is taken as it is: letting it flip would turn tangents into spikes.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-from valveflow_ros.core.jit import JIT
+from valveflow_ros.core.jit import jit
 from valveflow_ros.records import ByteArray, FloatArray, IntArray
 
 
-@numba.njit(**JIT)
+@jit
 def piece_of(u: float, knots: FloatArray) -> int:
     """Return the piece ``u`` lies in; the outer pieces go on for ever."""
     k = 0
@@ -25,15 +24,15 @@ def piece_of(u: float, knots: FloatArray) -> int:
     return k
 
 
-@numba.njit(**JIT)
+@jit
 def curve(u: float, knots: FloatArray, left: FloatArray, right: FloatArray) -> float:
     """Evaluate F: piece k runs from ``left[k]`` to ``right[k]`` in MW."""
     k = piece_of(u, knots)
     w = (u - knots[k]) / (knots[k + 1] - knots[k])
-    return left[k] + (right[k] - left[k]) * w
+    return float(left[k] + (right[k] - left[k]) * w)
 
 
-@numba.njit(**JIT)
+@jit
 def region_of(x: float, levels: FloatArray) -> int:
     """Return the region of flow x; ``levels`` are the inner boundaries in MW."""
     r = 0
@@ -42,7 +41,7 @@ def region_of(x: float, levels: FloatArray) -> int:
     return r
 
 
-@numba.njit(**JIT)
+@jit
 def respond(
     x: FloatArray,
     usable: ByteArray,
@@ -80,7 +79,53 @@ def respond(
         settled[t] = 1 if age > settle else 0
 
 
-@numba.njit(**JIT)
+@jit
+def answer_means(
+    u: FloatArray,
+    usable: ByteArray,
+    knots: FloatArray,
+    left: FloatArray,
+    right: FloatArray,
+    levels: FloatArray,
+    decay: FloatArray,
+    delay: FloatArray,
+    settle: int,
+    group: int,
+    flow: FloatArray,
+    answer: FloatArray,
+    weight: ByteArray,
+) -> None:
+    """Run the model; write means over ``group`` rows as `tangents` does, without derivatives.
+
+    ``flow`` (n,) is scratch.
+    """
+    state = 0.0
+    age = 0
+    for b in range(answer.size):
+        total = 0.0
+        good = True
+        for t in range(b * group, (b + 1) * group):
+            if not usable[t]:
+                age = 0
+                good = False
+                continue
+            x = curve(u[t], knots, left, right)
+            flow[t] = x
+            r = region_of(x, levels)
+            whole = int(delay[r])
+            part = delay[r] - whole
+            late = flow[t - min(whole, age)] * (1.0 - part) + flow[t - min(whole + 1, age)] * part
+            if age == 0:
+                state = x
+            state = decay[r] * state + (1.0 - decay[r]) * late
+            age += 1
+            good = good and age > settle
+            total += state
+        answer[b] = total / group
+        weight[b] = 1 if good else 0
+
+
+@jit
 def _slopes_of_curve(
     u: float, knots: FloatArray, left: FloatArray, right: FloatArray, share: float,
     gains: FloatArray,
@@ -104,7 +149,7 @@ def _slopes_of_curve(
         gains[pieces + k + 1] -= share * slope * w
 
 
-@numba.njit(**JIT)
+@jit
 def tangents(
     u: FloatArray,
     usable: ByteArray,
@@ -138,11 +183,12 @@ def tangents(
     state = 0.0
     gains = np.zeros(n_curve)
     tangent = np.zeros(columns)
+    sums = np.zeros(columns)
+    decay = np.exp(-step_s / time_constants)
     age = 0
-    m = answer.size
-    for b in range(m):
+    for b in range(answer.size):
         total = 0.0
-        sums = np.zeros(columns)
+        sums[:] = 0.0
         good = True
         for t in range(b * group, (b + 1) * group):
             if not usable[t]:
@@ -151,15 +197,15 @@ def tangents(
                 continue
             x = curve(u[t], knots, left, right)
             r = region_of(x, levels)
-            a = np.exp(-step_s / time_constants[r])
-            steps = delays[r] / step_s
-            whole = int(steps)
-            part = steps - whole
+            a = decay[r]
+            whole = int(delays[r] / step_s)
+            part = delays[r] / step_s - whole
             back, further = min(whole, age), min(whole + 1, age)
             near = curve(u[t - back], knots, left, right)
             far = curve(u[t - further], knots, left, right)
             late = near * (1.0 - part) + far * part
-            gains[:] = 0.0
+            for p in range(n_curve):
+                gains[p] = 0.0
             _slopes_of_curve(u[t - back], knots, left, right, 1.0 - part, gains)
             _slopes_of_curve(u[t - further], knots, left, right, part, gains)
             if age == 0:
@@ -168,22 +214,23 @@ def tangents(
                 tangent[:n_curve] = gains
             for p in range(n_curve):
                 tangent[p] = a * tangent[p] + (1.0 - a) * gains[p]
-            for q in range(regions):
-                tangent[n_curve + q] *= a
-                tangent[n_curve + regions + q] *= a
+            for p in range(n_curve, columns):
+                tangent[p] *= a
             tangent[n_curve + r] += a * step_s / time_constants[r] * (state - late)
             tangent[n_curve + regions + r] += (1.0 - a) * (far - near) / step_s
             state = a * state + (1.0 - a) * late
             age += 1
             good = good and age > settle
             total += state
-            sums += tangent
+            for p in range(columns):
+                sums[p] += tangent[p]
         answer[b] = total / group
-        jacobian[b] = sums / group
+        for p in range(columns):
+            jacobian[b, p] = sums[p] / group
         weight[b] = 1 if good else 0
 
 
-@numba.njit(**JIT)
+@jit
 def whiten(series: FloatArray, weight: ByteArray, ar: FloatArray, out: FloatArray) -> int:
     """Write the innovations of ``series`` (m,) under AR coefficients ``ar``.
 
@@ -203,7 +250,7 @@ def whiten(series: FloatArray, weight: ByteArray, ar: FloatArray, out: FloatArra
     return written
 
 
-@numba.njit(**JIT)
+@jit
 def lagged_products(series: FloatArray, weight: ByteArray, order: int) -> FloatArray:
     """Return mean products at lags 0..order over pairs of weighted rows."""
     out = np.zeros(order + 1)

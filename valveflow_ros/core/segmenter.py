@@ -103,7 +103,7 @@ class Segmenter:
         self._state = np.zeros(kernel.INT_STATE, dtype=np.int64)
         self._state[kernel.FRESH] = 1
         self._state[kernel.LAST_NS] = -(2**62)
-        self._sums = np.zeros(3)
+        self._sums = np.zeros(kernel.SUMS)
         self._lines = np.zeros((kernel.LINES, LINE_SIZE))
         room = int(setting[kernel.LONGEST] + setting[kernel.SETTLE]) + 8
         self._blocks = np.zeros((3, room))
@@ -163,18 +163,17 @@ class Segmenter:
             )
             done += taken
             if closed:
-                found.append((done, self._describe(int(self._state[kernel.LAST_NS]))))
+                found.append((done, self._describe()))
                 if most is not None and len(found) >= most:
                     break
         return Segmented(kinds[:done], found)
 
-    def _describe(self, last_ns: int) -> FoundSegment:
+    def _describe(self) -> FoundSegment:
         """Turn the kernel's numbers into a record."""
         f = self._found
         first, end = int(f[kernel.SEG_FIRST]), int(f[kernel.SEG_END])
         period_ns = round(self._period_s * NS_PER_S)
-        # Rows inside a segment follow each other without a gap.
-        end_ns = last_ns - (int(self._state[kernel.ROW]) - end) * period_ns
+        end_ns = int(self._state[kernel.END_NS])
         half = 0.5 * ((end - first) / self._block_rows - 1.0)
         self._number += 1
         segment = SpecialSegment(

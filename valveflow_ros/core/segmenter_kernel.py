@@ -14,10 +14,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from valveflow_ros.core.jit import JIT
+from valveflow_ros.core.jit import jit
 from valveflow_ros.core.line import (
     LINE_SIZE,
     N,
@@ -26,14 +25,28 @@ from valveflow_ros.core.line import (
     line_fit,
     line_reset,
 )
-from valveflow_ros.core.noise import BINS, WARM_UP, WINDOW, noise_add, noise_level
+from valveflow_ros.core.noise import WARM_UP, WINDOW, noise_add, noise_level
 from valveflow_ros.records import ByteArray, FloatArray, IntArray
 
 # Integer state.
-ROW, ROWS_IN_BLOCK, BLOCKS, FIRST_ROW, FRESH, RUN_U, RUN_Y, STRETCHES, IN_STRETCH, LAST_NS = (
-    range(10)
-)
-INT_STATE = 10
+(
+    ROW,
+    ROWS_IN_BLOCK,
+    BLOCKS,
+    FIRST_ROW,
+    FRESH,
+    RUN_U,
+    RUN_Y,
+    STRETCHES,
+    IN_STRETCH,
+    LAST_NS,
+    END_NS,
+) = range(11)
+INT_STATE = 11
+
+# The block that is filling: sums of u, power and temperature, and how many temperatures there were.
+BLOCK_T_COUNT = 3
+SUMS = 4
 
 # Rows of `lines`: of u up to now, of u up to a minute ago, of the power, of a stretch of each.
 LINE_U, LINE_U_BEHIND, LINE_Y, STRETCH_U, STRETCH_Y = range(5)
@@ -83,7 +96,7 @@ SEG_SIZE = 10
 TRANSIENT, SETTLED_STEADY, SETTLED_SLOPE, NO_DATA = range(4)
 
 
-@numba.njit(**JIT)
+@jit
 def noise_now(histograms: FloatArray, setting: FloatArray) -> tuple[float, float]:
     """Return the noise sd of u and of the power, the given one before the learnt one."""
     u = setting[NOISE_U] if setting[NOISE_U] > 0.0 else noise_level(histograms[0])
@@ -92,7 +105,7 @@ def noise_now(histograms: FloatArray, setting: FloatArray) -> tuple[float, float
     return max(u, 1e-6), max(y, 1e-6)
 
 
-@numba.njit(**JIT)
+@jit
 def _learn(state: IntArray, lines: FloatArray, histograms: FloatArray, u: float, y: float) -> None:
     """Put one block into the running stretch and close it when it is long enough."""
     line_add(lines[STRETCH_U], u)
@@ -107,7 +120,7 @@ def _learn(state: IntArray, lines: FloatArray, histograms: FloatArray, u: float,
         line_reset(lines[STRETCH_Y])
 
 
-@numba.njit(**JIT)
+@jit
 def _begin(
     state: IntArray, lines: FloatArray, blocks: FloatArray, drop: int, fresh: bool, settle: int
 ) -> None:
@@ -122,11 +135,11 @@ def _begin(
     state[RUN_Y] = 0
     for row in range(3):
         line_reset(lines[row])
-    for k in range(keep):
+    for _ in range(keep):
         _grow(state, lines, blocks, settle)
 
 
-@numba.njit(**JIT)
+@jit
 def _grow(state: IntArray, lines: FloatArray, blocks: FloatArray, settle: int) -> None:
     """Let the lines take the block that stands at the end of ``blocks``."""
     k = state[BLOCKS]
@@ -138,7 +151,7 @@ def _grow(state: IntArray, lines: FloatArray, blocks: FloatArray, settle: int) -
     state[BLOCKS] = k + 1
 
 
-@numba.njit(**JIT)
+@jit
 def _leaves(line: FloatArray, value: float, noise: float, limit: float, run: int) -> int:
     """Return the signed count of blocks in a row that left the line (0: it stays)."""
     if line[N] < _LEAST:
@@ -153,7 +166,7 @@ def _leaves(line: FloatArray, value: float, noise: float, limit: float, run: int
     return run + step if run * step >= 0 else step
 
 
-@numba.njit(**JIT)
+@jit
 def _drifts(lines: FloatArray, blocks: FloatArray, k: int, noise: float) -> bool:
     """Tell whether the last minute's mean left the line through what came before."""
     behind = lines[LINE_U_BEHIND]
@@ -170,7 +183,7 @@ def _drifts(lines: FloatArray, blocks: FloatArray, k: int, noise: float) -> bool
     return abs(off / _BEHIND) > _BEHIND_LIMIT * sd
 
 
-@numba.njit(**JIT)
+@jit
 def judge(
     blocks: FloatArray,
     first: int,
@@ -181,10 +194,14 @@ def judge(
     found: FloatArray,
 ) -> int:
     """Judge the blocks ``[first, end)``: 0 none, 1 steady state, 2 slope response."""
-    line = np.zeros((3, LINE_SIZE))
+    line = np.zeros((2, LINE_SIZE))
+    temperature, known = 0.0, 0
     for k in range(first, end):
-        for row in range(3):
-            line_add(line[row], blocks[row, k])
+        line_add(line[BLOCK_U], blocks[BLOCK_U, k])
+        line_add(line[BLOCK_Y], blocks[BLOCK_Y, k])
+        if math.isfinite(blocks[BLOCK_T, k]):
+            temperature += blocks[BLOCK_T, k]
+            known += 1
     mean_u, slope_u, rms_u = line_fit(line[BLOCK_U])
     mean_y, slope_y, rms_y = line_fit(line[BLOCK_Y])
     n = end - first
@@ -192,7 +209,7 @@ def judge(
     move_y = abs(slope_y) * n / noise_y
     found[SEG_U_MEAN], found[SEG_U_SLOPE], found[SEG_U_RMS] = mean_u, slope_u, rms_u
     found[SEG_Y_MEAN], found[SEG_Y_SLOPE], found[SEG_Y_RMS] = mean_y, slope_y, rms_y
-    found[SEG_T] = line_fit(line[BLOCK_T])[0]
+    found[SEG_T] = temperature / known if known > 0 else math.nan
     if rms_u > _ROUGH * noise_u or rms_y > _ROUGH * noise_y:
         return 0
     if move_u <= setting[STEADY] and move_y <= setting[STEADY] + 0.5:
@@ -202,7 +219,7 @@ def judge(
     return 0
 
 
-@numba.njit(**JIT)
+@jit
 def _close(
     state: IntArray,
     blocks: FloatArray,
@@ -224,10 +241,13 @@ def _close(
     found[SEG_FIRST] = state[FIRST_ROW] + first * rows
     found[SEG_END] = state[FIRST_ROW] + end * rows
     found[SEG_KIND] = kind
+    # The rows of a segment follow each other without a gap.
+    behind = state[ROW] - state[FIRST_ROW] - end * rows
+    state[END_NS] = state[LAST_NS] - behind * int(setting[PERIOD_NS])
     return True
 
 
-@numba.njit(**JIT)
+@jit
 def _take_block(
     state: IntArray,
     lines: FloatArray,
@@ -250,9 +270,7 @@ def _take_block(
     state[RUN_U] = _leaves(lines[LINE_U], u, noise_u, setting[BREAK], state[RUN_U])
     state[RUN_Y] = _leaves(lines[LINE_Y], y, noise_y, setting[BREAK], state[RUN_Y])
     back = -1
-    if abs(state[RUN_U]) >= 2:
-        back = 1
-    elif abs(state[RUN_Y]) >= 2:
+    if abs(state[RUN_U]) >= 2 or abs(state[RUN_Y]) >= 2:
         back = 1
     elif _drifts(lines, blocks, k, noise_u):
         back = _BEHIND
@@ -274,7 +292,7 @@ def _take_block(
     return closed
 
 
-@numba.njit(**JIT)
+@jit
 def _kind_now(
     state: IntArray, lines: FloatArray, histograms: FloatArray, setting: FloatArray
 ) -> int:
@@ -289,7 +307,69 @@ def _kind_now(
     return SETTLED_SLOPE if moved >= setting[SLOPE] else SETTLED_STEADY
 
 
-@numba.njit(**JIT)
+@jit
+def _break_off(
+    state: IntArray,
+    sums: FloatArray,
+    lines: FloatArray,
+    blocks: FloatArray,
+    histograms: FloatArray,
+    setting: FloatArray,
+    found: FloatArray,
+) -> bool:
+    """End what is open at a gap; nothing is known of what happened in it.
+
+    True when that closed a special segment; the row that shows the gap is not
+    taken yet.
+    """
+    closed = False
+    if state[BLOCKS] > 0:
+        noise_u, noise_y = noise_now(histograms, setting)
+        closed = _close(state, blocks, state[BLOCKS], noise_u, noise_y, setting, found)
+    _begin(state, lines, blocks, state[BLOCKS], True, int(setting[SETTLE]))
+    state[FIRST_ROW] = state[ROW]
+    state[ROWS_IN_BLOCK] = 0
+    sums[:] = 0.0
+    # The stretch the noise is learnt from must not span a gap either.
+    state[IN_STRETCH] = 0
+    line_reset(lines[STRETCH_U])
+    line_reset(lines[STRETCH_Y])
+    return closed
+
+
+@jit
+def _take_row(
+    u: float,
+    y: float,
+    temperature: float,
+    state: IntArray,
+    sums: FloatArray,
+    lines: FloatArray,
+    blocks: FloatArray,
+    histograms: FloatArray,
+    setting: FloatArray,
+    found: FloatArray,
+) -> bool:
+    """Add a row to the block that is filling; True when that closed a special segment."""
+    sums[BLOCK_U] += u
+    sums[BLOCK_Y] += y
+    if math.isfinite(temperature):
+        sums[BLOCK_T] += temperature
+        sums[BLOCK_T_COUNT] += 1.0
+    state[ROWS_IN_BLOCK] += 1
+    if state[ROWS_IN_BLOCK] < int(setting[BLOCK_ROWS]):
+        return False
+    k = state[BLOCKS]
+    blocks[BLOCK_U, k] = sums[BLOCK_U] / state[ROWS_IN_BLOCK]
+    blocks[BLOCK_Y, k] = sums[BLOCK_Y] / state[ROWS_IN_BLOCK]
+    count = sums[BLOCK_T_COUNT]
+    blocks[BLOCK_T, k] = sums[BLOCK_T] / count if count > 0.0 else math.nan
+    sums[:] = 0.0
+    state[ROWS_IN_BLOCK] = 0
+    return _take_block(state, lines, blocks, histograms, setting, found)
+
+
+@jit
 def run(
     time_ns: IntArray,
     u: FloatArray,
@@ -306,50 +386,27 @@ def run(
 ) -> tuple[int, bool]:
     """Run over rows until they end or a special segment closes.
 
-    Returns the rows consumed and whether ``found`` holds a segment. ``sums``
-    (3,) are the running sums of the block that is filling, ``kinds`` gets one
-    code a row.
+    Returns the rows consumed and whether ``found`` holds a segment, closed at
+    the last of them; ``kinds`` gets one code a row.
     """
-    rows = int(setting[BLOCK_ROWS])
     gap_ns = int(1.5 * setting[PERIOD_NS])
-    settle = int(setting[SETTLE])
     for i in range(u.size):
         usable = math.isfinite(u[i]) and math.isfinite(y[i])
         jumped = time_ns[i] - state[LAST_NS] > gap_ns or time_ns[i] <= state[LAST_NS]
-        if (jumped or not usable) and state[ROW] > state[FIRST_ROW]:
-            # A gap ends what is open; nothing is known of what happened in it.
-            noise_u, noise_y = noise_now(histograms, setting)
-            closed = False
-            if state[BLOCKS] > 0:
-                closed = _close(state, blocks, state[BLOCKS], noise_u, noise_y, setting, found)
-            _begin(state, lines, blocks, state[BLOCKS], True, settle)
-            state[FIRST_ROW] = state[ROW]
-            state[ROWS_IN_BLOCK] = 0
-            sums[:] = 0.0
-            # The stretch the noise is learnt from must not span a gap either.
-            state[IN_STRETCH] = 0
-            line_reset(lines[STRETCH_U])
-            line_reset(lines[STRETCH_Y])
-            if closed:
-                return i, True
+        closed = False
+        if jumped or not usable:
+            closed = _break_off(state, sums, lines, blocks, histograms, setting, found)
         state[LAST_NS] = time_ns[i]
         state[ROW] += 1
-        if not usable:
-            kinds[i] = NO_DATA
+        if usable:
+            if _take_row(
+                u[i], y[i], temperature[i], state, sums, lines, blocks, histograms, setting, found
+            ):
+                closed = True
+            kinds[i] = _kind_now(state, lines, histograms, setting)
+        else:
             state[FIRST_ROW] = state[ROW]
-            continue
-        sums[BLOCK_U] += u[i]
-        sums[BLOCK_Y] += y[i]
-        sums[BLOCK_T] += temperature[i]
-        state[ROWS_IN_BLOCK] += 1
-        closed = False
-        if state[ROWS_IN_BLOCK] == rows:
-            for row in range(3):
-                blocks[row, state[BLOCKS]] = sums[row] / rows
-                sums[row] = 0.0
-            state[ROWS_IN_BLOCK] = 0
-            closed = _take_block(state, lines, blocks, histograms, setting, found)
-        kinds[i] = _kind_now(state, lines, histograms, setting)
+            kinds[i] = NO_DATA
         if closed:
             return i + 1, True
     return u.size, False

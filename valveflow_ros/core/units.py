@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valveflow_ros.core.jit import jit
 from valveflow_ros.errors import InputError
 from valveflow_ros.records import SIGNALS, FloatArray, Signal
 
@@ -74,6 +75,17 @@ def integrated_input(
 
     NaN where an input is NaN or the pressure is not positive.
     """
-    with np.errstate(invalid='ignore'):
-        power = np.where(pressure_mpa > 0.0, np.abs(pressure_mpa), np.nan) ** exponent
-    return np.asarray(opening_percent * power, dtype=np.float64)
+    opening = np.ascontiguousarray(opening_percent, dtype=np.float64)
+    pressure = np.ascontiguousarray(pressure_mpa, dtype=np.float64)
+    u = np.empty(len(opening))
+    _integrated_input(opening, pressure, exponent, u)
+    return u
+
+
+@jit
+def _integrated_input(
+    opening: FloatArray, pressure: FloatArray, exponent: float, out: FloatArray
+) -> None:
+    """Write u row by row; a loop, so that blocks of any size round alike."""
+    for t in range(opening.size):
+        out[t] = opening[t] * pressure[t] ** exponent if pressure[t] > 0.0 else np.nan

@@ -103,10 +103,10 @@ class RollingWindow:
         """Remember a special segment that has closed."""
         self._segments.append(found)
 
-    def tail(self, rows: int) -> tuple[FloatArray, FloatArray]:
-        """Return copies of ``u`` and power of the last ``rows`` rows (fewer if fewer are held)."""
-        first = max(0, self._end - rows)
-        return self._data[0, first : self._end].copy(), self._data[1, first : self._end].copy()
+    def tail(self, rows: int) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Return copies of time, ``u`` and power of the last ``rows`` rows, or of all held."""
+        part = slice(max(0, self._end - rows), self._end)
+        return self._time_ns[part].copy(), self._data[0, part].copy(), self._data[1, part].copy()
 
     def contents(self) -> WindowContents:
         """Return a copy of the rows inside the window and their segments."""

@@ -1,0 +1,131 @@
+"""The number of pieces, judged in the space where the noise is white.
+
+Eq. (24) of the paper looks at the costs of the static fit alone: it cannot
+answer one piece, and one strong knee hides weak ones. With dynamics and an AR
+model of the noise in hand, a further knee can be tested for what it is worth:
+its hinge is sent through the dynamics, whitened, freed of all that the model
+explains already, and held against the innovations. Knees are added while the
+best of them gains enough in log-likelihood after a full refit, and taken away
+while the weakest loses too little.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.core.problem import Problem, free_parameters, move
+from valveflow_ros.core.whitening import whitened
+from valveflow_ros.records import FloatArray
+
+# Log-likelihood a knee must gain. A knee is two parameters found by a search along u;
+# by chance the best of such a search gains 3 or 4, once in a thousand about 9.
+KNEE_GAIN = 12.0
+_CANDIDATES = 30
+_BLOCKS = 60
+
+
+def _insert(model: RegionalModel, knot: float) -> RegionalModel:
+    """Put a knot onto the curve without changing it."""
+    k = int(np.clip(np.searchsorted(model.knots, knot) - 1, 0, model.pieces - 1))
+    value = float(model.static(np.array([knot]))[0])
+    return replace(
+        model,
+        knots=np.insert(model.knots, k + 1, knot),
+        left=np.insert(model.left, k + 1, value),
+        right=np.insert(model.right, k, value),
+    )
+
+
+def _remove(model: RegionalModel, inner: int) -> RegionalModel:
+    """Take the inner knot number ``inner`` (from 0) out; its pieces become one."""
+    return replace(
+        model,
+        knots=np.delete(model.knots, inner + 1),
+        left=np.delete(model.left, inner + 1),
+        right=np.delete(model.right, inner),
+    )
+
+
+def _candidates(problem: Problem, model: RegionalModel) -> FloatArray:
+    """Return places for a new knee: quantiles and an even grid, away from knots and ends."""
+    u = problem.u[problem.usable > 0]
+    spread = np.quantile(u, np.linspace(0.02, 0.98, _CANDIDATES // 2))
+    even = np.linspace(spread[0], spread[-1], _CANDIDATES // 2)
+    places = np.unique(np.concatenate([spread, even]))
+    low, high = model.knots[0], model.knots[-1]
+    distance = np.abs(places[:, None] - model.knots[None, :]).min(axis=1)
+    away = (distance > 0.02 * (high - low)) & (places > low) & (places < high)
+    return np.asarray(places[away])
+
+
+def _best_knee(problem: Problem, model: RegionalModel, ar: FloatArray) -> tuple[float, float]:
+    """Return the most promising place for a knee and its score gain."""
+    places = _candidates(problem, model)
+    if not len(places):
+        return float('nan'), 0.0
+    dense = model
+    for place in places:
+        dense = _insert(dense, float(place))
+    _, hats, _ = problem.tangents(dense)
+    hats = hats[:, : dense.pieces + 1]
+    hinges = hats @ np.maximum(dense.knots[:, None] - places[None, :], 0.0)
+    residual, own, weight = problem.tangents(model)
+    own = own[:, free_parameters(model.pieces, model.regions)]
+    table = whitened(np.column_stack([own, hinges, residual]), weight, ar)
+    n_own = own.shape[1]
+    own, hinges, e = table[:, :n_own], table[:, n_own:-1], table[:, -1]
+    basis, _ = np.linalg.qr(own / np.maximum(np.linalg.norm(own, axis=0), 1e-300))
+    hinges = hinges - basis @ (basis.T @ hinges)
+    e = e - basis @ (basis.T @ e)
+    scores = hinges * e[:, None]
+    total = scores.sum(axis=0) ** 2
+    plain = (hinges**2).sum(axis=0) * float(e @ e) / len(e)
+    blocks = np.array([part.sum(axis=0) for part in np.array_split(scores, _BLOCKS)])
+    # What the AR model leaves of correlation shows between blocks; the larger variance counts.
+    variance = np.maximum(plain, (blocks**2).sum(axis=0) - total / _BLOCKS)
+    gain = 0.5 * total / np.maximum(variance, 1e-300)
+    best = int(np.argmax(gain))
+    return float(places[best]), float(gain[best])
+
+
+def _gain(problem: Problem, small: RegionalModel, large: RegionalModel, ar: FloatArray) -> float:
+    """Return the log-likelihood that ``large`` gains over ``small``."""
+    residual, weight = problem.answer(large)
+    count = len(whitened(residual, weight, ar))
+    return float(0.5 * count * np.log(problem.cost(small, ar) / problem.cost(large, ar)))
+
+
+def choose_pieces(
+    problem: Problem, model: RegionalModel, ar: FloatArray, most: int
+) -> RegionalModel:
+    """Add and remove knees until each is worth its place.
+
+    Parameters
+    ----------
+    problem : Problem
+    model : RegionalModel
+        Refined, without jumps.
+    ar : float64 (4,)
+    most : int
+        Largest number of pieces.
+    """
+    while model.pieces < most:
+        place, gain = _best_knee(problem, model, ar)
+        if gain < KNEE_GAIN:
+            break
+        trial = _insert(model, place)
+        trial, _ = move(problem, trial, ar, free_parameters(trial.pieces, trial.regions), 8)
+        if _gain(problem, model, trial, ar) < KNEE_GAIN:
+            break
+        model = trial
+    while model.pieces > 1:
+        trials = [_remove(model, k) for k in range(model.pieces - 1)]
+        refitted = [move(problem, t, ar, free_parameters(t.pieces, t.regions), 6) for t in trials]
+        best = min(range(len(trials)), key=lambda k: refitted[k][1])
+        if _gain(problem, refitted[best][0], model, ar) >= KNEE_GAIN:
+            break
+        model = refitted[best][0]
+    return model

@@ -1,0 +1,170 @@
+"""Measured rows, what a model makes of them, and how its parameters move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from valveflow_ros.core import regional_kernel as kernel
+from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.core.whitening import whitened
+from valveflow_ros.records import BoolArray, ByteArray, FloatArray
+
+_LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4)
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """All rows of the window, as the model needs them.
+
+    Attributes
+    ----------
+    u, power_mw : float64 (n,)
+    usable : uint8 (n,)
+        0 where a row has no data; a gap restarts the filters.
+    step_s : float
+    settle_s : float
+        Rows this long after a gap are not scored.
+    group : int
+        Rows averaged before scoring.
+    """
+
+    u: FloatArray
+    power_mw: FloatArray
+    usable: ByteArray
+    step_s: float
+    settle_s: float
+    group: int
+
+    @property
+    def means(self) -> int:
+        """Return the number of scored means."""
+        return len(self.u) // self.group
+
+
+class Problem:
+    """Measured means, and what a model makes of them."""
+
+    def __init__(self, samples: Samples) -> None:
+        self.samples = samples
+        m = samples.means
+        cut = m * samples.group
+        self.settle = round(samples.settle_s / samples.step_s)
+        self.u = np.ascontiguousarray(samples.u[:cut])
+        self.usable = np.ascontiguousarray(samples.usable[:cut])
+        self._flow = np.empty(cut)
+        power = np.where(self.usable > 0, samples.power_mw[:cut], 0.0)
+        self.power = power.reshape(m, samples.group).mean(axis=1)
+
+    def answer(self, model: RegionalModel) -> tuple[FloatArray, ByteArray]:
+        """Return residual means (m,) and their weight."""
+        s = self.samples
+        means = np.empty(s.means)
+        weight = np.empty(s.means, dtype=np.uint8)
+        kernel.answer_means(
+            self.u, self.usable, model.knots, model.left, model.right, model.levels,
+            model.decays(s.step_s), model.delays / s.step_s, self.settle, s.group,
+            self._flow, means, weight,
+        )  # fmt: skip
+        return np.where(weight > 0, self.power - means, 0.0), weight
+
+    def tangents(self, model: RegionalModel) -> tuple[FloatArray, FloatArray, ByteArray]:
+        """Return residual (m,), Jacobian of the prediction (m, P) and weight (m,)."""
+        s = self.samples
+        m = s.means
+        answer = np.empty(m)
+        jacobian = np.empty((m, 3 * model.pieces - 1 + 2 * model.regions))
+        weight = np.empty(m, dtype=np.uint8)
+        kernel.tangents(
+            self.u, self.usable, model.knots, model.left, model.right, model.levels,
+            model.time_constants, model.delays, s.step_s, self.settle, s.group,
+            answer, jacobian, weight,
+        )  # fmt: skip
+        return np.where(weight > 0, self.power - answer, 0.0), jacobian, weight
+
+    def cost(self, model: RegionalModel, ar: FloatArray) -> float:
+        """Return the sum of squared innovations."""
+        residual, weight = self.answer(model)
+        e = whitened(residual, weight, ar)
+        return float((e * e).sum())
+
+
+def free_parameters(pieces: int, regions: int, jumps: BoolArray | None = None) -> BoolArray:
+    """Return the mask of free parameters in packed order; no jumps unless ``jumps`` (J - 1,)."""
+    if jumps is None:
+        jumps = np.zeros(pieces - 1, dtype=bool)
+    return np.concatenate(
+        [np.ones(2 * pieces, dtype=bool), jumps, np.ones(2 * regions, dtype=bool)]
+    )
+
+
+def _in_bounds(model: RegionalModel, samples: Samples) -> bool:
+    """Tell whether a model is one a plant can have and a filter can run."""
+    span = model.knots[-1] - model.knots[0]
+    return bool(
+        np.all(np.diff(model.knots) > 0.004 * span)
+        and np.all(model.time_constants >= 0.1 * samples.step_s)
+        and np.all(model.time_constants <= 3600.0)
+        and np.all(model.delays >= 0.0)
+        and np.all(model.delays <= 600.0)
+    )
+
+
+def move(
+    problem: Problem, model: RegionalModel, ar: FloatArray, free: BoolArray, steps: int
+) -> tuple[RegionalModel, float]:
+    """Levenberg-Marquardt in the free parameters, levels held."""
+    damping = 1e-4
+    cost = problem.cost(model, ar)
+    for _ in range(steps):
+        residual, jacobian, weight = problem.tangents(model)
+        both = whitened(np.column_stack([jacobian[:, free], residual]), weight, ar)
+        j, e = both[:, :-1], both[:, -1]
+        normal, slope = j.T @ j, j.T @ e
+        scale = np.sqrt(np.maximum(np.diag(normal), 1e-12 * np.diag(normal).max()))
+        normal = normal / np.outer(scale, scale)
+        better = None
+        for _ in range(6):
+            step = np.linalg.solve(
+                normal + damping * np.eye(len(scale)), slope / scale
+            ) / scale  # fmt: skip
+            packed = model.pack()
+            packed[free] += step
+            n_delays = model.regions
+            packed[-n_delays:] = np.maximum(packed[-n_delays:], 0.0)
+            trial = model.unpack(packed)
+            if _in_bounds(trial, problem.samples):
+                value = problem.cost(trial, ar)
+                if value < cost:
+                    better = (trial, value)
+                    break
+            damping *= 10.0
+        if better is None:
+            break
+        gain = cost - better[1]
+        model, cost = better
+        damping = max(damping / 10.0, 1e-8)
+        if gain < 1e-7 * cost:
+            break
+    return model, cost
+
+
+def search_levels(
+    problem: Problem, model: RegionalModel, ar: FloatArray, cost: float
+) -> tuple[RegionalModel, float]:
+    """Move each level along a line, the step shrinking, while the cost falls."""
+    for k in range(len(model.levels)):
+        for step in _LEVEL_STEPS_MW:
+            for sign in (1.0, -1.0):
+                while True:
+                    levels = model.levels.copy()
+                    levels[k] += sign * step
+                    if np.any(np.diff(levels) <= 1.0):
+                        break
+                    trial = model.with_levels(levels)
+                    value = problem.cost(trial, ar)
+                    if not value < cost:
+                        break
+                    model, cost = trial, value
+    return model, cost
