@@ -121,7 +121,7 @@ def _close(state: State, rules: Rules, rows: Rows, place: int, coming_ns: int) -
     k = number % rules.spare
     alive = False
     for s in range(state.held_ns.size):
-        if state.open_row[s, k] == number:
+        if state.open_row[s, k] == number and state.open_ns[s, k] > state.held_ns[s]:
             state.held_ns[s], state.held[s] = state.open_ns[s, k], state.open_value[s, k]
             state.held_quality[s] = state.open_quality[s, k]
         if tick - rules.hold_ns <= state.held_ns[s] <= tick:
@@ -261,7 +261,7 @@ def _far(
 
 
 @jit
-def align(
+def align(  # noqa: C901 - one loop over all that can meet a reading
     time_ns: IntArray,
     signal: NDArray[np.int8],
     value: FloatArray,

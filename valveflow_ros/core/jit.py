@@ -10,21 +10,12 @@ import numba
 # No fastmath: it lets NaN disappear and reorders the sums that tests compare.
 JIT: dict[str, Any] = {'cache': True, 'nogil': True}
 
-# Kernels made for SIMD: a division by zero gives inf or NaN instead of an
-# exception, whose test would keep the loop scalar.
-KERNEL_JIT: dict[str, Any] = {**JIT, 'error_model': 'numpy'}
-
 _Function = TypeVar('_Function', bound=Callable[..., Any])
 
 
 def jit(function: _Function) -> _Function:
     """Compile a loop over arrays, keeping its type for the checker."""
     return cast(_Function, numba.njit(**JIT)(function))
-
-
-def kernel_jit(function: _Function) -> _Function:
-    """Compile a loop whose divisions may give inf or NaN."""
-    return cast(_Function, numba.njit(**KERNEL_JIT)(function))
 
 
 # A division by zero gives inf or NaN here instead of an exception, whose test
