@@ -30,7 +30,7 @@ class RecordingError(ValveflowError):
     def __init__(self, path: object, problem: str) -> None:
         self.path = str(path)
         self.problem = problem
-        super().__init__(f"{self.path}: {problem}.")
+        super().__init__(f'{self.path}: {problem}.')
 
 
 class DataError(ValveflowError):

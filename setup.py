@@ -1,0 +1,61 @@
+"""The ament_python package valveflow_ros; its metadata stand in package.xml, once."""
+
+from glob import glob
+from pathlib import Path
+from xml.etree import ElementTree
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'valveflow_ros'
+# colcon and pip both run this file from the folder it stands in, and data_files
+# must be relative to it.
+MANIFEST = ElementTree.parse(Path(__file__).with_name('package.xml')).getroot()
+MAINTAINER = MANIFEST.find('maintainer')
+
+
+def files(pattern: str) -> list[str]:
+    """Return the files that match, none if the folder is empty or absent."""
+    return sorted(name for name in glob(pattern) if Path(name).is_file())
+
+
+setup(
+    name=PACKAGE,
+    version=MANIFEST.findtext('version'),
+    description=MANIFEST.findtext('description'),
+    maintainer=MAINTAINER.text,
+    maintainer_email=MAINTAINER.get('email'),
+    license=MANIFEST.findtext('license'),
+    python_requires='>=3.10',
+    packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
+    package_data={'': ['py.typed', '*.css', '*.html', '*.js', '*.yaml']},
+    zip_safe=False,
+    install_requires=[
+        'lz4',
+        'mcap>=1.5',
+        'numba',
+        'numpy',
+        'pandas',
+        'plotly',
+        'pyarrow',
+        'pyyaml',
+        'scipy',
+        'zstandard',
+    ],
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
+        (f'share/{PACKAGE}', ['package.xml']),
+        (f'share/{PACKAGE}/config', files('config/*')),
+        (f'share/{PACKAGE}/launch', files('launch/*')),
+        # Recordings carry the definitions of what they hold, also where valveflow_msgs is
+        # not built.
+        (f'share/{PACKAGE}/msg', files('msg/*.msg')),
+    ],
+    entry_points={
+        'console_scripts': [
+            'monitor = valveflow_ros.ros.monitor_main:main',
+            'plant_simulator = valveflow_ros.ros.simulator_main:main',
+            'replay = valveflow_ros.ros.replay_main:main',
+            'valveflow = valveflow_ros.cli.main:main',
+        ],
+    },
+)

@@ -1,0 +1,84 @@
+"""Logs to run the command on, and a way to run it in this process."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from valveflow_ros.cli.main import main
+
+# Long enough for a curve of several pieces, short enough for a test.
+DAYS, SEED = '0.4', '1'
+
+
+@dataclass(frozen=True)
+class Ran:
+    """What one run of the command left."""
+
+    status: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> dict[str, Any]:
+        def refuse(word: str) -> None:
+            raise AssertionError(f'{word} is no JSON')
+
+        content: dict[str, Any] = json.loads(self.out, parse_constant=refuse)
+        return content
+
+    def refused(self, status: int = 1) -> str:
+        """Assert that it was refused with one sentence; return it."""
+        assert self.status == status, self.err
+        assert self.out == ''
+        assert 'Traceback' not in self.err
+        last = self.err.rstrip('\n').splitlines()[-1]
+        assert last.startswith('valveflow: ')
+        assert last.endswith(('.', '"')), last
+        assert 'nan' not in last.split()
+        return last
+
+
+Run = Callable[..., Ran]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    def command(*words: object) -> Ran:
+        capsys.readouterr()
+        status = main([str(word) for word in words])
+        out, err = capsys.readouterr()
+        return Ran(status, out, err)
+
+    return command
+
+
+@pytest.fixture(scope='session')
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the same simulated log as plant.csv, plant.parquet and plant.mcap."""
+    folder = tmp_path_factory.mktemp('logs')
+    for name in ('plant.csv', 'plant.parquet', 'plant.mcap'):
+        words = ['simulate', '-o', str(folder / name), '--days', DAYS, '--seed', SEED, '--quiet']
+        assert main(words) == 0
+    return folder
+
+
+@pytest.fixture(scope='session')
+def shared_data() -> Path:
+    """Measured data that are not part of the project."""
+    place = os.environ.get('VALVEFLOW_SHARED_DATA')
+    folder = Path(place) if place else Path(__file__).resolve().parents[3] / 'shared' / 'data'
+    if not folder.is_dir():
+        pytest.skip(f'no measured data at {folder}; VALVEFLOW_SHARED_DATA names another place')
+    return folder
+
+
+def write_csv(path: Path, header: str, rows: list[str]) -> Path:
+    path.write_text('\n'.join([header, *rows]) + '\n', encoding='utf-8')
+    return path

@@ -1,0 +1,106 @@
+"""``valveflow simulate``."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from valveflow_ros.logs import open_log, read_table
+from valveflow_ros.plant.effects import catalogue
+from valveflow_ros.plant.unit import UnitDescription
+from valveflow_ros.records import SIGNALS
+
+SHORT = ['--days', '0.02', '--seed', '4']
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp('simulated')
+
+
+def test_every_kind_of_log_holds_the_same(run, folder):
+    names = ['a.csv', 'a.parquet', 'a.mcap', 'bag']
+    for name in names:
+        ran = run('simulate', '-o', folder / name, *SHORT)
+        assert ran.status == 0, ran.err
+        assert name in ran.out
+    first = open_log(folder / names[0]).readings
+    for name in names[1:]:
+        readings = open_log(folder / name).readings
+        for info in SIGNALS:
+            mine, theirs = first.signal == info.signal, readings.signal == info.signal
+            assert np.array_equal(first.value[mine], readings.value[theirs]), (name, info.topic)
+            assert np.array_equal(first.time_ns[mine], readings.time_ns[theirs])
+    assert (folder / 'bag' / 'metadata.yaml').is_file()
+
+
+def test_truth_is_told_only_when_asked(run, folder):
+    words = ['simulate', '-o', folder / 't.mcap', *SHORT, '--effect', 'gain_drift:g=0.02']
+    ran = run(*words, '--truth', folder / 'truth.json')
+    truth = json.loads((folder / 'truth.json').read_text())
+    curve = UnitDescription().curve
+    assert [p['slope'] for p in truth['pieces']] == curve.slopes.tolist()
+    assert truth['effects'] == [{'name': 'gain_drift', 'parameters': {'g': 0.02}}]
+    assert truth['seed'] == 4
+    assert 'gain_drift:g=0.02' in ran.out
+    contents = open_log(folder / 't.mcap')
+    assert not contents.attachments
+    assert b'gain_drift' not in (folder / 't.mcap').read_bytes()
+
+
+def test_json_is_the_truth_with_the_place_of_the_log(run, folder):
+    data = run('simulate', '-o', folder / 'j.csv', *SHORT, '--json').json
+    assert data['log'] == str(folder / 'j.csv')
+    assert data['rows'] == len(read_table(folder / 'j.csv').time_ns)
+    assert data['effects'] == []
+    assert data['dynamics'][-1]['power_to'] is None
+
+
+def test_effects_are_listed_with_their_parameters(run):
+    ran = run('simulate', '--effects')
+    data = run('simulate', '--effects', '--json').json
+    assert set(data['effects']) == set(catalogue())
+    for name, effect in catalogue().items():
+        assert effect.summary in ran.out
+        assert set(data['effects'][name]['parameters']) == {p.name for p in effect.parameters}
+
+
+@pytest.mark.parametrize(
+    ('words', 'part'),
+    [
+        (['-o', 'x.xlsx'], 'must end in .mcap or .csv or .parquet'),
+        (['-o', 'none/x.mcap'], 'there is no folder'),
+        (['-o', 'x.mcap', '--days', '0'], 'more than 0'),
+        (['-o', 'x.mcap', '--days', 'nan'], 'more than 0'),
+        (['-o', 'x.mcap', '--seed', '-1'], '0 or more'),
+        (['-o', 'x.mcap', '--effect', 'gain_drif'], "Did you mean 'gain_drift'"),
+        (['-o', 'x.mcap', '--effect', 'gain_drift:h=1'], "no parameter 'h'"),
+        (['-o', 'x.mcap', '--effect', 'gain_drift:g=big'], "not 'big'"),
+    ],
+)
+def test_refusals_leave_nothing_behind(run, tmp_path, monkeypatch, words, part):
+    monkeypatch.chdir(tmp_path)
+    assert part in run('simulate', *words).refused()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_log_that_is_there_is_not_replaced_by_accident(run, tmp_path):
+    log = tmp_path / 'x.mcap'
+    log.touch()
+    assert run('simulate', '-o', log, *SHORT).status == 0, 'an empty file is no loss'
+    before = log.read_bytes()
+    assert 'add --overwrite' in run('simulate', '-o', log, *SHORT[:2]).refused()
+    assert log.read_bytes() == before
+    assert run('simulate', '-o', log, *SHORT[:2], '--overwrite').status == 0
+    assert log.read_bytes() != before
+    bag = tmp_path / 'bag'
+    bag.mkdir()
+    (bag / 'mine.txt').write_text('keep')
+    assert 'not empty' in run('simulate', '-o', bag, *SHORT).refused()
+
+
+def test_refused_truth_leaves_the_sentence(run, tmp_path):
+    ran = run('simulate', '-o', tmp_path / 'x.csv', *SHORT, '--truth', tmp_path / 'no' / 't.json')
+    assert 'cannot be written' in ran.refused()

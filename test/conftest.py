@@ -1,0 +1,84 @@
+"""What every test may ask for: a ROS domain of its own, the real data; how hypothesis runs."""
+
+from __future__ import annotations
+
+import fcntl
+import importlib.util
+import itertools
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import hypothesis
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+# A failing example prints the line that brings it back. No deadline: a test machine
+# may be busy, and the first call of a compiled function takes a second.
+hypothesis.settings.register_profile(
+    'valveflow',
+    deadline=None,
+    print_blob=True,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+)
+hypothesis.settings.load_profile('valveflow')
+
+# Above 101 a domain's ports run into those that Linux hands out to anybody.
+DOMAINS = 101
+_turn = itertools.count(os.getpid())
+
+
+@contextmanager
+def leased_domain() -> Iterator[int]:
+    """Hold a ROS domain id (1 to 101) that no other test on this machine holds.
+
+    The lease is a file lock, so it ends with the process, however that ends. Every
+    lease takes another number than the one before, because a dead test's nodes stay
+    known to its domain for a while.
+    """
+    for _ in range(DOMAINS):
+        domain = next(_turn) % DOMAINS + 1
+        path = Path(tempfile.gettempdir(), f'valveflow-ros-domain-{domain}.lock')
+        try:
+            handle = os.open(path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o666)
+        except PermissionError:  # another user's
+            continue
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield domain
+            return
+        except BlockingIOError:
+            continue
+        finally:
+            os.close(handle)
+    pytest.fail(f'all {DOMAINS} ROS domains are held by other tests on this machine')
+
+
+@pytest.fixture
+def ros_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, str]]:
+    """Give the test a ROS domain of its own that stays on this machine.
+
+    Yields the environment for child processes; this process has it too. Without
+    rclpy the test is skipped, except under `make test`, which promises it.
+    """
+    if importlib.util.find_spec('rclpy') is None:
+        if os.environ.get('VALVEFLOW_REQUIRE_ROS'):
+            pytest.fail('rclpy cannot be imported although the set-up has been done')
+        pytest.skip('rclpy cannot be imported; source env.sh first')
+    with leased_domain() as domain:
+        monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
+        monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+        yield dict(os.environ)
+
+
+@pytest.fixture(scope='session')
+def shared_data() -> Path:
+    """Return the folder of real plant data, or skip the test where there is none."""
+    named = os.environ.get('VALVEFLOW_SHARED_DATA')
+    folder = Path(named) if named else ROOT.parent / 'shared' / 'data'
+    if not folder.is_dir():
+        pytest.skip(f'no real plant data in {folder}; VALVEFLOW_SHARED_DATA names another folder')
+    return folder

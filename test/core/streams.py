@@ -1,0 +1,154 @@
+"""Streams the engine is tested on, ways of cutting them, and a form to compare events in."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+
+from valveflow_ros.core.prediction import PredictionBlock
+from valveflow_ros.records import NS_PER_S, SampleTable, Signal
+
+START_NS = 1_700_006_400 * NS_PER_S
+INTERPRETED = os.environ.get('NUMBA_DISABLE_JIT', '0') not in ('', '0')
+needs_jit = pytest.mark.skipif(INTERPRETED, reason='too many rows for interpreted loops')
+
+
+def examples(count):
+    """Settings of a hypothesis test: fewer examples where loops are interpreted."""
+    return settings(
+        max_examples=max(3, count // 5) if INTERPRETED else count,
+        deadline=None,
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+    )
+
+
+def cuts(rows, most=6):
+    """Strategy for the places where a stream of ``rows`` is cut into blocks."""
+    return st.lists(st.integers(0, rows), max_size=most).map(sorted)
+
+
+def blocks_of(rows, places):
+    """Return the blocks ``(start, end)`` that the places cut ``rows`` into; some are empty."""
+    edges = [0, *places, rows]
+    return list(zip(edges[:-1], edges[1:], strict=True))
+
+
+def grid_ns(n, period_s=1.0, start_ns=START_NS):
+    """Return n rows on a grid."""
+    return start_ns + np.arange(n, dtype=np.int64) * round(period_s * NS_PER_S)
+
+
+def steps_and_ramps(rng, n, low=1100.0, high=1900.0, hold=(40, 120), rate=4.0):
+    """Return u without noise: holds with ramps of ``rate`` a row between them."""
+    u = np.empty(n)
+    at, value = 0, float(rng.uniform(low, high))
+    while at < n:
+        stay = int(rng.integers(*hold))
+        u[at : at + stay] = value
+        at += stay
+        target = float(rng.uniform(low, high))
+        path = np.arange(value, target, rate if target > value else -rate)
+        u[at : at + len(path)] = path[: max(0, n - at)]
+        at += len(path)
+        value = target
+    return u
+
+
+def lagged(x, time_constant, delay, step=1.0):
+    """Filter x by a first-order lag with a delay of whole steps."""
+    late = np.concatenate([np.full(round(delay / step), x[0]), x])[: len(x)]
+    a = np.exp(-step / time_constant)
+    y = np.empty(len(x))
+    state = late[0]
+    for t, value in enumerate(late):
+        state = a * state + (1.0 - a) * value
+        y[t] = state
+    return y
+
+
+def table_of(time_ns, u, power, temperature=None, pressure=10.0, exponent=1.125):
+    """Return rows whose integrated input is ``u``, at a constant pressure."""
+    n = len(time_ns)
+    return SampleTable.from_columns(
+        time_ns,
+        {
+            Signal.VALVE_OPENING: np.asarray(u) / pressure**exponent,
+            Signal.MAIN_STEAM_PRESSURE: np.full(n, pressure),
+            Signal.MAIN_STEAM_TEMPERATURE: (
+                np.full(n, 540.0) if temperature is None else temperature
+            ),
+            Signal.GENERATED_POWER: power,
+        },
+    )
+
+
+def frozen(thing):
+    """Turn a value into something that is equal exactly when every bit is."""
+    if isinstance(thing, np.ndarray):
+        return thing.dtype.str, thing.shape, np.ascontiguousarray(thing).tobytes()
+    if isinstance(thing, float):
+        return float(thing).hex()
+    if dataclasses.is_dataclass(thing) and not isinstance(thing, type):
+        fields = [(f.name, frozen(getattr(thing, f.name))) for f in dataclasses.fields(thing)]
+        return type(thing).__name__, tuple(fields)
+    if isinstance(thing, dict):
+        return tuple((k, frozen(v)) for k, v in thing.items())
+    if isinstance(thing, list | tuple):
+        return tuple(frozen(v) for v in thing)
+    if hasattr(thing, 'real') and hasattr(thing, 'text'):  # Settings
+        return tuple((k, frozen(v)) for k, v in thing.items())
+    return thing
+
+
+@dataclasses.dataclass
+class Story:
+    """Events in a form that does not show how the stream was cut.
+
+    ``columns`` has one entry a row; ``others`` has every other event with the
+    number of rows predicted before it.
+    """
+
+    columns: dict
+    others: list
+
+
+def story(events):
+    """Join the predictions of all blocks; keep everything else in its order."""
+    names = ['time_ns', 'u', 'measured_mw', 'static_mw', 'dynamic_mw', 'residual_mw',
+             'average_mw', 'state', 'limit_mw', 'model_id']  # fmt: skip
+    columns = {name: [] for name in names}
+    others = []
+    rows = 0
+    for event in events:
+        if isinstance(event, PredictionBlock):
+            rows += len(event)
+            for name in names:
+                value = getattr(event, name)
+                if not isinstance(value, np.ndarray):
+                    value = [value] * len(event)
+                columns[name] += [frozen(v) for v in (
+                    value.tolist() if isinstance(value, np.ndarray) else value)]  # fmt: skip
+        else:
+            others.append((rows, frozen(event)))
+    return Story(columns, others)
+
+
+def first_difference(a, b):
+    """Say where two stories part, for a failing test."""
+    for name, column in a.columns.items():
+        for k, (x, y) in enumerate(zip(column, b.columns[name], strict=False)):
+            if x != y:
+                return f'{name} row {k}: {x} != {y}'
+        if len(column) != len(b.columns[name]):
+            return f'{name}: {len(column)} rows != {len(b.columns[name])}'
+    for k, (x, y) in enumerate(zip(a.others, b.others, strict=False)):
+        if x != y:
+            return f'event {k}: {str(x)[:300]} != {str(y)[:300]}'
+    if len(a.others) != len(b.others):
+        return f'{len(a.others)} events != {len(b.others)}'
+    return ''

@@ -1,0 +1,346 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from naive_stream import NaiveAligner
+from streams import START_NS, blocks_of, cuts, examples, needs_jit
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.align import REASONS, Aligner
+from valveflow_ros.records import (
+    N_SIGNALS,
+    NS_PER_S,
+    SIGNALS,
+    Quality,
+    Readings,
+    SampleTable,
+    Signal,
+    table_to_readings,
+)
+
+GOOD = [50.0, 10.0, 540.0, 200.0, 50.0]
+WRONG = [float('nan'), float('inf'), -float('inf'), 1e9, -1e9]
+TOPICS = [info.topic for info in SIGNALS]
+
+
+def rows_of(aligned):
+    """Return rows as lists, so that NaN equals NaN."""
+    t = aligned.table
+    return [
+        (int(t.time_ns[k]), [v.hex() for v in t.values[k].tolist()], t.quality[k].tolist())
+        for k in range(len(t))
+    ]
+
+
+def naive_rows(rows):
+    return [(time, [float(v).hex() for v in values], q) for time, values, q in rows]
+
+
+def counts_of(naive):
+    return {t: {r: naive.counts[t].get(r, 0) for r in REASONS} for t in TOPICS}
+
+
+def run(settings, rows):
+    """Feed everything at once and finish."""
+    aligner = Aligner(settings)
+    parts = [aligner.feed(Readings.of(rows)), aligner.finish()]
+    return SampleTable.concatenate([p.table for p in parts]), aligner
+
+
+def steady_stream(n, offset_s=(0.0, 0.0, 0.0, 0.0), period_s=1.0, signals=range(4)):
+    """Return n rounds of readings; each signal has its own offset in the period."""
+    rows = []
+    for k in range(n):
+        for s in signals:
+            time = START_NS + round((k * period_s + offset_s[s]) * NS_PER_S)
+            rows.append((time, s, GOOD[s] + 0.01 * k, 0))
+    return sorted(rows, key=lambda r: r[0])
+
+
+STEPS_MS = [0, 0, 1, 40, 137, 250, 333, 500, 900, -1, -300]  # after the reading before
+SENT = [0, 0, 1, 1, 2, 2, 3, 3, 4]
+LEAPS_S = [0.0, 0.0, 0.7, 3.0, 12.0, -0.5, -4.0, 61.0, 4000.0, -61.0, -9000.0]
+era = st.tuples(st.sampled_from(LEAPS_S), st.integers(1, 60), st.integers(0, 2**32 - 1))
+
+
+def readings_of(eras):
+    """Return readings whose clock leaps from era to era."""
+    rows, now = [], START_NS
+    for leap_s, n, seed in eras:
+        rng = np.random.default_rng(seed)
+        now += round(leap_s * NS_PER_S)
+        for _ in range(n):
+            now += int(rng.choice(STEPS_MS)) * 1_000_000
+            signal = int(rng.choice(SENT))
+            value = GOOD[signal] + 0.001 * len(rows)
+            if rng.random() < 0.05:
+                value = float(rng.choice(WRONG))
+            rows.append((now, signal, value, int(rng.choice([0, 0, 0, 0, 1, 2]))))
+    return rows
+
+
+rules = st.fixed_dictionaries(
+    {
+        'sample_period': st.sampled_from([0.1, 1.0, 2.5]),
+        'hold_limit': st.sampled_from([2.5, 3.0, 10.0]),
+        'lateness': st.sampled_from([0.0, 0.5, 2.0, 7.0]),
+        'clock_jump': st.sampled_from([1.0, 10.0, 60.0]),
+    }
+)
+
+
+@examples(100)
+@given(st.lists(era, min_size=1, max_size=6), rules, st.data())
+def test_every_block_gives_what_the_slow_truth_gives(eras, values, data):
+    settings = Settings(values)
+    rows = readings_of(eras)
+    fast, slow = Aligner(settings), NaiveAligner(settings)
+    told = resets = 0
+    for start, end in blocks_of(len(rows), data.draw(cuts(len(rows)))):
+        aligned = fast.feed(Readings.of(rows[start:end]))
+        slow.feed(rows[start:end])
+        assert rows_of(aligned) == naive_rows(slow.rows[told:])
+        assert [told + int(k) for k in aligned.resets] == slow.resets[resets:]
+        assert fast.counts() == counts_of(slow)
+        told, resets = len(slow.rows), len(slow.resets)
+    aligned = fast.finish()
+    slow.finish()
+    assert rows_of(aligned) == naive_rows(slow.rows[told:])
+    assert fast.counts() == counts_of(slow)
+
+
+@examples(60)
+@given(st.lists(era, min_size=1, max_size=5), rules)
+def test_every_reading_has_one_fate(eras, values):
+    rows = readings_of(eras)
+    table, aligner = run(Settings(values), rows)
+    for s, topic in enumerate(TOPICS):
+        counts = aligner.counts()[topic]
+        assert sum(counts.values()) - counts['late'] == sum(r[1] == s for r in rows)
+    assert np.array_equal(table.quality == Quality.BAD, np.isnan(table.values))
+
+
+@examples(60)
+@given(st.lists(era, min_size=1, max_size=4), rules, st.integers(-1000, 1000))
+def test_time_shifted_by_whole_periods_gives_the_same_rows_later(eras, values, periods):
+    settings = Settings(values)
+    shift = periods * round(settings.real('sample_period') * NS_PER_S)
+    rows = readings_of(eras)
+    here, _ = run(settings, rows)
+    there, _ = run(settings, [(r[0] + shift, *r[1:]) for r in rows])
+    assert np.array_equal(here.time_ns + shift, there.time_ns)
+    assert np.array_equal(here.values, there.values, equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    'offset', [(0.0,) * 4, (0.9,) * 4, (0.1, 0.4, 0.6, 0.9), (0.0, 0.999, 0.001, 0.5)]
+)
+def test_stamps_off_the_grid_fill_every_row(offset):
+    table, _ = run(Settings(), steady_stream(50, offset))
+    assert 49 <= len(table) <= 50
+    assert np.all(np.diff(table.time_ns) == NS_PER_S)
+    assert np.isfinite(table.values[1:, :4]).all()
+
+
+def test_a_slow_topic_within_the_lateness_costs_the_others_nothing():
+    rows = steady_stream(60)
+    late = [(t + (1_500_000_000 if s == Signal.GENERATED_POWER else 0), k)
+            for k, (t, s, _, _) in enumerate(rows)]  # fmt: skip
+    table, aligner = run(Settings(), [rows[k] for _, k in sorted(late)])
+    expected, _ = run(Settings(), rows)
+    assert np.array_equal(table.values, expected.values, equal_nan=True)
+    assert np.array_equal(table.time_ns, expected.time_ns)
+    assert all(c['late'] == 0 for c in aligner.counts().values())
+
+
+def test_a_silent_topic_does_not_stop_the_others_and_its_column_turns_bad():
+    rows = [r for r in steady_stream(100) if r[1] != Signal.GENERATED_POWER or r[0] < START_NS
+            + 30 * NS_PER_S]  # fmt: skip
+    table, _ = run(Settings(), rows)
+    assert len(table) == 100
+    power = table.column(Signal.GENERATED_POWER)
+    held = 29 + 10  # the last value and the hold limit after it
+    assert np.isfinite(power[: held + 1]).all()
+    assert np.isnan(power[held + 1 :]).all()
+    assert np.isfinite(table.column(Signal.VALVE_OPENING)).all()
+
+
+def test_one_wild_stamp_is_counted_and_changes_no_row():
+    rows = steady_stream(40)
+    for k, leap in ((50, 86_400), (90, -86_400), (120, 5_000_000)):
+        time = rows[k][0] + leap * NS_PER_S
+        rows.insert(k, (time, 0, GOOD[0], 0))
+    table, aligner = run(Settings(), rows)
+    expected, _ = run(Settings(), steady_stream(40))
+    assert np.array_equal(table.values, expected.values, equal_nan=True)
+    assert aligner.counts()['valve_opening']['time_outlier'] == 3
+
+
+def test_a_leap_ahead_ends_the_rows_and_begins_new_ones():
+    first, second = steady_stream(30), steady_stream(30)
+    leap = 3600 * NS_PER_S
+    table, aligner = run(Settings(), first + [(r[0] + leap, *r[1:]) for r in second])
+    steps = np.diff(table.time_ns)
+    assert (steps > NS_PER_S).sum() == 1
+    gap = int(np.argmax(steps))
+    assert gap == 29 + 10  # held for the hold limit
+    assert np.isfinite(table.values[:, :4]).all()
+    assert len(table) == 30 + 10 + 30
+    assert all(c['time_outlier'] == 0 for c in aligner.counts().values())
+
+
+def test_a_clock_set_back_restarts_the_rows_once_and_loses_none_before_it():
+    back = steady_stream(30)
+    rows = steady_stream(50, (0.2, 0.3, 0.4, 0.5))
+    rows += [(r[0] - 7200 * NS_PER_S, *r[1:]) for r in back]
+    aligner = Aligner(Settings())
+    aligned = aligner.feed(Readings.of(rows))
+    rest = aligner.finish()
+    assert aligned.resets.tolist() == [49]  # the newest stamp before is 49.5 s
+    assert aligned.table.time_ns[49] == START_NS - 7200 * NS_PER_S
+    assert len(aligned.table) + len(rest.table) == 49 + 30
+    assert np.all(np.diff(aligned.table.time_ns[:49]) == NS_PER_S)
+
+
+def test_the_optional_command_is_held_while_sent_and_absent_otherwise():
+    with_command = steady_stream(30, (0.0, 0.0, 0.0, 0.0, 0.0), signals=(4, 0, 1, 2, 3))
+    table, _ = run(Settings(), with_command)
+    assert np.isfinite(table.column(Signal.VALVE_COMMAND)).all()
+    table, _ = run(Settings(), steady_stream(30))
+    assert np.isnan(table.column(Signal.VALVE_COMMAND)).all()
+    assert (table.quality[:, Signal.VALVE_COMMAND] == Quality.BAD).all()
+
+
+@examples(30)
+@given(st.integers(1, 30), st.integers(0, 2**32 - 1))
+def test_a_table_on_the_grid_comes_back_as_it_was(n, seed):
+    rng = np.random.default_rng(seed)
+    values = np.array(GOOD) + rng.normal(0.0, 0.1, (n, N_SIGNALS))
+    table = SampleTable(
+        START_NS + np.arange(n) * NS_PER_S, values, np.zeros((n, N_SIGNALS), dtype=np.uint8)
+    )
+    aligner = Aligner(Settings())
+    parts = [aligner.feed(table_to_readings(table)).table, aligner.finish().table]
+    back = SampleTable.concatenate(parts)
+    assert back.time_ns.tolist() == table.time_ns.tolist()
+    assert np.array_equal(back.values, table.values)
+
+
+def test_quality_goes_with_its_value():
+    rows = [(t, s, v, 1 if s == 0 and k % 2 else 0)
+            for k, (t, s, v, _) in enumerate(steady_stream(20))]  # fmt: skip
+    table, _ = run(Settings(), rows)
+    by_time = {(t, s): q for t, s, _, q in rows}
+    for k, time in enumerate(table.time_ns.tolist()):
+        assert table.quality[k, 0] == by_time[time, 0]
+
+
+# --- hostile --------------------------------------------------------------------------------
+
+
+def test_nothing_gives_nothing():
+    aligner = Aligner(Settings())
+    assert len(aligner.feed(Readings.of([])).table) == 0
+    assert len(aligner.finish().table) == 0
+    assert all(sum(c.values()) == 0 for c in aligner.counts().values())
+
+
+def test_one_reading_gives_one_row_with_the_rest_bad():
+    table, _ = run(Settings(), [(START_NS, 0, 50.0, 0)])
+    assert len(table) == 1
+    assert table.values[0, 0] == 50.0
+    assert np.isnan(table.values[0, 1:]).all()
+
+
+@pytest.mark.parametrize('wrong', WRONG)
+@pytest.mark.parametrize('signal', list(Signal))
+def test_an_unusable_value_is_counted_and_the_last_good_one_held(signal, wrong):
+    rows = steady_stream(20, (0.0,) * 5, signals=(4, 0, 1, 2, 3))
+    rows = [(t, s, wrong if s == signal and k > 40 else v, q)
+            for k, (t, s, v, q) in enumerate(rows)]  # fmt: skip
+    table, aligner = run(Settings(), rows)
+    reason = 'not_finite' if not np.isfinite(wrong) else 'impossible'
+    assert aligner.counts()[SIGNALS[signal].topic][reason] == sum(
+        s == signal and k > 40 for k, (_, s, _, _) in enumerate(rows)
+    )
+    assert np.isfinite(table.column(signal)[:18]).all()
+
+
+STRANGE = [-(2**63), -(2**63) + 1, -1, 0, 1, 2**62, 2**63 - 1]
+
+
+@pytest.mark.parametrize('first', STRANGE)
+def test_a_strange_first_stamp_neither_hangs_nor_lasts(first):
+    """A first stamp has nobody to be compared with; twenty good ones must win."""
+    rows = [(first, s, GOOD[s], 0) for s in range(4)] + steady_stream(30)
+    table, aligner = run(Settings(), rows)
+    assert len(table) < 100
+    good = table.time_ns >= START_NS
+    assert (good & (table.time_ns < START_NS + 60 * NS_PER_S)).sum() >= 20
+    for s, topic in enumerate(TOPICS):
+        counts = aligner.counts()[topic]
+        assert sum(counts.values()) - counts['late'] == sum(r[1] == s for r in rows)
+
+
+@pytest.mark.parametrize('stamp', STRANGE)
+def test_a_strange_stamp_later_is_an_outlier(stamp):
+    rows = steady_stream(30)
+    rows.insert(60, (stamp, 0, GOOD[0], 0))
+    table, aligner = run(Settings(), rows)
+    expected, _ = run(Settings(), steady_stream(30))
+    assert np.array_equal(table.values, expected.values, equal_nan=True)
+    assert aligner.counts()['valve_opening']['time_outlier'] == 1
+
+
+def test_time_that_runs_backwards_from_the_start_gives_bounded_rows_and_full_counts():
+    rows = steady_stream(100)[::-1]
+    table, aligner = run(Settings(), rows)
+    assert len(table) <= 100
+    for counts in aligner.counts().values():
+        if sum(counts.values()):
+            assert sum(counts.values()) - counts['late'] == 100
+
+
+@pytest.mark.parametrize('period', [0.1, 60.0])
+def test_other_periods(period):
+    values = {'sample_period': period, 'hold_limit': 5 * period, 'alarm_average': 300.0,
+              'block': max(10.0, period), 'longest_segment': 1800.0}  # fmt: skip
+    table, _ = run(Settings(values), steady_stream(40, (0.0,) * 4, period))
+    assert len(table) == 40
+    assert np.all(np.diff(table.time_ns) == round(period * NS_PER_S))
+    assert np.isfinite(table.values[:, :4]).all()
+
+
+def test_read_only_arrays_are_read():
+    rows = Readings.of(steady_stream(10))
+    for array in (rows.time_ns, rows.signal, rows.value, rows.quality):
+        array.setflags(write=False)
+    assert len(Aligner(Settings()).feed(rows).table) == 10
+
+
+@needs_jit
+def test_more_rows_than_one_call_has_room_for():
+    rows = Readings.of(
+        [(START_NS + k * NS_PER_S, s, GOOD[s], 0) for k in range(0, 70_000, 5) for s in range(4)]
+    )
+    table = Aligner(Settings({'sample_period': 1.0})).feed(rows).table
+    assert len(table) == 69_996
+    assert np.all(np.diff(table.time_ns) == NS_PER_S)
+
+
+@example(0.0)
+@examples(10)
+@given(st.sampled_from([0.0, 0.5, 2.0]))
+def test_a_row_waits_no_longer_than_the_lateness(lateness):
+    """One topic alone closes rows once it is ``lateness`` past them."""
+    settings = Settings({'lateness': lateness})
+    aligner = Aligner(settings)
+    for k in range(20):
+        aligned = aligner.feed(Readings.of([(START_NS + k * NS_PER_S, 0, 50.0, 0)]))
+        newest = START_NS + k * NS_PER_S
+        expected = [newest - round(lateness) * NS_PER_S] if k >= lateness else []
+        if lateness in (0.0, 2.0):
+            assert aligned.table.time_ns.tolist() == expected
+        assert all(t <= newest - lateness * NS_PER_S for t in aligned.table.time_ns.tolist())

@@ -1,0 +1,347 @@
+from __future__ import annotations
+
+import copy
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from streams import examples
+
+from valveflow_ros.core.characteristic import (
+    Characteristic,
+    Choice,
+    Piece,
+    RegionDynamics,
+    ResidualStatistics,
+    Source,
+)
+from valveflow_ros.core.characteristic_json import from_json, to_json
+from valveflow_ros.errors import DataError
+
+NAN, INF = math.nan, math.inf
+
+
+def curve(knots, slopes, jumps=None, start=0.0, **more):
+    """Return a characteristic through ``start`` at the first knot, with jumps at inner knots."""
+    pieces, value = [], start
+    for k, slope in enumerate(slopes):
+        if k and jumps is not None:
+            value += jumps[k - 1]
+        pieces.append(
+            Piece(float(knots[k]), float(knots[k + 1]), float(slope),
+                  float(value - slope * knots[k]), 0.01, 1.0, 100 + k)
+        )  # fmt: skip
+        value += slope * (knots[k + 1] - knots[k])
+    many = range(1, len(slopes) + 1)
+    fields = {
+        'pressure_exponent': 1.125,
+        'pieces': tuple(pieces),
+        'breakpoint_intervals': tuple((p.u_from - 5.0, NAN) for p in pieces[1:]),
+        'choice': Choice('paper', {j: 3.0 / j for j in many}, dict.fromkeys(many, 0.5), 'why'),
+        'source': Source(10, 20, 3, 4, 500, 539.5, 2.5, False),
+        'residuals': ResidualStatistics(2.5, 0.4, 300.0, 0.7, 0.3),
+        'partition_pieces': tuple(pieces),
+        'notes': ('one', 'two'),
+    }
+    return Characteristic(**{**fields, **more})
+
+
+DYNAMICS = (
+    RegionDynamics(0.0, 240.0, 10.0, 3.0, 0.5, NAN),
+    RegionDynamics(240.0, 300.0, 80.0, 10.0, 2.0, 1.0),
+)
+
+
+@st.composite
+def curves(draw, rising=True, jumps=True):
+    pieces = draw(st.integers(1, 6))
+    widths = draw(st.lists(st.floats(1.0, 500.0), min_size=pieces, max_size=pieces))
+    knots = np.cumsum([draw(st.floats(-100.0, 1500.0)), *widths])
+    low = 0.01 if rising else -0.5
+    slopes = draw(st.lists(st.floats(low, 0.5), min_size=pieces, max_size=pieces))
+    steps = None
+    if jumps:
+        steps = draw(st.lists(st.one_of(st.just(0.0), st.floats(-60.0, 60.0)),
+                              min_size=pieces - 1, max_size=pieces - 1))  # fmt: skip
+    return curve(knots, slopes, steps, draw(st.floats(-50.0, 200.0)))
+
+
+def naive_value(c, u):
+    """Evaluate by walking through the pieces; the right piece has a knot."""
+    if math.isnan(u) or u < c.pieces[0].u_from or u > c.pieces[-1].u_to:
+        return NAN
+    piece = [p for p in c.pieces if p.u_from <= u][-1]
+    return piece.slope * u + piece.intercept
+
+
+# --- evaluation and inverse -----------------------------------------------------------------
+
+
+@examples(80)
+@given(curves(rising=False), st.lists(st.floats(-300.0, 5000.0), max_size=20))
+def test_it_is_each_pieces_line_and_nothing_outside(c, inputs):
+    inputs = [*inputs, *c.breakpoints, NAN, INF, -INF]
+    expected = [naive_value(c, u) for u in inputs]
+    scale = max(1.0, *(abs(v) for v in expected if math.isfinite(v)))
+    assert c(np.array(inputs)) == pytest.approx(expected, abs=1e-9 * scale, nan_ok=True)
+
+
+@examples(100)
+@given(curves(), st.lists(st.floats(0.0, 1.0), min_size=1, max_size=20))
+def test_the_inverse_is_the_smallest_input_that_reaches_the_power(c, shares):
+    dense = np.unique(
+        np.concatenate([np.linspace(p.u_from, p.u_to, 400, endpoint=False) for p in c.pieces])
+    )
+    reached = c(dense)
+    low, high = reached[0], max(reached.max(), c.model.right.max())
+    for power in low + np.array(shares) * (high - low):
+        (u,) = c.inverse(np.array([power]))
+        before = dense[dense < u - 1e-6]
+        assert not len(before) or c(before).max() <= power + 1e-6
+        value = naive_value(c, u)
+        if abs(value - power) > 1e-6:  # only in a jump, or at the end of a piece
+            assert np.abs(c.breakpoints - u).min() < 1e-6
+            k = int(np.argmin(np.abs(c.breakpoints - u)))
+            from_left = c.model.right[k - 1]
+            assert from_left - 1e-6 <= power
+
+
+@examples(60)
+@given(curves(jumps=False), st.lists(st.floats(0.0, 1.0), min_size=1, max_size=20))
+def test_without_jumps_the_inverse_undoes_the_curve_both_ways(c, shares):
+    knots = c.breakpoints
+    u = knots[0] + np.array(shares) * (knots[-1] - knots[0])
+    assert c.inverse(c(u)) == pytest.approx(u, abs=1e-6)
+    values = c.values()
+    power = values[0] + np.array(shares) * (values[-1] - values[0])
+    assert c(c.inverse(power)) == pytest.approx(power, abs=1e-6)
+
+
+def test_a_power_out_of_reach_has_no_input():
+    c = curve([0.0, 10.0, 20.0], [1.0, 2.0])
+    got = c.inverse(np.array([-0.1, 30.1, NAN, INF, -INF]))
+    assert np.isnan(got).all()
+    assert c.inverse(np.array([0.0, 10.0, 30.0])).tolist() == [0.0, 10.0, 20.0]
+
+
+def test_in_a_jump_up_the_knot_answers():
+    c = curve([0.0, 10.0, 20.0], [1.0, 1.0], [5.0])
+    assert c.inverse(np.array([10.0, 12.0, 15.0])).tolist() == [10.0, 10.0, 10.0]
+    assert c.inverse(np.array([16.0])).tolist() == [11.0]
+    assert c.values().tolist() == [0.0, 12.5, 25.0]
+
+
+def test_after_a_jump_down_the_inverse_goes_on_where_the_power_is_new():
+    c = curve([0.0, 10.0, 20.0], [1.0, 1.0], [-4.0])
+    power = np.array([9.0, 10.0, 11.0, 16.0])
+    assert c.inverse(power).tolist() == [9.0, 10.0, 15.0, 20.0]
+
+
+@pytest.mark.parametrize('slope', [0.0, -0.01, -1.0])
+@pytest.mark.parametrize('place', [0, 1, 2])
+def test_a_piece_that_does_not_rise_is_named_and_the_inverse_refused(slope, place):
+    slopes = [0.2, 0.3, 0.1]
+    slopes[place] = slope
+    with pytest.raises(DataError) as caught:
+        curve([0.0, 100.0, 200.0, 300.0], slopes).inverse(np.array([10.0]))
+    assert f'piece {place + 1}' in str(caught.value)
+    assert 'no inverse' in str(caught.value)
+
+
+def test_the_model_has_the_numbers_of_the_pieces():
+    c = curve([1050.0, 1250.0, 1600.0], [0.24, 0.18], [1.5], 150.0, dynamics=DYNAMICS)
+    m = c.model
+    assert m.knots.tolist() == c.breakpoints.tolist() == [1050.0, 1250.0, 1600.0]
+    assert m.slopes() == pytest.approx([0.24, 0.18])
+    assert m.intercepts() == pytest.approx([p.intercept for p in c.pieces])
+    assert m.levels.tolist() == [240.0]
+    assert m.time_constants.tolist() == [10.0, 80.0]
+    assert m.delays.tolist() == [3.0, 10.0]
+
+
+@pytest.mark.parametrize('dtype', [np.float32, np.int64, np.float64])
+def test_other_arrays_are_taken_too(dtype):
+    c = curve([0.0, 10.0, 20.0], [1.0, 2.0])
+    u = np.array([1, 5, 15], dtype=dtype)
+    u.setflags(write=False)
+    assert c(u).tolist() == [1.0, 5.0, 20.0]
+    assert c(np.array(5.0)) == 5.0
+    assert c(np.empty(0)).shape == (0,)
+    assert c.inverse(np.empty(0)).shape == (0,)
+
+
+# --- the id ---------------------------------------------------------------------------------
+
+
+@examples(30)
+@given(curves())
+def test_the_id_follows_from_the_numbers_and_nothing_else(c):
+    named = c.with_id()
+    assert len(named.model_id) == 12
+    assert named.with_id().model_id == named.model_id
+    assert dataclasses.replace(c, model_id='other').with_id().model_id == named.model_id
+    piece = dataclasses.replace(
+        c.pieces[0], intercept=math.nextafter(c.pieces[0].intercept, math.inf)
+    )
+    moved = dataclasses.replace(c, pieces=(piece, *c.pieces[1:]))
+    assert moved.with_id().model_id != named.model_id
+
+
+# --- JSON -----------------------------------------------------------------------------------
+
+
+def through_json(c):
+    """Write and read as a file would, in strict JSON."""
+    text = json.dumps(to_json(c), allow_nan=False)
+    return from_json(json.loads(text))
+
+
+@examples(60)
+@given(curves(rising=False), st.booleans())
+def test_json_and_back_is_the_same_to_the_last_bit(c, dynamic):
+    c = dataclasses.replace(c, dynamics=DYNAMICS if dynamic else ()).with_id()
+    back = through_json(c)
+    assert repr(back) == repr(c)  # NaN equals NaN in its repr
+    assert back.with_id().model_id == c.model_id
+
+
+@pytest.mark.parametrize('value', [NAN, INF, -INF])
+def test_numbers_that_json_does_not_have_become_absent(value):
+    c = curve([0.0, 1.0], [1.0], choice=Choice('paper', {1: value}, {1: value}),
+              source=Source(0, 1, 2, 3, 4, value, value, False))  # fmt: skip
+    back = through_json(c)
+    assert math.isnan(back.choice.cost[1])
+    assert math.isnan(back.source.temperature_mean_degc)
+
+
+def test_the_contracts_keys_are_there():
+    raw = to_json(curve([0.0, 1.0, 2.0], [1.0, 2.0], dynamics=DYNAMICS).with_id())
+    assert (raw['format'], raw['version'], raw['optimal']) == ('valveflow/characteristic', 1, True)
+    assert {'u_from', 'u_to', 'slope', 'intercept', 'slope_stderr', 'intercept_stderr',
+            'samples'} <= set(raw['pieces'][0])  # fmt: skip
+    assert len(raw['breakpoint_intervals']) == 1
+    assert set(raw['selection']) >= {'rule', 'cost', 'turning_angle'}
+    assert set(raw['selection']['cost']) == {'1', '2'}
+    assert set(raw['segments']) == {'steady', 'slope_response', 'samples'}
+    assert set(raw['dynamics'][0]) >= {'power_from', 'power_to', 'time_constant_s', 'delay_s'}
+
+
+GOOD = to_json(curve([0.0, 10.0, 20.0], [1.0, 2.0], dynamics=DYNAMICS).with_id())
+
+
+def test_what_this_program_adds_to_the_contract_may_be_missing():
+    raw = {k: v for k, v in GOOD.items()
+           if k not in ('model_id', 'window', 'temperature', 'residuals', 'partition', 'notes')}
+    raw['dynamics'] = [
+        {k: d[k] for k in ('power_from', 'power_to', 'time_constant_s', 'delay_s')}
+        for d in raw['dynamics']
+    ]  # fmt: skip
+    back = from_json(raw)
+    assert back.pieces == from_json(GOOD).pieces
+    assert math.isnan(back.residuals.rmse_mw)
+    assert back.notes == ()
+
+
+def paths(raw, at=()):
+    """Yield the path of every value in nested JSON."""
+    items = raw.items() if isinstance(raw, dict) else enumerate(raw)
+    for key, value in items:
+        yield (*at, key)
+        if isinstance(value, dict | list):
+            yield from paths(value, (*at, key))
+
+
+def changed(path, value, delete=False):
+    raw = copy.deepcopy(GOOD)
+    inside = raw
+    for key in path[:-1]:
+        inside = inside[key]
+    if delete:
+        del inside[path[-1]]
+    else:
+        inside[path[-1]] = value
+    return raw
+
+
+@pytest.mark.parametrize('value', [None, 'x', True, [], {}, NAN, INF, -1, 10**400, 1e308, [[]]],
+                         ids=repr)  # fmt: skip
+def test_any_value_replaced_by_nonsense_is_read_or_refused_with_a_sentence(value):
+    """Whatever is read must be usable: finite numbers, and through JSON again."""
+    for path in paths(GOOD):
+        try:
+            c = from_json(changed(path, value))
+        except DataError as error:
+            assert str(error).endswith('.')
+            assert 'Error' not in str(error)
+            continue
+        assert np.isfinite(c.breakpoints).all()
+        assert np.isfinite(c(c.breakpoints)).all(), path
+        assert all(0.0 < d.time_constant_s <= 3600.0 for d in c.dynamics)
+        assert all(0.0 <= d.delay_s <= 600.0 for d in c.dynamics)
+        through_json(c)
+
+
+def test_any_key_taken_away_is_missed_or_not_needed():
+    for path in paths(GOOD):
+        try:
+            c = from_json(changed(path, None, delete=True))
+        except DataError as error:
+            assert str(error).endswith('.')
+            continue
+        through_json(c)
+
+
+@pytest.mark.parametrize(
+    ('path', 'value'),
+    [
+        (('pieces',), []),
+        (('pieces', 0, 'samples'), INF),
+        (('pieces', 0, 'samples'), -3),
+        (('pieces', 0, 'slope'), None),
+        (('pieces', 0, 'slope'), '1.5'),
+        (('pieces', 1, 'u_from'), 12.0),
+        (('pieces', 1, 'u_to'), 10.0),
+        (('pieces', 1, 'slope_stderr'), -0.1),
+        (('dynamics', 0, 'time_constant_s'), 0),
+        (('dynamics', 0, 'time_constant_s'), -1.0),
+        (('dynamics', 0, 'delay_s'), NAN),
+        (('dynamics', 0, 'delay_s'), -1.0),
+        (('dynamics', 0, 'delay_s'), 1e9),
+        (('dynamics', 1, 'power_to'), 200.0),
+        (('pressure_exponent',), NAN),
+        (('pressure_exponent',), -3.0),
+        (('residuals', 'average_sd_mw'), -1.0),
+        (('residuals', 'average_sd_mw'), INF),
+        (('breakpoint_intervals',), []),
+        (('breakpoint_intervals', 0), [1.0]),
+        (('selection', 'cost'), {'x': 1.0}),
+        (('temperature', 'flag'), 'false'),
+        (('notes',), 'abc'),
+        (('window', 'start_ns'), INF),
+        (('window', 'start_ns'), 1e300),
+        (('version',), 2),
+        (('version',), True),
+        (('format',), 'valveflow/diagnosis'),
+    ],
+)  # fmt: skip
+def test_what_no_plant_has_is_refused_and_the_place_named(path, value):
+    with pytest.raises(DataError) as caught:
+        from_json(changed(path, value))
+    assert str(path[-1]) in str(caught.value) or str(path[0]) in str(caught.value)
+
+
+@pytest.mark.parametrize('raw', [None, [], 'x', 3, {}, {'format': 'valveflow/characteristic'}])
+def test_what_is_no_characteristic_at_all_is_refused(raw):
+    with pytest.raises(DataError):
+        from_json(raw)
+
+
+@examples(30)
+@given(curves(), curves())
+def test_two_curves_are_equal_exactly_when_their_ids_are(a, b):
+    assume(a.pieces != b.pieces)
+    assert a.with_id().model_id != b.with_id().model_id

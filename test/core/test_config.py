@@ -1,0 +1,224 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from streams import examples
+
+from valveflow_ros.config import PARAMETERS, TABLE, Settings, as_yaml, parameter
+from valveflow_ros.errors import InputError, ParameterError, ValveflowError
+
+NUMBERS = [row for row in TABLE if row.low is not None]
+TEXTS = [row for row in TABLE if isinstance(row.default, str)]
+SWITCHES = [row for row in TABLE if isinstance(row.default, bool)]
+
+
+def refusal(values):
+    """Return the sentence with which the values are refused."""
+    with pytest.raises(ParameterError) as caught:
+        Settings(values)
+    assert isinstance(caught.value, InputError)
+    assert isinstance(caught.value, ValveflowError)
+    return str(caught.value)
+
+
+def read_back(text):
+    return yaml.safe_load(text)['/**']['ros__parameters']
+
+
+def test_names_are_unique_and_every_row_says_what_it_is():
+    assert len(PARAMETERS) == len(TABLE)
+    assert len(NUMBERS) + len(TEXTS) + len(SWITCHES) == len(TABLE)
+    for row in TABLE:
+        assert row.name.isidentifier()
+        assert row.name == row.name.lower()
+        assert row.sentence.endswith('.')
+
+
+@pytest.mark.parametrize('row', TABLE, ids=lambda row: row.name)
+def test_the_default_passes_its_own_row(row):
+    got = row.check(row.default)
+    assert got == row.default
+    assert type(got) is type(row.default)
+
+
+@pytest.mark.parametrize('row', NUMBERS, ids=lambda row: row.name)
+def test_a_number_is_taken_from_end_to_end_of_its_range_and_no_further(row):
+    whole = isinstance(row.default, int)
+    assert row.check(row.low) == row.low
+    assert row.check(row.high) == row.high
+    assert type(row.check(row.high)) is (int if whole else float)
+    step = 1 if whole else max(abs(row.high), 1.0) * 1e-9
+    for wrong in (row.low - step, row.high + step):
+        sentence = refusal({row.name: wrong})
+        assert row.name in sentence
+        assert f'{row.low:g}' in sentence
+        assert f'{row.high:g}' in sentence
+
+
+@pytest.mark.parametrize('row', NUMBERS, ids=lambda row: row.name)
+@pytest.mark.parametrize(
+    'wrong', [math.nan, math.inf, -math.inf, True, False, '3', None, [1.0], np.nan, 1j], ids=repr
+)
+def test_what_is_no_number_in_range_is_refused_by_name(row, wrong):
+    assert f"'{row.name}'" in refusal({row.name: wrong})
+
+
+@pytest.mark.parametrize('row', [r for r in NUMBERS if isinstance(r.default, int)],
+                         ids=lambda row: row.name)  # fmt: skip
+def test_a_broken_number_is_refused_where_a_whole_one_is_wanted(row):
+    assert 'whole number' in refusal({row.name: row.low + 0.5})
+    assert type(row.check(float(row.default))) is int
+
+
+@pytest.mark.parametrize('row', SWITCHES, ids=lambda row: row.name)
+@pytest.mark.parametrize('wrong', [0, 1, 'true', None, math.nan, []], ids=repr)
+def test_what_is_no_switch_is_refused_by_name(row, wrong):
+    assert f"'{row.name}'" in refusal({row.name: wrong})
+
+
+@pytest.mark.parametrize('row', TEXTS, ids=lambda row: row.name)
+@pytest.mark.parametrize(
+    'wrong', [0, True, None, math.nan, b'x', 'a\x00b', 'a\nb', 'a\rb', 'a\x1b[2J', 'x' * 501,
+              'a\x85b', '\ud800'], ids=repr,
+)  # fmt: skip
+def test_what_is_no_line_of_text_is_refused_by_name(row, wrong):
+    assert f"'{row.name}'" in refusal({row.name: wrong})
+
+
+@pytest.mark.parametrize('row', [r for r in TEXTS if r.choices], ids=lambda row: row.name)
+def test_a_word_that_is_no_choice_is_refused_and_the_choices_named(row):
+    sentence = refusal({row.name: 'nonsense'})
+    assert all(choice in sentence for choice in row.choices)
+    assert all(Settings({row.name: choice}).text(row.name) == choice for choice in row.choices)
+
+
+@pytest.mark.parametrize(
+    ('name', 'near'),
+    [('smaple_period', 'sample_period'), ('windowdays', 'window_days'), ('qqqq', None), ('', None)],
+)
+def test_an_unknown_name_is_refused_and_the_nearest_one_suggested(name, near):
+    sentence = refusal({name: 1.0})
+    assert 'does not exist' in sentence
+    assert (near in sentence) if near else ('did you mean' not in sentence)
+
+
+@pytest.mark.parametrize('key', [5, None, 2.5, True, ('a',)])
+def test_a_name_that_is_no_text_is_refused_too(key):
+    """A file can have any key: ``5: 3`` is good YAML."""
+    assert 'does not exist' in refusal({key: 3})
+
+
+@pytest.mark.parametrize(
+    ('values', 'name'),
+    [
+        ({'valve_opening_low': 50.0, 'valve_opening_high': 50.0}, 'valve_opening_low'),
+        ({'generated_power_low': 10.0, 'generated_power_high': 5.0}, 'generated_power_low'),
+        ({'main_steam_pressure_low': 30.0, 'main_steam_pressure_high': 10.0},
+         'main_steam_pressure_low'),
+        ({'main_steam_temperature_low': 700.0, 'main_steam_temperature_high': 600.0},
+         'main_steam_temperature_low'),
+        ({'sample_period': 20.0}, 'hold_limit'),
+        ({'sample_period': 20.0, 'hold_limit': 60.0}, 'block'),
+        ({'sample_period': 400.0, 'hold_limit': 600.0, 'block': 400.0,
+          'longest_segment': 9000.0}, 'alarm_average'),
+        ({'block': 1000.0}, 'longest_segment'),
+        ({'slope_limit': 2.5}, 'slope_limit'),
+        ({'steady_min': 3600.0}, 'steady_min'),
+        ({'slope_min': 1800.1}, 'slope_min'),
+    ],
+)  # fmt: skip
+def test_values_at_odds_are_refused_by_the_name_of_one_of_them(values, name):
+    assert f"'{name}'" in refusal(values)
+
+
+def random_values(draw):
+    """Draw a value in range for some rows, as a file could have it."""
+    values = {}
+    for row in draw(st.lists(st.sampled_from(TABLE), max_size=12, unique_by=lambda r: r.name)):
+        if isinstance(row.default, bool):
+            values[row.name] = draw(st.booleans())
+        elif row.choices:
+            values[row.name] = draw(st.sampled_from(row.choices))
+        elif isinstance(row.default, str):
+            values[row.name] = draw(st.text(max_size=30))
+        elif isinstance(row.default, int):
+            values[row.name] = draw(st.integers(int(row.low), int(row.high)))
+        else:
+            values[row.name] = draw(
+                st.one_of(
+                    st.floats(row.low, row.high),
+                    st.sampled_from([row.low, row.high, max(row.low, min(1e-5, row.high))]),
+                )
+            )
+    return values
+
+
+@examples(150)
+@given(st.data())
+def test_whatever_passes_stands_in_the_yaml_file_and_is_read_back_unchanged(data):
+    try:
+        settings = Settings(random_values(data.draw))
+    except ParameterError as error:
+        assert str(error).startswith("Parameter '")
+        return
+    back = read_back(as_yaml(values=settings))
+    assert back == dict(settings)
+    assert {k: type(v) for k, v in back.items()} == {k: type(v) for k, v in settings.items()}
+    assert Settings(back) == settings
+
+
+def test_the_file_of_defaults_says_unit_range_and_choices_of_everything():
+    text = as_yaml()
+    assert read_back(text) == {row.name: row.default for row in TABLE}
+    lines = text.splitlines()
+    for row in TABLE:
+        at = next(k for k, line in enumerate(lines) if line.startswith(f'    {row.name}:'))
+        about = lines[at - 1]
+        assert row.sentence in about
+        if row.low is not None:
+            assert f'{row.low:g} to {row.high:g}' in about
+        assert all(choice in about for choice in row.choices)
+        assert ('while running' in about) == row.live
+
+
+def test_settings_are_complete_and_do_not_change():
+    settings = Settings({'delay': 12})
+    assert list(settings) == [row.name for row in TABLE]
+    assert len(settings) == len(TABLE)
+    assert settings.real('delay') == 12.0
+    assert type(settings['delay']) is float
+    other = settings.changed({'delay': 20.0, 'autostart': False})
+    assert (settings.real('delay'), other.real('delay')) == (12.0, 20.0)
+    assert settings.flag('autostart')
+    assert not other.flag('autostart')
+    with pytest.raises(TypeError):
+        settings['delay'] = 3.0
+    with pytest.raises(AttributeError):
+        settings.something = 3.0
+
+
+def test_a_refused_change_leaves_nothing_behind():
+    settings = Settings()
+    with pytest.raises(ParameterError):
+        settings.changed({'delay': 12.0, 'break_limit': math.nan})
+    assert settings == Settings()
+
+
+@examples(40)
+@given(st.floats(0.1, 3600.0), st.floats(0.0, 3600.0))
+def test_the_transient_is_five_time_constants_and_the_delay(time_constant, delay):
+    settings = Settings({'time_constant': time_constant, 'delay': delay})
+    assert settings.settle_s == 5.0 * time_constant + delay
+
+
+def test_a_row_is_found_by_its_name():
+    assert parameter('delay') is PARAMETERS['delay']
+
+
+def test_numpy_numbers_are_taken_as_numbers():
+    assert type(Settings({'delay': np.float64(3.0)})['delay']) is float

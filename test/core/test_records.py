@@ -1,0 +1,143 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from streams import START_NS, examples, grid_ns
+
+from valveflow_ros.records import (
+    N_SIGNALS,
+    SIGNALS,
+    Quality,
+    Readings,
+    SampleTable,
+    Signal,
+    table_to_readings,
+)
+
+value = st.one_of(
+    st.floats(-1e3, 1e3), st.sampled_from([float('nan'), float('inf'), -float('inf')])
+)
+
+
+@st.composite
+def tables(draw):
+    n = draw(st.integers(0, 12))
+    columns, quality = {}, {}
+    for signal in draw(st.sets(st.sampled_from(list(Signal)))):
+        columns[signal] = np.array(draw(st.lists(value, min_size=n, max_size=n)))
+        if draw(st.booleans()):
+            codes = st.lists(st.integers(0, 2), min_size=n, max_size=n)
+            quality[signal] = np.array(draw(codes), dtype=np.uint8)
+    return SampleTable.from_columns(grid_ns(n), columns, quality), columns, quality
+
+
+def test_the_signals_stand_in_the_order_of_their_numbers():
+    assert [info.signal for info in SIGNALS] == list(range(N_SIGNALS))
+    assert [s.value for s in Signal] == list(range(N_SIGNALS))
+    assert [info.topic for info in SIGNALS if not info.required] == ['valve_command']
+    assert all(info.column.startswith(info.topic) for info in SIGNALS)
+
+
+@examples(80)
+@given(tables())
+def test_a_value_is_bad_exactly_where_it_is_nan(made):
+    table, columns, quality = made
+    assert table.values.shape == table.quality.shape == (len(table), N_SIGNALS)
+    assert np.array_equal(table.quality == Quality.BAD, np.isnan(table.values))
+    assert not np.isinf(table.values).any()
+    for signal in Signal:
+        if signal not in columns:
+            assert np.isnan(table.column(signal)).all()
+            continue
+        codes = quality.get(signal, np.zeros(len(table)))
+        good = np.isfinite(columns[signal]) & (codes < 2)
+        assert np.array_equal(table.column(signal)[good], columns[signal][good])
+        assert np.array_equal(table.quality[good, signal], codes[good])
+        assert np.isnan(table.column(signal)[~good]).all()
+
+
+@examples(60)
+@given(tables())
+def test_making_a_table_does_not_touch_what_it_is_made_from(made):
+    _, columns, quality = made
+    before = {s: c.copy() for s, c in columns.items()}
+    for column in (*columns.values(), *quality.values()):
+        column.setflags(write=False)
+    n = len(next(iter(columns.values()))) if columns else 0
+    SampleTable.from_columns(grid_ns(n), columns, quality)
+    assert all(np.array_equal(columns[s], before[s], equal_nan=True) for s in columns)
+
+
+@examples(60)
+@given(tables(), st.integers(0, 12), st.integers(0, 12))
+def test_parts_joined_are_the_whole(made, a, b):
+    table, _, _ = made
+    a, b = sorted((min(a, len(table)), min(b, len(table))))
+    parts = [table.part(0, a), table.part(a, b), table.part(b, len(table))]
+    joined = SampleTable.concatenate(parts)
+    assert np.array_equal(joined.time_ns, table.time_ns)
+    assert np.array_equal(joined.values, table.values, equal_nan=True)
+    assert np.array_equal(joined.quality, table.quality)
+    assert np.shares_memory(parts[0].values, table.values) or a == 0
+
+
+def test_joining_nothing_gives_an_empty_table():
+    empty = SampleTable.concatenate([])
+    assert len(empty) == 0
+    assert empty.values.shape == (0, N_SIGNALS)
+    assert empty.time_ns.dtype == np.int64
+
+
+@examples(80)
+@given(tables())
+def test_readings_tell_every_row_and_leave_out_only_absent_optional_values(made):
+    table, _, _ = made
+    readings = table_to_readings(table)
+    expected = []
+    for k in range(len(table)):
+        command = table.values[k, Signal.VALVE_COMMAND]
+        if np.isfinite(command):
+            expected.append((table.time_ns[k], int(Signal.VALVE_COMMAND), command,
+                             table.quality[k, Signal.VALVE_COMMAND]))  # fmt: skip
+        expected += [(table.time_ns[k], s, table.values[k, s], table.quality[k, s])
+                     for s in range(4)]  # fmt: skip
+    assert len(readings) == len(expected)
+    got = zip(readings.time_ns, readings.signal, readings.value, readings.quality, strict=True)
+    for (t, s, v, q), (et, es, ev, eq) in zip(got, expected, strict=True):
+        assert (t, s, q) == (et, es, eq)
+        assert v == ev or (np.isnan(v) and np.isnan(ev) and q == Quality.BAD)
+
+
+def test_readings_from_rows_and_their_parts():
+    rows = [(START_NS + k, k % 4, float(k), k % 3) for k in range(10)]
+    readings = Readings.of(rows)
+    assert len(readings) == 10
+    assert [a.dtype.str for a in (readings.time_ns, readings.signal, readings.value,
+            readings.quality)] == ['<i8', '|i1', '<f8', '|u1']  # fmt: skip
+    part = readings.part(3, 7)
+    assert part.value.tolist() == [3.0, 4.0, 5.0, 6.0]
+    assert np.shares_memory(part.value, readings.value)
+    assert len(Readings.of([])) == 0
+
+
+def test_records_do_not_change():
+    table = SampleTable.from_columns(grid_ns(2), {})
+    with pytest.raises(AttributeError):
+        table.time_ns = grid_ns(3)
+    with pytest.raises((AttributeError, TypeError)):
+        table.something = 1
+
+
+def test_integer_and_single_precision_columns_become_double():
+    table = SampleTable.from_columns(
+        grid_ns(3),
+        {
+            Signal.VALVE_OPENING: np.array([1, 2, 3]),
+            Signal.GENERATED_POWER: np.array([1.5, 2.5, np.nan], dtype=np.float32),
+        },
+    )
+    assert table.values.dtype == np.float64
+    assert table.column(Signal.VALVE_OPENING).tolist() == [1.0, 2.0, 3.0]
+    assert table.column(Signal.GENERATED_POWER)[:2].tolist() == [1.5, 2.5]

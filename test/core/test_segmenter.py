@@ -1,0 +1,536 @@
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from naive_stream import NaiveSegmenter
+from streams import (
+    START_NS,
+    blocks_of,
+    cuts,
+    examples,
+    frozen,
+    grid_ns,
+    lagged,
+    needs_jit,
+    steps_and_ramps,
+)
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.segmenter import Segmenter
+from valveflow_ros.core.segmenter_kernel import NO_DATA, SETTLED_SLOPE, SETTLED_STEADY, TRANSIENT
+from valveflow_ros.records import NS_PER_S, SegmentKind
+
+# Seconds instead of minutes, so that a few hundred rows hold many segments.
+QUICK = {
+    'block': 1.0,
+    'time_constant': 2.0,
+    'delay': 1.0,
+    'steady_min': 6.0,
+    'slope_min': 6.0,
+    'longest_segment': 60.0,
+    'input_noise': 1.0,
+    'power_noise': 0.3,
+}
+SETTLE = 11
+
+
+@dataclasses.dataclass
+class Stream:
+    time_ns: np.ndarray
+    u: np.ndarray
+    power: np.ndarray
+    temperature: np.ndarray
+
+    def __len__(self):
+        return len(self.u)
+
+    def part(self, start, end):
+        return [a[start:end] for a in (self.time_ns, self.u, self.power, self.temperature)]
+
+
+def plant(seed, n, noise=0.5, hold=(30, 90)):
+    """Holds and ramps with a little noise; power follows with the lag of `QUICK`."""
+    rng = np.random.default_rng(seed)
+    u = steps_and_ramps(rng, n, hold=hold)
+    x = lagged(0.1 * u + 20.0, 2.0, 1.0)
+    return Stream(
+        grid_ns(n),
+        u + noise * rng.normal(0.0, 1.0, n),
+        x + 0.3 * noise * rng.normal(0.0, 1.0, n),
+        540.0 + rng.normal(0.0, 0.2, n),
+    )
+
+
+harm = st.lists(
+    st.tuples(
+        st.sampled_from(['nan_u', 'nan_power', 'inf', 'nan_temperature', 'leap', 'back']),
+        st.integers(0, 599),
+        st.integers(1, 40),
+    ),
+    max_size=6,
+)
+
+
+def harmed(stream, harms):
+    """Return a copy with gaps and bad rows."""
+    s = Stream(*(a.copy() for a in stream.part(0, len(stream))))
+    for what, at, length in harms:
+        if at >= len(s):
+            continue
+        end = min(at + length, len(s))
+        if what == 'nan_u':
+            s.u[at:end] = np.nan
+        elif what == 'nan_power':
+            s.power[at:end] = np.nan
+        elif what == 'inf':
+            s.u[at] = np.inf
+            s.power[end - 1] = -np.inf
+        elif what == 'nan_temperature':
+            s.temperature[at:end] = np.nan
+        elif what == 'leap':
+            s.time_ns[at:] += length * NS_PER_S
+        else:
+            s.time_ns[at:] -= length * NS_PER_S
+    return s
+
+
+def whole(settings, stream):
+    segmenter = Segmenter(settings)
+    out = segmenter.feed(*stream.part(0, len(stream)))
+    return out, segmenter
+
+
+def spans(found):
+    return [(f.first_row, f.end_row, int(f.segment.kind)) for _, f in found]
+
+
+@examples(40)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(1, 600),
+    harm,
+    st.sampled_from([1.0, 3.0]),
+    st.booleans(),
+    st.data(),
+)
+def test_every_block_gives_what_the_slow_truth_gives(seed, n, harms, block, given_noise, data):
+    values = {**QUICK, 'block': block}
+    if not given_noise:
+        values |= {'input_noise': 0.0, 'power_noise': 0.0}
+    settings = Settings(values)
+    stream = harmed(plant(seed, n), harms)
+    fast, slow = Segmenter(settings), NaiveSegmenter(settings)
+    told = 0
+    for start, end in blocks_of(n, data.draw(cuts(n))):
+        out = fast.feed(*stream.part(start, end))
+        slow.feed(*stream.part(start, end))
+        assert out.rows == end - start
+        assert out.kinds.tolist() == slow.kinds[start:end]
+        fresh = slow.segments[told:]
+        assert [f.segment.number for _, f in out.found] == [
+            told + 1 + k for k in range(len(fresh))
+        ]
+        for (_, f), truth in zip(out.found, fresh, strict=True):
+            assert (f.first_row, f.end_row, f.segment.kind) == (
+                truth['first_row'], truth['end_row'], truth['kind'],
+            )  # fmt: skip
+            assert f.segment.samples == f.end_row - f.first_row
+            assert f.segment.start_ns == stream.time_ns[f.first_row]
+            assert f.segment.end_ns == stream.time_ns[f.end_row - 1]
+            for name in ('u_start', 'u_end', 'u_rms', 'u_rate_per_s', 'power_start_mw',
+                         'power_end_mw', 'power_rms_mw'):  # fmt: skip
+                assert getattr(f.segment, name) == pytest.approx(truth[name], rel=1e-7, abs=1e-7)
+            warm = stream.temperature[f.first_row : f.end_row]
+            assert f.segment.temperature_mean_degc == pytest.approx(
+                truth['temperature_mean_degc'],
+                abs=1e-7 if np.isfinite(warm).all() else 0.5,
+                nan_ok=True,
+            )
+        told = len(slow.segments)
+        if given_noise or len(slow.stretches):
+            noise = fast.noise()
+            assert (noise.input, noise.power_mw) == pytest.approx(slow.noise(), rel=1e-9)
+
+
+def test_noise_learnt_from_the_data_is_what_the_slow_truth_learns():
+    settings = Settings({**QUICK, 'input_noise': 0.0, 'power_noise': 0.0})
+    stream = plant(3, 700, hold=(100, 200))
+    fast, slow = Segmenter(settings), NaiveSegmenter(settings)
+    assert not fast.noise().learnt
+    for start, end in blocks_of(700, list(range(0, 700, 21))):
+        fast.feed(*stream.part(start, end))
+        slow.feed(*stream.part(start, end))
+        assert fast.noise().learnt == (len(slow.stretches) >= 4)
+        if slow.stretches:
+            assert fast.noise().input == pytest.approx(slow.noise()[0], rel=1e-9)
+    assert fast.noise().input == pytest.approx(0.5, rel=0.3)
+    assert fast.noise().power_mw == pytest.approx(0.15, rel=0.3)
+
+
+@examples(40)
+@given(st.integers(0, 2**32 - 1), harm, st.data())
+def test_any_cutting_gives_the_same_bits(seed, harms, data):
+    settings = Settings(QUICK)
+    stream = harmed(plant(seed, 600), harms)
+    expected, _ = whole(settings, stream)
+    segmenter = Segmenter(settings)
+    kinds, found = [], []
+    for start, end in blocks_of(600, data.draw(cuts(600, most=25))):
+        at = start
+        while True:
+            out = segmenter.feed(*stream.part(at, end), most=data.draw(st.sampled_from([None, 1])))
+            found += [(at + row, f) for row, f in out.found]
+            kinds += out.kinds.tolist()
+            at += out.rows
+            if at >= end and not (out.found and out.rows == 0):
+                break
+    assert kinds == expected.kinds.tolist()
+    assert [frozen(f) for f in found] == [frozen(f) for f in expected.found]
+
+
+@examples(30)
+@given(st.integers(0, 2**32 - 1), harm)
+def test_segments_lie_apart_inside_the_rows_and_on_good_data_only(seed, harms):
+    stream = harmed(plant(seed, 600), harms)
+    out, segmenter = whole(Settings(QUICK), stream)
+    usable = np.isfinite(stream.u) & np.isfinite(stream.power)
+    steps = np.diff(stream.time_ns)
+    last_end = 0
+    for row, f in out.found:
+        assert last_end <= f.first_row < f.end_row <= row <= 600
+        assert row - f.first_row <= segmenter.longest_rows
+        assert usable[f.first_row : f.end_row].all()
+        assert (steps[f.first_row : f.end_row - 1] == NS_PER_S).all()
+        last_end = f.end_row
+
+
+@examples(30)
+@given(st.integers(0, 2**32 - 1), harm)
+def test_after_a_gap_the_transient_never_counts(seed, harms):
+    stream = harmed(plant(seed, 600), harms)
+    out, _ = whole(Settings(QUICK), stream)
+    usable = np.isfinite(stream.u) & np.isfinite(stream.power)
+    good = usable.copy()
+    good[1:] &= np.diff(stream.time_ns) == NS_PER_S
+    good[0] = False  # what was before the first row nobody knows
+    for _, f in out.found:
+        assert good[max(0, f.first_row - SETTLE + 1) : f.end_row].all()
+    settled = np.flatnonzero(out.kinds != TRANSIENT)
+    for row in settled[out.kinds[settled] != NO_DATA]:
+        assert good[max(0, row - SETTLE + 2) : row + 1].all()
+
+
+@examples(30)
+@given(st.integers(0, 2**32 - 1), harm)
+def test_rows_without_data_are_named_and_poison_nothing(seed, harms):
+    stream = harmed(plant(seed, 600), harms)
+    out, segmenter = whole(Settings(QUICK), stream)
+    usable = np.isfinite(stream.u) & np.isfinite(stream.power)
+    assert np.array_equal(out.kinds == NO_DATA, ~usable)
+    for _, f in out.found:
+        numbers = [v for k, v in dataclasses.asdict(f.segment).items() if isinstance(v, float)]
+        finite = np.isfinite(numbers)
+        warm = np.isfinite(stream.temperature[f.first_row : f.end_row])
+        assert finite.all() or not warm.all()
+        assert np.isfinite(f.segment.temperature_mean_degc) == warm.any()
+    after = plant(seed, 300)
+    later = segmenter.feed(after.time_ns + 10**13, after.u, after.power, after.temperature)
+    expected, _ = whole(Settings(QUICK), after)
+    assert later.kinds.tolist() == expected.kinds.tolist()
+    # The gap before it may have closed a segment of what came before.
+    fresh = [f for _, f in later.found if f.first_row >= 600]
+    assert [(f.segment.u_start, f.segment.power_end_mw) for f in fresh] == [
+        (f.segment.u_start, f.segment.power_end_mw) for _, f in expected.found
+    ]
+
+
+@examples(30)
+@given(
+    st.integers(0, 2**32 - 1), harm, st.sampled_from([-900.0, 64.0, 1e6]),
+    st.sampled_from([-150.0, 1024.0]),
+)  # fmt: skip
+def test_shifting_u_or_power_moves_no_segment(seed, harms, more_u, more_power):
+    stream = harmed(plant(seed, 600), harms)
+    there = Stream(
+        stream.time_ns, stream.u + more_u, stream.power + more_power, stream.temperature
+    )
+    here, _ = whole(Settings(QUICK), stream)
+    shifted, _ = whole(Settings(QUICK), there)
+    assert spans(here.found) == spans(shifted.found)
+    assert here.kinds.tolist() == shifted.kinds.tolist()
+    for (_, a), (_, b) in zip(here.found, shifted.found, strict=True):
+        assert b.segment.u_start == pytest.approx(a.segment.u_start + more_u, abs=1e-6)
+        assert b.segment.u_rms == pytest.approx(a.segment.u_rms, abs=1e-5)
+        assert b.segment.power_end_mw == pytest.approx(
+            a.segment.power_end_mw + more_power, abs=1e-6
+        )
+
+
+@examples(30)
+@given(st.integers(0, 2**32 - 1), harm, st.sampled_from([0.25, 4.0, -1.0, -64.0]),
+       st.sampled_from([0.5, -2.0]))  # fmt: skip
+def test_scaling_signals_and_their_noise_together_moves_no_segment(seed, harms, u_by, power_by):
+    stream = harmed(plant(seed, 600), harms)
+    there = Stream(
+        stream.time_ns, stream.u * u_by, stream.power * power_by, stream.temperature
+    )
+    scaled = {'input_noise': abs(u_by), 'power_noise': 0.3 * abs(power_by)}
+    here, _ = whole(Settings(QUICK), stream)
+    other, _ = whole(Settings({**QUICK, **scaled}), there)
+    assert spans(here.found) == spans(other.found)
+    assert here.kinds.tolist() == other.kinds.tolist()
+    for (_, a), (_, b) in zip(here.found, other.found, strict=True):
+        assert b.segment.u_end == u_by * a.segment.u_end
+        assert b.segment.power_rms_mw == abs(power_by) * a.segment.power_rms_mw
+
+
+@examples(10)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([10.0, 1000.0]))
+def test_noise_learnt_scales_with_the_signals(seed, factor):
+    settings = Settings({**QUICK, 'input_noise': 0.0, 'power_noise': 0.0})
+    stream = plant(seed, 600)
+    there = Stream(stream.time_ns, factor * stream.u, factor * stream.power, stream.temperature)
+    _, here = whole(settings, stream)
+    _, other = whole(settings, there)
+    # A number on the edge of a bin of the histogram may fall to either side: 6 %.
+    assert other.noise().input == pytest.approx(factor * here.noise().input, rel=0.06)
+    assert other.noise().power_mw == pytest.approx(factor * here.noise().power_mw, rel=0.06)
+
+
+@examples(20)
+@given(st.integers(0, 2**32 - 1), harm, st.integers(-(10**6), 10**6))
+def test_shifting_time_moves_stamps_only(seed, harms, seconds):
+    stream = harmed(plant(seed, 600), harms)
+    shift = seconds * NS_PER_S
+    there = Stream(stream.time_ns + shift, stream.u, stream.power, stream.temperature)
+    here, _ = whole(Settings(QUICK), stream)
+    other, _ = whole(Settings(QUICK), there)
+    assert here.kinds.tolist() == other.kinds.tolist()
+    for (_, a), (_, b) in zip(here.found, other.found, strict=True):
+        moved = dataclasses.replace(
+            a.segment, start_ns=a.segment.start_ns + shift, end_ns=a.segment.end_ns + shift
+        )
+        assert frozen(moved) == frozen(b.segment)
+
+
+def hold_ramp_hold(rng, n, at, rate, length, noise):
+    """Return u with one ramp, and the power lagging behind it (T = 80 s, tau = 10 s)."""
+    u = np.full(n, 1300.0)
+    u[at : at + length] += rate * np.arange(1, length + 1)
+    u[at + length :] = u[at + length - 1]
+    power = lagged(0.2 * u, 80.0, 10.0)
+    return u + noise * rng.normal(0.0, 1.0, n), power + 0.5 * rng.normal(0.0, 1.0, n)
+
+
+@pytest.mark.parametrize('rate', [0.3, -0.3, 1.0, -2.0])
+@pytest.mark.parametrize('seed', range(6))
+def test_no_segment_begins_or_ends_in_the_transient_of_a_ramp(seed, rate):
+    """The first 5 T + tau after a ramp begins are transient, eq. (13); so is what follows it."""
+    rng = np.random.default_rng(seed)
+    n, at, length = 9000, 4000 + 7 * seed, 1500
+    u, power = hold_ramp_hold(rng, n, at, rate, length, noise=2.0)
+    stream = Stream(grid_ns(n), u, power, np.full(n, 540.0))
+    settings = Settings()
+    settle = settings.settle_s
+    out, _ = whole(settings, stream)
+    kinds = {SegmentKind(k): 0 for k in (1, 2)}
+    for first, end, kind in spans(out.found):
+        kinds[SegmentKind(kind)] += end - first
+        for start in (at, at + length):
+            # A block that holds the start of the move may be the first of the transient.
+            assert not start < first < start + settle - 10, (first, end, kind, start)
+            assert not (first < start and end > start + 10), (first, end, kind, start)
+    assert kinds[SegmentKind.STEADY] > 1500
+    assert kinds[SegmentKind.SLOPE] > 600
+
+
+def test_a_ramp_too_short_for_the_transient_gives_no_slope_segment():
+    rng = np.random.default_rng(1)
+    u, power = hold_ramp_hold(rng, 8000, 4000, 1.0, 300, noise=2.0)
+    out, _ = whole(Settings(), Stream(grid_ns(8000), u, power, np.full(8000, 540.0)))
+    assert out.found
+    assert all(f.segment.kind == SegmentKind.STEADY for _, f in out.found)
+
+
+def test_kinds_say_slope_on_a_long_ramp_and_steady_on_a_hold():
+    rng = np.random.default_rng(2)
+    u, power = hold_ramp_hold(rng, 9000, 4000, 1.0, 1500, noise=2.0)
+    out, _ = whole(Settings(), Stream(grid_ns(9000), u, power, np.full(9000, 540.0)))
+    assert (out.kinds[4600:5400] == SETTLED_SLOPE).mean() > 0.95
+    assert (out.kinds[3000:3900] == SETTLED_STEADY).mean() > 0.95
+    assert (out.kinds[4100:4400] == TRANSIENT).all()
+
+
+@pytest.mark.parametrize('extra', range(-3, 4))
+@pytest.mark.parametrize('how', ['leap', 'nan'])
+def test_a_gap_right_where_the_longest_segment_is_cut_is_still_a_gap(extra, how):
+    """The cut leaves nothing open; a gap at that very row must begin a transient all the same."""
+    n, cut = 300, SETTLE + 60 + extra
+    rng = np.random.default_rng(0)
+    stream = Stream(grid_ns(n), 1500.0 + rng.normal(0.0, 0.5, n), 200.0 + rng.normal(0.0, 0.1, n),
+                    np.full(n, 540.0))  # fmt: skip
+    if how == 'leap':
+        stream.time_ns[cut:] += 600 * NS_PER_S
+        first = cut
+    else:
+        stream.u[cut] = np.nan
+        first = cut + 1
+    out, _ = whole(Settings(QUICK), stream)
+    assert (out.kinds[first : first + SETTLE - 1] == TRANSIENT).all()
+    assert not [s for s in spans(out.found) if first <= s[0] < first + SETTLE]
+    assert [s for s in spans(out.found) if s[0] >= first + SETTLE]
+
+
+@pytest.mark.parametrize('at', [41, 42, 43, 84])
+def test_a_gap_while_the_noise_is_learnt_starts_its_stretch_anew(at):
+    settings = Settings({**QUICK, 'input_noise': 0.0, 'power_noise': 0.0})
+    stream = plant(1, 400)
+    stream.time_ns[at:] += 600 * NS_PER_S
+    fast, slow = Segmenter(settings), NaiveSegmenter(settings)
+    fast.feed(*stream.part(0, 400))
+    slow.feed(*stream.part(0, 400))
+    assert fast.noise().input == pytest.approx(slow.noise()[0], rel=1e-9)
+
+
+def test_a_longer_hold_is_cut_and_goes_on_without_a_transient():
+    stream = Stream(*(a[:400] for a in plant(0, 400, hold=(400, 401)).part(0, 400)))
+    out, _ = whole(Settings(QUICK), stream)
+    found = spans(out.found)
+    assert [s[0] for s in found] == [SETTLE + 60 * k for k in range(len(found))]
+    assert len(found) == (400 - SETTLE) // 60
+    assert all(kind == SegmentKind.STEADY for *_, kind in found)
+
+
+# --- hostile --------------------------------------------------------------------------------
+
+
+def test_nothing_and_one_row():
+    segmenter = Segmenter(Settings())
+    empty = Stream(grid_ns(0), np.empty(0), np.empty(0), np.empty(0))
+    assert segmenter.feed(*empty.part(0, 0)).rows == 0
+    out = segmenter.feed(grid_ns(1), np.array([1.0]), np.array([2.0]), np.array([3.0]))
+    assert out.kinds.tolist() == [TRANSIENT]
+    assert out.found == []
+
+
+@pytest.mark.parametrize('offset', [0.0, 1e6, -1e6])
+def test_a_valve_that_never_moves_is_steady_with_no_slope(offset):
+    rng = np.random.default_rng(0)
+    n = 8000
+    stream = Stream(grid_ns(n), np.full(n, 1500.0 + offset), 200.0 + rng.normal(0, 0.3, n),
+                    np.full(n, 540.0))  # fmt: skip
+    out, _ = whole(Settings(), stream)
+    assert out.found
+    for _, f in out.found:
+        assert f.segment.kind == SegmentKind.STEADY
+        assert f.segment.u_start == f.segment.u_end == 1500.0 + offset
+        assert f.segment.u_rms == 0.0
+
+
+def test_everything_constant_gives_steady_segments_with_finite_numbers():
+    n = 8000
+    stream = Stream(grid_ns(n), np.zeros(n), np.zeros(n), np.zeros(n))
+    out, _ = whole(Settings(), stream)
+    assert out.found
+    for _, f in out.found:
+        assert all(math.isfinite(v) for v in dataclasses.asdict(f.segment).values())
+
+
+def test_moves_are_found_when_the_valve_stood_still_most_of_the_time():
+    """A historian that stores changes only has stretches without any noise; they teach nothing."""
+    rng = np.random.default_rng(4)
+    n = 30_000
+    u = np.full(n, 1300.0)
+    u[20_000:22_000] += np.arange(2000) * 0.3 + np.round(rng.normal(0.0, 2.0, 2000))
+    u[22_000:] = 1300.0 + 600.0 + np.round(rng.normal(0.0, 2.0, 8000))
+    power = lagged(0.2 * u, 10.0, 3.0) + 0.5 * rng.normal(0.0, 1.0, n)
+    out, _ = whole(Settings(), Stream(grid_ns(n), u, power, np.full(n, 540.0)))
+    later = [s for s in spans(out.found) if s[0] >= 20_000]
+    assert any(kind == SegmentKind.SLOPE for *_, kind in later)
+    assert any(kind == SegmentKind.STEADY for *_, kind in later)
+
+
+def test_time_reversed_every_row_is_a_gap():
+    stream = plant(0, 300)
+    stream.time_ns = stream.time_ns[::-1].copy()
+    out, _ = whole(Settings(QUICK), stream)
+    assert out.found == []
+    assert (out.kinds == TRANSIENT).all()
+
+
+@pytest.mark.parametrize('huge', [1e12, 1e154, 1e300])
+def test_huge_numbers_do_not_poison_what_comes_after(huge):
+    stream = plant(0, 300)
+    wild = Stream(*(a.copy() for a in stream.part(0, 300)))
+    wild.u[100:103] *= huge
+    segmenter = Segmenter(Settings(QUICK))
+    segmenter.feed(*wild.part(0, 300))
+    later = segmenter.feed(
+        stream.time_ns + 10**13, stream.u, stream.power, stream.temperature
+    )
+    expected, _ = whole(Settings(QUICK), stream)
+    assert later.kinds.tolist() == expected.kinds.tolist()
+    assert len([f for _, f in later.found if f.first_row >= 300]) == len(expected.found)
+
+
+@pytest.mark.parametrize('dtype', [np.float32, np.float64])
+def test_read_only_strided_and_single_precision_arrays(dtype):
+    stream = plant(0, 300)
+    wide = np.zeros((300, 5), dtype=dtype)
+    for c, column in enumerate(stream.part(0, 300)[1:]):
+        wide[:, c] = column
+    wide.setflags(write=False)
+    out = Segmenter(Settings(QUICK)).feed(stream.time_ns, wide[:, 0], wide[:, 1], wide[:, 2])
+    expected, _ = whole(Settings(QUICK), Stream(
+        stream.time_ns, *(np.ascontiguousarray(wide[:, c], dtype=np.float64) for c in range(3))
+    ))  # fmt: skip
+    assert spans(out.found) == spans(expected.found)
+    assert out.kinds.tolist() == expected.kinds.tolist()
+
+
+@pytest.mark.parametrize(('period', 'block'), [(0.1, 10.0), (60.0, 60.0)])
+@needs_jit
+def test_other_periods_find_the_same_holds_and_ramps(period, block):
+    rng = np.random.default_rng(7)
+    step = 1.0 if period < 1.0 else period
+    n = 40_000 if period < 1.0 else 3000
+    at, length = int(0.45 * n), int(0.3 * n) if period < 1.0 else 400
+    rate = 0.3 * period if period < 1.0 else 2.0
+    u = np.full(n, 1300.0)
+    u[at : at + length] += rate * np.arange(1, length + 1)
+    u[at + length :] = u[at + length - 1]
+    power = lagged(0.2 * u, 80.0, 10.0, period) + 0.5 * rng.normal(0.0, 1.0, n)
+    values = {'sample_period': period, 'block': block, 'hold_limit': 10 * period,
+              'longest_segment': 30 * step * 60, 'input_noise': 0.7, 'power_noise': 0.2}
+    stream = Stream(grid_ns(n, period), u + 2.0 * rng.normal(0.0, 1.0, n), power,
+                    np.full(n, 540.0))  # fmt: skip
+    out, _ = whole(Settings(values), stream)
+    found = spans(out.found)
+    assert any(kind == SegmentKind.SLOPE and a >= at and b <= at + length for a, b, kind in found)
+    assert any(kind == SegmentKind.STEADY and b <= at for _, b, kind in found)
+    for _, f in out.found:
+        assert f.segment.start_ns == START_NS + round(f.first_row * period * NS_PER_S)
+        assert f.segment.end_ns == START_NS + round((f.end_row - 1) * period * NS_PER_S)
+
+
+def test_every_setting_at_its_corner_still_runs():
+    """No corner of the ranges may write beyond the arrays (see NUMBA_BOUNDSCHECK)."""
+    stream = plant(0, 400)
+    for values in (
+        {'block': 1.0, 'longest_segment': 60.0, 'steady_min': 0.0, 'slope_min': 0.0,
+         'time_constant': 0.1, 'delay': 0.0},
+        {'block': 10.0, 'longest_segment': 60.0, 'steady_min': 60.0, 'slope_min': 60.0},
+        {'break_limit': 1.0, 'steady_limit': 0.1, 'slope_limit': 1.0, 'block': 1.0,
+         'time_constant': 0.1, 'delay': 0.0, 'input_noise': 1e-3, 'power_noise': 1e-3},
+        {'break_limit': 50.0, 'steady_limit': 50.0, 'slope_limit': 1000.0, 'block': 1.0,
+         'input_noise': 1e6, 'power_noise': 1e6},
+        {'time_constant': 3600.0, 'delay': 3600.0},
+    ):  # fmt: skip
+        out, _ = whole(Settings(values), stream)
+        assert out.rows == 400
+        assert all(0 <= f.first_row < f.end_row <= 400 for _, f in out.found)

@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from streams import examples
+
+from valveflow_ros.config import PARAMETERS
+from valveflow_ros.core.units import UNITS, convert, integrated_input, unit_of
+from valveflow_ros.errors import InputError
+from valveflow_ros.records import SIGNALS, Signal
+
+# The same state of a plant, told in every unit there is (NIST SP 811 for the definitions).
+SAME = {
+    Signal.VALVE_OPENING: {'%': 42.0, 'percent': 42.0, 'fraction': 0.42},
+    Signal.VALVE_COMMAND: {'%': 42.0, 'percent': 42.0, 'fraction': 0.42},
+    Signal.MAIN_STEAM_PRESSURE: {
+        'MPa': 16.7,
+        'kPa': 16_700.0,
+        'Pa': 16_700_000.0,
+        'bar': 167.0,
+        'psi': 16.7e6 / (0.45359237 * 9.80665 / 0.0254**2),
+    },
+    Signal.MAIN_STEAM_TEMPERATURE: {'degC': 538.0, 'K': 811.15, 'degF': 1000.4},
+    Signal.GENERATED_POWER: {'MW': 300.0, 'kW': 300_000.0, 'W': 3e8},
+}
+
+
+@pytest.mark.parametrize(
+    ('signal', 'name'), [(s, name) for s, units in SAME.items() for name in units]
+)
+def test_every_unit_tells_the_same_state(signal, name):
+    engine = next(iter(SAME[signal].values()))
+    got = convert(signal, name, np.array([SAME[signal][name]]))
+    assert got[0] == pytest.approx(engine, rel=1e-12)
+
+
+def test_every_unit_there_is_has_been_compared():
+    assert {s: set(units) for s, units in UNITS.items()} == {s: set(u) for s, u in SAME.items()}
+
+
+@pytest.mark.parametrize('info', SIGNALS)
+def test_the_parameter_offers_exactly_these_units(info):
+    assert PARAMETERS[f'{info.topic}_unit'].choices == tuple(UNITS[info.signal])
+    assert PARAMETERS[f'{info.topic}_unit'].default == info.unit
+
+
+@pytest.mark.parametrize('spelling', ['mpa', ' MPA ', 'Mpa'])
+def test_capitals_and_blanks_do_not_matter(spelling):
+    assert unit_of(Signal.MAIN_STEAM_PRESSURE, spelling).scale == 1.0
+
+
+@pytest.mark.parametrize('name', ['', 'atm', 'MW', 'mm', '\x00', 'M Pa'])
+def test_an_unknown_unit_is_refused_and_the_known_ones_named(name):
+    with pytest.raises(InputError) as caught:
+        unit_of(Signal.MAIN_STEAM_PRESSURE, name)
+    sentence = str(caught.value)
+    assert 'main_steam_pressure' in sentence
+    assert all(unit in sentence for unit in ('MPa', 'kPa', 'Pa', 'bar', 'psi'))
+
+
+@examples(60)
+@given(
+    st.lists(st.floats(0.0, 110.0), min_size=1, max_size=20),
+    st.floats(0.1, 30.0),
+    st.floats(0.5, 2.0),
+)
+def test_u_is_opening_times_pressure_to_the_exponent(opening, pressure, exponent):
+    u = integrated_input(np.array(opening), np.full(len(opening), pressure), exponent)
+    assert u == pytest.approx([v * math.exp(exponent * math.log(pressure)) for v in opening])
+    twice = integrated_input(2.0 * np.array(opening), np.full(len(opening), pressure), exponent)
+    assert twice == pytest.approx(2.0 * u)
+
+
+@pytest.mark.parametrize('pressure', [0.0, -0.0, -1.0, float('nan'), -float('inf')])
+def test_without_pressure_there_is_no_u(pressure):
+    assert np.isnan(integrated_input(np.array([50.0]), np.array([pressure])))
+
+
+def test_an_infinite_input_gives_no_finite_u():
+    assert not np.isfinite(integrated_input(np.array([np.inf]), np.array([10.0])))
+    assert not np.isfinite(integrated_input(np.array([50.0]), np.array([np.inf])))
+    assert np.isnan(integrated_input(np.array([np.nan]), np.array([10.0])))
+
+
+def test_single_precision_inputs_are_computed_in_double():
+    opening, pressure = np.array([37.3], dtype=np.float32), np.array([11.7], dtype=np.float32)
+    u = integrated_input(opening, pressure)
+    assert u.dtype == np.float64
+    assert u[0] == pytest.approx(float(opening[0]) * float(pressure[0]) ** 1.125, rel=1e-12)
+
+
+def test_empty_and_read_only_arrays():
+    assert len(integrated_input(np.empty(0), np.empty(0))) == 0
+    values = np.array([1.0, 2.0])
+    values.setflags(write=False)
+    assert convert(Signal.GENERATED_POWER, 'kW', values).tolist() == [0.001, 0.002]
+    assert integrated_input(values, values).shape == (2,)

@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from streams import START_NS, examples
+
+from valveflow_ros.core.segmenter import FoundSegment
+from valveflow_ros.core.window import RollingWindow
+from valveflow_ros.records import NS_PER_S, SegmentKind, SpecialSegment
+
+
+def segment(number, first, end, start_ns, kind=SegmentKind.STEADY):
+    record = SpecialSegment(
+        number=number, kind=kind, start_ns=start_ns,
+        end_ns=start_ns + (end - first - 1) * NS_PER_S, samples=end - first, u_start=0.0,
+        u_end=0.0, u_rate_per_s=0.0, u_rms=0.0, power_start_mw=0.0, power_end_mw=0.0,
+        power_rms_mw=0.0, temperature_mean_degc=540.0,
+    )  # fmt: skip
+    return FoundSegment(record, first, end)
+
+
+def rows_after(last_ns, n, gap_s=0):
+    return last_ns + (gap_s + 1 + np.arange(n, dtype=np.int64)) * NS_PER_S
+
+
+actions = st.lists(
+    st.tuples(st.integers(0, 200), st.sampled_from([0, 0, 0, 5, 300])), min_size=1, max_size=25
+)
+
+
+class NaiveWindow:
+    """All rows and all segments, for ever; the window is looked up when asked for."""
+
+    def __init__(self, window_s):
+        self.window_s = window_s
+        self.rows, self.segments = [], []
+
+    def contents(self):
+        if not self.rows:
+            return [], []
+        oldest = self.rows[-1][0] - self.window_s * NS_PER_S
+        first = next(k for k, row in enumerate(self.rows) if row[0] > oldest)
+        spans = [
+            [s.first_row - first, s.end_row - first, int(s.segment.kind)]
+            for s in self.segments
+            if s.first_row >= first
+        ]
+        return self.rows[first:], spans
+
+
+@examples(60)
+@given(actions, st.sampled_from([20, 60, 333]), st.integers(0, 2**32 - 1))
+def test_after_every_append_the_window_holds_what_the_slow_truth_holds(plan, window_s, seed):
+    rng = np.random.default_rng(seed)
+    fast, slow = RollingWindow(window_s, 1.0), NaiveWindow(window_s)
+    last = START_NS
+    for n, gap in plan:
+        time_ns = rows_after(last, n, gap)
+        columns = rng.normal(0.0, 1.0, (3, n))
+        columns[0, rng.random(n) < 0.1] = np.nan
+        fast.append(time_ns, *columns)
+        slow.rows += list(zip(time_ns.tolist(), *columns.tolist(), strict=True))
+        if n:
+            last = int(time_ns[-1])
+        if n > 20:
+            end = len(slow.rows)
+            found = segment(len(slow.segments) + 1, end - 15, end - 5, int(time_ns[-15]),
+                            SegmentKind(int(rng.integers(1, 3))))  # fmt: skip
+            fast.add_segment(found)
+            slow.segments.append(found)
+        rows, spans = slow.contents()
+        held = fast.contents()
+        assert held.time_ns.tolist() == [r[0] for r in rows]
+        for c, column in enumerate((held.u, held.power_mw, held.temperature_degc), start=1):
+            assert np.array_equal(column, [r[c] for r in rows], equal_nan=True)
+        assert held.spans.tolist() == spans
+        assert fast.rows_seen == len(slow.rows)
+        assert held.special_rows().tolist() == [k for a, b, _ in spans for k in range(a, b)]
+        for kind in SegmentKind:
+            assert held.count(kind) == sum(s[2] == kind for s in spans)
+
+
+@examples(30)
+@given(actions, st.integers(0, 300))
+def test_the_tail_is_the_newest_rows(plan, wanted):
+    window = RollingWindow(100.0, 1.0)
+    seen = []
+    last = START_NS
+    for n, gap in plan:
+        time_ns = rows_after(last, n, gap)
+        window.append(time_ns, np.arange(n) + len(seen), np.zeros(n), np.zeros(n))
+        seen += list(range(len(seen), len(seen) + n))
+        last = int(time_ns[-1]) if n else last
+    newest = window.tail(wanted)[-2]
+    assert newest.tolist() == (seen[-len(newest) :] if len(newest) else [])
+    assert len(newest) >= min(wanted, len(seen), 101)
+
+
+def test_counters_follow_segments_out_of_the_window():
+    window = RollingWindow(100.0, 1.0)
+    time_ns = rows_after(START_NS, 60)
+    window.append(time_ns, *np.zeros((3, 60)))
+    window.add_segment(segment(1, 10, 30, int(time_ns[10])))
+    window.add_segment(segment(2, 40, 55, int(time_ns[40])))
+    assert (window.segments, window.special_samples) == (2, 35)
+    more = rows_after(int(time_ns[-1]), 60)
+    window.append(more, *np.zeros((3, 60)))
+    assert (window.segments, window.special_samples) == (1, 15)
+    window.append(rows_after(int(more[-1]), 60), *np.zeros((3, 60)))
+    assert (window.segments, window.special_samples) == (0, 0)
+
+
+def test_memory_is_bounded_however_long_it_runs():
+    window = RollingWindow(1000.0, 1.0)
+    last = START_NS
+    for _ in range(60):
+        time_ns = rows_after(last, 777)
+        window.append(time_ns, *np.zeros((3, 777)))
+        last = int(time_ns[-1])
+        assert len(window) <= 1000 * 5 // 4 + 20
+    assert len(window.contents().time_ns) == 1000
+
+
+def test_contents_are_a_copy():
+    window = RollingWindow(100.0, 1.0)
+    time_ns = rows_after(START_NS, 10)
+    window.append(time_ns, *np.ones((3, 10)))
+    held = window.contents()
+    window.append(rows_after(int(time_ns[-1]), 500), *np.zeros((3, 500)))
+    assert held.u.tolist() == [1.0] * 10
+    assert held.time_ns.tolist() == time_ns.tolist()
+
+
+def test_an_empty_window_has_empty_contents():
+    window = RollingWindow(100.0, 1.0)
+    window.append(np.empty(0, dtype=np.int64), *np.empty((3, 0)))
+    held = window.contents()
+    assert len(held.time_ns) == len(held.u) == 0
+    assert held.spans.shape == (0, 3)
+    assert len(held.special_rows()) == 0
+    assert held.count(SegmentKind.SLOPE) == 0
+
+
+def test_columns_in_single_precision_and_read_only_are_taken():
+    window = RollingWindow(100.0, 1.0)
+    column = np.full(5, 1.5, dtype=np.float32)
+    column.setflags(write=False)
+    window.append(rows_after(START_NS, 5), column, column, column)
+    assert window.contents().u.dtype == np.float64
+    assert window.contents().power_mw == pytest.approx(1.5)

@@ -1,0 +1,399 @@
+"""The recorder's account against what is found on the disk, whatever the disk does."""
+
+import errno
+import threading
+import time
+
+import pytest
+from log_files import FLOAT64, START_NS, STOCK, float64, write_chunks
+
+from valveflow_ros.errors import InputError, RecordingError
+from valveflow_ros.logs import (
+    LATCHED,
+    Recorder,
+    RecorderSettings,
+    RecorderState,
+    open_log,
+)
+from valveflow_ros.logs.part_file import PartFile
+
+QUICK = RecorderSettings(
+    flush_period_s=0.002, sync_period_s=0.01, retry_s=0.002, retry_max_s=0.01, free_floor_bytes=0
+)
+LIMIT_S = 20.0
+
+
+def wait_for(condition):
+    end = time.monotonic() + LIMIT_S
+    while not condition():
+        assert time.monotonic() < end, 'waited in vain'
+        time.sleep(0.001)
+
+
+class Disk:
+    """Opens files that fail as they are told, counting every call."""
+
+    def __init__(self, fails=lambda call: None):
+        self.fails = fails
+        self.calls = 0
+        self.lock = threading.Lock()
+
+    def __call__(self, path):
+        self.count('open', b'')
+        return FailingFile(self, PartFile(path))
+
+    def count(self, name, data):
+        with self.lock:
+            self.calls += 1
+            call = self.calls
+        error = self.fails(call)
+        if error is not None:
+            raise OSError(error, 'no luck')
+        return data
+
+
+class FailingFile:
+    def __init__(self, disk, file):
+        self.disk = disk
+        self.file = file
+
+    def write(self, data):
+        try:
+            self.disk.count('write', data)
+        except OSError:
+            # As a full disk does, take a part before saying so.
+            self.file.write(data[: len(data) // 2])
+            raise
+        return self.file.write(data)
+
+    def sync(self):
+        self.disk.count('sync', b'')
+        self.file.sync()
+
+    def publish(self):
+        self.disk.count('publish', b'')
+        self.file.publish()
+
+    def close(self):
+        self.file.close()
+
+    def discard(self):
+        self.file.discard()
+
+
+class ShortFile(FailingFile):
+    """Takes at most seven bytes at once."""
+
+    def write(self, data):
+        return self.file.write(data[:7])
+
+
+def recorder_of(folder, settings=QUICK, **options):
+    recorder = Recorder(folder, settings, definitions=STOCK, **options)
+    recorder.add_topic('/valve_opening', FLOAT64)
+    return recorder
+
+
+def record(recorder, first, count, topic='/valve_opening'):
+    for number in range(first, first + count):
+        time_ns = START_NS + number
+        recorder.record(topic, float64(number), time_ns, time_ns)
+
+
+def values_on_disk(folder):
+    try:
+        return open_log(folder).readings.value.tolist()
+    except RecordingError:
+        return []
+
+
+def is_balanced(status):
+    columns = status.written + status.queued + status.lost + sum(status.dropped.values())
+    return status.received == columns
+
+
+def test_all_that_is_handed_in_is_on_disk(tmp_path):
+    recorder = recorder_of(tmp_path / 'log', attachments={'parameters.yaml': b'a: 1\n'})
+    record(recorder, 0, 5000)
+    status = recorder.close()
+    assert (status.state, status.reason) == (RecorderState.STOPPED, '')
+    assert status.received == status.written == 5000
+    assert (status.queued, status.lost, status.dropped) == (0, 0, {})
+    assert (status.files_finished, status.recovered) == (1, ())
+    assert values_on_disk(tmp_path / 'log') == list(range(5000))
+    contents = open_log(tmp_path / 'log')
+    assert contents.attachments == {'parameters.yaml': b'a: 1\n'}
+    assert contents.metadata['valveflow_recorder'] == {'received': '5000'}
+    path = tmp_path / 'log' / 'log_0.mcap'
+    assert status.bytes_written == path.stat().st_size
+
+
+def test_what_was_flushed_is_readable_while_recording(tmp_path):
+    recorder = recorder_of(tmp_path / 'log')
+    record(recorder, 0, 100)
+    wait_for(lambda: recorder.status().written == 100)
+    assert recorder.status().file == 'log_0.mcap'
+    assert values_on_disk(tmp_path / 'log') == list(range(100))
+    assert recorder.close().written == 100
+
+
+@pytest.mark.parametrize('error', [errno.ENOSPC, errno.EIO])
+@pytest.mark.parametrize('call', range(1, 26))
+def test_one_failing_call_loses_nothing(tmp_path, call, error):
+    disk = Disk(lambda number: error if number == call else None)
+    recorder = recorder_of(tmp_path / 'log', open_file=disk)
+    for part in range(8):
+        record(recorder, 20 * part, 20)
+        wait_for(lambda part=part: recorder.status().written == 20 * (part + 1))
+        assert is_balanced(recorder.status())
+        if part % 3 == 2:
+            recorder.rotate()
+    status = recorder.close()
+    assert disk.calls >= call
+    assert (status.written, status.lost) == (160, 0)
+    assert values_on_disk(tmp_path / 'log') == list(range(160))
+
+
+def test_a_disk_that_often_fails_keeps_an_exact_account(tmp_path):
+    disk = Disk(lambda number: errno.EIO if number % 7 == 0 else None)
+    recorder = recorder_of(tmp_path / 'log', open_file=disk)
+    for part in range(30):
+        record(recorder, 10 * part, 10)
+        wait_for(lambda part=part: recorder.status().written == 10 * (part + 1))
+    status = recorder.close()
+    assert is_balanced(status)
+    assert (status.written, status.lost) == (300, 0)
+    assert values_on_disk(tmp_path / 'log') == list(range(300))
+
+
+def test_a_disk_that_always_fails_loses_what_it_says(tmp_path):
+    disk = Disk(lambda number: errno.ENOSPC)
+    recorder = recorder_of(tmp_path / 'log', open_file=disk)
+    record(recorder, 0, 50)
+    wait_for(lambda: recorder.status().state == RecorderState.DEGRADED)
+    status = recorder.status()
+    assert 'cannot be written' in status.reason
+    assert (status.received, status.written, status.queued) == (50, 0, 50)
+    status = recorder.close()
+    assert (status.state, status.lost, status.written) == (RecorderState.STOPPED, 50, 0)
+    assert is_balanced(status)
+    assert list((tmp_path / 'log').glob('*.mcap*')) == []
+
+
+def test_a_file_begins_anew_when_space_returns(tmp_path):
+    full = threading.Event()
+    disk = Disk(lambda number: errno.ENOSPC if full.is_set() else None)
+    recorder = recorder_of(tmp_path / 'log', open_file=disk)
+    record(recorder, 0, 40)
+    wait_for(lambda: recorder.status().written == 40)
+    full.set()
+    record(recorder, 40, 40)
+    wait_for(lambda: recorder.status().state == RecorderState.DEGRADED)
+    full.clear()
+    wait_for(lambda: recorder.status().written == 80)
+    wait_for(lambda: recorder.status().state == RecorderState.RECORDING)
+    assert recorder.close().lost == 0
+    names = sorted(p.name for p in (tmp_path / 'log').glob('*.mcap*'))
+    assert names == ['log_0.mcap.part', 'log_1.mcap']
+    assert values_on_disk(tmp_path / 'log') == list(range(80))
+
+
+def test_writes_of_a_few_bytes_are_put_together(tmp_path):
+    disk = Disk()
+    recorder = recorder_of(tmp_path / 'log', open_file=lambda p: ShortFile(disk, PartFile(p)))
+    record(recorder, 0, 100)
+    assert recorder.close().written == 100
+    assert open_log(tmp_path / 'log').warnings == ()
+    assert values_on_disk(tmp_path / 'log') == list(range(100))
+
+
+def test_too_many_waiting_messages_are_dropped_by_topic_and_counted(tmp_path):
+    gate = threading.Event()
+
+    def slow(path):
+        gate.wait(LIMIT_S)
+        return PartFile(path)
+
+    settings = RecorderSettings(queue_limit=30, flush_period_s=0.002, free_floor_bytes=0)
+    recorder = recorder_of(tmp_path / 'log', settings, open_file=slow)
+    recorder.add_topic('/generated_power', FLOAT64)
+    record(recorder, 0, 25)
+    record(recorder, 25, 10, '/generated_power')
+    record(recorder, 35, 7)
+    assert not recorder.record('/valve_opening', float64(0), START_NS, START_NS)
+    status = recorder.status()
+    assert status.dropped == {'/generated_power': 5, '/valve_opening': 8}
+    assert (status.received, status.queued) == (43, 30)
+    gate.set()
+    wait_for(lambda: recorder.status().written == 30)
+    status = recorder.close()
+    assert is_balanced(status)
+    assert values_on_disk(tmp_path / 'log') == list(range(30))
+    notes = open_log(tmp_path / 'log').metadata['valveflow_recorder']
+    assert notes == {
+        'received': '43',
+        'dropped /generated_power': '5',
+        'dropped /valve_opening': '8',
+    }
+
+
+def test_dropping_is_a_degraded_state(tmp_path):
+    gate = threading.Event()
+
+    def slow(path):
+        gate.wait(LIMIT_S)
+        return PartFile(path)
+
+    settings = RecorderSettings(queue_limit=1, flush_period_s=60, free_floor_bytes=0)
+    recorder = recorder_of(tmp_path / 'log', settings, open_file=slow)
+    record(recorder, 0, 3)
+    recorder.rotate()
+    gate.set()
+    wait_for(lambda: recorder.status().written == 1)
+    wait_for(lambda: recorder.status().state == RecorderState.DEGRADED)
+    assert '2 messages were dropped' in recorder.status().reason
+    recorder.rotate()
+    wait_for(lambda: recorder.status().state == RecorderState.RECORDING)
+    recorder.close()
+
+
+def test_a_hundred_rotations_lose_nothing(tmp_path):
+    recorder = recorder_of(tmp_path / 'log')
+    for part in range(100):
+        record(recorder, 10 * part, 10)
+        recorder.rotate()
+        wait_for(lambda part=part: recorder.status().files_finished == part + 1)
+    status = recorder.close()
+    assert status.files_finished == 100
+    assert values_on_disk(tmp_path / 'log') == list(range(1000))
+
+
+def test_rotation_by_size_and_by_age(tmp_path):
+    for name, limits in (('size', {'rotate_bytes': 1}), ('age', {'rotate_s': 0.0})):
+        settings = RecorderSettings(flush_period_s=0.002, free_floor_bytes=0, **limits)
+        recorder = recorder_of(tmp_path / name, settings)
+        for part in range(3):
+            record(recorder, part, 1)
+            wait_for(lambda part=part, r=recorder: r.status().files_finished == part + 1)
+        recorder.close()
+        assert len(list((tmp_path / name).glob('*.mcap'))) == 3
+        assert values_on_disk(tmp_path / name) == [0.0, 1.0, 2.0]
+
+
+def test_latched_messages_head_every_later_split(tmp_path):
+    recorder = recorder_of(tmp_path / 'log')
+    recorder.add_topic('/curve', FLOAT64, qos=LATCHED, latched=True)
+    record(recorder, 0, 2, '/curve')
+    for part in range(3):
+        record(recorder, 10 + 10 * part, 2)
+        wait_for(lambda part=part: recorder.status().queued == 0)
+        recorder.rotate()
+        wait_for(lambda part=part: recorder.status().files_finished == part + 1)
+    record(recorder, 50, 1)
+    status = recorder.close()
+    assert status.written == 9
+    for number in (1, 2, 3):
+        first = next(open_log(tmp_path / 'log' / f'log_{number}.mcap').iter_messages())
+        assert (first.topic, first.data) == ('/curve', float64(1))
+    curves = list(open_log(tmp_path / 'log').iter_messages(['/curve']))
+    assert [m.data for m in curves] == [float64(0), float64(1)]
+
+
+def test_the_oldest_files_go_when_told_so(tmp_path):
+    folder = tmp_path / 'log'
+    settings = RecorderSettings(flush_period_s=0.002, free_floor_bytes=0, keep_files=2)
+    (tmp_path / 'bystander.mcap').write_bytes(b'not ours')
+    recorder = recorder_of(folder, settings)
+    for part in range(5):
+        record(recorder, part, 1)
+        wait_for(lambda part=part: recorder.status().queued == 0)
+        recorder.rotate()
+        wait_for(lambda part=part: recorder.status().files_finished == part + 1)
+    recorder.close()
+    assert sorted(p.name for p in folder.glob('*.mcap')) == ['log_3.mcap', 'log_4.mcap']
+    assert open_log(folder).warnings == ()
+    assert values_on_disk(folder) == [3.0, 4.0]
+    assert (tmp_path / 'bystander.mcap').exists()
+
+
+def test_it_stops_before_the_disk_is_full_and_goes_on_afterwards(tmp_path):
+    free = [10**12]
+    settings = RecorderSettings(
+        flush_period_s=0.002, retry_s=0.002, retry_max_s=0.01, free_floor_bytes=10**9
+    )
+    recorder = recorder_of(tmp_path / 'log', settings, free_bytes=lambda folder: free[0])
+    record(recorder, 0, 10)
+    wait_for(lambda: recorder.status().written == 10)
+    free[0] = 10**8
+    wait_for(lambda: recorder.status().state == RecorderState.DEGRADED)
+    assert 'MiB must stay free' in recorder.status().reason
+    assert [p.name for p in (tmp_path / 'log').glob('*.mcap*')] == ['log_0.mcap']
+    record(recorder, 10, 10)
+    free[0] = 10**12
+    wait_for(lambda: recorder.status().written == 20)
+    recorder.close()
+    assert values_on_disk(tmp_path / 'log') == list(range(20))
+
+
+def test_leftovers_are_finished_at_the_start(tmp_path):
+    part, wanted, writer = write_chunks(tmp_path / 'log', close=False)
+    writer.abandon()
+    assert part.exists()
+    recorder = Recorder(tmp_path / 'log', QUICK, definitions=STOCK)
+    wait_for(lambda: recorder.status().recovered)
+    recorder.add_topic('/unit1/valve_opening', FLOAT64)
+    record(recorder, 0, 3, '/unit1/valve_opening')
+    status = recorder.close()
+    assert status.recovered[0].messages == len(wanted)
+    names = sorted(p.name for p in (tmp_path / 'log').iterdir())
+    assert names == ['log_0.mcap', 'log_1.mcap', 'metadata.yaml']
+    assert len(open_log(tmp_path / 'log').readings) == len(wanted) + 3
+
+
+def test_closing_takes_a_bounded_time_and_later_messages_are_counted(tmp_path):
+    gate = threading.Event()
+
+    def stuck(path):
+        gate.wait(LIMIT_S)
+        return PartFile(path)
+
+    recorder = recorder_of(tmp_path / 'log', open_file=stuck)
+    record(recorder, 0, 10)
+    begin = time.monotonic()
+    status = recorder.close(timeout_s=0.05)
+    assert time.monotonic() - begin < 2.0
+    assert (status.queued, status.written) == (10, 0)
+    assert not recorder.record('/valve_opening', float64(0), START_NS, START_NS)
+    gate.set()
+    status = recorder.close(LIMIT_S)
+    assert (status.written, status.lost, status.dropped) == (10, 0, {'/valve_opening': 1})
+    assert is_balanced(status)
+
+
+def test_an_error_nobody_thought_of_stops_it_visibly(tmp_path):
+    def broken(path):
+        raise ZeroDivisionError('a mistake')
+
+    recorder = recorder_of(tmp_path / 'log', open_file=broken)
+    record(recorder, 0, 1)
+    wait_for(lambda: recorder.status().state == RecorderState.STOPPED)
+    status = recorder.status()
+    assert 'ZeroDivisionError' in status.reason
+    assert (status.lost, is_balanced(status)) == (1, True)
+    assert not recorder.record('/valve_opening', float64(0), START_NS, START_NS)
+
+
+def test_misuse_is_one_sentence(tmp_path):
+    recorder = recorder_of(tmp_path / 'log')
+    with pytest.raises(InputError, match="'/gone' was not made known"):
+        recorder.record('/gone', b'', 0, 0)
+    with pytest.raises(InputError, match='impossible time'):
+        recorder.record('/valve_opening', float64(0), -1, 0)
+    with pytest.raises(InputError, match='is recorded as'):
+        recorder.add_topic('/valve_opening', 'std_msgs/msg/Bool')
+    with pytest.raises(RecordingError, match='was not found'):
+        recorder.add_topic('/other', 'std_msgs/msg/Nothing')
+    assert recorder.close().received == 0
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(RecordingError, match='cannot be made'):
+        Recorder(tmp_path / 'file' / 'log')

@@ -1,0 +1,252 @@
+"""What we write is read by programs we did not write, with the right values."""
+
+import json
+import os
+import shutil
+import stat
+import subprocess
+from pathlib import Path
+
+import pytest
+import yaml
+from log_files import (
+    FLOAT64,
+    SAMPLE,
+    START_NS,
+    STOCK,
+    float64,
+    plant_sample,
+    read_back,
+    write_chunks,
+    write_messages,
+)
+from mcap.reader import NonSeekingReader, make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+from valveflow_ros.errors import InputError, RecordingError
+from valveflow_ros.logs import LATCHED, Message, RecordingWriter, open_log
+
+READ_IN_NODE = Path(__file__).with_name('read_mcap.mjs')
+
+
+def by_rosbags(folder):
+    with AnyReader([folder]) as reader:
+        return [
+            (connection.topic, time_ns, reader.deserialize(raw, connection.msgtype))
+            for connection, time_ns, raw in reader.messages()
+        ]
+
+
+def by_mcap(path):
+    with path.open('rb') as stream:
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        return [
+            (channel.topic, message.log_time, message.publish_time, decoded)
+            for _, channel, message, decoded in reader.iter_decoded_messages()
+        ]
+
+
+@pytest.fixture
+def samples(tmp_path):
+    folder = tmp_path / 'samples'
+    rows = [(START_NS + k * 10**9, [k + 0.5, 12.0, 538.0, 600.0 + k, 41.0]) for k in range(50)]
+    messages = [
+        Message('/unit1/plant_sample', plant_sample(t, v, [0, 1, 0, 2, 0]), t + 5, t)
+        for t, v in rows
+    ]
+    write_messages(folder, {'/unit1/plant_sample': SAMPLE}, messages)
+    return folder, rows
+
+
+def test_rosbags_reads_the_folder(tmp_path):
+    path, wanted, _ = write_chunks(tmp_path / 'log')
+    found = by_rosbags(path.parent)
+    assert [(t, m.data) for _, t, m in found] == [(w.log_time_ns, w.value) for w in wanted]
+    assert {topic for topic, _, _ in found} == {
+        '/unit1/valve_opening',
+        '/unit1/main_steam_pressure',
+        '/unit1/main_steam_temperature',
+        '/unit1/generated_power',
+    }
+
+
+def test_mcap_and_its_decoder_read_the_file(tmp_path):
+    path, wanted, _ = write_chunks(tmp_path / 'log')
+    found = by_mcap(path)
+    assert [(log, publish, m.data) for _, log, publish, m in found] == [
+        (w.log_time_ns, w.time_ns, w.value) for w in wanted
+    ]
+
+
+def test_own_messages_are_read_by_both(samples):
+    folder, rows = samples
+    for found in (by_rosbags(folder), by_mcap(folder / 'samples_0.mcap')):
+        assert [m[-1].main_steam_pressure for m in found] == [v[1] for _, v in rows]
+        assert [m[-1].generated_power for m in found] == [v[3] for _, v in rows]
+        assert {m[-1].generated_power_quality for m in found} == {2}
+        assert {m[-1].header.frame_id for m in found} == {'HV101'}
+
+
+def test_a_reader_of_streams_sees_valid_checksums_and_the_same_messages(tmp_path):
+    path, wanted, _ = write_chunks(tmp_path / 'log')
+    with path.open('rb') as stream:
+        messages = list(NonSeekingReader(stream, validate_crcs=True).iter_messages())
+    assert [m.log_time for _, _, m in messages] == [w.log_time_ns for w in wanted]
+
+
+def test_the_summary_is_right(tmp_path):
+    path, wanted, _ = write_chunks(tmp_path / 'log')
+    with path.open('rb') as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        header, summary = reader.get_header(), reader.get_summary()
+        attachments = [(a.name, a.data) for a in reader.iter_attachments()]
+        metadata = {m.name: m.metadata for m in reader.iter_metadata()}
+    assert header.profile == 'ros2'
+    assert header.library.startswith('valveflow_ros ')
+    statistics = summary.statistics
+    assert statistics.message_count == len(wanted)
+    assert statistics.message_start_time == wanted[0].log_time_ns
+    assert statistics.message_end_time == wanted[-1].log_time_ns
+    assert statistics.chunk_count == len(summary.chunk_indexes)
+    assert {c.compression for c in summary.chunk_indexes} == {'zstd'}
+    assert attachments == [('parameters.yaml', b'a: 1\n')]
+    assert yaml.safe_load(metadata['rosbag2']['serialized_metadata'])['message_count'] == len(
+        wanted
+    )
+    channel = next(iter(summary.channels.values()))
+    assert channel.message_encoding == 'cdr'
+    assert channel.metadata['topic_type_hash'] == STOCK.type_hash(FLOAT64)
+    assert yaml.safe_load(channel.metadata['offered_qos_profiles'])[0]['reliability'] == 'reliable'
+    assert {s.encoding for s in summary.schemas.values()} == {'ros2msg'}
+
+
+def test_the_metadata_file_says_what_is_there(tmp_path):
+    path, wanted, writer = write_chunks(tmp_path / 'log')
+    info = yaml.safe_load((path.parent / 'metadata.yaml').read_text())[
+        'rosbag2_bagfile_information'
+    ]
+    assert (info['version'], info['storage_identifier']) == (9, 'mcap')
+    assert info['message_count'] == writer.written == len(wanted)
+    assert info['starting_time']['nanoseconds_since_epoch'] == wanted[0].log_time_ns
+    assert info['duration']['nanoseconds'] == wanted[-1].log_time_ns - wanted[0].log_time_ns
+    assert info['relative_file_paths'] == [path.name] == [f['path'] for f in info['files']]
+    assert sum(t['message_count'] for t in info['topics_with_message_count']) == len(wanted)
+    profile = info['topics_with_message_count'][0]['topic_metadata']['offered_qos_profiles'][0]
+    assert profile['deadline'] == {'sec': 9223372036, 'nsec': 854775807}
+    assert isinstance(info['custom_data'], dict)
+
+
+def test_only_the_owner_may_look(tmp_path):
+    before = os.umask(0)
+    try:
+        path, _, _ = write_chunks(tmp_path / 'deep' / 'log')
+    finally:
+        os.umask(before)
+    assert {stat.S_IMODE(p.stat().st_mode) for p in path.parent.iterdir()} == {0o600}
+    folders = [path.parent, path.parent.parent]
+    assert {stat.S_IMODE(folder.stat().st_mode) for folder in folders} == {0o700}
+
+
+def test_an_unfinished_file_carries_another_name(tmp_path):
+    path, wanted, writer = write_chunks(tmp_path / 'log', close=False)
+    assert path.name == 'log_0.mcap.part'
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+    assert len(open_log(path).readings) == len(wanted)
+    writer.close()
+    assert sorted(p.name for p in path.parent.iterdir()) == ['log_0.mcap', 'metadata.yaml']
+
+
+def test_a_folder_is_continued(tmp_path):
+    folder = tmp_path / 'log'
+    _, first, _ = write_chunks(folder)
+    _, second, _ = write_chunks(folder)
+    assert sorted(p.name for p in folder.glob('*.mcap')) == ['log_0.mcap', 'log_1.mcap']
+    assert len(by_rosbags(folder)) == len(first) + len(second)
+    info = yaml.safe_load((folder / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
+    assert info['message_count'] == len(first) + len(second)
+
+
+def test_splits_begin_with_the_latched_messages_which_are_read_once(tmp_path):
+    folder = tmp_path / 'log'
+    curve = Message('/curve', float64(7.0), START_NS, START_NS)
+    with RecordingWriter(folder, definitions=STOCK, head_messages=lambda: [curve]) as writer:
+        writer.add_topic('/curve', FLOAT64, qos=LATCHED)
+        writer.add_topic('/valve_opening', FLOAT64)
+        writer.write(*curve)
+        for step in range(1, 4):
+            writer.rotate()
+            time_ns = START_NS + step * 10**9
+            writer.write('/valve_opening', float64(step), time_ns, time_ns)
+    assert writer.written == 4
+    for number in (1, 2, 3):
+        topic, log_ns, publish_ns, message = by_mcap(folder / f'log_{number}.mcap')[0]
+        assert (topic, publish_ns, message.data) == ('/curve', START_NS, 7.0)
+        assert log_ns == START_NS + number * 10**9
+    contents = open_log(folder)
+    assert [m.topic for m in contents.iter_messages()] == ['/curve', *['/valve_opening'] * 3]
+    assert contents.readings.value.tolist() == [1.0, 2.0, 3.0]
+
+
+def test_a_topic_has_one_type(tmp_path):
+    with RecordingWriter(tmp_path / 'log', definitions=STOCK) as writer:
+        writer.add_topic('/x', FLOAT64)
+        writer.add_topic('/x', FLOAT64)
+        with pytest.raises(InputError, match=r"'/x' is recorded as std_msgs/msg/Float64"):
+            writer.add_topic('/x', 'std_msgs/msg/Bool')
+
+
+def test_a_definition_may_come_from_the_caller(tmp_path):
+    with RecordingWriter(tmp_path / 'log', definitions=STOCK) as writer:
+        writer.add_topic('/x', 'demo_msgs/msg/One', definition='float64 data\n')
+        writer.write('/x', float64(3.0), 1, 1)
+    contents = open_log(tmp_path / 'log')
+    [message] = contents.iter_messages()
+    assert contents.decoder('/x').decode(message.data) == {'data': 3.0}
+    assert contents.topics['/x'].type_hash.startswith('RIHS01_')
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(RecordingError, match='cannot be written'):
+        RecordingWriter(tmp_path / 'file' / 'log')
+
+
+def write_and_stumble(folder):
+    with RecordingWriter(folder, definitions=STOCK) as writer:
+        writer.add_topic('/x', FLOAT64)
+        writer.write('/x', float64(1.0), 1, 1)
+        writer.flush()
+        writer.write('/unknown', b'', 1, 1)
+
+
+def test_an_error_within_leaves_the_file_unfinished(tmp_path):
+    with pytest.raises(KeyError):
+        write_and_stumble(tmp_path / 'log')
+    assert [p.name for p in (tmp_path / 'log').iterdir()] == ['log_0.mcap.part']
+
+
+def node_modules():
+    folder = os.environ.get('VALVEFLOW_NODE_MODULES', '')
+    return folder if folder and shutil.which('node') else None
+
+
+@pytest.mark.skipif(not node_modules(), reason='VALVEFLOW_NODE_MODULES names no node modules')
+def test_the_reader_of_foxglove_reads_the_file(tmp_path, samples):
+    path, wanted, _ = write_chunks(tmp_path / 'log')
+    folder, rows = samples
+    for file, expected in (
+        (path, [(w.log_time_ns, w.time_ns, w.value) for w in wanted]),
+        (folder / 'samples_0.mcap', [(t + 5, t, v[3]) for t, v in rows]),
+    ):
+        command = ['node', str(READ_IN_NODE), node_modules(), str(file)]
+        lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        found = [json.loads(line) for line in lines.splitlines()]
+        assert [(int(f['log']), int(f['publish']), f['value']) for f in found] == expected
+
+
+def test_both_ways_of_reading_agree(samples):
+    folder, rows = samples
+    found = read_back(open_log(folder))
+    assert [r.time_ns for r in found] == [t for t, _ in rows for _ in range(5)]
+    assert [r.value for r in found] == [v for _, values in rows for v in values]

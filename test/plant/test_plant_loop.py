@@ -1,0 +1,194 @@
+"""The slow truth of the closed loop: plain Python, no arrays, no state between parts."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from valveflow_ros.plant.hooks import DAY_S
+from valveflow_ros.plant.lag import lag_coefficients
+from valveflow_ros.plant.plant import Disturbance
+from valveflow_ros.plant.programme import LoadProgramme
+from valveflow_ros.plant.random_unit import random_unit
+from valveflow_ros.plant.simulator import WARM_UP_S, simulate
+from valveflow_ros.plant.spec import EffectSpec
+from valveflow_ros.plant.unit import Region, UnitDescription
+
+
+@dataclass
+class Faults:
+    """What may be wrong with the naive plant; as printed, nothing is."""
+
+    slack: float = 0.0
+    stick: float = 0.0
+    jump: float = 0.0
+    speed: float = 1e9
+    top: float = 1e9
+    kappa: float = 0.0
+    alpha: float = 1.0
+    reheat_s: float = 0.0
+
+
+def naive_curve(unit: UnitDescription, u: float) -> float:
+    """Evaluate eq. (2) piece by piece."""
+    curve = unit.curve
+    for j in range(len(curve.slopes)):
+        if u < curve.knots[j + 1] or j == len(curve.slopes) - 1:
+            return float(curve.slopes[j] * u + curve.intercepts[j])
+    raise AssertionError
+
+
+def naive_inverse(unit: UnitDescription, x: float) -> float:
+    """Solve F(u) = x by halving."""
+    low, high = 0.0, 10_000.0
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if naive_curve(unit, middle) < x else (low, middle)
+    return 0.5 * (low + high)
+
+
+def naive_lag(y: float, x0: float, x1: float, time_s: float, h: float) -> float:
+    """Solve T y' + y = x exactly over one step in which x is straight."""
+    if time_s == 0.0:
+        return x1
+    slope = (x1 - x0) / h
+    return x1 - slope * time_s + (y - x0 + slope * time_s) * math.exp(-h / time_s)
+
+
+def naive_at(history: list[float], index: float, first: float) -> float:
+    """Read a history between samples; before its begin it was ``first``."""
+
+    def get(i: int) -> float:
+        return history[i] if i >= 0 else first
+
+    whole = math.floor(index)
+    return (
+        get(whole) + (index - whole) * (get(whole + 1) - get(whole))
+        if index != whole
+        else get(whole)
+    )
+
+
+def naive_psi(ratio: float) -> float:
+    """Return the ellipse of sub-critical flow."""
+    critical = 0.546
+    return 1.0 if ratio < critical else math.sqrt(1 - ((ratio - critical) / (1 - critical)) ** 2)
+
+
+def naive_plug(wanted: float, memory: list[float], h: float, faults: Faults) -> float:
+    """Pass an opening through servo, friction, stop and slack."""
+    limit = faults.speed * h
+    memory[0] += min(max(wanted - memory[0], -limit), limit)
+    pull = memory[0] - memory[1]
+    if abs(pull) > (faults.stick + faults.jump) / 2:
+        memory[1] = memory[0] - math.copysign((faults.stick - faults.jump) / 2, pull)
+    stopped = min(memory[1], faults.top)
+    if stopped > memory[2] + faults.slack / 2:
+        memory[2] = stopped - faults.slack / 2
+    elif stopped < memory[2] - faults.slack / 2:
+        memory[2] = stopped + faults.slack / 2
+    return memory[2]
+
+
+def naive_plant(unit: UnitDescription, days: float, seed: int, faults: Faults) -> np.ndarray:
+    """Run the plant of the paper row by row; columns command, plug, u, power."""
+    h, plan = unit.sample_period_s, unit.programme
+    skip, rows = round(WARM_UP_S / h), round(days * DAY_S / h)
+    drive = LoadProgramme(unit, seed, (skip + rows) * h, -WARM_UP_S)
+    outside = drive.advance(0, skip + rows)
+    noise = Disturbance(unit, seed).advance(outside.load_mw)
+    first = float(outside.load_mw[0])
+    correction, direct, reheated = 0.0, first, first
+    memory: list[float] = []
+    flow: list[float] = []
+    out = []
+    for t in range(skip + rows):
+        load, p = float(outside.load_mw[t]), float(outside.pressure_mpa[t])
+        density = p**1.125
+        command = (naive_inverse(unit, load) + correction) / density
+        command = min(max(command + float(outside.moves_percent[t]), 0.0), 100.0)
+        memory = memory or [command] * 3
+        plug = naive_plug(command, memory, h, faults)
+        u = plug * density
+        if faults.kappa:
+            x = naive_curve(unit, u)
+            line = plan.pressure_low_mpa + plan.pressure_rise_mpa * (
+                (x - plan.load_low_mw) / plan.pressure_span_mw
+            )
+            u = u * naive_psi(faults.kappa * x / p) / naive_psi(faults.kappa * x / line)
+        flow.append(naive_curve(unit, u))
+        region = next(r for r in unit.regions if flow[t] < r.power_to_mw)
+        back = region.delay_s / h
+        old, new = naive_at(flow, t - 1 - back, first), naive_at(flow, t - back, first)
+        before, direct = direct, naive_lag(direct, old, new, region.time_constant_s, h)
+        reheated = naive_lag(reheated, before, direct, faults.reheat_s, h)
+        power = faults.alpha * direct + (1 - faults.alpha) * reheated
+        if plan.feedback and load < plan.feedback_off_above_mw:
+            error = load - (power + float(noise[t]))
+            correction += h / plan.feedback_s * error / plan.feedback_slope_mw
+            correction = min(max(correction, -plan.feedback_limit_u), plan.feedback_limit_u)
+        elif plan.feedback:
+            correction -= correction * h / plan.feedback_s
+        out.append((command, plug, u, power))
+    return np.array(out)[skip:]
+
+
+EVERYTHING = Faults(0.6, 1.0, 0.7, 0.12, 84.0, 0.0, 0.3, 20.0)
+EVERYTHING_SPECS = ('backlash', 'stiction', 'rate_limit', 'saturation', 'reheater')
+
+
+@pytest.mark.parametrize('number', [None, 0, 1, 2, 3])
+@pytest.mark.parametrize('faulty', [False, True])
+def test_the_fast_loop_is_the_slow_one(number: int | None, faulty: bool) -> None:
+    rng = np.random.default_rng(number)
+    unit = UnitDescription() if number is None else random_unit(rng)
+    plan = unit.programme
+    kappa = (
+        0.65 * float(plan.sliding_pressure_mpa(np.array(plan.load_high_mw))) / plan.load_high_mw
+    )
+    faults = dataclasses.replace(EVERYTHING, kappa=kappa) if faulty else Faults()
+    effects = [EffectSpec.parse(name) for name in EVERYTHING_SPECS] if faulty else []
+    effects += [EffectSpec.of('choked', kappa=kappa)] if faulty else []
+    log = simulate(0.12, seed=5, unit=unit, effects=effects)
+    slow = naive_plant(unit, 0.12, 5, faults)
+    np.testing.assert_allclose(log.table.values[:, 4], np.round(slow[:, 0], 2), atol=0.0101)
+    np.testing.assert_allclose(log.plug_percent, slow[:, 1], rtol=1e-9)
+    np.testing.assert_allclose(log.true_u, slow[:, 2], rtol=1e-9)
+    np.testing.assert_allclose(log.true_power_mw, slow[:, 3], rtol=1e-9)
+
+
+@pytest.mark.parametrize('step_s', [0.5, 1.0, 2.0, 7.0])
+@pytest.mark.parametrize('time_s', [0.5, 10.0, 80.0])
+def test_a_ramp_is_answered_late_by_its_time_constant(step_s: float, time_s: float) -> None:
+    a, b, c = lag_coefficients(time_s, step_s)
+    ramp = np.arange(0.0, 20.0 * time_s + 10.0 * step_s, step_s)
+    y = ramp[0]
+    for before, now in itertools.pairwise(ramp):
+        y = a * y + b * before + c * now
+    assert y == pytest.approx(ramp[-1] - time_s, rel=1e-6, abs=1e-6 * time_s)
+
+
+def test_a_lag_without_time_constant_lets_everything_through() -> None:
+    assert lag_coefficients(0.0, 1.0) == (0.0, 0.0, 1.0)
+
+
+def test_sampling_twice_as_often_gives_the_same_plant(quiet: UnitDescription) -> None:
+    # Noise would differ from rate to rate; a manual step test has none here.
+    from valveflow_ros.plant.step_test import StepPlan, step_test
+
+    plan = StepPlan(pressure_wander_mpa=0.0, steps=4, hold_s=600.0)
+    regions = (Region(np.inf, 30.0, 4.0),)
+    powers = []
+    for h in (1.0, 2.0):
+        unit = UnitDescription(
+            regions=regions, noise=quiet.noise, programme=quiet.programme, sample_period_s=h
+        )
+        powers.append(step_test(1, plan, unit).true_power_mw)
+    # Straight between samples is exact but for the corners of the moves.
+    np.testing.assert_allclose(powers[0][::2], powers[1], atol=0.4)
+    assert np.abs(powers[0][::2] - powers[1]).mean() < 0.02

@@ -1,0 +1,341 @@
+"""The outside of the plant: what the text of the paper's study asks for, by counting."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from valveflow_ros.errors import InputError
+from valveflow_ros.plant.hooks import DAY_S
+from valveflow_ros.plant.programme import Pulses, load_knots
+from valveflow_ros.plant.random_unit import random_unit
+from valveflow_ros.plant.recorder import SimulatedLog
+from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate, simulate_parts
+from valveflow_ros.plant.spec import EffectSpec
+from valveflow_ros.plant.unit import Curve, Noise, Programme, Region, UnitDescription
+from valveflow_ros.records import NS_PER_S, Quality, Signal
+
+LONG_S = 300.0 * DAY_S
+
+
+@pytest.fixture(scope='module')
+def days() -> SimulatedLog:
+    return simulate(4.0, seed=20)
+
+
+@pytest.fixture(scope='module')
+def knots() -> tuple[np.ndarray, np.ndarray]:
+    return load_knots(np.random.default_rng(1), LONG_S, 0.0, Programme())
+
+
+def same(one: SimulatedLog, other: SimulatedLog) -> None:
+    """Assert that two logs are equal bit for bit."""
+    np.testing.assert_array_equal(one.table.time_ns, other.table.time_ns)
+    np.testing.assert_array_equal(one.table.values, other.table.values)
+    np.testing.assert_array_equal(one.table.quality, other.table.quality)
+    for name in ('true_u', 'true_power_mw', 'load_mw', 'noise_mw', 'plug_percent'):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_holds_and_ramps_of_the_load(knots: tuple[np.ndarray, np.ndarray]) -> None:
+    seconds, load = knots
+    holds, ramps = np.diff(seconds)[0::2], np.diff(seconds)[1::2]
+    targets, moves = load[2::2], np.abs(np.diff(load)[1::2])
+    assert np.all(np.diff(load)[0::2] == 0.0)
+    assert holds.min() >= 600.0
+    assert holds.mean() == pytest.approx(1500.0, rel=0.05)
+    rates = 60.0 * moves[moves > 1.0] / ramps[moves > 1.0]
+    assert 2.5 <= rates.min() < 2.6
+    assert 5.9 < rates.max() <= 6.0 + 1e-9
+    assert 160.0 <= targets.min() < 161.0
+    assert targets.max() <= 293.5
+    # Full load is also reached by the daily wave: at least 15 % of targets, not many more.
+    assert 0.15 < np.mean(targets >= 286.0) < 0.21
+
+
+@pytest.mark.parametrize('clock_h', [0.0, 7.0])
+def test_the_load_follows_the_clock(clock_h: float) -> None:
+    seconds, load = load_knots(
+        np.random.default_rng(2), LONG_S, clock_h * 3600.0, Programme(full_load_share=0.0)
+    )
+    t = np.arange(0.0, LONG_S, 600.0)
+    phase = 2.0 * np.pi * ((t / 3600.0 + clock_h) - 9.0) / 24.0
+    wave = np.interp(t, seconds, load)
+    a, b = 2.0 * np.mean(wave * np.sin(phase)), 2.0 * np.mean(wave * np.cos(phase))
+    late_h = np.arctan2(-b, a) * 12.0 / np.pi
+    # A target holds for a while, so the load follows the wave late, and clipped.
+    assert 0.0 < late_h < 1.5
+    assert 20.0 < np.hypot(a, b) < 32.0
+
+
+def test_pulses_of_primary_frequency_control() -> None:
+    pulses = Pulses.draw(np.random.default_rng(3), LONG_S, Programme())
+    assert pulses.start_s.size == pytest.approx(LONG_S / 1500.0, rel=0.05)
+    height = np.abs(pulses.height_percent)
+    assert 1.0 <= height.min() < 1.05
+    assert 3.95 < height.max() <= 4.0
+    assert np.mean(pulses.height_percent > 0.0) == pytest.approx(0.5, abs=0.03)
+    assert 30.0 <= pulses.hold_s.min() < 31.0
+    assert 119.0 < pulses.hold_s.max() <= 120.0
+
+
+def test_a_pulse_is_a_trapezoid() -> None:
+    pulse = Pulses(np.array([10.0]), np.array([20.0]), np.array([-2.0]))
+    shown = pulse.at(np.array([9.0, 10.0, 12.0, 14.0, 20.0, 34.0, 36.0, 38.0, 39.0]))
+    np.testing.assert_allclose(shown, [0, 0, -1, -2, -2, -2, -1, 0, 0])
+
+
+def test_ranges_of_the_paper_unit(days: SimulatedLog) -> None:
+    values = days.table.values
+    opening, pressure, temperature, power, _ = values.T
+    assert 990.0 < days.true_u.min() < 1100.0
+    assert 2200.0 < days.true_u.max() < 2400.0
+    assert 135.0 < power.min() < 155.0
+    assert 295.0 < power.max() < 312.0
+    assert 0.08 < np.mean(days.load_mw >= 286.0) < 0.25
+    assert pressure.min() > 9.0
+    assert pressure.max() < 17.8
+    assert temperature.mean() == pytest.approx(539.0, abs=0.8)
+    assert 1.5 < temperature.std() < 3.0
+    assert opening.min() > 55.0
+    assert opening.max() < 100.2
+
+
+def test_noise_of_the_power(days: SimulatedLog) -> None:
+    noise = days.noise_mw
+    assert noise.std() == pytest.approx(np.hypot(2.0, 2.2), rel=0.03)
+    one_minute = np.mean(noise[60:] * noise[:-60])
+    assert one_minute == pytest.approx(4.0 * np.exp(-1.0), rel=0.15)
+    np.testing.assert_array_equal(
+        days.table.values[:, Signal.GENERATED_POWER], np.round(days.true_power_mw + noise, 2)
+    )
+
+
+def test_noise_and_rounding_of_the_sensors(days: SimulatedLog) -> None:
+    values = days.table.values
+    error = values[:, Signal.VALVE_OPENING] - days.plug_percent
+    assert error.std() == pytest.approx(0.02, rel=0.05)
+    for signal, decimals in zip(Signal, (2, 3, 1, 2, 2), strict=True):
+        np.testing.assert_array_equal(values[:, signal], np.round(values[:, signal], decimals))
+    assert np.all(days.table.quality == Quality.GOOD)
+    # Pressure and temperature move slowly: their differences are the sensors' noise.
+    for signal, sigma in (
+        (Signal.MAIN_STEAM_PRESSURE, 0.01),
+        (Signal.MAIN_STEAM_TEMPERATURE, 0.2),
+    ):
+        assert np.diff(values[:, signal]).std() == pytest.approx(np.sqrt(2) * sigma, rel=0.4)
+
+
+def test_true_input_is_opening_times_a_power_of_the_pressure(days: SimulatedLog) -> None:
+    opening, pressure = days.table.values[:, 0], days.table.values[:, 1]
+    np.testing.assert_allclose(opening * pressure**1.125, days.true_u, rtol=0.01)
+
+
+def test_the_record_begins_in_equilibrium() -> None:
+    starts = [simulate(0.02, seed) for seed in range(40)]
+    error = [np.mean(s.true_power_mw[:60] - s.load_mw[:60]) for s in starts]
+    assert np.std(error) < 4.0
+    assert abs(np.mean(error)) < 1.5
+
+
+def test_the_power_control_removes_a_lasting_error() -> None:
+    effect = [EffectSpec.parse('output_offset_drift:b_mw=50')]
+    error = {}
+    for feedback in (False, True):
+        unit = UnitDescription(
+            programme=Programme(feedback=feedback, load_high_mw=280.0, full_load_from_mw=275.0)
+        )
+        log = simulate(1.5, 4, unit, effects=effect)
+        late = log.true_power_mw - log.load_mw
+        error[feedback] = abs(np.mean(late[-40_000:]))
+    assert error[True] < 0.2 * error[False]
+
+
+@pytest.mark.parametrize('wanted', [0.0, 0.8])
+def test_temperature_and_pressure_correlate_as_asked(wanted: float) -> None:
+    plan = Programme(
+        temperature_pressure_correlation=wanted, load_daily_mw=0.0, load_spread_mw=0.1,
+        full_load_share=0.0,
+    )  # fmt: skip
+    found = []
+    for seed in range(3):
+        # Both wander slowly; a coarse step shows it as well.
+        log = simulate(6.0, seed, UnitDescription(programme=plan, sample_period_s=10.0))
+        found.append(np.corrcoef(log.table.values[:, 1], log.table.values[:, 2])[0, 1])
+    assert np.mean(found) == pytest.approx(wanted, abs=0.12)
+
+
+def test_load_dependent_noise_grows_with_the_load() -> None:
+    log = simulate(0.3, 6, UnitDescription(noise=Noise(load_dependence=0.8)))
+    base = simulate(0.3, 6)
+    share = log.noise_mw / base.noise_mw
+    expected = 1.0 + 0.8 * (log.load_mw - 228.0) / (293.5 - 228.0)
+    np.testing.assert_allclose(share, expected, rtol=1e-9)
+
+
+def test_a_slow_wander_adds_noise_and_nothing_else() -> None:
+    log = simulate(0.5, 7, UnitDescription(noise=Noise(wander_mw=0.6)))
+    added = log.noise_mw - simulate(0.5, 7).noise_mw
+    assert 0.2 < added.std() < 1.2
+    assert np.mean(added[600:] * added[:-600]) / np.mean(added**2) > 0.8
+
+
+def test_the_seed_decides_everything() -> None:
+    same(simulate(0.1, 8), simulate(0.1, 8))
+    assert not np.array_equal(simulate(0.1, 8).noise_mw, simulate(0.1, 9).noise_mw)
+
+
+def test_a_longer_run_begins_with_the_shorter_one() -> None:
+    effects = [EffectSpec.parse(t) for t in ('clock:d_s=2.5', 'spikes:per_day=300', 'diurnal')]
+    short, long = (simulate(days, 8, effects=effects) for days in (0.1, 0.2))
+    n = len(short)
+    np.testing.assert_array_equal(short.table.values, long.table.values[:n])
+    np.testing.assert_array_equal(short.true_u, long.true_u[:n])
+
+
+@pytest.mark.parametrize('part_s', [61.0, 3600.0, 5000.0, np.inf])
+@pytest.mark.parametrize('lead', ['7.5', '-7.5'])
+def test_any_cutting_into_parts_gives_the_same_run(part_s: float, lead: str) -> None:
+    texts = (
+        f'clock:d_s={lead}', 'flatline:t0_days=0.02,minutes=60,signal=valve_opening', 'backlash',
+        'stiction:before_sensor=1', 'rate_limit', 'reheater', 'curve_step:t0_days=0.03',
+        'temperature', 'spikes:per_day=500,signal=main_steam_pressure', 'choked',
+    )  # fmt: skip
+    effects = [EffectSpec.parse(text) for text in texts]
+    parts = list(simulate_parts(0.1, 3, effects=effects, part_s=part_s))
+    assert all(len(part) <= max(part_s, 61.0) for part in parts)
+    same(SimulatedLog.joined(parts), simulate(0.1, 3, effects=effects))
+
+
+def test_stamps_follow_the_sample_period() -> None:
+    unit = UnitDescription(sample_period_s=2.0)
+    log = simulate(0.01, 1, unit, start_ns=5 * NS_PER_S)
+    assert len(log) == 432
+    np.testing.assert_array_equal(log.table.time_ns, (5 + 2 * np.arange(432)) * NS_PER_S)
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        ({'days': 0.0}, 'more than 0'),
+        ({'days': float('nan')}, 'more than 0'),
+        ({'days': 401.0}, 'at most 400'),
+        ({'seed': -1}, 'seed must be 0 or more, not -1'),
+        ({'start_ns': -1}, 'between the years'),
+        ({'start_ns': 2**63 - 2}, 'between the years'),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused(arguments: dict, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        simulate(**{'days': 0.1, 'seed': 1, **arguments})
+
+
+@pytest.mark.parametrize('part_s', [0.0, -1.0, float('nan')])
+def test_parts_without_rows_are_refused_at_the_call(part_s: float) -> None:
+    with pytest.raises(InputError, match='one sample period'):
+        simulate_parts(0.1, 1, part_s=part_s)
+
+
+@pytest.mark.parametrize(
+    'regions',
+    [
+        (),
+        (Region(240.0, 10.0, 3.0),),
+        (Region(240.0, 10.0, 3.0), Region(230.0, 5.0, 3.0), Region(np.inf, 10.0, 3.0)),
+        (Region(np.inf, 10.0, 3.0), Region(np.inf, 10.0, 3.0)),
+    ],
+)
+def test_regions_that_leave_gaps_are_refused(regions: tuple[Region, ...]) -> None:
+    with pytest.raises(InputError, match='follow each other'):
+        UnitDescription(regions=regions)
+
+
+@pytest.mark.parametrize(
+    'change',
+    [
+        {'load_mean_mw': 100.0},
+        {'full_load_from_mw': 300.0},
+        {'full_load_share': 1.1},
+        {'load_spread_mw': -1.0},
+        {'hold_min_s': -1.0},
+        {'ramp_low_mw_per_min': 0.0},
+        {'ramp_low_mw_per_min': 7.0},
+        {'pressure_low_mpa': float('nan')},
+        {'pressure_span_mw': 0.0},
+        {'jitter_s': 0.0},
+        {'temperature_pressure_correlation': 1.1},
+        {'pulse_low_percent': 5.0},
+        {'feedback_slope_mw': 0.0},
+    ],
+)
+def test_contradicting_habits_are_refused(change: dict) -> None:
+    with pytest.raises(InputError, match='This programme cannot be simulated: '):
+        Programme(**change)
+
+
+@pytest.mark.parametrize(
+    'change', [{'slow_time_s': 0.0}, {'white_mw': -1.0}, {'load_dependence': float('nan')}]
+)
+def test_impossible_noise_is_refused(change: dict) -> None:
+    with pytest.raises(InputError, match='This noise cannot be simulated: '):
+        Noise(**change)
+
+
+@pytest.mark.parametrize('pair', [(0.0, 1.0), (np.inf, 1.0), (1.0, -1.0), (1.0, np.nan)])
+def test_impossible_dynamics_are_refused(pair: tuple[float, float]) -> None:
+    with pytest.raises(InputError, match='time constant above 0'):
+        Region(np.inf, *pair)
+
+
+def test_a_curve_through_points_passes_through_them() -> None:
+    u, x = np.array([1.0, 4.0, 9.0]), np.array([2.0, 8.0, 9.0])
+    curve = Curve.through(u, x)
+    np.testing.assert_allclose(curve(u), x)
+    np.testing.assert_allclose(curve.inverse_table()[0], x)
+    with pytest.raises(InputError, match='must increase'):
+        Curve.through(u, x[::-1])
+
+
+@pytest.mark.parametrize('number', range(24))
+def test_other_units_are_plausible(number: int) -> None:
+    unit = random_unit(np.random.default_rng(number))
+    curve, plan = unit.curve, unit.programme
+    assert 2 <= len(curve.slopes) <= 6
+    assert 1 <= len(unit.regions) <= 3
+    ratio = curve.slopes[1:] / curve.slopes[:-1]
+    assert np.all((ratio < 0.7501) | (ratio > 1.3499))
+    jumps = np.diff(curve.slopes) * curve.knots[1:-1] + np.diff(curve.intercepts)
+    np.testing.assert_allclose(jumps, 0.0, atol=1e-9)
+    log = simulate(0.5, number, unit)
+    inside = (log.true_u > curve.knots[0]) & (log.true_u < curve.knots[-1])
+    assert inside.mean() > 0.99
+    assert np.mean(log.table.values[:, 4] >= 100.0) < 0.05
+    assert abs(np.mean(log.true_power_mw - log.load_mw)) < 0.03 * plan.load_high_mw
+    assert log.table.values[:, 4].min() > 40.0
+
+
+def test_other_units_differ_in_every_respect() -> None:
+    units = [random_unit(np.random.default_rng(k)) for k in range(60)]
+    assert {len(u.curve.slopes) for u in units} == {2, 3, 4, 5, 6}
+    assert {len(u.regions) for u in units} == {1, 2, 3}
+    assert {u.sample_period_s for u in units} == {1.0, 2.0}
+    assert {u.programme.feedback for u in units} == {False, True}
+    assert any(np.any(np.diff(u.curve.slopes) > 0.0) for u in units)
+
+
+def test_every_unit_description_is_used(days: SimulatedLog) -> None:
+    # A field nobody reads would make two units the same.
+    for field in dataclasses.fields(Noise):
+        changed = dataclasses.replace(Noise(), **{field.name: 2.0 * getattr(Noise(), field.name)})
+        if field.name in ('wander_mw', 'load_dependence'):
+            changed = dataclasses.replace(Noise(), **{field.name: 0.5})
+        if field.name == 'wander_time_s':
+            changed = Noise(wander_mw=1.0, wander_time_s=100.0)
+        log = simulate(0.02, 20, UnitDescription(noise=changed))
+        assert not np.array_equal(log.table.values, days.table.values[: len(log)]), field.name
+
+
+def test_default_start_is_a_midnight() -> None:
+    assert DEFAULT_START_NS % int(DAY_S * NS_PER_S) == 0

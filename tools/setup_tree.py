@@ -1,0 +1,68 @@
+"""Set up the tree: wheels into .venv, the two packages into install/.
+
+Each step leaves a stamp, a hash of everything it depends on, and is skipped
+while the stamp fits. What is missing is said in one sentence.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import platform
+import sys
+import time
+
+from machine import check_machine
+from packages import build_packages, packages_done
+from tree import LOG, ROOT, VENV, SetupError, say, stamp, stamped
+from wheels import install_wheels, make_venv, repair_cmake, wheels_key
+
+
+def steps() -> None:
+    """Do what has not been done yet."""
+    wheels = wheels_key()
+    if stamped(VENV, wheels) and packages_done(wheels):
+        return
+    check_machine()
+    LOG.mkdir(exist_ok=True)
+    log = LOG / 'setup.log'
+    log.write_text('', encoding='utf-8')
+    if not stamped(VENV, wheels):
+        say(f'Python {platform.python_version()} ({sys.executable}), packages into .venv ...')
+        begun = time.monotonic()
+        make_venv(log)
+        install_wheels(log)
+        repaired = repair_cmake()
+        stamp(VENV, wheels)
+        say(f'installed in {time.monotonic() - begun:.0f} s, {repaired} CMake files repaired')
+    begun = time.monotonic()
+    build_packages(wheels, log)
+    say(f'built in {time.monotonic() - begun:.0f} s; next: source env.sh')
+
+
+def main() -> int:
+    """Set up, one at a time in a folder, and turn every failure into a sentence."""
+    folder = os.open(ROOT, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            say('another set-up works in this folder; waiting for it')
+            fcntl.flock(folder, fcntl.LOCK_EX)
+        steps()
+    except SetupError as error:
+        say(str(error))
+        return 1
+    except OSError as error:
+        say(f'{error.filename or ROOT}: {error.strerror}')
+        return 1
+    except KeyboardInterrupt:
+        say('interrupted; run make setup again to go on')
+        return 130
+    finally:
+        os.close(folder)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

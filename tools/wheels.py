@@ -1,0 +1,91 @@
+"""The first step: .venv, filled from requirements.lock and nothing else."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import sys
+import sysconfig
+from pathlib import Path
+
+from tree import LOG, PYTHON, ROOT, VENV, SetupError, contents, digest, run, say
+
+LOCK = ROOT / 'requirements.lock'
+# Published as source only. Both are pure Python; they are built with the pinned
+# setuptools, so that none is fetched that the lock does not name.
+SOURCE_ONLY = ('empy', 'notify2')
+
+
+def wheels_key() -> str:
+    """Hash what .venv depends on; the paths too, because it cannot be moved."""
+    who = [sys.version, sys.base_prefix, str(ROOT)]
+    return digest([x.encode() for x in who] + list(contents([LOCK, Path(__file__)])))
+
+
+def make_venv(log: Path) -> None:
+    """Create .venv anew.
+
+    It is never brought up to date in place: the ROS wheels carry a second set of
+    metadata, by which an installer takes half of what they brought for strangers.
+    """
+    shutil.rmtree(VENV, ignore_errors=True)
+    problem = run([sys.executable, '-m', 'venv', VENV], log)
+    if problem is not None:
+        raise SetupError(f'{sys.executable} could not make a virtual environment: {problem}')
+
+
+def locked(names: tuple[str, ...]) -> str:
+    """Return the entries of some packages, with their hashes, from the lock file."""
+    entries = re.split(r'\n(?=\S)', LOCK.read_text(encoding='utf-8'))
+    return '\n'.join(e for e in entries if re.match(rf'({"|".join(names)})==', e)) + '\n'
+
+
+def install_wheels(log: Path) -> None:
+    """Put what the lock file names into .venv, and nothing else.
+
+    uv needs a tenth of pip's time. It does not read pip's settings, so where a
+    plant's mirror or certificate is known to pip only, pip does it.
+    """
+    pip: list[str | Path] = [PYTHON, '-m', 'pip', '--disable-pip-version-check', '--no-input']
+    pip += ['install', '--no-deps', '--require-hashes', '--only-binary', ':all:']
+    first = LOG / 'installer.txt'
+    first.write_text(locked(('setuptools', 'uv')), encoding='utf-8')
+    problem = run([*pip, '-r', first], log)
+    if problem is None:
+        build = ['--no-build-isolation', *(x for name in SOURCE_ONLY for x in ('--no-binary', name))]
+        uv: list[str | Path] = [VENV / 'bin' / 'uv', 'pip', 'install', '--python', PYTHON]
+        uv += ['--no-deps', '--require-hashes', '--only-binary', ':all:', *build, '-r', LOCK]
+        if run(uv, log) is not None:
+            say('uv did not get through to the registry; trying pip, which has its own settings')
+            problem = run([*pip, *build, '-r', LOCK], log)
+    if problem is not None:
+        raise SetupError(
+            f'the Python packages could not be installed: {problem}; check the network, or '
+            f"pip's settings for your mirror, and run make setup again; details in {log}"
+        )
+
+
+def repair_cmake() -> int:
+    """Point the wheels' exported CMake targets at this Python; return how many files.
+
+    They carry the include paths of the machine that built the wheels, and CMake
+    refuses a path that does not exist. A file is replaced, never written in place:
+    it may be a hard link into the installer's cache. A second run finds nothing
+    to do, and nothing outside .venv is looked at.
+    """
+    builder = r'/opt/python/cp\d+-cp\d+'
+    version = f'python{sys.version_info.major}.{sys.version_info.minor}'
+    include = str(sysconfig.get_config_var('INCLUDEPY'))
+    site = str(VENV / 'lib' / version / 'site-packages')
+    repaired = 0
+    for path in sorted(VENV.glob('share/*/cmake/*.cmake')):
+        text = path.read_text(encoding='utf-8')
+        right = re.sub(builder + r'/include/python3\.\d+(?=[;"])', lambda _: include, text)
+        right = re.sub(builder + r'/lib/python3\.\d+/site-packages(?=[;"/])', lambda _: site, right)
+        if right != text:
+            fresh = path.with_suffix('.new')
+            fresh.write_text(right, encoding='utf-8')
+            os.replace(fresh, path)
+            repaired += 1
+    return repaired

@@ -1,0 +1,42 @@
+"""From readings to rows, with a progress bar on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.align import Aligned, Aligner
+from valveflow_ros.records import IntArray, Readings, SampleTable
+
+Progress = Callable[[float, str], None]
+_BLOCK = 200_000  # readings between two looks at the progress bar
+
+
+def quiet(_share: float, _what: str) -> None:
+    """Show no progress."""
+
+
+def align(
+    readings: Readings, settings: Settings, progress: Progress = quiet
+) -> tuple[SampleTable, IntArray, dict[str, dict[str, int]]]:
+    """Return all rows, the rows before which the clock was set back, and the counts."""
+    aligner = Aligner(settings)
+    tables: list[SampleTable] = []
+    resets: list[int] = []
+    for aligned in aligned_blocks(aligner, readings, progress, 'putting rows together'):
+        resets += [sum(map(len, tables)) + int(k) for k in aligned.resets]
+        tables.append(aligned.table)
+    table = SampleTable.concatenate(tables)
+    return table, np.array(resets, dtype=np.int64), aligner.counts()
+
+
+def aligned_blocks(
+    aligner: Aligner, readings: Readings, progress: Progress, what: str
+) -> Iterator[Aligned]:
+    """Yield the rows block by block, with those that only the end closes."""
+    for start in range(0, len(readings), _BLOCK):
+        progress(0.1 + 0.4 * start / len(readings), what)
+        yield aligner.feed(readings.part(start, min(start + _BLOCK, len(readings))))
+    yield aligner.finish()

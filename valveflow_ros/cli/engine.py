@@ -1,0 +1,110 @@
+"""Run the engine over a finished log: the same path as live, the fit at the end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from valveflow_ros.cli.alignment import Progress, aligned_blocks, quiet
+from valveflow_ros.config import Settings
+from valveflow_ros.core.align import Aligner
+from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.events import FitRequested, JournalEntry, JournalKind, SegmentClosed
+from valveflow_ros.core.fit import FitTask, fit
+from valveflow_ros.core.monitor import Monitor
+from valveflow_ros.core.offline import feed_aligned
+from valveflow_ros.errors import DataError
+from valveflow_ros.records import SIGNALS, Readings, SampleTable, SpecialSegment
+from valveflow_ros.report.numbers import duration
+from valveflow_ros.report.quality import REASON_WORDS
+
+_NEEDED = tuple(i for i in SIGNALS if i.required and i.topic != 'main_steam_temperature')
+
+
+@dataclass(frozen=True, slots=True)
+class Watched:
+    """A log after the engine saw it, and what is needed for a fit.
+
+    Attributes
+    ----------
+    table : SampleTable
+        The rows in the engine's window; after the clock went back only those that follow.
+    segments : tuple of SpecialSegment
+    counts : dict
+        ``{topic: {reason: readings}}``.
+    task : FitTask
+    clock_resets : int
+        How often the clock went back.
+    """
+
+    table: SampleTable
+    segments: tuple[SpecialSegment, ...]
+    counts: dict[str, dict[str, int]]
+    task: FitTask
+    clock_resets: int
+
+
+def watch(readings: Readings, settings: Settings, progress: Progress = quiet) -> Watched:
+    """Feed a whole log to a monitor and ask it for a fit.
+
+    Raises
+    ------
+    DataError
+        There is nothing that could be fitted; the sentence says what is missing.
+    """
+    aligner, monitor = Aligner(settings), Monitor(settings)
+    tables: list[SampleTable] = []
+    segments: list[SpecialSegment] = []
+    resets = 0
+    for aligned in aligned_blocks(aligner, readings, progress, 'finding segments'):
+        if len(aligned.resets):
+            resets += len(aligned.resets)
+            tables.clear()
+        last = int(aligned.resets[-1]) if len(aligned.resets) else 0
+        tables.append(aligned.table.part(last, len(aligned.table)))
+        for event in feed_aligned(monitor, aligned):
+            if isinstance(event, SegmentClosed):
+                segments.append(event.segment)
+            elif isinstance(event, JournalEntry) and event.kind == JournalKind.RESET:
+                segments.clear()
+    table, counts = SampleTable.concatenate(tables), aligner.counts()
+    _check_signals(table, counts)
+    if not monitor.segments:
+        raise DataError(_no_segment(table, settings))
+    task = next(e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
+    # A log longer than the window is longer than what the fit sees.
+    first = int(task.contents.time_ns[0])
+    held = table.part(int(np.searchsorted(table.time_ns, first)), len(table))
+    inside = tuple(s for s in segments if s.start_ns >= first)
+    return Watched(held, inside, counts, task, resets)
+
+
+def identify(watched: Watched, progress: Progress = quiet) -> Characteristic:
+    """Fit the curve; raises `DataError` with the reason if the data carry none."""
+    return fit(watched.task, lambda what: progress(0.6, what))
+
+
+def _check_signals(table: SampleTable, counts: dict[str, dict[str, int]]) -> None:
+    """Refuse a log in which a needed signal has no usable value, and say which and why."""
+    for info in _NEEDED:
+        if len(table) and np.isfinite(table.column(info.signal)).any():
+            continue
+        refused = {r: n for r, n in counts[info.topic].items() if n and r != 'accepted'}
+        if not refused:
+            raise DataError(
+                f'The log has no {info.topic}; name yours with --column {info.topic}=THEIRS, '
+                f'or give --constant {info.topic}=VALUE if it hardly changes.'
+            )
+        told = ', '.join(f'{n} {REASON_WORDS.get(r, r)}' for r, n in refused.items())
+        raise DataError(f'{info.topic} has no usable value: {told}.')
+
+
+def _no_segment(table: SampleTable, settings: Settings) -> str:
+    span = duration((int(table.time_ns[-1]) - int(table.time_ns[0])) / 1e9)
+    least = settings.settle_s + min(settings.real('steady_min'), settings.real('slope_min'))
+    return (
+        f'No steady-state or slope-response segment was found in {span} of data: the valve must '
+        f'rest, or move along a straight ramp, for at least {duration(least)} at a time. '
+        'A longer log, or shorter times by --set time_constant, delay and steady_min, may help.'
+    )

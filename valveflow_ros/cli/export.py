@@ -1,0 +1,78 @@
+"""``valveflow export``: a log becomes a table."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+
+from valveflow_ros.cli.console import Console, Outcome
+from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
+
+_DESCRIPTION = """\
+Write a log as a table with one row a sample: the rows the engine sees, in its units. Where a
+signal has no usable value the cell is empty.
+
+example:
+  valveflow export plant.mcap -o plant.csv"""
+
+
+def arguments(parser: ArgumentParser) -> None:
+    """Add description, example and options."""
+    parser.description = _DESCRIPTION
+    parser.usage = 'valveflow export LOG -o TABLE [options]'
+    parser.epilog = MAPPING_HELP
+    parser.add_argument('log', metavar='LOG', type=Path, help='the log to read')
+    parser.add_argument(
+        '-o', '--output', metavar='TABLE', type=Path, required=True, help='a .csv or .parquet file'
+    )
+    add_mapping(parser)
+    parser.add_argument(
+        '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs',
+        help='a parameter, such as sample_period=10',
+    )  # fmt: skip
+    parser.add_argument('--overwrite', action='store_true', help='replace a table that is there')
+
+
+def run(options: Namespace, console: Console) -> Outcome:
+    """Align and write."""
+    mapping = read_mapping(options.column, options.constant)
+    from valveflow_ros.cli.alignment import align
+    from valveflow_ros.cli.files import check_output
+    from valveflow_ros.cli.log_input import open_input, steps_of
+    from valveflow_ros.cli.outputs import TABLES, write_log
+    from valveflow_ros.cli.parameters import read_parameters, settings_for
+    from valveflow_ros.cli.report_words import rejected_words
+    from valveflow_ros.errors import DataError
+    from valveflow_ros.report.numbers import count, duration, moment
+
+    given = read_parameters(None, options.pairs)
+    check_output(options.output, TABLES, source=options.log, overwrite=options.overwrite)
+    console.progress(0.1, 'reading')
+    log = open_input(options.log, mapping, console)
+    settings, notes = settings_for(steps_of(log.readings), 0.0, given)
+    for sentence in notes:
+        console.say(sentence)
+    table, resets, counts = align(log.readings, settings, console.progress)
+    if not len(table):
+        raise DataError('The log holds no usable reading, so there is no row to write.')
+    if len(resets):
+        raise DataError(
+            'The clock goes back within the log, and a table must go forward in time; '
+            'split the log there first.'
+        )
+    console.progress(0.7, 'writing')
+    write_log(table, options.output, overwrite=options.overwrite)
+    first, last = int(table.time_ns[0]), int(table.time_ns[-1])
+    text = (
+        f'Wrote {count(len(table))} rows, one every {duration(settings.real("sample_period"))}, '
+        f'{moment(first)} to {moment(last)}, to {options.output}.\n{rejected_words(counts)}'
+    )
+    data = {
+        'table': str(options.output),
+        'rows': len(table),
+        'sample_period_s': settings.real('sample_period'),
+        'start_ns': first,
+        'end_ns': last,
+        'readings': counts,
+    }
+    return Outcome(text, data)

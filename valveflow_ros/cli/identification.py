@@ -1,0 +1,156 @@
+"""From a log that was read to the files and the words of an identification."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from valveflow_ros.cli import engine
+from valveflow_ros.cli.console import Console, Outcome
+from valveflow_ros.cli.log_input import LogInput, steps_of
+from valveflow_ros.cli.parameters import settings_for
+from valveflow_ros.cli.report_words import columns, rejected_words
+from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.characteristic_json import to_json
+from valveflow_ros.records import SIGNALS
+from valveflow_ros.report.answer import explained, opening_gain, temperature_words
+from valveflow_ros.report.identification import identification_report
+from valveflow_ros.report.identified import Identified
+from valveflow_ros.report.numbers import (
+    count,
+    counted,
+    decimals,
+    interval,
+    moment,
+    percent,
+    plain,
+    with_error,
+)
+from valveflow_ros.report.quality import rejected
+
+
+def found_in(
+    log: LogInput, given: Mapping[str, Any], source: Path, console: Console
+) -> Identified:
+    """Run the engine and the fit.
+
+    Raises
+    ------
+    DataError
+        The data carry no curve; the sentence says why.
+    """
+    times = log.readings.time_ns
+    span_s = float(times.max() - times.min()) / 1e9 if len(times) else 0.0
+    settings, notes = settings_for(steps_of(log.readings), span_s, given)
+    notes += _constant_notes(log)
+    for sentence in notes:
+        console.say(sentence)
+    watched = engine.watch(log.readings, settings, console.progress)
+    if watched.clock_resets:
+        told = 'The clock went back within the log; only what follows the last time counts.'
+        console.warn(told)
+        notes.append(told)
+    characteristic = engine.identify(watched, console.progress)
+    return Identified(
+        source=source.name, characteristic=characteristic, table=watched.table,
+        segments=watched.segments, counts=watched.counts, settings=settings,
+        notes=(*log.contents.warnings, *(d.sentence for d in log.doubts), *notes),
+    )  # fmt: skip
+
+
+def _constant_notes(log: LogInput) -> list[str]:
+    return [
+        f'{SIGNALS[signal].topic} was not logged and is taken as {value:g} {SIGNALS[signal].unit}.'
+        for signal, value in sorted(log.constants.items())
+    ]
+
+
+def texts(found: Identified) -> dict[str, str]:
+    """Return the files of the result by name."""
+    content = json.dumps(to_json(found.characteristic), indent=2, allow_nan=False)
+    return {
+        'characteristic.json': content + '\n',
+        'report.html': identification_report(found),
+    }
+
+
+def outcome(found: Identified, written: Mapping[str, Path], log: LogInput) -> Outcome:
+    """Return what is printed at the end."""
+    data = {
+        **to_json(found.characteristic),
+        'explained': explained(found),
+        'readings': found.counts,
+        'sample_period_s': found.settings.real('sample_period'),
+        'inputs': {SIGNALS[s].topic: name for s, name in log.contents.signals.items()},
+        'constants': {SIGNALS[s].topic: value for s, value in log.constants.items()},
+        'reading_notes': list(found.notes),
+        'files': {name: str(path) for name, path in written.items()},
+    }
+    return Outcome(_text(found, written), data)
+
+
+def _text(found: Identified, written: Mapping[str, Path]) -> str:
+    c = found.characteristic
+    parts = [
+        f'{found.source}: {moment(c.source.window_start_ns)} to {moment(c.source.window_end_ns)}',
+        f'The flow characteristic has {counted(len(c.pieces), "piece")} and explains '
+        f'{percent(explained(found))} of the variance of the power.',
+        _pieces(found),
+        _breakpoints(c),
+        _dynamics(c),
+        f'Found in {counted(c.source.steady, "steady-state segment")} and '
+        f'{counted(c.source.slope_response, "slope-response segment")}, '
+        f'{counted(c.source.samples, "sample")}. Typical difference '
+        f'{plain(c.residuals.rmse_mw, 2)} MW.',
+        temperature_words(c),
+        *c.notes,
+        rejected_words(found.counts) if rejected(found.counts) else '',
+        f'Wrote {written["report.html"]} and {written["characteristic.json"].name}.',
+    ]
+    return '\n'.join(part for part in parts if part)
+
+
+def _pieces(found: Identified) -> str:
+    c = found.characteristic
+    rows = []
+    for k, piece in enumerate(c.pieces):
+        gain, pressure = opening_gain(found, piece)
+        at = f'{plain(gain, 3)} at {plain(pressure, 3)} MPa' if math.isfinite(gain) else '-'
+        rows.append(
+            [
+                str(k + 1),
+                f'{decimals(piece.u_from, 1)} to {decimals(piece.u_to, 1)}',
+                with_error(piece.slope, piece.slope_stderr),
+                with_error(piece.intercept, piece.intercept_stderr),
+                at,
+                count(piece.samples),
+            ]
+        )
+    head = ['piece', 'u (% MPa^m)', 'slope (MW per u)', 'intercept (MW)', 'MW per 1 % opening',
+            'samples']  # fmt: skip
+    return columns(rows, head)
+
+
+def _breakpoints(c: Characteristic) -> str:
+    rows = [
+        [decimals(piece.u_to, 1), f'{interval(low, high)}', f'{decimals(float(value), 1)} MW']
+        for piece, (low, high), value in zip(
+            c.pieces[:-1], c.breakpoint_intervals, c.values()[1:-1], strict=True
+        )
+    ]
+    return columns(rows, ['breakpoint u', '95 % interval', 'power']) if rows else ''
+
+
+def _dynamics(c: Characteristic) -> str:
+    rows = [
+        [
+            f'{decimals(d.power_from, 0)} to {decimals(d.power_to, 0)} MW',
+            with_error(d.time_constant_s, d.time_constant_stderr_s, 's'),
+            with_error(d.delay_s, d.delay_stderr_s, 's'),
+        ]
+        for d in c.dynamics
+    ]
+    return columns(rows, ['dynamics', 'time constant', 'delay']) if rows else ''

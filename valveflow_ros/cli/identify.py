@@ -1,0 +1,66 @@
+"""``valveflow identify``: the flow characteristic of a log."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from valveflow_ros.cli.console import Console, Outcome
+from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
+
+if TYPE_CHECKING:
+    from valveflow_ros.report.identified import Identified
+
+_DESCRIPTION = """\
+Find the flow characteristic of the valve in a log of ordinary operation: the moments in
+which the unit rests or moves along a ramp are searched out, and the best curve of straight
+pieces is put through them. DIR gets report.html for people and characteristic.json for
+programs. The step of the data is found by itself.
+
+example:
+  valveflow identify plant.mcap -o result
+
+and for a table with names of your own:
+  valveflow identify history.csv -o result --column valve_opening=CV_POS
+      --column main_steam_pressure=PT_100:bar --column generated_power=MW_GROSS
+      --constant main_steam_temperature=540"""
+
+
+def arguments(parser: ArgumentParser) -> None:
+    """Add description, example and options."""
+    parser.description = _DESCRIPTION
+    parser.usage = 'valveflow identify LOG -o DIR [options]'
+    parser.epilog = MAPPING_HELP
+    parser.add_argument('log', metavar='LOG', type=Path, help='the log to read')
+    parser.add_argument(
+        '-o', '--output', metavar='DIR', type=Path, required=True,
+        help='folder for the results, made if absent',
+    )  # fmt: skip
+    parser.add_argument(
+        '--params', metavar='FILE', type=Path, help='parameters, a YAML file as the node takes it'
+    )
+    parser.add_argument(
+        '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs',
+        help='one parameter, such as time_constant=120; stands above the file',
+    )  # fmt: skip
+    add_mapping(parser)
+
+
+def run(options: Namespace, console: Console) -> Outcome:
+    """Read, watch, fit, write."""
+    mapping = read_mapping(options.column, options.constant)
+    console.progress(0.0, 'starting')
+    from valveflow_ros.cli.files import check_folder, write_texts
+    from valveflow_ros.cli.identification import found_in, outcome, texts
+    from valveflow_ros.cli.log_input import open_input
+    from valveflow_ros.cli.parameters import read_parameters
+
+    given = read_parameters(options.params, options.pairs)
+    check_folder(options.output)
+    console.progress(0.02, 'reading')
+    log = open_input(options.log, mapping, console)
+    found: Identified = found_in(log, given, options.log, console)
+    console.progress(0.9, 'writing the report')
+    written = write_texts(options.output, texts(found))
+    return outcome(found, written, log)

@@ -1,0 +1,207 @@
+"""A log as the engine wants it: readings in its own units, constants filled in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from valveflow_ros.cli.console import Console
+from valveflow_ros.cli.mapping import Column, Mapping
+from valveflow_ros.cli.plausible import Doubt, doubt, limits
+from valveflow_ros.cli.usage import UsageError
+from valveflow_ros.config import Settings
+from valveflow_ros.core.units import UNITS, convert
+from valveflow_ros.errors import DataError, InputError
+from valveflow_ros.logs import LogContents, open_log
+from valveflow_ros.records import SIGNALS, Quality, Readings, Signal
+
+_BY_TOPIC = {info.topic: info for info in SIGNALS}
+
+
+@dataclass(frozen=True, slots=True)
+class LogInput:
+    """What was read, and how it was understood.
+
+    Attributes
+    ----------
+    contents : LogContents
+        As it stands in the file.
+    readings : Readings
+        In engine units; constants stand at the times of another signal.
+    units : dict
+        The unit each measured signal was taken to have.
+    constants : dict
+        Value of each constant signal, engine units.
+    doubts : list of Doubt
+        Signals whose values do not suit their unit.
+    """
+
+    contents: LogContents
+    readings: Readings
+    units: dict[Signal, str]
+    constants: dict[Signal, float]
+    doubts: list[Doubt]
+
+    def name_of(self, signal: Signal) -> str:
+        """Return the topic or column a signal comes from, empty if it is not there."""
+        return '' if signal in self.constants else self.contents.signals.get(signal, '')
+
+
+def open_input(path: Path, mapping: Mapping, console: Console) -> LogInput:
+    """Open a log, convert it, and say aloud what looks wrong.
+
+    Raises
+    ------
+    RecordingError, InputError, DataError
+        The log cannot be read, a column is missing, a unit unknown.
+    """
+    contents = open_with(path, mapping)
+    for sentence in contents.warnings:
+        console.warn(sentence)
+    units = {s: unit_for(s, mapping) for s in contents.signals}
+    constants = {_BY_TOPIC[c.name].signal: c.value for c in mapping.constants.values()}
+    check_constants(constants)
+    readings = _converted(contents.readings, units)
+    doubts = _doubts(contents, units, constants)
+    for found in doubts:
+        console.warn(advice(found, contents.signals[found.signal]))
+    for signal in constants.keys() & contents.signals.keys():
+        console.warn(
+            f"{SIGNALS[signal].topic} stands in the log as '{contents.signals[signal]}' too; "
+            'the constant is used instead.'
+        )
+    return LogInput(contents, _with_constants(readings, constants), units, constants, doubts)
+
+
+def open_with(path: Path, mapping: Mapping) -> LogContents:
+    """Open a log under the names of ``--column``; raises like `open_input`."""
+    columns, strange = names_for(mapping)
+    try:
+        return open_log(path, columns=columns, absent=list(mapping.constants))
+    except InputError as error:
+        if not strange:
+            raise
+        raise unknown_unit(strange[0]) from error
+
+
+def names_for(mapping: Mapping) -> tuple[dict[str, str], list[Column]]:
+    """Return contract name to their name, and the columns whose unit is unknown.
+
+    Where what follows the last colon is no unit, the colon is taken to belong
+    to the column's name.
+    """
+    strange = [c for c in mapping.columns.values() if not _is_known(c)]
+    columns = {c.name: c.whole if c in strange else c.theirs for c in mapping.columns.values()}
+    return columns, strange
+
+
+def unknown_unit(column: Column) -> UsageError:
+    """Return the error for a unit nobody knows."""
+    known = ', '.join(UNITS[_BY_TOPIC[column.name].signal])
+    return UsageError(
+        f"Unit '{column.unit}' is unknown for {column.name}: use one of {known} "
+        f"(and the log has nothing called '{column.whole}')."
+    )
+
+
+def _is_known(column: Column) -> bool:
+    return not column.unit or column.unit in UNITS[_BY_TOPIC[column.name].signal]
+
+
+def unit_for(signal: Signal, mapping: Mapping) -> str:
+    """Return the unit a signal of the log is taken to have."""
+    info = SIGNALS[signal]
+    column = mapping.columns.get(info.topic)
+    return column.unit if column and column.unit and _is_known(column) else info.unit
+
+
+def check_constants(constants: dict[Signal, float]) -> None:
+    """Refuse constants that the engine would reject at each row.
+
+    Raises
+    ------
+    UsageError
+    """
+    settings = Settings()
+    for signal, value in constants.items():
+        low, high = limits(signal, settings)
+        if not low <= value <= high:
+            info = SIGNALS[signal]
+            others = ', '.join(list(UNITS[signal])[1:])
+            raise UsageError(
+                f'--constant {info.topic}: {value:g} {info.unit} is impossible ({low:g} to '
+                f'{high:g} {info.unit}); for another unit write {info.topic}=VALUE:UNIT with one '
+                f'of {others}.'
+            )
+
+
+def advice(found: Doubt, theirs: str) -> str:
+    """Return the sentence about a doubtful signal, with the exact option that helps."""
+    if not found.looks_like:
+        return found.sentence
+    topic = SIGNALS[found.signal].topic
+    quoted = f"'{topic}={theirs}:{found.looks_like}'"
+    plain = quoted[1:-1]
+    return f'{found.sentence} If so, add --column {quoted if " " in theirs else plain}'
+
+
+def steps_of(readings: Readings) -> dict[Signal, float]:
+    """Return the median time between readings of each signal that has several, in s."""
+    steps: dict[Signal, float] = {}
+    for info in SIGNALS:
+        times = readings.time_ns[readings.signal == info.signal]
+        gaps = np.diff(times)
+        gaps = gaps[gaps > 0]
+        if len(gaps):
+            steps[info.signal] = float(np.median(gaps)) / 1e9
+    return steps
+
+
+def _converted(readings: Readings, units: dict[Signal, str]) -> Readings:
+    value = readings.value
+    for signal, unit in units.items():
+        if unit == SIGNALS[signal].unit:
+            continue
+        mine = readings.signal == signal
+        value = value.copy() if value is readings.value else value
+        value[mine] = convert(signal, unit, value[mine])
+    return replace(readings, value=value)
+
+
+def _doubts(
+    contents: LogContents, units: dict[Signal, str], constants: Iterable[Signal]
+) -> list[Doubt]:
+    settings = Settings()
+    readings = contents.readings
+    judged = [s for s in sorted(contents.signals) if s not in constants]
+    found = [doubt(s, readings.value[readings.signal == s], units[s], settings) for s in judged]
+    return [d for d in found if d is not None]
+
+
+def _with_constants(readings: Readings, constants: dict[Signal, float]) -> Readings:
+    """Put each constant beside every reading of a measured signal."""
+    if not constants:
+        return readings
+    kept = ~np.isin(readings.signal, [int(s) for s in constants])
+    readings = Readings(
+        readings.time_ns[kept], readings.signal[kept], readings.value[kept],
+        readings.quality[kept],
+    )  # fmt: skip
+    measured = [i.signal for i in SIGNALS if i.required and i.signal not in constants]
+    lead = next((s for s in measured if (readings.signal == s).any()), None)
+    if lead is None:
+        raise DataError('Every signal is a constant or missing; nothing is left to learn from.')
+    beside = np.flatnonzero(readings.signal == lead)
+    for signal, value in sorted(constants.items()):
+        n = len(beside)
+        readings = Readings(
+            np.insert(readings.time_ns, beside, readings.time_ns[beside]),
+            np.insert(readings.signal, beside, np.full(n, int(signal), dtype=np.int8)),
+            np.insert(readings.value, beside, np.full(n, value)),
+            np.insert(readings.quality, beside, np.full(n, int(Quality.GOOD), dtype=np.uint8)),
+        )
+        beside = beside + np.arange(1, n + 1)
+    return readings

@@ -1,0 +1,60 @@
+"""``valveflow recover``: make a whole recording of what is left of one."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+
+from valveflow_ros.cli.console import Console, Outcome
+
+_DESCRIPTION = """\
+Repair a recording that a crash, a full disk or a bad sector has left: everything that is
+intact is copied and gets a new index, what is damaged is left out and counted. Nothing is
+repaired by guessing, and the broken file is not touched.
+
+example:
+  valveflow recover broken.mcap -o whole.mcap"""
+
+
+def arguments(parser: ArgumentParser) -> None:
+    """Add description, example and options."""
+    parser.description = _DESCRIPTION
+    parser.usage = 'valveflow recover BROKEN -o LOG [options]'
+    parser.add_argument('broken', metavar='BROKEN', type=Path, help='an .mcap or .mcap.part file')
+    parser.add_argument(
+        '-o', '--output', metavar='LOG', type=Path, required=True, help='the whole .mcap file'
+    )
+
+
+def run(options: Namespace, console: Console) -> Outcome:
+    """Recover and say what was kept."""
+    from valveflow_ros.cli.files import check_output
+    from valveflow_ros.logs import recover
+    from valveflow_ros.report.numbers import count, counted
+
+    check_output(options.output, ('.mcap',), source=options.broken)
+    console.progress(0.2, 'recovering')
+    report = recover(options.broken, options.output)
+    for sentence in report.warnings:
+        console.warn(sentence)
+    lost = (
+        f'{counted(report.damaged_chunks, "place")} damaged and left out'
+        if report.damaged_chunks
+        else 'nothing damaged'
+    )
+    text = (
+        f'Kept {counted(report.messages, "message")} in {counted(report.chunks, "chunk")}; {lost}.'
+        f'\nRead {count(report.bytes_read)} bytes, wrote {count(report.bytes_written)} '
+        f'to {report.out}.'
+    )
+    data = {
+        'source': str(report.source),
+        'log': str(report.out),
+        'messages': report.messages,
+        'chunks': report.chunks,
+        'damaged_chunks': report.damaged_chunks,
+        'bytes_read': report.bytes_read,
+        'bytes_written': report.bytes_written,
+        'warnings': list(report.warnings),
+    }
+    return Outcome(text, data)

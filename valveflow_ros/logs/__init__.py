@@ -1,0 +1,39 @@
+"""Files, without ROS: recordings in MCAP, tables in CSV and Parquet, repair."""
+
+from valveflow_ros.logs.cdr import Decoder
+from valveflow_ros.logs.contents import LogContents, LoggedMessage, TopicInfo
+from valveflow_ros.logs.definitions import Definitions
+from valveflow_ros.logs.importing import WrittenLog, write_samples
+from valveflow_ros.logs.qos import LATCHED, Qos
+from valveflow_ros.logs.reader import open_log
+from valveflow_ros.logs.recorder import Recorder
+from valveflow_ros.logs.recorder_status import RecorderSettings, RecorderState, RecorderStatus
+from valveflow_ros.logs.recover import RecoveryReport, recover, recover_leftovers
+from valveflow_ros.logs.table_write import write_table
+from valveflow_ros.logs.tables import RawTable, read_table
+from valveflow_ros.logs.writer import Message, RecordingWriter
+
+__all__ = [
+    'LATCHED',
+    'Decoder',
+    'Definitions',
+    'LogContents',
+    'LoggedMessage',
+    'Message',
+    'Qos',
+    'RawTable',
+    'Recorder',
+    'RecorderSettings',
+    'RecorderState',
+    'RecorderStatus',
+    'RecordingWriter',
+    'RecoveryReport',
+    'TopicInfo',
+    'WrittenLog',
+    'open_log',
+    'read_table',
+    'recover',
+    'recover_leftovers',
+    'write_samples',
+    'write_table',
+]

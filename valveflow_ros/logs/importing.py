@@ -1,0 +1,185 @@
+"""Turns a table of samples into a recording, as fast as the disk allows.
+
+Records are laid out for a whole chunk at once: all of them have the same size,
+so a structured array is the chunk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from valveflow_ros.errors import DataError, RecordingError
+from valveflow_ros.logs.chunk_builder import CHUNK_BYTES, pack_content
+from valveflow_ros.logs.chunk_file import ChunkFile
+from valveflow_ros.logs.compression import Packer
+from valveflow_ros.logs.definitions import Definitions
+from valveflow_ros.logs.folder import (
+    LIBRARY,
+    METADATA_NAME,
+    Split,
+    information_text,
+    write_metadata,
+)
+from valveflow_ros.logs.layout import RECORD_HEAD, Attachment, Op
+from valveflow_ros.logs.names import FLOAT64
+from valveflow_ros.logs.part_file import PartFile, make_folder
+from valveflow_ros.logs.topic_book import TableSchedule, TopicBook
+from valveflow_ros.logs.writer import Metadata, media_type
+from valveflow_ros.records import SIGNALS, IntArray, SampleTable, table_to_readings
+
+_RECORD = np.dtype(
+    [
+        ('op', 'u1'),
+        ('length', '<u8'),
+        ('channel', '<u2'),
+        ('sequence', '<u4'),
+        ('log_time', '<i8'),
+        ('publish_time', '<i8'),
+        ('mark', '>u4'),
+        ('value', '<f8'),
+    ]
+)
+# Little-endian CDR, no options.
+_MARK = 0x00010000
+_PER_CHUNK = CHUNK_BYTES // _RECORD.itemsize
+
+
+@dataclass(frozen=True, slots=True)
+class WrittenLog:
+    """A recording that was written: its file, how many messages, and sentences about it."""
+
+    path: Path
+    messages: int
+    notes: tuple[str, ...] = ()
+
+
+def write_samples(
+    table: SampleTable,
+    path: str | Path,
+    *,
+    prefix: str = '',
+    attachments: Mapping[str, bytes] | None = None,
+    metadata: Metadata | None = None,
+    definitions: Definitions | None = None,
+    overwrite: bool = False,
+) -> WrittenLog:
+    """Write samples as ``std_msgs/Float64`` topics named after the signals.
+
+    A sample's time is the publish time of its values. Log times are the same,
+    but for values of one sample, which follow each other by a nanosecond, so
+    that every reader sees them in the same order.
+
+    Parameters
+    ----------
+    table : SampleTable
+        Its NaN in required signals are written, as values of bad quality.
+    path : str or Path
+        Ending in ``.mcap``: that file. Otherwise a folder as rosbag2 makes it.
+    prefix : str
+        Namespace before the topics, such as ``/unit1``.
+    attachments, metadata, definitions
+        As in `RecordingWriter`.
+    overwrite : bool
+        Take the place of a file that exists.
+
+    Raises
+    ------
+    DataError
+        If there is nothing to write.
+    RecordingError
+        If the file exists or cannot be written.
+    """
+    place = Path(path)
+    target = place if place.suffix == '.mcap' else place / f'{place.resolve().name}_0.mcap'
+    if target.exists() and not overwrite:
+        raise RecordingError(target, 'exists already')
+    records = _records(table)
+    book = TopicBook(definitions or Definitions())
+    for info in SIGNALS:
+        if info.required or np.isfinite(table.column(info.signal)).any():
+            book.add(f'{prefix.rstrip("/")}/{info.topic}', FLOAT64)
+    try:
+        make_folder(target.parent)
+        out = PartFile(target, replace=True)
+        try:
+            file = ChunkFile(out, LIBRARY)
+            for name, data in (attachments or {}).items():
+                file.put_attachment(Attachment(name, media_type(name), data))
+            for name, items in (metadata or {}).items():
+                file.put_metadata(name, items)
+            _put_chunks(file, records, book)
+            split = Split.of_file(target.name, file, book.table)
+            information = information_text([split])
+            file.put_metadata('rosbag2', {'serialized_metadata': information})
+            file.finish(book.table)
+        except BaseException:
+            out.discard()
+            raise
+        notes = _describe_beside(target, split)
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(target, f'cannot be written ({reason})') from None
+    return WrittenLog(target, len(records), notes)
+
+
+def _records(table: SampleTable) -> NDArray[np.void]:
+    """Return message records in the order of their log times; channel ids are signals + 1."""
+    readings = table_to_readings(table)
+    if not len(readings):
+        raise DataError('There are no samples to write.')
+    if int(readings.time_ns[0]) < 0:
+        raise DataError('The samples begin before 1970, which a recording cannot hold.')
+    records: NDArray[np.void] = np.zeros(len(readings), dtype=_RECORD)
+    records['op'] = int(Op.MESSAGE)
+    records['length'] = _RECORD.itemsize - RECORD_HEAD.size
+    records['channel'] = readings.signal + 1
+    records['log_time'] = strictly_increasing(readings.time_ns)
+    records['publish_time'] = readings.time_ns
+    records['mark'] = _MARK
+    records['value'] = readings.value
+    for channel in np.unique(records['channel']).tolist():
+        mine = records['channel'] == channel
+        records['sequence'][mine] = np.arange(1, int(mine.sum()) + 1)
+    return records
+
+
+def strictly_increasing(times: IntArray) -> IntArray:
+    """Return times of which each is at least a nanosecond after the one before."""
+    steps = np.arange(len(times), dtype=np.int64)
+    return np.maximum.accumulate(times - steps) + steps
+
+
+def _put_chunks(file: ChunkFile, records: NDArray[np.void], book: TopicBook) -> None:
+    schedule, packer, topics = TableSchedule(), Packer(), len(book.ids)
+    for start in range(0, len(records), _PER_CHUNK):
+        part = records[start : start + _PER_CHUNK]
+        due = schedule.due(topics)
+        table = book.packed() if due else b''
+        offset = len(table) + _RECORD.itemsize * np.arange(len(part), dtype=np.int64)
+        file.put_chunk(
+            pack_content(table + part.tobytes(), part['channel'], part['log_time'], offset, packer)
+        )
+        schedule.done(topics, due)
+
+
+def _describe_beside(target: Path, split: Split) -> tuple[str, ...]:
+    """Write `metadata.yaml`, unless one that tells of other files stands there."""
+    path = target.parent / METADATA_NAME
+    if path.exists() and not _tells_of(path, target.name):
+        return (f'{path} tells of another recording and was left as it is.',)
+    write_metadata(target.parent, [split])
+    return ()
+
+
+def _tells_of(path: Path, name: str) -> bool:
+    try:
+        top = yaml.safe_load(path.read_text(encoding='utf-8'))
+        return bool(top['rosbag2_bagfile_information']['relative_file_paths'] == [name])
+    except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError):
+        return False

@@ -1,0 +1,159 @@
+"""Goes through the raw messages of a recording again, in the order of their log times."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from valveflow_ros.errors import RecordingError
+from valveflow_ros.logs.contents import LoggedMessage
+from valveflow_ros.logs.found import FileContents, Group
+from valveflow_ros.logs.layout import LayoutError
+from valveflow_ros.logs.limits import OverBudgetError
+from valveflow_ros.logs.scan import Scanner
+from valveflow_ros.logs.source import Source
+from valveflow_ros.logs.walk import HEAD_SIZE, MessageTable, walk
+from valveflow_ros.records import IntArray
+
+_END = np.iinfo(np.int64).max
+
+
+@dataclass(frozen=True, slots=True)
+class _Batch:
+    """Messages of one group that wait for their turn."""
+
+    file: int
+    place: int
+    content: bytes
+    table: MessageTable
+    rows: IntArray
+
+
+class Journal:
+    """The raw messages of one or several files; holds only what overlaps in time.
+
+    Parameters
+    ----------
+    files : list of FileContents
+        What `gather` found, in the order of the splits.
+    unchecked : bool
+        As when they were found.
+    """
+
+    def __init__(self, files: list[FileContents], unchecked: bool = False) -> None:
+        self._files = files
+        self._unchecked = unchecked
+
+    def messages(self, topics: Collection[str] | None) -> Iterator[LoggedMessage]:
+        """Yield messages; see `LogContents.iter_messages`."""
+        repeats = _Repeats()
+        plan = sorted(
+            (group.first_ns, number, place)
+            for number, file in enumerate(self._files)
+            for place, group in enumerate(file.groups)
+            if group.channels & _channels(file, topics).keys()
+        )
+        waiting: list[_Batch] = []
+        for index, (_, number, place) in enumerate(plan):
+            waiting.append(self._load(number, place, topics))
+            # Nothing that is still to be read can come before this.
+            until = plan[index + 1][0] if index + 1 < len(plan) else _END
+            yield from self._release(waiting, until, repeats)
+
+    def _load(self, number: int, place: int, topics: Collection[str] | None) -> _Batch:
+        file = self._files[number]
+        content = self._content(file, file.groups[place])
+        table, _ = walk(content)
+        wanted = np.isin(table.channel, list(_channels(file, topics)))
+        return _Batch(number, place, content, table, np.flatnonzero(wanted))
+
+    def _release(
+        self, waiting: list[_Batch], until: int, repeats: _Repeats
+    ) -> Iterator[LoggedMessage]:
+        """Yield what comes before ``until`` and keep the rest waiting."""
+        waiting.sort(key=lambda batch: (batch.file, batch.place))
+        times = [batch.table.log_time[batch.rows] for batch in waiting]
+        due = [part < until for part in times]
+        # A stable sort keeps messages of one time in the order of files and places.
+        due_times = [part[mask] for part, mask in zip(times, due, strict=True)]
+        order = np.argsort(np.concatenate(due_times), kind='stable')
+        lines = [
+            line
+            for batch, part in zip(waiting, due, strict=True)
+            for line in self._lines(batch, batch.rows[part])
+        ]
+        waiting[:] = [
+            replace(batch, rows=batch.rows[~part])
+            for batch, part in zip(waiting, due, strict=True)
+            if not part.all()
+        ]
+        single = len(self._files) == 1
+        for index in order.tolist():
+            line = lines[index]
+            if single or not repeats.seen(*line):
+                yield line[2]
+
+    def _lines(self, batch: _Batch, rows: IntArray) -> Iterator[tuple[int, int, LoggedMessage]]:
+        names = _channels(self._files[batch.file], None)
+        table, content = batch.table, batch.content
+        starts = table.offset[rows] + HEAD_SIZE
+        columns = (
+            table.channel[rows],
+            table.sequence[rows],
+            table.log_time[rows],
+            table.publish_time[rows],
+            starts,
+            starts + table.size[rows],
+        )
+        for channel, sequence, log_ns, publish_ns, start, end in zip(
+            *(column.tolist() for column in columns), strict=True
+        ):
+            topic, kind = names[channel]
+            message = LoggedMessage(topic, kind, log_ns, publish_ns, content[start:end])
+            yield batch.file, sequence, message
+
+    def _content(self, file: FileContents, group: Group) -> bytes:
+        try:
+            with Source.open(file.path) as source:
+                scanner = Scanner(source, unchecked=self._unchecked)
+                return b''.join(scanner.chunk_at(offset).content for offset in group.chunks)
+        except (LayoutError, OverBudgetError):
+            raise RecordingError(file.path, 'has changed while it was read') from None
+
+
+class _Repeats:
+    """Knows the latched messages that a recorder wrote again at the head of a split."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, tuple[int, LoggedMessage]] = {}
+        self._met: set[tuple[int, str]] = set()
+
+    def seen(self, file: int, sequence: int, message: LoggedMessage) -> bool:
+        """Tell whether the first message of a topic in a split is the last of those before.
+
+        The number that the writer gave it tells a repetition from a message
+        that happens to be equal.
+        """
+        last = self._last.get(message.topic)
+        self._last[message.topic] = (sequence, message)
+        if last is None or (file, message.topic) in self._met:
+            self._met.add((file, message.topic))
+            return False
+        self._met.add((file, message.topic))
+        before = last[1]
+        return (
+            sequence == last[0]
+            and message.publish_time_ns == before.publish_time_ns
+            and message.data == before.data
+        )
+
+
+def _channels(file: FileContents, topics: Collection[str] | None) -> dict[int, tuple[str, str]]:
+    """Return topic and type by channel, of some or all topics that the file names."""
+    return {
+        number: (channel.topic, file.table.type_of(channel))
+        for number, channel in file.table.channels.items()
+        if topics is None or channel.topic in topics
+    }

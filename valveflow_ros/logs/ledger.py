@@ -1,0 +1,98 @@
+"""The account of a recorder, kept so that every message is in exactly one column."""
+
+from __future__ import annotations
+
+import threading
+
+from valveflow_ros.logs.recorder_status import RecorderState, RecorderStatus
+from valveflow_ros.logs.recover import RecoveryReport
+
+
+class Ledger:
+    """Shared by the recorder's thread and everyone who asks; nobody holds it for long."""
+
+    def __init__(self, limit: int) -> None:
+        self._lock = threading.Lock()
+        self._limit = limit
+        self._open = True
+        self._received = self._written = self._queued = self._lost = 0
+        self._dropped: dict[str, int] = {}
+        self._drops = 0
+        self._drops_told = 0
+        self._state, self._reason = RecorderState.RECORDING, ''
+        self._file, self._files, self._bytes = '', 0, 0
+        self._recovered: tuple[RecoveryReport, ...] = ()
+
+    def admit(self, topic: str) -> bool:
+        """Count a message in; False if it must be dropped."""
+        with self._lock:
+            self._received += 1
+            if self._open and self._queued < self._limit:
+                self._queued += 1
+                return True
+            self._dropped[topic] = self._dropped.get(topic, 0) + 1
+            self._drops += 1
+            return False
+
+    def refuse(self) -> None:
+        """Drop whatever comes from now on."""
+        with self._lock:
+            self._open = False
+
+    def settle(self, written: int, file: str, files: int, size: int) -> None:
+        """Take note of how many messages are on disk in all, and where."""
+        with self._lock:
+            self._queued -= written - self._written
+            self._written = written
+            self._file, self._files, self._bytes = file, files, size
+
+    def well(self) -> None:
+        """All that waited could be written."""
+        with self._lock:
+            fresh, self._drops_told = self._drops - self._drops_told, self._drops
+            if fresh and self._open:
+                self._state = RecorderState.DEGRADED
+                self._reason = f'{fresh} messages were dropped because too many were waiting'
+            else:
+                self._state, self._reason = RecorderState.RECORDING, ''
+
+    def ill(self, reason: str) -> None:
+        """Say that nothing can be written for now."""
+        with self._lock:
+            self._state, self._reason = RecorderState.DEGRADED, reason
+
+    def recovered(self, reports: tuple[RecoveryReport, ...]) -> None:
+        """Take note of leftovers that were finished."""
+        with self._lock:
+            self._recovered = reports
+
+    def stopped(self, reason: str = '') -> None:
+        """Close the account: what waits now is lost."""
+        with self._lock:
+            self._open = False
+            self._lost += self._queued
+            self._queued = 0
+            self._state, self._reason, self._file = RecorderState.STOPPED, reason, ''
+
+    def counters(self) -> dict[str, str]:
+        """Return the account as it is written into the recording."""
+        status = self.status()
+        items = {f'dropped {topic}': str(count) for topic, count in status.dropped.items()}
+        return {'received': str(status.received), **items}
+
+    def status(self) -> RecorderStatus:
+        """Return the account."""
+        with self._lock:
+            return RecorderStatus(
+                self._state,
+                self._reason,
+                self._file,
+                self._received,
+                self._written,
+                self._queued,
+                self._lost,
+                dict(self._dropped),
+                self._files,
+                self._bytes,
+                self._recovered,
+            )

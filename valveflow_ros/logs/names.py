@@ -1,0 +1,144 @@
+"""Which topic or column stands for which signal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from valveflow_ros.errors import InputError, RecordingError
+from valveflow_ros.records import SIGNALS, Signal
+
+FLOAT64 = 'std_msgs/msg/Float64'
+PLANT_SAMPLE = 'valveflow_msgs/msg/PlantSample'
+PLANT_SAMPLE_TOPIC = 'plant_sample'
+
+_BY_NAME = {info.topic: info.signal for info in SIGNALS} | {
+    info.column: info.signal for info in SIGNALS
+}
+_TOPICS = {info.topic for info in SIGNALS}
+
+
+def signal_of(name: str) -> Signal:
+    """Return the signal of a contract name, written as topic or as column.
+
+    Raises
+    ------
+    InputError
+        If there is no such name.
+    """
+    try:
+        return _BY_NAME[name]
+    except KeyError:
+        known = ', '.join(info.column for info in SIGNALS)
+        raise InputError(f"There is no signal '{name}'; there are {known}.") from None
+
+
+def signals_of(names: Iterable[str]) -> set[Signal]:
+    """Return the signals of several contract names; raises like `signal_of`."""
+    return {signal_of(name) for name in names}
+
+
+def last_part(topic: str) -> str:
+    """Return the part of a topic behind its last slash."""
+    return topic.rsplit('/', 1)[-1]
+
+
+class TopicChoice:
+    """Chooses among the topics of a recording.
+
+    Parameters
+    ----------
+    wanted : mapping of str to str
+        Contract name (or ``plant_sample``) to the topic that is to stand for it.
+
+    Raises
+    ------
+    InputError
+        If a contract name is unknown.
+    """
+
+    def __init__(self, wanted: Mapping[str, str]) -> None:
+        self._stamped = wanted.get(PLANT_SAMPLE_TOPIC)
+        self._wanted = {
+            signal_of(name): topic for name, topic in wanted.items() if name != PLANT_SAMPLE_TOPIC
+        }
+        self._wanted_topics = {_rooted(topic) for topic in wanted.values()}
+
+    def may_matter(self, topic: str, type_name: str) -> bool:
+        """Tell whether a topic may turn out to be chosen."""
+        if type_name == FLOAT64:
+            return last_part(topic) in _TOPICS or _rooted(topic) in self._wanted_topics
+        if type_name == PLANT_SAMPLE:
+            named = last_part(topic) == PLANT_SAMPLE_TOPIC
+            return named or _rooted(topic) in self._wanted_topics
+        return False
+
+    def signals(self, types: Mapping[str, str], path: str) -> dict[str, Signal]:
+        """Return the Float64 topics to be read and what each stands for.
+
+        Parameters
+        ----------
+        types : mapping of str to str
+            Every topic of the recording and its type.
+        path : str
+            The recording, for the sentence.
+
+        Raises
+        ------
+        InputError
+            If two topics could stand for one signal, or a wanted topic is not there.
+        """
+        chosen: dict[str, Signal] = {}
+        for info in SIGNALS:
+            wanted = self._wanted.get(info.signal)
+            if wanted is not None:
+                chosen[_present(wanted, info.topic, FLOAT64, types, path)] = info.signal
+                continue
+            topic = _only(info.topic, FLOAT64, types, path)
+            if topic is not None:
+                chosen.setdefault(topic, info.signal)
+        return chosen
+
+    def plant_sample(self, types: Mapping[str, str], path: str) -> str | None:
+        """Return the topic of stamped samples, if there is one; raises like `signals`."""
+        if self._stamped is not None:
+            return _present(self._stamped, PLANT_SAMPLE_TOPIC, PLANT_SAMPLE, types, path)
+        return _only(PLANT_SAMPLE_TOPIC, PLANT_SAMPLE, types, path)
+
+
+def misfits(types: Mapping[str, str]) -> list[str]:
+    """Return a clause for each topic that has an input's name and another type."""
+    return [
+        f"the topic '{topic}' is of type {type_name or 'unknown'} where {FLOAT64} is needed"
+        for topic, type_name in types.items()
+        if last_part(topic) in _TOPICS and type_name != FLOAT64
+    ]
+
+
+def _only(name: str, type_name: str, types: Mapping[str, str], path: str) -> str | None:
+    found = [t for t, kind in types.items() if kind == type_name and last_part(t) == name]
+    if len(found) > 1:
+        both = ' and '.join(f"'{topic}'" for topic in found)
+        raise InputError(
+            f'{path}: the topics {both} could each be {name}; '
+            f'choose with --column {name}={found[0]}.'
+        )
+    return found[0] if found else None
+
+
+def _present(wanted: str, name: str, type_name: str, types: Mapping[str, str], path: str) -> str:
+    for topic in (wanted, _rooted(wanted)):
+        if topic not in types:
+            continue
+        if types[topic] != type_name:
+            problem = f"the topic '{topic}' is of type {types[topic]} where {type_name} is needed"
+            raise RecordingError(path, problem)
+        return topic
+    have = ', '.join(sorted(types)) or 'none'
+    raise InputError(
+        f"{path}: there is no topic '{wanted}' for {name}; the topics are: {have}. "
+        f'Choose with --column {name}=TOPIC.'
+    )
+
+
+def _rooted(topic: str) -> str:
+    return topic if topic.startswith('/') else f'/{topic}'

@@ -1,0 +1,144 @@
+"""A file that is being written: it carries its own name only when it is whole.
+
+It is written as ``NAME.mcap.part``, locked as long as its writer lives, and
+renamed when finished, so whoever finds a ``.part`` without a lock knows that
+its writer died.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import Protocol
+
+PART_SUFFIX = '.part'
+FILE_MODE = 0o600
+FOLDER_MODE = 0o700
+
+
+class Writable(Protocol):
+    """What a recording is written to."""
+
+    def write(self, data: bytes) -> int:
+        """Append bytes and return how many were taken; raises `OSError`."""
+
+    def sync(self) -> None:
+        """Bring everything to the disk; raises `OSError`."""
+
+    def publish(self) -> None:
+        """Give the file its own name; raises `OSError`."""
+
+    def close(self) -> None:
+        """Let go of the file, finished or not."""
+
+    def discard(self) -> None:
+        """Let go of an unfinished file and remove it: nothing worth keeping is in it."""
+
+
+class PartFile:
+    """The real thing; see `Writable`.
+
+    Parameters
+    ----------
+    path : Path
+        The name of the finished file.
+    replace : bool
+        Take the place of an unlocked ``.part`` that a dead writer left.
+
+    Raises
+    ------
+    OSError
+        `FileExistsError` if the ``.part`` stands there already.
+    """
+
+    def __init__(self, path: Path, replace: bool = False) -> None:
+        self.path = path
+        self.part = path.with_name(path.name + PART_SUFFIX)
+        if replace and self.part.exists() and not is_held(self.part):
+            self.part.unlink()
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
+        self._descriptor = os.open(self.part, flags, FILE_MODE)
+        try:
+            # The umask may have taken rights away; nothing may have added any.
+            os.fchmod(self._descriptor, FILE_MODE)
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self.close()
+            raise
+
+    def write(self, data: bytes) -> int:
+        """Append bytes and return how many were taken."""
+        return os.write(self._descriptor, data)
+
+    def sync(self) -> None:
+        """Bring everything to the disk."""
+        os.fdatasync(self._descriptor)
+
+    def publish(self) -> None:
+        """Give the file its own name, durably."""
+        os.fsync(self._descriptor)
+        os.replace(self.part, self.path)
+        sync_folder(self.path.parent)
+
+    def close(self) -> None:
+        """Let go of the file and its lock."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def discard(self) -> None:
+        """Let go of the file and remove it."""
+        self.close()
+        with suppress(OSError):
+            self.part.unlink()
+
+
+def sync_folder(folder: Path) -> None:
+    """Bring a folder's names to the disk."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, and those above it, that only its owner can enter; one that exists stays."""
+    for missing in reversed([folder, *folder.parents]):
+        if not missing.exists():
+            missing.mkdir(mode=FOLDER_MODE, exist_ok=True)
+
+
+def is_held(part: Path) -> bool:
+    """Tell whether a living writer holds a ``.part``."""
+    descriptor = os.open(part, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Put a small file in place at once: it is the old one or the new one, never half."""
+    temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
+    flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW
+    descriptor = os.open(temporary, flags, FILE_MODE)
+    try:
+        os.fchmod(descriptor, FILE_MODE)
+        view = memoryview(data)
+        while view:
+            view = view[os.write(descriptor, view) :]
+        os.fsync(descriptor)
+    except OSError:
+        with suppress(OSError):
+            temporary.unlink()
+        raise
+    finally:
+        os.close(descriptor)
+    os.replace(temporary, path)
+    sync_folder(path.parent)

@@ -1,0 +1,141 @@
+"""Opens any log: a recording, a folder of one, or a historian's table."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import yaml
+
+try:
+    from yaml import CSafeLoader as SafeLoader
+except ImportError:  # PyYAML was built without libyaml
+    from yaml import SafeLoader  # type: ignore[assignment]
+
+from valveflow_ros.errors import RecordingError
+from valveflow_ros.logs.contents import LogContents
+from valveflow_ros.logs.folder import METADATA_NAME, in_order
+from valveflow_ros.logs.layout import MAGIC
+from valveflow_ros.logs.mcap_log import read_recording
+from valveflow_ros.logs.part_file import PART_SUFFIX
+from valveflow_ros.logs.source import Source, os_problem
+from valveflow_ros.logs.tables import open_table
+
+MAX_METADATA_BYTES = 16 << 20
+_TABLES = ('.csv', '.tsv', '.txt', '.parquet', '.pq')
+
+
+def open_log(
+    path: str | Path,
+    *,
+    columns: Mapping[str, str] | None = None,
+    absent: Collection[str] = (),
+    unchecked: bool = False,
+) -> LogContents:
+    """Return what a log holds.
+
+    Parameters
+    ----------
+    path : str or Path
+        An ``.mcap`` file in any state, a rosbag2 folder, a ``.csv`` or a
+        ``.parquet`` table.
+    columns : mapping of str to str, optional
+        Contract name to the topic or column that is to stand for it.
+    absent : collection of str
+        Contract names that a table need not have.
+    unchecked : bool
+        Also read chunks that were written without a checksum.
+
+    Raises
+    ------
+    RecordingError
+        If nothing can be read.
+    InputError
+        If it is not clear which topic or column stands for a signal.
+    """
+    place = Path(path)
+    names = dict(columns or {})
+    try:
+        is_folder = place.is_dir()
+    except (OSError, ValueError):
+        is_folder = False
+    if is_folder:
+        files, warnings = _files_of(place)
+        contents = read_recording(files, str(path), names, unchecked)
+        return replace(contents, warnings=(*warnings, *contents.warnings))
+    if place.suffix.lower() in _TABLES:
+        return open_table(place, names, absent)
+    if place.suffix.lower() == '.db3':
+        raise RecordingError(path, _sqlite_problem())
+    if place.suffix.lower() not in ('.mcap', PART_SUFFIX):
+        with Source.open(place) as source:
+            if source.read(0, len(MAGIC)) != MAGIC:
+                raise RecordingError(path, 'is neither an .mcap file nor a .csv or .parquet table')
+    return read_recording([place], str(path), names, unchecked)
+
+
+def _files_of(folder: Path) -> tuple[list[Path], list[str]]:
+    """Return the splits of a folder in their order, and sentences about the choice."""
+    try:
+        names = {entry.name for entry in folder.iterdir()}
+    except OSError as error:
+        raise RecordingError(folder, os_problem(error)) from None
+    whole = {name for name in names if name.endswith('.mcap')}
+    # While a .part is made whole, both may stand there for a moment.
+    parts = {
+        name
+        for name in names
+        if name.endswith(f'.mcap{PART_SUFFIX}') and name[: -len(PART_SUFFIX)] not in whole
+    }
+    listed = _listed(folder) if METADATA_NAME in names else []
+    if not whole | parts:
+        if any(name.endswith('.db3') for name in names):
+            raise RecordingError(folder, _sqlite_problem())
+        raise RecordingError(folder, 'has no .mcap file in it')
+    missing = [name for name in listed if name not in whole]
+    warnings = [f"'{name}' is named in {METADATA_NAME} and is not there." for name in missing]
+    found = in_order(folder / name for name in whole | parts)
+    if not listed:
+        return found, warnings
+    stems = {_stem(name) for name in listed}
+    own = [folder / name for name in listed if name in whole]
+    own += [path for path in found if path not in own and _stem(path.name) in stems]
+    others = [path.name for path in found if path not in own]
+    if others:
+        names_text = ', '.join(others)
+        warnings.append(f'{names_text}: not named in {METADATA_NAME}, not read.')
+    return own or found, warnings
+
+
+def _stem(name: str) -> str:
+    """Return the name of a split without number and suffix."""
+    return name.split('.mcap')[0].rstrip('0123456789')
+
+
+def _listed(folder: Path) -> list[str]:
+    """Return the file names of `metadata.yaml`; what it says beyond that is in the files."""
+    # Whatever is wrong with it, the files say themselves what they hold.
+    try:
+        with Source.open(folder / METADATA_NAME) as source:
+            raw = source.read(0, min(source.size, MAX_METADATA_BYTES))
+    except RecordingError:
+        return []
+    try:
+        top = yaml.load(raw, Loader=SafeLoader)
+        info = top['rosbag2_bagfile_information']
+        storage, names = info['storage_identifier'], info['relative_file_paths']
+        mode = str(info.get('compression_mode') or '').lower()
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError, RecursionError):
+        return []
+    if storage == 'sqlite3':
+        raise RecordingError(folder, _sqlite_problem())
+    if mode in ('file', 'message'):
+        problem = f'is compressed {mode} by {mode} by rosbag2, which no reader of MCAP understands'
+        raise RecordingError(folder, f"{problem}; rewrite it with 'ros2 bag convert'")
+    # Only names within the folder count, whatever path is written there.
+    return [Path(str(name)).name for name in names if name] if isinstance(names, list) else []
+
+
+def _sqlite_problem() -> str:
+    return "is a recording in sqlite3; rewrite it as MCAP with 'ros2 bag convert'"

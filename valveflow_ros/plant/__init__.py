@@ -1,0 +1,1 @@
+"""The simulated plant: the paper's unit, with effects to switch on."""

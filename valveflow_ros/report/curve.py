@@ -1,0 +1,177 @@
+"""The curve over the samples it was found in, with what is known of its error."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from valveflow_ros.core.characteristic import Piece
+from valveflow_ros.records import FloatArray
+from valveflow_ros.report.downsample import Density, density
+from valveflow_ros.report.figure import Figure, Spec, rounded, token
+from valveflow_ros.report.identified import Identified
+from valveflow_ros.report.numbers import plain
+from valveflow_ros.report.words import input_title
+
+_Z95 = 1.959963984540054
+_SHADES = 5
+_COLUMNS, _ROWS = 150, 100
+
+
+def band(piece: Piece, u_samples: FloatArray, u: FloatArray) -> FloatArray:
+    """Return the standard error of one piece's line at ``u`` in MW, NaN if not known.
+
+    For a straight line through samples with mean m and variance s of u, the
+    error is ``slope_stderr * sqrt((u - m)^2 + s)``: smallest where the samples
+    are, and growing away from them. Taking it from the slope's error alone
+    avoids the difference of two large numbers that slope and intercept give.
+    """
+    inside = u_samples[(u_samples >= piece.u_from) & (u_samples <= piece.u_to)]
+    if not math.isfinite(piece.slope_stderr) or len(inside) < 3:
+        return np.full(len(u), np.nan)
+    return np.asarray(piece.slope_stderr * np.sqrt((u - inside.mean()) ** 2 + inside.var()))
+
+
+def _line(piece: Piece, u: FloatArray) -> FloatArray:
+    return np.asarray(piece.slope * u + piece.intercept)
+
+
+def _lines(pieces: tuple[Piece, ...]) -> tuple[FloatArray, FloatArray]:
+    """Return end points of all pieces, a gap between two."""
+    x, y = [], []
+    for piece in pieces:
+        ends = np.array([piece.u_from, piece.u_to])
+        x += [*ends, np.nan]
+        y += [*_line(piece, ends), np.nan]
+    return np.array(x), np.array(y)
+
+
+def _shades(most: int) -> list[list[float | str]]:
+    """Return a colour scale whose steps follow the logarithm of the count."""
+    places = np.linspace(0.0, 1.0, _SHADES)
+    if most > 1:
+        places = (most**places - 1.0) / (most - 1.0)
+    return [[float(p), token(f'density-{k}')] for k, p in enumerate(places)]
+
+
+def _heat(cells: Density) -> Spec:
+    most = max(1, int(cells.counts.max(initial=0)))
+    return {
+        'type': 'heatmap', 'name': 'special samples', 'showscale': False,
+        'x0': cells.x_from, 'dx': cells.x_step, 'y0': cells.y_from, 'dy': cells.y_step,
+        'z': [[c or None for c in row] for row in cells.counts.tolist()],
+        'zmin': 1, 'zmax': max(2, most), 'colorscale': _shades(most), 'hoverongaps': False,
+        'hovertemplate': 'u %{x:.0f}<br>%{y:.1f} MW<br>%{z} samples<extra></extra>',
+    }  # fmt: skip
+
+
+def _bands(data: Identified, u_samples: FloatArray) -> list[Spec]:
+    traces: list[Spec] = []
+    for piece in data.characteristic.pieces:
+        u = np.linspace(piece.u_from, piece.u_to, 25)
+        error = _Z95 * band(piece, u_samples, u)
+        if not np.all(np.isfinite(error)):
+            continue
+        line = _line(piece, u)
+        traces.append(
+            {
+                'type': 'scatter', 'mode': 'lines', 'fill': 'toself', 'hoverinfo': 'skip',
+                'x': rounded(np.append(u, u[::-1]), 6),
+                'y': rounded(np.append(line + error, (line - error)[::-1]), 6),
+                'fillcolor': token('band'), 'line': {'width': 0}, 'legendgroup': 'band',
+                'name': '95 % band', 'showlegend': not traces,
+            }
+        )  # fmt: skip
+    return traces
+
+
+def _breakpoints(data: Identified) -> Spec:
+    c = data.characteristic
+    u, x = c.breakpoints[1:-1], c.values()[1:-1]
+    low = np.array([lo for lo, _ in c.breakpoint_intervals])
+    high = np.array([hi for _, hi in c.breakpoint_intervals])
+    known = np.isfinite(low) & np.isfinite(high)
+    hover = [
+        f'breakpoint at u {plain(float(b), 5)}'
+        + (f'<br>95 %: {plain(float(lo), 5)} to {plain(float(hi), 5)}' if ok else '')
+        for b, lo, hi, ok in zip(u, low, high, known, strict=True)
+    ]
+    return {
+        'type': 'scatter', 'mode': 'markers', 'name': 'breakpoints, 95 %',
+        'x': rounded(u, 7), 'y': rounded(x, 7), 'hovertext': hover, 'hoverinfo': 'text',
+        'marker': {
+            'color': token('paper'), 'size': 9, 'line': {'color': token('curve'), 'width': 2},
+        },
+        'error_x': {
+            'type': 'data', 'symmetric': False, 'thickness': 2, 'width': 5,
+            'color': token('curve'),
+            'array': rounded(np.where(known, high - u, 0.0)),
+            'arrayminus': rounded(np.where(known, u - low, 0.0)),
+        },
+    }  # fmt: skip
+
+
+def curve_figure(data: Identified) -> Figure:
+    """Return the picture of the characteristic."""
+    c = data.characteristic
+    special = data.special
+    u, power = data.u[special], data.power[special]
+    x, y = _lines(c.pieces)
+    raw_x, raw_y = _lines(c.partition_pieces)
+    traces: list[Spec] = [
+        _heat(density(u, power, _COLUMNS, _ROWS)),
+        *_bands(data, u),
+        {
+            'type': 'scatter', 'mode': 'lines', 'name': 'before refining',
+            'x': rounded(raw_x, 7), 'y': rounded(raw_y, 7), 'hoverinfo': 'skip',
+            'line': {'color': token('raw'), 'width': 1.2, 'dash': 'dash'},
+        },
+        {
+            'type': 'scatter', 'mode': 'lines', 'name': 'flow characteristic',
+            'x': rounded(x, 7), 'y': rounded(y, 7),
+            'line': {'color': token('curve'), 'width': 2.6},
+            'hovertemplate': 'u %{x:.0f}<br>%{y:.1f} MW<extra>flow characteristic</extra>',
+        },
+    ]  # fmt: skip
+    if c.pieces == c.partition_pieces:
+        del traces[-2]
+    if len(c.pieces) > 1:
+        traces.append(_breakpoints(data))
+    layout = {
+        'xaxis': {'title': {'text': input_title(c.pressure_exponent)}},
+        'yaxis': {'title': {'text': 'generated power (MW)'}},
+    }
+    return Figure('curve', _caption(data), _description(data), traces, layout, height=500)
+
+
+def _caption(data: Identified) -> str:
+    c = data.characteristic
+    parts = [
+        '<b>The curve should run through the middle of the cloud.</b> Colour: samples in '
+        'special segments, the stronger the more there are.'
+    ]
+    if len(c.pieces) > 1:
+        parts.append(
+            'Circles are the breakpoints; a bar through one is the range in which it lies with '
+            '95 % confidence.'
+        )
+    parts.append(
+        'The shaded band, often thinner than the line itself, is the 95 % range of the curve.'
+    )
+    if c.pieces != c.partition_pieces:
+        parts.append(
+            'The dashed <span class="key raw">line</span> is the exact partition before the '
+            'dynamics were fitted with it; where it leaves the curve, ramps had bent it.'
+        )
+    return ' '.join(parts)
+
+
+def _description(data: Identified) -> str:
+    c = data.characteristic
+    ends, values = c.breakpoints, c.values()
+    return (
+        f'Flow characteristic of {len(c.pieces)} pieces from u {plain(float(ends[0]))} '
+        f'({plain(float(values[0]))} MW) to u {plain(float(ends[-1]))} '
+        f'({plain(float(values[-1]))} MW), over the density of special samples.'
+    )

@@ -1,0 +1,105 @@
+"""The report of an identification: the answer first, then the evidence."""
+
+from __future__ import annotations
+
+from valveflow_ros import __version__
+from valveflow_ros.config import PARAMETERS
+from valveflow_ros.report.answer import (
+    answer_words,
+    breakpoints_table,
+    pieces_table,
+    temperature_words,
+    window_words,
+)
+from valveflow_ros.report.choice import choice_figure
+from valveflow_ros.report.curve import curve_figure
+from valveflow_ros.report.dynamics import dynamics_figure, dynamics_table
+from valveflow_ros.report.identified import Identified
+from valveflow_ros.report.numbers import moment, plain
+from valveflow_ros.report.page import Section, page, paragraph, table, text
+from valveflow_ros.report.quality import quality_table, quality_words
+from valveflow_ros.report.signals import signals_figure
+
+
+def identification_report(data: Identified) -> str:
+    """Return ``report.html``: one self-contained page that opens without a network."""
+    c = data.characteristic
+    tag = data.settings.text('unit_tag')
+    named = tag != PARAMETERS['unit_tag'].default
+    title = f'Flow characteristic of {tag}' if named else 'Main steam valve flow characteristic'
+    lead = paragraph(text(data.source)) + paragraph(
+        f'{moment(c.source.window_start_ns)} to {moment(c.source.window_end_ns)} '
+        f'({window_words(c)})'
+    )
+    sections = [
+        _answer(data),
+        Section('The moments that carry it', [signals_figure(data)]),
+        Section('Why this number of pieces', [choice_figure(c.choice, max(1, len(c.pieces)))]),
+        _dynamics(data),
+        Section('The data', [quality_words(data), quality_table(data), _read(data)]),
+        Section('How it was made', [_settings(data)]),
+    ]
+    foot = (
+        f'Made by valveflow {text(__version__)}. Curve <code>{text(c.model_id)}</code>; the same '
+        'numbers, unrounded, stand in characteristic.json beside this page.'
+    )
+    return page(title, lead, sections, foot)
+
+
+def _answer(data: Identified) -> Section:
+    c = data.characteristic
+    return Section(
+        'The answer',
+        [answer_words(data), pieces_table(data), curve_figure(data), breakpoints_table(c)],
+    )
+
+
+def _dynamics(data: Identified) -> Section:
+    dynamics = data.characteristic.dynamics
+    if not dynamics:
+        return Section(
+            'How fast the unit answers',
+            [paragraph('Time constants and delays were not estimated for this curve.')],
+        )
+    return Section(
+        'How fast the unit answers', [dynamics_table(dynamics), dynamics_figure(dynamics)]
+    )
+
+
+def _read(data: Identified) -> str:
+    c = data.characteristic
+    told = paragraph(text(temperature_words(c)))
+    told += paragraph(
+        f'Noise the thresholds stand on, as standard deviation of block means: '
+        f'{plain(c.residuals.input_noise, 3)} in u, {plain(c.residuals.power_noise_mw, 3)} MW '
+        'in power.'
+    )
+    if data.notes:
+        told += '<ul>' + ''.join(f'<li>{text(n)}</li>' for n in data.notes) + '</ul>'
+    return told
+
+
+def _settings(data: Identified) -> str:
+    """Return the parameters that were not left at their default."""
+    rows = [
+        [
+            text(name),
+            text(_shown(data.settings[name]) + (f' {row.unit}' if row.unit else '')),
+            text(_shown(row.default)),
+        ]
+        for name, row in PARAMETERS.items()
+        if data.settings[name] != row.default
+    ]
+    if not rows:
+        return paragraph('Every parameter has its default value.')
+    return paragraph('Parameters that differ from their default:') + table(
+        ['parameter', 'value', 'default'], rows
+    )
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, bool):
+        return 'true' if value else 'false'
+    if isinstance(value, int | float):
+        return f'{value:g}' if isinstance(value, float) else str(value)
+    return str(value)

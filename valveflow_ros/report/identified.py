@@ -1,0 +1,89 @@
+"""What the report of an identification is made from, and what it derives once for all parts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.units import integrated_input
+from valveflow_ros.records import (
+    FloatArray,
+    IntArray,
+    SampleTable,
+    SegmentKind,
+    Signal,
+    SpecialSegment,
+)
+from valveflow_ros.report.downsample import segment_rows
+
+
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """An identification and the data it came from.
+
+    Attributes
+    ----------
+    source : str
+        Name of the log, as the person wrote it.
+    characteristic : Characteristic
+    table : SampleTable
+        The aligned rows the engine saw.
+    segments : tuple of SpecialSegment
+        In order of time.
+    counts : mapping
+        ``{topic: {reason: readings}}`` as the aligner counted them.
+    settings : Settings
+    notes : tuple of str
+        Sentences about how the data were read, for a person.
+    u : float64 (n,)
+        Integrated input of each row, made from the table.
+    rows : int64 (k, 2)
+        First and end row of each segment.
+    special : int64 (m,)
+        The rows inside segments whose input and power are known.
+    """
+
+    source: str
+    characteristic: Characteristic
+    table: SampleTable
+    segments: tuple[SpecialSegment, ...]
+    counts: Mapping[str, Mapping[str, int]]
+    settings: Settings
+    notes: tuple[str, ...] = ()
+    u: FloatArray = field(init=False)
+    rows: IntArray = field(init=False)
+    special: IntArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Derive what several parts need."""
+        u = integrated_input(
+            self.table.column(Signal.VALVE_OPENING),
+            self.table.column(Signal.MAIN_STEAM_PRESSURE),
+            self.characteristic.pressure_exponent,
+        )
+        object.__setattr__(self, 'u', u)
+        rows = segment_rows(self.table.time_ns, list(self.segments))
+        object.__setattr__(self, 'rows', rows)
+        inside = [np.arange(a, b, dtype=np.int64) for a, b in rows.tolist()]
+        special = np.concatenate([np.empty(0, dtype=np.int64), *inside])
+        known = np.isfinite(u[special]) & np.isfinite(self.power[special])
+        object.__setattr__(self, 'special', special[known])
+
+    @property
+    def power(self) -> FloatArray:
+        """Return the generated power in MW, shape (n,)."""
+        return self.table.column(Signal.GENERATED_POWER)
+
+    @property
+    def period_ns(self) -> int:
+        """Return the step of the table in ns."""
+        return round(self.settings.real('sample_period') * 1e9)
+
+    def rows_of(self, kind: SegmentKind) -> IntArray:
+        """Return (first, end) rows of the segments of one kind, shape (k, 2)."""
+        wanted = np.array([s.kind == kind for s in self.segments], dtype=bool)
+        return self.rows[wanted] if len(self.rows) else self.rows.reshape(-1, 2)

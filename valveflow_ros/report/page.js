@@ -1,0 +1,111 @@
+'use strict';
+(function () {
+  const figures = JSON.parse(document.getElementById('figures').textContent);
+  const paperWidth = 680;
+  let printing = false;
+
+  function colours() {
+    const style = getComputedStyle(document.documentElement);
+    return (name) => style.getPropertyValue('--' + name).trim() || '#888888';
+  }
+
+  // Colours stand in the pictures by name; give each its value in the page's present look.
+  function painted(value, colour) {
+    if (typeof value === 'string') {
+      return value.startsWith('token:') ? colour(value.slice(6)) : value;
+    }
+    if (Array.isArray(value)) {
+      const last = value[value.length - 1];
+      return typeof last === 'number' ? value : value.map((v) => painted(v, colour));
+    }
+    if (value !== null && typeof value === 'object') {
+      const out = {};
+      for (const key of Object.keys(value)) out[key] = painted(value[key], colour);
+      return out;
+    }
+    return value;
+  }
+
+  function axis(given, colour) {
+    return Object.assign({
+      gridcolor: colour('grid'), linecolor: colour('rule'), tickcolor: colour('rule'),
+      zeroline: false, ticks: 'outside', automargin: true, hoverformat: given.hoverformat,
+    }, given, { title: Object.assign({ standoff: 8 }, given.title) });
+  }
+
+  function layout(given, colour, narrow) {
+    const out = painted(given, colour);
+    const base = {
+      paper_bgcolor: colour('paper'), plot_bgcolor: colour('paper'),
+      font: { family: getComputedStyle(document.body).fontFamily, size: 13, color: colour('ink') },
+      margin: { l: 56, r: 12, t: 34, b: 46 }, hovermode: 'closest', dragmode: narrow ? false : 'zoom',
+      legend: { orientation: 'h', x: 0, y: 1.02, xanchor: 'left', yanchor: 'bottom', font: { size: 12 } },
+      hoverlabel: { bgcolor: colour('panel'), bordercolor: colour('rule'), font: { color: colour('ink') } },
+    };
+    for (const key of Object.keys(out)) {
+      base[key] = /^[xy]axis/.test(key) ? axis(out[key], colour) : out[key];
+    }
+    return base;
+  }
+
+  function draw() {
+    const colour = colours();
+    const narrow = window.innerWidth < 560;
+    const settings = {
+      responsive: !printing, displaylogo: false, displayModeBar: narrow || printing ? false : 'hover',
+      // A list of our own: the usual one has a button that sends the data to a server.
+      modeBarButtons: [['toImage'], ['zoom2d', 'pan2d'], ['resetScale2d']],
+      toImageButtonOptions: { format: 'svg' }, plotlyServerURL: '', showSendToCloud: false,
+    };
+    const jobs = Object.keys(figures).map((name) => {
+      const place = document.getElementById(name);
+      const waiting = place.querySelector('.waiting');
+      if (waiting) waiting.remove();
+      const look = layout(figures[name].layout, colour, narrow);
+      if (printing) look.width = paperWidth;
+      return Plotly.react(place, painted(figures[name].data, colour), look, settings);
+    });
+    return Promise.all(jobs);
+  }
+
+  function sorry(reason) {
+    for (const place of document.querySelectorAll('.waiting')) {
+      place.textContent = 'The picture cannot be drawn by this browser (' + reason + ').';
+    }
+  }
+
+  async function unpack() {
+    const text = document.getElementById('library').textContent;
+    const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('gzip'));
+    const script = document.createElement('script');
+    script.textContent = await new Response(stream).text();
+    document.head.appendChild(script);
+  }
+
+  function print(on) {
+    printing = on;
+    document.documentElement.classList.toggle('printing', on);
+    draw();
+  }
+
+  async function begin() {
+    if (typeof DecompressionStream === 'undefined') {
+      sorry('it cannot unpack compressed data; a version from 2023 or later can');
+      return;
+    }
+    try {
+      await unpack();
+      await draw();
+      document.documentElement.dataset.drawn = 'yes';
+    } catch (error) {
+      sorry(error.message);
+      throw error;
+    }
+    matchMedia('(prefers-color-scheme: dark)').addEventListener('change', draw);
+    window.addEventListener('beforeprint', () => print(true));
+    window.addEventListener('afterprint', () => print(false));
+  }
+
+  begin();
+})();

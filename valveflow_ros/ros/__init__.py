@@ -1,0 +1,1 @@
+"""The only folder that knows ROS: node, replay, simulated plant, conversions."""

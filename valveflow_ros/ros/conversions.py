@@ -1,0 +1,183 @@
+"""The engine's records as messages, and the journal's messages as records."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+from builtin_interfaces.msg import Time
+from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension
+from valveflow_msgs.msg import Alarm, FlowCharacteristic, Prediction
+from valveflow_msgs.msg import JournalEntry as JournalMessage
+from valveflow_msgs.msg import SpecialSegment as SegmentMessage
+
+from valveflow_ros.core.alarms import AlarmChange
+from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.events import JournalEntry, JournalKind
+from valveflow_ros.core.monitor import CurveStatus
+from valveflow_ros.core.prediction import PredictionBlock
+from valveflow_ros.records import NS_PER_S, FloatArray, SpecialSegment
+
+# What the seconds of a stamp can hold.
+_LAST_NS = (1 << 31) * NS_PER_S - 1
+
+
+def to_time(time_ns: int) -> Time:
+    """Return a stamp; times before 1970 or after 2038 become the nearest one there is."""
+    sec, nanosec = divmod(min(max(time_ns, 0), _LAST_NS), NS_PER_S)
+    return Time(sec=sec, nanosec=nanosec)
+
+
+def from_time(stamp: Time) -> int:
+    """Return a stamp in ns since the epoch."""
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+
+
+def header(time_ns: int, tag: str) -> Header:
+    """Return the head of a message."""
+    return Header(stamp=to_time(time_ns), frame_id=tag)
+
+
+def predictions(block: PredictionBlock, tag: str) -> Iterator[tuple[int, Prediction]]:
+    """Yield a message for each row, with the row's time in ns."""
+    columns = (
+        block.time_ns, block.u, block.measured_mw, block.static_mw, block.dynamic_mw,
+        block.residual_mw, block.state,
+    )  # fmt: skip
+    for row in zip(*(column.tolist() for column in columns), strict=True):
+        time_ns, u, measured, static, dynamic, residual, state = row
+        message = Prediction(
+            header=header(time_ns, tag),
+            state=state,
+            model_id=block.model_id,
+            integrated_input=u,
+            measured_mw=measured,
+            static_mw=static,
+            dynamic_mw=dynamic,
+            residual_mw=residual,
+            limit_low_mw=-block.limit_mw,
+            limit_high_mw=block.limit_mw,
+        )
+        yield time_ns, message
+
+
+def segment(found: SpecialSegment, tag: str) -> SegmentMessage:
+    """Return a special segment as a message."""
+    return SegmentMessage(
+        header=header(found.end_ns, tag),
+        number=found.number,
+        kind=int(found.kind),
+        start=to_time(found.start_ns),
+        end=to_time(found.end_ns),
+        samples=found.samples,
+        u_start=found.u_start,
+        u_end=found.u_end,
+        u_rate_per_s=found.u_rate_per_s,
+        power_start_mw=found.power_start_mw,
+        power_end_mw=found.power_end_mw,
+        u_rms=found.u_rms,
+        power_rms_mw=found.power_rms_mw,
+        temperature_mean_degc=found.temperature_mean_degc,
+    )
+
+
+def alarm(change: AlarmChange, tag: str) -> Alarm:
+    """Return a change of an alarm's state as a message."""
+    return Alarm(
+        header=header(change.time_ns, tag),
+        name=change.name,
+        state=int(change.state),
+        previous_state=int(change.previous),
+        priority=int(change.priority),
+        value=change.value,
+        limit=change.limit,
+        unit=change.unit,
+        sentence=change.sentence,
+        occurrence=change.occurrence,
+        raised=to_time(change.raised_ns),
+        model_id=change.model_id,
+    )
+
+
+def journal(entry: JournalEntry, tag: str) -> JournalMessage:
+    """Return a line of the journal as a message; `journal_entry` is the way back."""
+    return JournalMessage(
+        header=header(entry.time_ns, tag),
+        kind=int(entry.kind),
+        request=to_time(entry.request_ns),
+        samples=entry.rows,
+        model_id=entry.model_id,
+        text=entry.text,
+    )
+
+
+def journal_entry(message: JournalMessage) -> JournalEntry:
+    """Return a journal message as the engine's record."""
+    return JournalEntry(
+        time_ns=from_time(message.header.stamp),
+        kind=JournalKind(message.kind),
+        request_ns=from_time(message.request),
+        rows=int(message.samples),
+        model_id=message.model_id,
+        text=message.text,
+    )
+
+
+def characteristic(
+    curve: Characteristic | None, status: CurveStatus, cause: str, tag: str
+) -> FlowCharacteristic:
+    """Return the running curve and what it is worth; without a curve, say why there is none."""
+    nan = math.nan
+    message = FlowCharacteristic(
+        header=header(0, tag),
+        status=int(status),
+        cause=cause,
+        pressure_exponent=nan,
+        rmse_mw=nan,
+        temperature_mean_degc=nan,
+        temperature_spread_degc=nan,
+    )
+    if curve is None:
+        return message
+    source = curve.source
+    message.header = header(source.window_end_ns, tag)
+    message.model_id = curve.model_id
+    message.window_start = to_time(source.window_start_ns)
+    message.window_end = to_time(source.window_end_ns)
+    message.breakpoints = curve.breakpoints.tolist()
+    message.values = curve.values().tolist()
+    message.pieces = len(curve.pieces)
+    message.slopes = [p.slope for p in curve.pieces]
+    message.intercepts = [p.intercept for p in curve.pieces]
+    message.slope_stderr = [p.slope_stderr for p in curve.pieces]
+    message.intercept_stderr = [p.intercept_stderr for p in curve.pieces]
+    message.breakpoint_low = [low for low, _ in curve.breakpoint_intervals]
+    message.breakpoint_high = [high for _, high in curve.breakpoint_intervals]
+    message.cost, message.turning_angle = _selection(curve)
+    message.pressure_exponent = curve.pressure_exponent
+    message.samples = source.samples
+    message.steady_segments = source.steady
+    message.slope_segments = source.slope_response
+    message.rmse_mw = curve.residuals.rmse_mw
+    message.temperature_mean_degc = source.temperature_mean_degc
+    message.temperature_spread_degc = source.temperature_spread_k
+    message.temperature_flag = source.temperature_flag
+    return message
+
+
+def _selection(curve: Characteristic) -> tuple[list[float], list[float]]:
+    """Return Omega(J) and Lambda(J) for J = 1, 2, ...; NaN where there is none."""
+    most = max(curve.choice.cost, default=0)
+    span = range(1, most + 1)
+    cost = [curve.choice.cost.get(j, math.nan) for j in span]
+    return cost, [curve.choice.turning_angle.get(j, math.nan) for j in span]
+
+
+def plain_array(values: FloatArray | Sequence[float], label: str) -> Float64MultiArray:
+    """Return numbers for clients without our messages; the label says what they are."""
+    numbers = [float(value) for value in values]
+    message = Float64MultiArray(data=numbers)
+    message.layout.dim = [
+        MultiArrayDimension(label=label, size=len(numbers), stride=len(numbers))
+    ]
+    return message

@@ -1,0 +1,95 @@
+"""The table of parameters as ROS parameters: declared, described, and checked together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import InvalidParameterValueException
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+
+from valveflow_ros.config import PARAMETERS, TABLE, Parameter, Settings, parameter
+from valveflow_ros.errors import ParameterError
+
+# What ROS itself puts among the parameters of every node.
+_FOREIGN = ('use_sim_time', 'start_type_description_service')
+_FOREIGN_PREFIX = 'qos_overrides.'
+
+
+def descriptor(row: Parameter) -> ParameterDescriptor:
+    """Describe a parameter to `ros2 param describe` and the like."""
+    found = ParameterDescriptor(
+        name=row.name,
+        description=f'{row.sentence} Unit: {row.unit}.' if row.unit else row.sentence,
+        read_only=not row.live,
+        # 30 is to be as good as 30.0; the table knows what is meant.
+        dynamic_typing=True,
+    )
+    if row.choices:
+        found.additional_constraints = f'One of {", ".join(row.choices)}.'
+    if row.low is None or row.high is None:
+        return found
+    if isinstance(row.default, int):
+        found.integer_range = [IntegerRange(from_value=int(row.low), to_value=int(row.high))]
+    else:
+        found.floating_point_range = [
+            FloatingPointRange(from_value=float(row.low), to_value=float(row.high))
+        ]
+    return found
+
+
+def declare(node: Node, table: Iterable[Parameter] = TABLE) -> dict[str, object]:
+    """Declare parameters and return the values given for them, checked one by one.
+
+    Raises
+    ------
+    ParameterError
+        A value does not fit its row.
+    """
+    values: dict[str, object] = {}
+    for row in table:
+        try:
+            given = node.declare_parameter(row.name, row.default, descriptor(row))
+        except InvalidParameterValueException as error:
+            row.check(error.value)
+            raise ParameterError(row.name, f'cannot be {error.value!r}') from None
+        values[row.name] = row.check(given.value)
+    return values
+
+
+def unknown_overrides(node: Node, known: Iterable[str] = PARAMETERS) -> list[str]:
+    """Return a sentence for each parameter that was given and does not exist."""
+    given: Mapping[str, object] = getattr(node, '_parameter_overrides', {})
+    names = set(known) | set(_FOREIGN)
+    sentences = []
+    for name in given:
+        if name in names or name.startswith(_FOREIGN_PREFIX):
+            continue
+        try:
+            parameter(name)
+        except ParameterError as error:
+            sentences.append(str(error))
+    return sentences
+
+
+def changed(settings: Settings, wanted: Iterable[RosParameter]) -> Settings:
+    """Return settings with some parameters changed.
+
+    Raises
+    ------
+    ParameterError
+        One may not be changed now, does not fit its row, or is at odds with another.
+    """
+    values = {}
+    for item in wanted:
+        if item.name in _FOREIGN:
+            continue
+        row = parameter(item.name)
+        value = row.check(item.value)
+        if not row.live:
+            raise ParameterError(
+                row.name, 'cannot be changed while the monitor runs; set it at the start'
+            )
+        values[row.name] = value
+    return settings.changed(values)

@@ -1,0 +1,191 @@
+"""How the inputs are: an item for each signal, with the numbers behind the sentence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.align import REASONS
+from valveflow_ros.core.units import unit_of
+from valveflow_ros.records import SIGNALS, SignalInfo
+from valveflow_ros.ros.diagnostics import Item, Level
+from valveflow_ros.ros.graph import Publishers
+from valveflow_ros.ros.inputs import PLANT_SAMPLE, Row, plausible_range, plausible_units
+from valveflow_ros.ros.tallies import Tally
+
+_REJECTED = tuple(reason for reason in REASONS if reason not in ('accepted', 'late'))
+_PATIENCE_S = 2.0
+
+
+@dataclass(slots=True)
+class InputHealth:
+    """Judges the inputs, from one look to the next.
+
+    Attributes
+    ----------
+    topics : mapping of str to str
+        Contract name to full topic name.
+    mismatched : set of str
+        Contract names on which a publisher's quality of service did not match.
+    """
+
+    settings: Settings
+    topics: Mapping[str, str]
+    mismatched: set[str] = field(default_factory=set)
+    _impossible: dict[str, tuple[str, float]] = field(default_factory=dict)
+    _rejected: dict[str, int] = field(default_factory=dict)
+    _lost: dict[str, int] = field(default_factory=dict)
+
+    def note(self, name: str, rows: Iterable[Row]) -> None:
+        """Remember the last impossible value of each signal, to name it."""
+        for _, number, value, _ in rows:
+            info = SIGNALS[number]
+            low, high = plausible_range(info.signal, self.settings)
+            if math.isfinite(value) and not low <= value <= high:
+                self._impossible[info.topic] = (name, value)
+
+    def items(
+        self,
+        tallies: Mapping[str, Tally],
+        counts: Mapping[str, Mapping[str, int]],
+        publishers: Mapping[str, Publishers],
+        now_s: float,
+        listening_s: float,
+    ) -> list[Item]:
+        """Return an item for each signal.
+
+        Parameters
+        ----------
+        tallies : mapping
+            By the contract's names of the topics.
+        counts : mapping
+            What became of the readings, by signal and reason.
+        publishers : mapping
+            What the graph says, by the contract's names of the topics.
+        now_s, listening_s : float
+            Time by a clock that never goes back, and for how long we have listened.
+        """
+        return [
+            self._item(info, tallies, counts[info.topic], publishers, now_s, listening_s)
+            for info in SIGNALS
+        ]
+
+    def _item(
+        self,
+        info: SignalInfo,
+        tallies: Mapping[str, Tally],
+        counts: Mapping[str, int],
+        publishers: Mapping[str, Publishers],
+        now_s: float,
+        listening_s: float,
+    ) -> Item:
+        name = _speaking(info.topic, tallies, publishers)
+        tally, seen = tallies[name], publishers.get(name, Publishers())
+        level, sentence = self._judge(info, name, tally, seen, counts, now_s, listening_s)
+        values: dict[str, object] = {
+            'Topic': self.topics[name],
+            'Actual frequency (Hz)': tally.rate_hz(),
+            'Age of the newest message (s)': tally.age_s(now_s),
+            'Publishers': seen.right,
+            'Messages received': tally.received,
+            'Messages lost on the way': tally.lost,
+            'Messages sent before the first received': tally.missed_at_start,
+            'Messages with irregular numbers': tally.irregular,
+            'Messages that cannot be read': tally.malformed,
+            'Messages without a time': tally.without_time,
+        }
+        values |= {f'Readings {reason.replace("_", " ")}': counts[reason] for reason in REASONS}
+        return Item(f'input {info.topic}', level, sentence, values)
+
+    def _judge(
+        self,
+        info: SignalInfo,
+        name: str,
+        tally: Tally,
+        seen: Publishers,
+        counts: Mapping[str, int],
+        now_s: float,
+        listening_s: float,
+    ) -> tuple[Level, str]:
+        topic = self.topics[name]
+        rejected = self._new(self._rejected, info.topic, _rejected(counts))
+        lost = self._new(self._lost, info.topic, tally.lost)
+        if seen.wrong_types:
+            kinds = ' and '.join(seen.wrong_types)
+            return Level.ERROR, f'{topic} is published as {kinds}, which the monitor cannot take.'
+        if tally.received == 0:
+            return self._silent(info, name, seen, listening_s)
+        if tally.stale(now_s):
+            return Level.STALE, f'{topic} has been silent for {tally.age_s(now_s):.1f} s.'
+        if seen.right > 1:
+            return Level.WARN, (
+                f'{topic} has {seen.right} publishers; their values are mixed. Stop all but one.'
+            )
+        if rejected:
+            return Level.WARN, f'{rejected} new readings were rejected. {self._why(info, counts)}'
+        if tally.without_time and tally.without_time == tally.received:
+            return Level.ERROR, f'{topic} comes without a time; is /clock published?'
+        if lost:
+            return Level.WARN, f'{lost} messages of {topic} were lost on the way.'
+        return Level.OK, f'{tally.rate_hz():.3g} Hz.'
+
+    def _silent(
+        self, info: SignalInfo, name: str, seen: Publishers, listening_s: float
+    ) -> tuple[Level, str]:
+        topic = self.topics[name]
+        if name in self.mismatched:
+            return Level.ERROR, (
+                f'{topic} is published as best effort and asked for as reliable, so nothing '
+                'comes: set input_reliability to best_effort.'
+            )
+        if not info.required and not seen.right:
+            return Level.OK, f'{topic} is not sent; it is optional.'
+        if listening_s < _PATIENCE_S:
+            return Level.OK, f'Waiting for {topic}.'
+        if seen.right:
+            return Level.STALE, f'{topic} has a publisher, but nothing has come from it yet.'
+        return Level.STALE, f'Nobody publishes {topic}; remap it, or start the gateway.'
+
+    def _why(self, info: SignalInfo, counts: Mapping[str, int]) -> str:
+        found = self._impossible.pop(info.topic, None)
+        if found is None:
+            reasons = [f'{r.replace("_", " ")} {counts[r]}' for r in _REJECTED if counts[r]]
+            return f'So far: {", ".join(reasons)}.'
+        name, value = found
+        low, high = plausible_range(info.signal, self.settings)
+        believed = f'believed: {low:g} to {high:g} {info.unit}'
+        if name == PLANT_SAMPLE:
+            return f'The last one, {value:g} {info.unit}, is impossible ({believed}).'
+        named = self.settings.text(f'{info.topic}_unit')
+        unit = unit_of(info.signal, named)
+        sent = (value - unit.offset) / unit.scale
+        text = f'The last one, {sent:g} {named}, is impossible ({believed}).'
+        fitting = [u for u in plausible_units(info.signal, self.settings, sent) if u != named]
+        if fitting:
+            text += f' Is {info.topic}_unit {" or ".join(fitting)} rather than {named}?'
+        return text
+
+    @staticmethod
+    def _new(before: dict[str, int], key: str, count: int) -> int:
+        last, before[key] = before.get(key, 0), count
+        return max(0, count - last)
+
+
+def _speaking(
+    topic: str, tallies: Mapping[str, Tally], publishers: Mapping[str, Publishers]
+) -> str:
+    """Return the topic that feeds a signal: the one heard last, or the one that somebody has."""
+    own, stamped = tallies[topic].last_s, tallies[PLANT_SAMPLE].last_s
+    if own is None and stamped is None:
+        nobody = publishers.get(topic, Publishers()) == Publishers()
+        somebody = publishers.get(PLANT_SAMPLE, Publishers()) != Publishers()
+        return PLANT_SAMPLE if nobody and somebody else topic
+    if stamped is not None and (own is None or stamped > own):
+        return PLANT_SAMPLE
+    return topic
+
+
+def _rejected(counts: Mapping[str, int]) -> int:
+    return sum(counts[reason] for reason in _REJECTED)

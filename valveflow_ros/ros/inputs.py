@@ -1,0 +1,137 @@
+"""What comes in: the topics, and how their bytes become readings in the engine's units."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from rclpy.serialization import deserialize_message
+from std_msgs.msg import Float64
+from valveflow_msgs.msg import PlantSample
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.units import UNITS, Unit, unit_of
+from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
+
+Row = tuple[int, int, float, int]
+"""A reading as ``(time_ns, signal, value, quality)``, as `Readings.of` takes it."""
+
+PLANT_SAMPLE = 'plant_sample'
+_STAMP = {b'\x00\x01': struct.Struct('<iI'), b'\x00\x00': struct.Struct('>iI')}
+_VALUE = {b'\x00\x01': struct.Struct('<d'), b'\x00\x00': struct.Struct('>d')}
+_HEAD = 4  # bytes before the data in which a message says how it is encoded
+
+
+@dataclass(frozen=True, slots=True)
+class InputTopic:
+    """A topic of the contract that the monitor listens to."""
+
+    name: str
+    message_type: type
+    type_name: str
+    signals: tuple[Signal, ...]
+
+
+# The optional signal comes first: who waits for the required ones of an instant has it then.
+_IN_ORDER = tuple(sorted(SIGNALS, key=lambda info: info.required))
+INPUTS: tuple[InputTopic, ...] = (
+    *(
+        InputTopic(info.topic, Float64, 'std_msgs/msg/Float64', (info.signal,))
+        for info in _IN_ORDER
+    ),
+    InputTopic(
+        PLANT_SAMPLE,
+        PlantSample,
+        'valveflow_msgs/msg/PlantSample',
+        tuple(info.signal for info in _IN_ORDER),
+    ),
+)
+INPUT_BY_NAME = {topic.name: topic for topic in INPUTS}
+INPUT_ORDER = {topic.name: k for k, topic in enumerate(INPUTS)}
+
+
+def header_time_ns(data: bytes) -> int:
+    """Return the stamp of a message that begins with a header, 0 if it cannot be read."""
+    layout = _STAMP.get(data[:2])
+    if layout is None or len(data) < _HEAD + layout.size:
+        return 0
+    seconds, nanoseconds = layout.unpack_from(data, _HEAD)
+    return int(seconds) * NS_PER_S + int(nanoseconds)
+
+
+class Decoder:
+    """Turns the bytes of an input into readings.
+
+    Parameters
+    ----------
+    settings : Settings
+        The unit in which each plain topic is sent.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._read: dict[str, Callable[[bytes, int], list[Row]]] = {PLANT_SAMPLE: _sample_rows}
+        for info in SIGNALS:
+            unit = unit_of(info.signal, settings.text(f'{info.topic}_unit'))
+            self._read[info.topic] = _float_reader(info.signal, unit)
+
+    def time_ns(self, name: str, data: bytes, otherwise_ns: int) -> int:
+        """Return a message's own time: its header if it has one."""
+        return header_time_ns(data) if name == PLANT_SAMPLE else otherwise_ns
+
+    def rows(self, name: str, data: bytes, time_ns: int) -> list[Row]:
+        """Return the readings in a message.
+
+        Raises
+        ------
+        ValueError
+            The bytes are no message of this topic's type.
+        """
+        return self._read[name](data, time_ns)
+
+
+def _float_reader(signal: Signal, unit: Unit) -> Callable[[bytes, int], list[Row]]:
+    scale, offset = unit.scale, unit.offset
+    number, good = int(signal), int(Quality.GOOD)
+
+    def read(data: bytes, time_ns: int) -> list[Row]:
+        layout = _VALUE.get(data[:2])
+        if layout is None or len(data) < _HEAD + layout.size:
+            raise ValueError('no std_msgs/Float64')
+        (value,) = layout.unpack_from(data, _HEAD)
+        return [(time_ns, number, value * scale + offset, good)]
+
+    return read
+
+
+def _sample_rows(data: bytes, time_ns: int) -> list[Row]:
+    try:
+        sample = deserialize_message(data, PlantSample)
+    except Exception as error:
+        # rclpy raises whatever the middleware's C++ gave it.
+        raise ValueError('no valveflow_msgs/PlantSample') from error
+    rows: list[Row] = []
+    for info in _IN_ORDER:
+        value = float(getattr(sample, info.topic))
+        if info.required or math.isfinite(value):
+            quality = min(int(getattr(sample, f'{info.topic}_quality')), int(Quality.BAD))
+            rows.append((time_ns, int(info.signal), value, quality))
+    return rows
+
+
+def plausible_units(signal: Signal, settings: Settings, sent: float) -> list[str]:
+    """Return the units in which ``sent`` would be a possible value of ``signal``."""
+    low, high = plausible_range(signal, settings)
+    return [
+        name
+        for name, unit in UNITS[signal].items()
+        if low <= sent * unit.scale + unit.offset <= high
+    ]
+
+
+def plausible_range(signal: Signal, settings: Settings) -> tuple[float, float]:
+    """Return the lowest and highest value believed, in the engine's unit."""
+    opening = Signal.VALVE_OPENING
+    topic = SIGNALS[opening if signal == Signal.VALVE_COMMAND else signal].topic
+    return settings.real(f'{topic}_low'), settings.real(f'{topic}_high')

@@ -1,0 +1,93 @@
+"""The engine as the node runs it: rows as they come, fits by a worker. Nothing here knows ROS."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.align import Aligner
+from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.events import Event, FitRequested
+from valveflow_ros.core.fit import FitTask
+from valveflow_ros.core.monitor import Monitor
+from valveflow_ros.core.offline import CLOCK_BACK
+from valveflow_ros.records import Readings, SampleTable
+from valveflow_ros.ros.inputs import Row
+from valveflow_ros.ros.outcome import FitOutcome
+
+
+class Worker(Protocol):
+    """Whoever computes fits."""
+
+    def submit(self, task: FitTask) -> None:
+        """Take a task; its outcome comes with a later `poll`."""
+
+    def poll(self) -> list[FitOutcome]:
+        """Return the outcomes there are, without waiting."""
+
+
+class LiveEngine:
+    """Readings in, events out; each call ends at a row's boundary.
+
+    Parameters
+    ----------
+    settings : Settings
+    worker : Worker
+    """
+
+    def __init__(self, settings: Settings, worker: Worker) -> None:
+        self.aligner = Aligner(settings)
+        self.monitor = Monitor(settings)
+        self.last_fit_s: float | None = None
+        self._worker = worker
+
+    def feed(self, rows: list[Row]) -> list[Event]:
+        """Take readings in their order of arrival."""
+        if not rows:
+            return []
+        aligned = self.aligner.feed(Readings.of(rows))
+        events: list[Event] = []
+        start = 0
+        for reset in aligned.resets.tolist():
+            events += self._feed_rows(aligned.table.part(start, reset))
+            events += self.monitor.restart(CLOCK_BACK)
+            start = reset
+        return events + self._feed_rows(aligned.table.part(start, len(aligned.table)))
+
+    def poll(self) -> list[Event]:
+        """Adopt or refuse what the worker has finished."""
+        events: list[Event] = []
+        for outcome in self._worker.poll():
+            self.last_fit_s = outcome.seconds
+            if isinstance(outcome.result, Characteristic):
+                events += self.monitor.adopt(outcome.request_ns, outcome.result)
+            else:
+                events += self.monitor.refuse(outcome.request_ns, outcome.result)
+        return events
+
+    def request_fit(self) -> list[Event]:
+        """Ask for a fit now; raises `DataError` where that makes no sense."""
+        return self._pass_on(self.monitor.request_fit())
+
+    def acknowledge(self) -> list[Event]:
+        """Acknowledge the alarm; raises `DataError` if there is none."""
+        return self.monitor.acknowledge()
+
+    def reconfigure(self, settings: Settings) -> list[Event]:
+        """Take settings of which only live ones differ."""
+        return self.monitor.reconfigure(settings) or []
+
+    def _feed_rows(self, table: SampleTable) -> list[Event]:
+        events: list[Event] = []
+        done = 0
+        while done < len(table):
+            fed = self.monitor.feed(table.part(done, len(table)))
+            done += fed.rows
+            events += self._pass_on(fed.events)
+        return events
+
+    def _pass_on(self, events: list[Event]) -> list[Event]:
+        for event in events:
+            if isinstance(event, FitRequested):
+                self._worker.submit(event.task)
+        return events

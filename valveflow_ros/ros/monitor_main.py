@@ -1,0 +1,80 @@
+"""The executable `monitor`: one loop, own signals, an orderly end."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.signals import SignalHandlerOptions
+
+from valveflow_ros.errors import ValveflowError
+from valveflow_ros.ros.monitor_node import MonitorNode
+from valveflow_ros.ros.sentences import one_line, with_place
+from valveflow_ros.ros.stops import StopFlag
+
+_PERIOD_S = 0.01
+_SPIN_EVERY_S = 0.02
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the monitor until it is asked to stop; return the exit status."""
+    stop = StopFlag().install()
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # noqa: BLE001 - rclpy raises what its C++ gave it
+        return _complain(f'ROS could not be started: {one_line(error)}')
+    try:
+        return _run(stop)
+    except ValveflowError as error:
+        return _complain(str(error))
+    except Exception as error:  # noqa: BLE001 - a person is owed a sentence, not a trace
+        return _complain(f'The monitor failed unexpectedly: {with_place(error)}')
+    finally:
+        rclpy.try_shutdown()
+
+
+def _run(stop: StopFlag) -> int:
+    node = MonitorNode(lambda: bool(stop))
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        if node.settings.flag('autostart') and not _start(node):
+            return 0 if stop else 1
+        _loop(node, executor, stop)
+        return 0
+    finally:
+        node.end_session()
+        executor.shutdown(timeout_sec=0.5)
+        node.destroy_node()
+
+
+def _start(node: MonitorNode) -> bool:
+    """Configure and activate."""
+    for transition in (node.trigger_configure, node.trigger_activate):
+        if transition() != TransitionCallbackReturn.SUCCESS:
+            return False
+    return True
+
+
+def _loop(node: MonitorNode, executor: SingleThreadedExecutor, stop: StopFlag) -> None:
+    spin_s = 0.0
+    while not stop and not node.finalized and rclpy.ok():
+        begun_s = time.monotonic()
+        node.step()
+        if begun_s >= spin_s:
+            spin_s = begun_s + _SPIN_EVERY_S
+            executor.spin_once(timeout_sec=0)
+        time.sleep(max(0.0, begun_s + _PERIOD_S - time.monotonic()))
+
+
+def _complain(sentence: str) -> int:
+    print(f'valveflow monitor: {sentence}', file=sys.stderr)
+    return 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,61 @@
+"""What comes back from a fit, and whether it may be believed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.fit import FitTask
+
+
+@dataclass(frozen=True, slots=True)
+class FitOutcome:
+    """A curve, or the sentence why there is none.
+
+    Attributes
+    ----------
+    request_ns : int
+        Which request it answers.
+    result : Characteristic or str
+    seconds : float
+        How long it took, with the way there and back.
+    """
+
+    request_ns: int
+    result: Characteristic | str
+    seconds: float
+
+
+def objection(task: FitTask, result: object) -> str:
+    """Return why a result is not to be adopted, empty if nothing speaks against it.
+
+    The worker is another process and may have been hurt in any way; the curve
+    that predicts and raises alarms is only replaced by a whole one.
+    """
+    if not isinstance(result, Characteristic):
+        return 'The fit gave no curve.'
+    pieces = result.pieces
+    most = task.settings.whole('max_pieces')
+    if not 1 <= len(pieces) <= most:
+        return f'The fit gave {len(pieces)} pieces where 1 to {most} are possible.'
+    numbers = [x for p in pieces for x in (p.u_from, p.u_to, p.slope, p.intercept)]
+    numbers += [x for d in result.dynamics for x in (d.time_constant_s, d.delay_s)]
+    numbers += [result.residuals.rmse_mw, result.residuals.average_sd_mw]
+    if not all(map(math.isfinite, numbers)):
+        return 'The fit gave numbers that are not finite.'
+    knots = result.breakpoints
+    joined = all(a.u_to == b.u_from for a, b in zip(pieces, pieces[1:], strict=False))
+    if not joined or np.any(np.diff(knots) <= 0.0):
+        return 'The fit gave breakpoints that do not increase.'
+    if any(d.time_constant_s <= 0.0 or d.delay_s < 0.0 for d in result.dynamics):
+        return 'The fit gave a time constant or delay that cannot be.'
+    if result.residuals.average_sd_mw <= 0.0:
+        return 'The fit gave residuals without spread.'
+    if result.source.window_end_ns != int(task.contents.time_ns[-1]):
+        return 'The fit answered for other data.'
+    if replace(result, model_id='').with_id().model_id != result.model_id:
+        return 'The fit gave a curve that does not fit its own name.'
+    return ''

@@ -1,0 +1,128 @@
+"""What the monitor says, as bytes: a pure function of the engine's events.
+
+The node publishes and records what comes out of here, and a verification
+compares it with what comes out when a recording is fed again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from std_msgs.msg import Float64MultiArray
+from valveflow_msgs.msg import Alarm, FlowCharacteristic, JournalEntry, Prediction, SpecialSegment
+
+from valveflow_ros.core import events as engine
+from valveflow_ros.core.alarms import AlarmChange
+from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.events import JournalKind
+from valveflow_ros.core.monitor import CurveStatus
+from valveflow_ros.core.prediction import PredictionBlock
+from valveflow_ros.ros import conversions
+from valveflow_ros.ros.encoding import encode
+
+NO_CURVE_YET = 'No curve yet: not enough special segments.'
+
+
+@dataclass(frozen=True, slots=True)
+class OutputTopic:
+    """A topic under the node's name."""
+
+    message_type: type
+    type_name: str
+    latched: bool
+
+
+OUTPUTS: Mapping[str, OutputTopic] = {
+    'characteristic': OutputTopic(
+        FlowCharacteristic, 'valveflow_msgs/msg/FlowCharacteristic', True
+    ),
+    'breakpoints': OutputTopic(Float64MultiArray, 'std_msgs/msg/Float64MultiArray', True),
+    'slopes': OutputTopic(Float64MultiArray, 'std_msgs/msg/Float64MultiArray', True),
+    'prediction': OutputTopic(Prediction, 'valveflow_msgs/msg/Prediction', False),
+    'segments': OutputTopic(SpecialSegment, 'valveflow_msgs/msg/SpecialSegment', False),
+    'alarms': OutputTopic(Alarm, 'valveflow_msgs/msg/Alarm', True),
+    'journal': OutputTopic(JournalEntry, 'valveflow_msgs/msg/JournalEntry', False),
+}
+
+
+class Output(NamedTuple):
+    """A message to be sent: the topic's name in `OUTPUTS`, its bytes, the time it speaks of."""
+
+    name: str
+    data: bytes
+    time_ns: int
+
+
+class Outputs:
+    """Turns events into messages, one after the other.
+
+    Parameters
+    ----------
+    tag : str
+        The unit's tag, the frame_id of every message.
+
+    Notes
+    -----
+    The status of the curve is followed here by the events alone, so that the
+    messages depend on nothing but their order.
+    """
+
+    def __init__(self, tag: str) -> None:
+        self._tag = tag
+        self.curve: Characteristic | None = None
+        self.status = CurveStatus.UNKNOWN
+        self.cause = NO_CURVE_YET
+
+    def first(self) -> Iterator[Output]:
+        """Yield what stands there before anything has happened."""
+        yield from self._curve_messages()
+
+    def of(self, event: engine.Event) -> Iterator[Output]:
+        """Yield the messages of an event."""
+        tag = self._tag
+        if isinstance(event, PredictionBlock):
+            for time_ns, message in conversions.predictions(event, tag):
+                yield _output('prediction', message, time_ns)
+        elif isinstance(event, engine.SegmentClosed):
+            message = conversions.segment(event.segment, tag)
+            yield _output('segments', message, event.segment.end_ns)
+        elif isinstance(event, AlarmChange):
+            yield _output('alarms', conversions.alarm(event, tag), event.time_ns)
+        elif isinstance(event, engine.CurveAdopted):
+            self.curve, self.status, self.cause = event.characteristic, CurveStatus.FRESH, ''
+            yield from self._curve_messages()
+        elif isinstance(event, engine.JournalEntry):
+            yield _output('journal', conversions.journal(event, tag), event.time_ns)
+            if self._note(event):
+                yield from self._curve_messages()
+
+    def _note(self, entry: engine.JournalEntry) -> bool:
+        """Take what an entry says about the curve; tell whether it says anything."""
+        if entry.kind == JournalKind.FIT_REFUSED:
+            self.status = CurveStatus.STALE if self.curve else CurveStatus.REFUSED
+        elif entry.kind == JournalKind.RESET and self.curve:
+            self.status = CurveStatus.STALE
+        else:
+            return False
+        self.cause = entry.text
+        return True
+
+    def _curve_messages(self) -> Iterator[Output]:
+        curve = self.curve
+        time_ns = 0 if curve is None else curve.source.window_end_ns
+        message = conversions.characteristic(curve, self.status, self.cause, self._tag)
+        yield _output('characteristic', message, time_ns)
+        knots = [] if curve is None else curve.breakpoints
+        slopes = [] if curve is None else [p.slope for p in curve.pieces]
+        unit = '% MPa^e'
+        for name, values, label in (
+            ('breakpoints', knots, f'integrated input u at the ends of the pieces [{unit}]'),
+            ('slopes', slopes, f'slope of each piece [MW / ({unit})]'),
+        ):
+            yield _output(name, conversions.plain_array(values, label), time_ns)
+
+
+def _output(name: str, message: Any, time_ns: int) -> Output:
+    return Output(name, encode(message), max(0, time_ns))

@@ -1,0 +1,133 @@
+"""The recording of a run: where it lies, what it holds, and that it never disturbs the run."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from valveflow_ros.config import Settings
+from valveflow_ros.errors import RecordingError, ValveflowError
+from valveflow_ros.logs import Qos, Recorder, RecorderSettings, RecorderState, RecorderStatus
+
+DEFAULT_FOLDER = 'valveflow_recordings'
+PARAMETERS = 'parameters.json'
+TOPICS = 'topics.json'
+_CLOSE_S = 1.2
+_MOST_NAMES = 1000
+
+
+def new_folder(settings: Settings, at_s: float) -> Path:
+    """Make and return a folder that no other run records into.
+
+    Raises
+    ------
+    RecordingError
+        It cannot be made.
+    """
+    parent = Path(settings.text('record_directory') or DEFAULT_FOLDER).expanduser()
+    tag = re.sub(r'[^A-Za-z0-9_-]+', '-', settings.text('unit_tag'))[:60] or 'unit'
+    stem = time.strftime('valveflow_%Y%m%dT%H%M%SZ', time.gmtime(at_s)) + f'_{tag}'
+    try:
+        parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for k in range(1, _MOST_NAMES):
+            folder = parent / (stem if k == 1 else f'{stem}_{k}')
+            try:
+                folder.mkdir(mode=0o700)
+            except FileExistsError:
+                continue
+            return folder
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(parent, f'cannot be made ({reason})') from None
+    raise RecordingError(parent, f"holds {_MOST_NAMES} folders called '{stem}' already")
+
+
+class Recording:
+    """Writes inputs and outputs; where that fails, says so and goes on.
+
+    Parameters
+    ----------
+    settings : Settings
+    topics : mapping
+        What stands in the attachment `TOPICS`: the names under which the inputs and
+        outputs of the contract were found in this run.
+    at_s : float
+        Time of the start, seconds since the epoch.
+    """
+
+    def __init__(self, settings: Settings, topics: Mapping[str, Any], at_s: float) -> None:
+        self.problem = ''
+        self.folder: Path | None = None
+        self._recorder: Recorder | None = None
+        if not settings.flag('record'):
+            self.problem = 'Recording is switched off (parameter record).'
+            return
+        limits = RecorderSettings(
+            queue_limit=settings.whole('record_queue'),
+            flush_period_s=settings.real('record_flush'),
+            rotate_s=settings.real('record_rotation'),
+        )
+        attachments = {
+            PARAMETERS: _json(dict(settings)),
+            TOPICS: _json(topics),
+        }
+        try:
+            self.folder = new_folder(settings, at_s)
+            self._recorder = Recorder(self.folder, limits, attachments=attachments)
+        except ValveflowError as error:
+            self.problem = str(error)
+
+    @property
+    def on(self) -> bool:
+        """Tell whether there is a recorder at work."""
+        return self._recorder is not None
+
+    def add_topic(self, topic: str, type_name: str, *, reliable: bool, latched: bool) -> None:
+        """Make a topic known before its first message."""
+        if self._recorder is None:
+            return
+        qos = Qos(
+            reliability='reliable' if reliable else 'best_effort',
+            durability='transient_local' if latched else 'volatile',
+            depth=1 if latched else 10,
+        )
+        try:
+            self._recorder.add_topic(topic, type_name, qos=qos, latched=latched)
+        except ValveflowError as error:
+            self._give_up(str(error))
+
+    def write(self, topic: str, data: bytes, log_ns: int, time_ns: int) -> None:
+        """Hand in a message; never waits and never raises."""
+        if self._recorder is None:
+            return
+        try:
+            self._recorder.record(topic, data, log_ns, time_ns)
+        except ValveflowError as error:
+            self._give_up(str(error))
+
+    def status(self) -> RecorderStatus | None:
+        """Return the recorder's account, None without one."""
+        return None if self._recorder is None else self._recorder.status()
+
+    def close(self) -> RecorderStatus | None:
+        """Finish the file; return the account."""
+        recorder, self._recorder = self._recorder, None
+        if recorder is None:
+            return None
+        status = recorder.close(_CLOSE_S)
+        if status.state == RecorderState.DEGRADED or status.queued:
+            self.problem = status.reason or f'{status.queued} messages were not written in time.'
+        return status
+
+    def _give_up(self, problem: str) -> None:
+        """Stop recording: a recording that lacks what it should hold would lie."""
+        self.close()
+        self.problem = problem
+
+
+def _json(content: Mapping[str, Any]) -> bytes:
+    return json.dumps(content, indent=2, sort_keys=True).encode()

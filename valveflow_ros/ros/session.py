@@ -1,0 +1,197 @@
+"""One run of the monitor, from configure to clean-up: inputs, engine, outputs, recording."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.events import Event
+from valveflow_ros.logs import RecorderStatus
+from valveflow_ros.ros import graph, work_health
+from valveflow_ros.ros.diagnostics import Item
+from valveflow_ros.ros.input_health import InputHealth
+from valveflow_ros.ros.inputs import INPUTS, Decoder
+from valveflow_ros.ros.intake import Clock, Intake
+from valveflow_ros.ros.live import LiveEngine
+from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
+from valveflow_ros.ros.recording import Recording
+from valveflow_ros.ros.stamps import LogClock
+from valveflow_ros.ros.taking import Taker
+from valveflow_ros.ros.warmup import warm_up
+from valveflow_ros.ros.worker import FitWorker
+
+DIAGNOSTICS = '/diagnostics'
+_GRAPH_S = 2.0
+_DEPTH = 1000
+
+
+class Session:
+    """Everything that lives between configure and clean-up.
+
+    Parameters
+    ----------
+    node : Node
+    settings : Settings
+    stop : callable
+        Tells whether to give up waiting.
+    """
+
+    def __init__(self, node: Node, settings: Settings, stop: Callable[[], bool]) -> None:
+        self._node = node
+        self._settings = settings
+        self._log_clock = LogClock()
+        self.inputs = {topic.name: node.resolve_topic_name(topic.name) for topic in INPUTS}
+        self.outputs = {name: node.resolve_topic_name(f'~/{name}') for name in OUTPUTS}
+        self.worker = FitWorker(settings.real('refit_timeout'))
+        self.worker.start()
+        self.warm_up_s = warm_up(settings, self.worker, stop)
+        self.engine = LiveEngine(settings, self.worker)
+        self._outputs = Outputs(settings.text('unit_tag'))
+        self._publishers = {
+            name: node.create_publisher(topic.message_type, f'~/{name}', _qos(topic.latched))
+            for name, topic in OUTPUTS.items()
+        }
+        self.recording = self._open_recording()
+        self._takers: list[Taker] = []
+        self._intake: Intake | None = None
+        self._health = InputHealth(settings, self.inputs)
+        self._seen: dict[str, graph.Publishers] = {}
+        self._looked_s = self._listening_since_s = 0.0
+        self._begun = False
+
+    @property
+    def listening(self) -> bool:
+        """Tell whether inputs are taken."""
+        return self._intake is not None
+
+    def listen(self) -> None:
+        """Subscribe."""
+        node, settings = self._node, self._settings
+        reliable = settings.text('input_reliability') == 'reliable'
+        by_name = {name: name for name in self.inputs} | {v: k for k, v in self.inputs.items()}
+
+        def mismatch(topic: str) -> None:
+            self._health.mismatched.add(by_name.get(topic, topic))
+
+        def taker(message_type: type, topic: str) -> Taker:
+            made = Taker(node, message_type, topic, reliable=reliable, on_mismatch=mismatch)
+            self._takers.append(made)
+            return made
+
+        sources = {topic.name: taker(topic.message_type, topic.name) for topic in INPUTS}
+        clock = None
+        if node.get_parameter('use_sim_time').value:
+            clock = Taker(node, Clock, '/clock')
+            self._takers.append(clock)
+        self._intake = Intake(
+            sources, Decoder(settings), self._log_clock, settings.text('stamp_source'), clock,
+            self._health.note,
+        )  # fmt: skip
+        self._listening_since_s = time.monotonic()
+        if not self._begun:
+            self._begun = True
+            self._say(self._outputs.first())
+
+    def hush(self) -> None:
+        """Unsubscribe, after taking what is there."""
+        if self._intake is None:
+            return
+        self.step(last=True)
+        for taker in self._takers:
+            taker.close()
+        self._takers.clear()
+        self._intake = None
+
+    def step(self, last: bool = False) -> bool:
+        """Take, record and feed what has arrived; tell whether there was anything."""
+        self.tell(self.engine.poll())
+        if self._intake is None:
+            return False
+        arrivals = self._intake.collect(time.monotonic(), time.time_ns(), last)
+        for arrival in arrivals:
+            self.recording.write(
+                self.inputs[arrival.name], arrival.data, arrival.log_ns, arrival.time_ns
+            )
+        self.tell(self.engine.feed(self._intake.rows(arrivals)))
+        return bool(arrivals)
+
+    def tell(self, events: Iterable[Event]) -> None:
+        """Publish and record what a call of the engine brought."""
+        for event in events:
+            self._say(self._outputs.of(event))
+
+    def reconfigure(self, settings: Settings) -> None:
+        """Take settings of which only live ones differ."""
+        self._settings = self._health.settings = settings
+        self.tell(self.engine.reconfigure(settings))
+
+    def items(self) -> list[Item]:
+        """Return how everything is."""
+        now_s = time.monotonic()
+        monitor = self.engine.monitor
+        items: list[Item] = []
+        if self._intake is not None:
+            if now_s - self._looked_s >= _GRAPH_S:
+                self._looked_s = now_s
+                types = {topic.name: topic.type_name for topic in INPUTS}
+                wanted = {name: (topic, types[name]) for name, topic in self.inputs.items()}
+                self._seen = graph.publishers(self._node, wanted)
+            items += self._health.items(
+                self._intake.tallies, self.engine.aligner.counts(), self._seen,
+                now_s, now_s - self._listening_since_s,
+            )  # fmt: skip
+        items.append(work_health.fit_item(monitor, self.worker, self.engine.last_fit_s))
+        items.append(work_health.alarm_item(monitor))
+        items.append(work_health.recorder_item(self.recording))
+        return items
+
+    def record(self, topic: str, data: bytes, time_ns: int) -> None:
+        """Record a message that no engine event stands behind."""
+        self.recording.write(topic, data, self._log_clock.stamp(time.time_ns()), time_ns)
+
+    def close(self) -> RecorderStatus | None:
+        """End everything; the recording is a finished file afterwards."""
+        self.hush()
+        self.worker.close()
+        status = self.recording.close()
+        for publisher in self._publishers.values():
+            self._node.destroy_publisher(publisher)
+        return status
+
+    def _say(self, outputs: Iterable[Output]) -> None:
+        for output in outputs:
+            publisher: Publisher = self._publishers[output.name]
+            publisher.publish(output.data)
+            self.record(self.outputs[output.name], output.data, output.time_ns)
+
+    def _open_recording(self) -> Recording:
+        topics: dict[str, Any] = {'inputs': self.inputs, 'outputs': self.outputs}
+        recording = Recording(self._settings, topics, time.time())
+        reliable = self._settings.text('input_reliability') == 'reliable'
+        for topic in INPUTS:
+            recording.add_topic(
+                self.inputs[topic.name], topic.type_name, reliable=reliable, latched=False
+            )
+        for name, output in OUTPUTS.items():
+            recording.add_topic(
+                self.outputs[name], output.type_name, reliable=True, latched=output.latched
+            )
+        recording.add_topic(
+            DIAGNOSTICS, 'diagnostic_msgs/msg/DiagnosticArray', reliable=True, latched=False
+        )
+        return recording
+
+
+def _qos(latched: bool) -> QoSProfile:
+    """Return what outputs are offered with: reliable, and kept for who comes late if latched."""
+    return QoSProfile(
+        depth=1 if latched else _DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )

@@ -1,0 +1,107 @@
+"""The executable `plant_simulator`: the paper's plant on the input topics."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator, Sequence
+
+import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from valveflow_ros.errors import ParameterError, ValveflowError
+from valveflow_ros.plant.simulator import simulate_parts
+from valveflow_ros.records import SIGNALS, SampleTable, Signal
+from valveflow_ros.ros import simulator_steps as steps
+from valveflow_ros.ros.declare import declare, unknown_overrides
+from valveflow_ros.ros.inputs import PLANT_SAMPLE
+from valveflow_ros.ros.playing import Player, Step
+from valveflow_ros.ros.sentences import one_line, with_place
+from valveflow_ros.ros.stops import StopFlag
+
+_EFFECTS = ParameterDescriptor(
+    description="What is wrong with the plant: texts of the form name or name:key=value,... as "
+    "in 'valveflow simulate --effect'.",
+    dynamic_typing=True,
+    read_only=True,
+)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Simulate and publish; return the exit status."""
+    stop = StopFlag().install()
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # noqa: BLE001 - rclpy raises what its C++ gave it
+        return _complain(f'ROS could not be started: {one_line(error)}')
+    node = Node('plant_simulator')
+    try:
+        return _run(node, stop)
+    except ValveflowError as error:
+        return _complain(str(error))
+    except Exception as error:  # noqa: BLE001 - a person is owed a sentence, not a trace
+        return _complain(f'failed unexpectedly: {with_place(error)}')
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _run(node: Node, stop: StopFlag) -> int:
+    values = declare(node, steps.TABLE)
+    effects = steps.effects_of(_texts(node.declare_parameter('effects', [], _EFFECTS).value))
+    log = node.get_logger()
+    for sentence in unknown_overrides(node, [*values, 'effects']):
+        log.warning(f'{sentence} It is ignored.')
+    rate, wait_s = float(values['rate']), float(values['wait'])  # type: ignore[arg-type]
+    steps.check_together(rate, bool(values['stamped']), bool(values['use_clock']))
+    start_ns = steps.start_ns_of(str(values['start']), rate, time.time_ns())
+    parts = simulate_parts(
+        float(values['days']), int(values['seed']), start_ns=start_ns, effects=effects  # type: ignore[arg-type,call-overload]
+    )
+    names, made = _steps((part.table for part in parts), values)
+    player = Player(node, names, rate, bool(values['use_clock']), lambda: bool(stop))
+    missing = player.wait_for_listeners(wait_s)
+    if missing and wait_s > 0 and not stop:
+        log.warning(f'Nobody listens to {", ".join(missing)}.')
+    wrong = ', '.join(str(effect) for effect in effects) or 'nothing'
+    log.info(f'{float(values["days"]):g} days of plant, seed {values["seed"]}; wrong with it: {wrong}.')  # type: ignore[arg-type]
+    count = player.play(made)
+    end = 'Stopped' if stop else 'Finished'
+    log.info(f'{end} after {count} samples, {sum(player.sent.values())} messages.')
+    return 0
+
+
+def _steps(
+    parts: Iterator[SampleTable], values: dict[str, object]
+) -> tuple[list[str], Iterator[Step]]:
+    """Return the inputs that will be published, and the steps."""
+    command = bool(values['command'])
+    if values['stamped']:
+        return [PLANT_SAMPLE], steps.stamped_steps(parts, command, str(values['unit_tag']))
+    names = [
+        info.topic for info in SIGNALS if command or info.signal != Signal.VALVE_COMMAND
+    ]
+    return names, steps.plain_steps(parts, command)
+
+
+def _texts(given: object) -> list[str]:
+    """Return the texts of the parameter effects, given as one text or as a list."""
+    if given is None or given == b'':
+        return []
+    if isinstance(given, str):
+        return [given]
+    texts = list(given) if isinstance(given, list | tuple) else [given]
+    if not all(isinstance(text, str) for text in texts):
+        raise ParameterError('effects', f'must be a list of texts, not {given!r}')
+    return texts
+
+
+def _complain(sentence: str) -> int:
+    print(f'valveflow plant_simulator: {sentence}', file=sys.stderr)
+    return 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,37 @@
+"""Signals become a flag: what runs is finished, then the process ends in order."""
+
+from __future__ import annotations
+
+import signal
+from types import FrameType
+
+_ASKED_TO_STOP = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class StopFlag:
+    """Set by SIGINT, SIGTERM or SIGHUP; asking twice changes nothing."""
+
+    def __init__(self) -> None:
+        self._by: int | None = None
+
+    def install(self) -> StopFlag:
+        """Take over the signals of this process."""
+        for number in _ASKED_TO_STOP:
+            signal.signal(number, self._note)
+        return self
+
+    def __bool__(self) -> bool:
+        """Tell whether to stop."""
+        return self._by is not None
+
+    @property
+    def name(self) -> str:
+        """Return the name of the signal, empty before one came."""
+        return '' if self._by is None else signal.Signals(self._by).name
+
+    def set(self) -> None:
+        """Ask to stop from inside."""
+        self._by = self._by or signal.SIGTERM
+
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        self._by = number

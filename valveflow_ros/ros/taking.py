@@ -1,0 +1,149 @@
+"""Take messages without the executor: the one place that leans on rclpy's inside.
+
+An executor spends far more time on choosing callbacks than the messages are
+worth. Here the loop asks each subscription itself, for raw bytes together with
+the stamps and the sequence number the middleware delivers. Where this rclpy
+does not offer that, the executor calls back instead and the rest of the house
+notices nothing; a contract test tells which way is taken.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+
+DEPTH = 1000
+
+
+class Taken(NamedTuple):
+    """One message as the middleware delivered it; stamps in ns, 0 where it gave none."""
+
+    data: bytes
+    source_ns: int
+    received_ns: int
+    sequence: int
+
+
+class _PolledGroup(CallbackGroup):
+    """Keeps the executor away from subscriptions, and lets their events through."""
+
+    def can_execute(self, entity: Any) -> bool:
+        """Tell the executor that nothing is to be done for a subscription."""
+        return not isinstance(entity, Subscription)
+
+    def beginning_execution(self, entity: Any) -> bool:
+        """Allow what `can_execute` allows."""
+        return self.can_execute(entity)
+
+    def ending_execution(self, entity: Any) -> None:
+        """Forget nothing, for nothing was noted."""
+
+
+def can_poll(subscription: Subscription) -> bool:
+    """Tell whether this rclpy lets a message be taken by hand."""
+    return callable(getattr(subscription.handle, 'take_message', None))
+
+
+class Taker:
+    """A subscription that is asked.
+
+    Parameters
+    ----------
+    node : Node
+    message_type : type
+    topic : str
+        May be relative; the node resolves and remaps it.
+    reliable : bool
+        Whether to ask for reliable delivery; a best-effort request matches every publisher.
+    on_mismatch : callable
+        Called with the topic when a publisher's quality of service does not match.
+    polled : bool
+        False to let the executor call back even where asking is possible.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        message_type: type,
+        topic: str,
+        *,
+        reliable: bool = False,
+        on_mismatch: Callable[[str], None] = lambda _: None,
+        polled: bool = True,
+    ) -> None:
+        self._node = node
+        self._type = message_type
+        self._waiting: deque[Taken] = deque(maxlen=DEPTH)
+        self._polled = polled
+        self._make(topic, reliable, on_mismatch, _PolledGroup() if polled else None)
+        if polled and not can_poll(self._subscription):
+            node.destroy_subscription(self._subscription)
+            self._polled = False
+            self._make(topic, reliable, on_mismatch, None)
+
+    @property
+    def topic(self) -> str:
+        """Return the full name of the topic."""
+        return str(self._subscription.topic_name)
+
+    @property
+    def polled(self) -> bool:
+        """Tell whether messages are asked for rather than called back."""
+        return self._polled
+
+    def take(self, most: int = DEPTH) -> list[Taken]:
+        """Return what has arrived, oldest first, at most ``most`` messages."""
+        if not self._polled:
+            return [self._waiting.popleft() for _ in range(min(most, len(self._waiting)))]
+        taken: list[Taken] = []
+        handle = self._subscription.handle
+        with handle:
+            while len(taken) < most:
+                found = handle.take_message(self._type, True)
+                if found is None:
+                    break
+                taken.append(_taken(*found))
+        return taken
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        self._node.destroy_subscription(self._subscription)
+
+    def _make(
+        self,
+        topic: str,
+        reliable: bool,
+        on_mismatch: Callable[[str], None],
+        group: CallbackGroup | None,
+    ) -> None:
+        reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        self._subscription = self._node.create_subscription(
+            self._type,
+            topic,
+            self._call_back,
+            QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=DEPTH, reliability=reliability),
+            raw=True,
+            callback_group=group or MutuallyExclusiveCallbackGroup(),
+            event_callbacks=SubscriptionEventCallbacks(
+                incompatible_qos=lambda _: on_mismatch(self.topic)
+            ),
+        )
+
+    def _call_back(self, data: bytes, info: dict[str, Any]) -> None:
+        self._waiting.append(_taken(data, info))
+
+
+def _taken(data: bytes, info: dict[str, Any]) -> Taken:
+    return Taken(
+        data,
+        int(info['source_timestamp'] or 0),
+        int(info['received_timestamp'] or 0),
+        int(info['publication_sequence_number'] or 0),
+    )

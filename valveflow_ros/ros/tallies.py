@@ -1,0 +1,81 @@
+"""Account of what arrived on one topic: how often, how lately, and what was lost on the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+_STALE_LEAST_S = 2.0
+_STALE_PERIODS = 2.5
+_MEMORY = 0.1  # weight of the newest interval in the mean period
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counts and times of one topic; times by a clock that never goes back.
+
+    Attributes
+    ----------
+    received : int
+        Messages taken.
+    lost : int
+        Messages the publisher sent and the middleware did not deliver, by gaps in
+        the publisher's numbering.
+    missed_at_start : int
+        Messages sent before the first one that came; most were sent before we listened.
+    irregular : int
+        Numbers that went back: a publisher started anew, or there are two.
+    malformed, without_time : int
+        Messages recorded and not used.
+    """
+
+    received: int = 0
+    lost: int = 0
+    missed_at_start: int = 0
+    irregular: int = 0
+    malformed: int = 0
+    without_time: int = 0
+    last_s: float | None = None
+    period_s: float | None = None
+    _number: int = 0
+    _wary: bool = False
+
+    def note_number(self, number: int) -> None:
+        """Take the publisher's number of a message; 0 where the middleware gives none."""
+        self.received += 1
+        if number <= 0:
+            return
+        if self._number == 0:
+            self.missed_at_start = number - 1
+        elif number <= self._number:
+            self.irregular += 1
+            # Coming back to the other publisher's numbers is no loss.
+            self._wary = True
+        else:
+            if not self._wary:
+                self.lost += number - self._number - 1
+            self._wary = False
+        self._number = number
+
+    def note_arrival(self, count: int, now_s: float) -> None:
+        """Take the time at which ``count`` messages were found."""
+        if count == 0:
+            return
+        if self.last_s is not None:
+            interval = (now_s - self.last_s) / count
+            before = interval if self.period_s is None else self.period_s
+            weight = 1.0 - (1.0 - _MEMORY) ** count
+            self.period_s = (1.0 - weight) * before + weight * interval
+        self.last_s = now_s
+
+    def age_s(self, now_s: float) -> float | None:
+        """Return how long ago the newest message came; None before the first."""
+        return None if self.last_s is None else now_s - self.last_s
+
+    def rate_hz(self) -> float:
+        """Return the mean rate of late, 0 while it is not known."""
+        return 1.0 / self.period_s if self.period_s else 0.0
+
+    def stale(self, now_s: float) -> bool:
+        """Tell whether a topic that spoke has fallen silent."""
+        age = self.age_s(now_s)
+        return age is not None and age > max(_STALE_LEAST_S, _STALE_PERIODS * (self.period_s or 0))

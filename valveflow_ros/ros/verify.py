@@ -1,0 +1,207 @@
+"""Feed a recording again and compare every message the monitor sent then with what it says now."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from rclpy.serialization import deserialize_message
+from valveflow_msgs.msg import JournalEntry as JournalMessage
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.align import Aligner
+from valveflow_ros.core.events import Event, JournalEntry
+from valveflow_ros.core.monitor import Monitor
+from valveflow_ros.core.offline import JournalReplayer
+from valveflow_ros.errors import RecordingError, ValveflowError
+from valveflow_ros.logs import LogContents, LoggedMessage, open_log
+from valveflow_ros.records import Readings
+from valveflow_ros.ros import conversions
+from valveflow_ros.ros.inputs import Decoder, Row
+from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
+from valveflow_ros.ros.recording import PARAMETERS, TOPICS
+
+_BLOCK = 20_000
+Progress = Callable[[int], None]
+
+
+@dataclass(slots=True)
+class Verification:
+    """What a comparison gave.
+
+    Attributes
+    ----------
+    inputs, rows : int
+        Messages fed and rows of the sample table made of them.
+    compared : dict of str to int
+        Messages that were equal byte for byte, by output.
+    difference : str
+        The first difference as a sentence; empty if there was none.
+    warnings : tuple of str
+        What the reader had to say about the file.
+    """
+
+    inputs: int = 0
+    rows: int = 0
+    compared: dict[str, int] = field(default_factory=dict)
+    difference: str = ''
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def identical(self) -> bool:
+        """Tell whether everything was equal."""
+        return not self.difference
+
+
+class _DifferenceError(Exception):
+    """The first difference was found."""
+
+
+def verify(path: str | Path, progress: Progress = lambda _: None) -> Verification:
+    """Compare a recording with its replay.
+
+    Parameters
+    ----------
+    path : str or Path
+        A recording of the monitor.
+    progress : callable
+        Is told from time to time how many inputs were fed.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be read, or is no recording of the monitor.
+    """
+    log = open_log(path)
+    settings, inputs, outputs = _attached(log)
+    result = Verification(warnings=log.warnings)
+    recorded = _messages(log, outputs)
+    replay = _replayed(log, settings, inputs, outputs, result, progress)
+    try:
+        for output in replay:
+            _compare(output, next(recorded, None), outputs, result)
+        extra = next(recorded, None)
+        if extra is not None:
+            name = outputs[extra.topic]
+            raise _DifferenceError(f'The recording goes on with {name} where the replay ends.')
+    except _DifferenceError as error:
+        result.difference = str(error)
+    return result
+
+
+def _attached(log: LogContents) -> tuple[Settings, dict[str, str], dict[str, str]]:
+    """Return the settings, and the inputs and outputs by their topics."""
+    try:
+        settings = Settings(json.loads(log.attachments[PARAMETERS]))
+        topics: dict[str, Any] = json.loads(log.attachments[TOPICS])
+        inputs = {str(topic): str(name) for name, topic in topics['inputs'].items()}
+        outputs = {str(t): str(n) for n, t in topics['outputs'].items() if n in OUTPUTS}
+    except KeyError as error:
+        problem = f'is no recording of the monitor (the attachment {error} is missing)'
+        raise RecordingError(log.path, problem) from None
+    except (ValueError, TypeError, AttributeError, ValveflowError) as error:
+        problem = f'holds attachments that cannot be used ({str(error).rstrip(".")})'
+        raise RecordingError(log.path, problem) from None
+    return settings, inputs, outputs
+
+
+def _replayed(
+    log: LogContents,
+    settings: Settings,
+    inputs: dict[str, str],
+    outputs: dict[str, str],
+    result: Verification,
+    progress: Progress,
+) -> Iterator[Output]:
+    """Yield what the engine says to the recorded inputs and decisions."""
+    speaker = Outputs(settings.text('unit_tag'))
+    yield from speaker.first()
+    monitor = Monitor(settings)
+    replayer = JournalReplayer(monitor, list(_journal(log, outputs)))
+    aligner, decoder = Aligner(settings), Decoder(settings)
+    messages = _messages(log, inputs)
+    while block := list(islice(messages, _BLOCK)):
+        result.inputs += len(block)
+        rows = [row for message in block for row in _rows(decoder, inputs, message)]
+        # Restarts of the clock stand in the journal, so the rows alone are enough here.
+        for event in _fed(replayer, aligner, rows):
+            yield from speaker.of(event)
+        result.rows = monitor.rows
+        progress(result.inputs)
+
+
+def _messages(log: LogContents, topics: Iterable[str]) -> Iterator[LoggedMessage]:
+    """Return the messages of those topics that are there."""
+    there = [topic for topic in topics if topic in log.topics]
+    return log.iter_messages(there) if there else iter(())
+
+
+def _journal(log: LogContents, outputs: dict[str, str]) -> Iterator[JournalEntry]:
+    topics = [topic for topic, name in outputs.items() if name == 'journal']
+    for message in _messages(log, topics):
+        try:
+            yield conversions.journal_entry(deserialize_message(message.data, JournalMessage))
+        except Exception as error:
+            # rclpy raises whatever the middleware's C++ gave it.
+            problem = f'holds a line of the journal that cannot be read ({error})'
+            raise RecordingError(log.path, problem) from error
+
+
+def _rows(decoder: Decoder, inputs: dict[str, str], message: LoggedMessage) -> list[Row]:
+    """Return the readings in a message as the live run took them."""
+    name = inputs[message.topic]
+    time_ns = decoder.time_ns(name, message.data, message.publish_time_ns)
+    if time_ns <= 0:
+        return []
+    try:
+        return decoder.rows(name, message.data, time_ns)
+    except ValueError:
+        return []
+
+
+def _fed(replayer: JournalReplayer, aligner: Aligner, rows: list[Row]) -> list[Event]:
+    try:
+        return replayer.feed(aligner.feed(Readings.of(rows)).table)
+    except (KeyError, ValveflowError) as error:
+        raise _DifferenceError(
+            f'The journal asks for what the replay cannot do: {error}.'
+        ) from None
+
+
+def _compare(
+    output: Output, then: LoggedMessage | None, outputs: dict[str, str], result: Verification
+) -> None:
+    """Raise `_DifferenceError` unless both are the same message."""
+    number = result.compared.get(output.name, 0) + 1
+    what = f'{output.name} number {number}'
+    if then is None:
+        raise _DifferenceError(f'The recording ends before {what}, after {result.rows} rows.')
+    if outputs[then.topic] != output.name:
+        raise _DifferenceError(
+            f'The replay gives {what} where the recording has {outputs[then.topic]}.'
+        )
+    if then.publish_time_ns != output.time_ns:
+        raise _DifferenceError(f'{what.capitalize()} belongs to another time in the recording.')
+    if then.data != output.data:
+        kind = OUTPUTS[output.name].message_type
+        raise _DifferenceError(
+            f'{what.capitalize()} differs: {_first_field(kind, then.data, output.data)}.'
+        )
+    result.compared[output.name] = number
+
+
+def _first_field(kind: type, then: bytes, now: bytes) -> str:
+    """Name the first field that differs."""
+    try:
+        old, new = deserialize_message(then, kind), deserialize_message(now, kind)
+    except Exception as error:  # noqa: BLE001 - see `_journal`
+        return f'it cannot be read ({error})'
+    for name in old.get_fields_and_field_types():
+        before, after = getattr(old, name), getattr(new, name)
+        if repr(before) != repr(after):
+            return f'{name} was {before!r} and is {after!r}'
+    return 'its padding'

@@ -1,0 +1,91 @@
+"""How the work goes: an item each for the fit, the alarm and the recorder."""
+
+from __future__ import annotations
+
+import math
+
+from valveflow_ros.core.monitor import CurveStatus, Monitor
+from valveflow_ros.logs import RecorderState
+from valveflow_ros.ros.diagnostics import Item, Level
+from valveflow_ros.ros.recording import Recording
+from valveflow_ros.ros.worker import FitWorker
+
+
+def fit_item(monitor: Monitor, worker: FitWorker, last_fit_s: float | None) -> Item:
+    """Return how the curve is, and the process that fits it."""
+    curve = monitor.characteristic
+    noise = monitor.noise()
+    values: dict[str, object] = {
+        'Status': monitor.status.name.lower(),
+        'Model': '' if curve is None else curve.model_id,
+        'Pieces': 0 if curve is None else len(curve.pieces),
+        'Age of the curve (s)': None if curve is None else _age_s(monitor),
+        'Special segments in the window': monitor.segments,
+        'Special samples in the window': monitor.special_samples,
+        'Samples taken': monitor.rows,
+        'Noise of the integrated input (% MPa^e)': noise.input,
+        'Noise of the power (MW)': noise.power_mw,
+        'Temperature spread (K)': math.nan if curve is None else curve.source.temperature_spread_k,
+        'Refit under way for (s)': worker.busy_s,
+        'Last refit took (s)': last_fit_s,
+        'Fit process starts': worker.starts,
+    }
+    if worker.failures_in_a_row:
+        sentence = f'{monitor.cause} {worker.failures_in_a_row} failures in a row.'.strip()
+        return Item('fit', Level.ERROR, sentence, values)
+    if curve is None:
+        refused = monitor.status == CurveStatus.REFUSED
+        return Item('fit', Level.WARN if refused else Level.OK, monitor.cause, values)
+    if monitor.status == CurveStatus.STALE:
+        return Item('fit', Level.WARN, f'The curve is not renewed: {monitor.cause}', values)
+    if curve.source.temperature_flag:
+        return Item(
+            'fit',
+            Level.WARN,
+            f'The main steam temperature spread over {curve.source.temperature_spread_k:.1f} K; '
+            'the method assumes an unchanged one, so the curve is to be doubted.',
+            values,
+        )
+    return Item('fit', Level.OK, f'A curve of {len(curve.pieces)} pieces.', values)
+
+
+def _age_s(monitor: Monitor) -> float:
+    curve = monitor.characteristic
+    return math.nan if curve is None else (monitor.last_ns - curve.source.window_end_ns) / 1e9
+
+
+def alarm_item(monitor: Monitor) -> Item:
+    """Return how the residual alarm stands."""
+    alarm = monitor.alarm
+    words = alarm.state.name.lower().replace('_', ' ')
+    values: dict[str, object] = {'State': words, 'Limit (MW)': monitor.limit_mw()}
+    if alarm.active:
+        return Item('alarm', Level.ERROR, f'The unit does not follow its curve ({words}).', values)
+    if alarm.standing:
+        return Item('alarm', Level.WARN, f'The alarm waits to be cleared ({words}).', values)
+    return Item('alarm', Level.OK, 'No alarm.', values)
+
+
+def recorder_item(recording: Recording) -> Item:
+    """Return how the recording goes."""
+    status = recording.status()
+    if status is None:
+        wanted = recording.folder is None and 'switched off' in recording.problem
+        return Item('recorder', Level.OK if wanted else Level.ERROR, recording.problem)
+    dropped = sum(status.dropped.values())
+    values: dict[str, object] = {
+        'State': status.state.name.lower(),
+        'Folder': str(recording.folder),
+        'File': status.file,
+        'Messages written': status.written,
+        'Messages waiting': status.queued,
+        'Messages dropped': dropped,
+        'Messages lost': status.lost,
+        'Files finished': status.files_finished,
+        'Bytes written': status.bytes_written,
+    }
+    if status.state != RecorderState.RECORDING:
+        return Item('recorder', Level.ERROR, f'Not recording: {status.reason}', values)
+    if dropped or status.lost:
+        return Item('recorder', Level.WARN, f'{dropped + status.lost} messages are missing.', values)
+    return Item('recorder', Level.OK, 'Recording.', values)

@@ -1,0 +1,224 @@
+"""Fits in a process of their own, so that no sample waits for one.
+
+The process is started once, is given low priority, and ends with the monitor.
+When it is killed, hangs or fails, that is seen at the next `FitWorker.poll`; the
+request gets an outcome that says so, and a new process is started after a pause
+that doubles while failures follow each other.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.fit import FitTask
+from valveflow_ros.ros.frames import FrameReader, send
+from valveflow_ros.ros.outcome import FitOutcome, objection
+
+FIT_JOB = 'valveflow_ros.core.fit:fit'
+_FIRST_PAUSE_S = 0.5
+_LONGEST_PAUSE_S = 60.0
+# One core is what the machine can spare; the parent's and an idle desktop's settings do not matter.
+_ONE_THREAD = dict.fromkeys(
+    ('NUMBA_NUM_THREADS', 'OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1'
+)
+
+
+@dataclass(slots=True)
+class _Running:
+    number: int
+    task: FitTask
+    begun_s: float
+    sent: bool = False
+
+
+class FitWorker:
+    """Computes one fit at a time.
+
+    Parameters
+    ----------
+    timeout_s : float
+        A fit that takes longer is ended.
+    job : str
+        The function that is called, as ``module:function``.
+    clock : callable
+        Seconds by a clock that never goes back.
+    """
+
+    def __init__(
+        self,
+        timeout_s: float,
+        job: str = FIT_JOB,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._timeout_s = timeout_s
+        self._job = job
+        self._clock = clock
+        self._process: subprocess.Popen[bytes] | None = None
+        self._reader: FrameReader | None = None
+        self._running: _Running | None = None
+        self._number = 0
+        self._pause_s = _FIRST_PAUSE_S
+        self._start_at_s = 0.0
+        self.starts = 0
+        self.failures_in_a_row = 0
+
+    @property
+    def pid(self) -> int | None:
+        """Return the process's id, None while there is none."""
+        return None if self._process is None else self._process.pid
+
+    @property
+    def busy_s(self) -> float | None:
+        """Return how long the fit at hand has been running, None without one."""
+        return None if self._running is None else self._clock() - self._running.begun_s
+
+    def start(self) -> None:
+        """Start the process; call it from the thread that lives as long as the monitor.
+
+        The kernel ends the process when the thread that started it ends.
+        """
+        command = [sys.executable, '-m', 'valveflow_ros.ros.worker_child']
+        try:
+            self._process = subprocess.Popen(
+                [*command, str(os.getpid()), self._job],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                bufsize=0,
+                env={**os.environ, **_ONE_THREAD},
+                # Ctrl-C in a terminal is for the monitor to deal with.
+                start_new_session=True,
+            )
+        except OSError as error:
+            self._failed(f'The fit process could not be started ({error.strerror}).', [])
+            return
+        self.starts += 1
+        assert self._process.stdout is not None
+        os.set_blocking(self._process.stdout.fileno(), False)
+        self._reader = FrameReader(self._process.stdout.fileno())
+
+    def submit(self, task: FitTask) -> None:
+        """Take a task; one that is still running is given up."""
+        if self._running is not None and self._process is not None:
+            self._end()
+            self.start()
+        self._number += 1
+        self._running = _Running(self._number, task, self._clock())
+        self._send()
+
+    def poll(self) -> list[FitOutcome]:
+        """Return the outcomes there are, and see to the process; never waits."""
+        outcomes: list[FitOutcome] = []
+        if self._process is None:
+            if self._clock() >= self._start_at_s:
+                self.start()
+                self._send()
+            return outcomes
+        self._take_results(outcomes)
+        if self._reader is not None and self._reader.ended:
+            status = self._end()
+            self._failed(f'The fit process ended unexpectedly ({status}).', outcomes)
+        elif self.busy_s is not None and self.busy_s > self._timeout_s:
+            self._end()
+            self._failed(
+                f'The fit took longer than {self._timeout_s:g} s and was ended '
+                '(parameter refit_timeout).',
+                outcomes,
+            )
+        return outcomes
+
+    def close(self) -> None:
+        """End the process at once, whatever it is doing."""
+        if self._process is not None:
+            self._end()
+        self._running = None
+
+    def _take_results(self, outcomes: list[FitOutcome]) -> None:
+        assert self._reader is not None
+        try:
+            results = self._reader.ready()
+        except Exception:  # noqa: BLE001 - unpickling what a hurt process wrote may raise anything
+            self._end()
+            self._failed('The fit process gave an answer that cannot be read.', outcomes)
+            return
+        for number, result in results:
+            running = self._running
+            if running is None or running.number != number:
+                continue
+            self._conclude(_believed(running.task, result), outcomes)
+            self.failures_in_a_row = 0
+            self._pause_s = _FIRST_PAUSE_S
+
+    def _conclude(self, result: Characteristic | str, outcomes: list[FitOutcome]) -> None:
+        running = self._running
+        if running is None:
+            return
+        self._running = None
+        seconds = self._clock() - running.begun_s
+        outcomes.append(FitOutcome(running.task.request_ns, result, seconds))
+
+    def _failed(self, sentence: str, outcomes: list[FitOutcome]) -> None:
+        self.failures_in_a_row += 1
+        self._start_at_s = self._clock() + self._pause_s
+        self._pause_s = min(2.0 * self._pause_s, _LONGEST_PAUSE_S)
+        self._conclude(sentence, outcomes)
+
+    def _send(self) -> None:
+        """Send the task at hand from a thread: a snapshot of days takes the pipe a while."""
+        running, process = self._running, self._process
+        if running is None or running.sent or process is None:
+            return
+        running.sent = True
+        # The time it waited for a process to be there is not the fit's.
+        running.begun_s = self._clock()
+        assert process.stdin is not None
+        thread = threading.Thread(
+            target=_send_quietly,
+            # A descriptor of its own: the other may be closed, and its number be
+            # somebody else's, while this thread still writes.
+            args=(os.dup(process.stdin.fileno()), (running.number, running.task)),
+            name='fit sender',
+            daemon=True,
+        )
+        thread.start()
+
+    def _end(self) -> str:
+        """Kill the process and return what became of it, in words."""
+        process, self._process, self._reader = self._process, None, None
+        if process is None:
+            return ''
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        code = process.wait()
+        assert process.stdin is not None and process.stdout is not None
+        process.stdout.close()
+        process.stdin.close()
+        return f'signal {signal.Signals(-code).name}' if code < 0 else f'exit status {code}'
+
+
+def _send_quietly(descriptor: int, item: object) -> None:
+    """Send; if the process is gone, the monitor learns it from the other pipe."""
+    try:
+        with contextlib.suppress(OSError):
+            send(descriptor, item)
+    finally:
+        os.close(descriptor)
+
+
+def _believed(task: FitTask, result: object) -> Characteristic | str:
+    """Return the result, or why it is not believed."""
+    if isinstance(result, str):
+        return result
+    try:
+        problem = objection(task, result)
+    except Exception as error:  # noqa: BLE001 - anything may stand in its fields
+        problem = f'The fit gave a curve that cannot be checked ({type(error).__name__}).'
+    return problem or result  # type: ignore[return-value]
