@@ -100,8 +100,8 @@ _vf_setup() {
     export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}"
 }
 
-_vf_setup
-_vf_status=$?
+_vf_status=0
+_vf_setup || _vf_status=$?
 unset -f _vf_put _vf_drop _vf_set_aside _vf_setup
 unset _vf_root _vf_old _vf_new _vf_rest _vf_entry _vf_prefix _vf_prefixes _vf_name \
     _vf_site _vf_version _vf_libs _vf_package

@@ -86,8 +86,11 @@ class NaiveAligner:
     def believe(self):
         waiting, self.waiting = self.waiting, []
         for reading in waiting:
+            # They count as arriving together: only what the lateness closes is closed between.
+            time = reading[0]
+            while self.tick is not None and self.tick < time - max(self.lateness - 1, 0):
+                self.close(coming=time)
             self.accept(*reading)
-            self.close_ready()
 
     def accept(self, time, signal, value, quality):
         before = self.accepted[signal]
@@ -126,7 +129,7 @@ class NaiveAligner:
                 return False
         return True
 
-    def close(self):
+    def close(self, coming=None):
         values, qualities = [], []
         for before in self.accepted.values():
             newest = next((r for r in reversed(before) if r[0] <= self.tick), None)
@@ -141,6 +144,8 @@ class NaiveAligner:
             self.tick += self.period
             return
         later = [r[0] for before in self.accepted.values() for r in before if r[0] > self.tick]
+        if coming is not None:
+            later.append(coming)
         self.tick = max(self.tick + self.period, self.on_grid(min(later)))
 
     def finish(self):

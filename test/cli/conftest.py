@@ -40,7 +40,7 @@ class Ran:
         assert 'Traceback' not in self.err
         last = self.err.rstrip('\n').splitlines()[-1]
         assert last.startswith('valveflow: ')
-        assert last.endswith(('.', '"')), last
+        assert last.endswith(('.', '?', '"')), last
         assert 'nan' not in last.split()
         return last
 
@@ -61,7 +61,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 
 @pytest.fixture(scope='session')
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the same simulated log as plant.csv, plant.parquet and plant.mcap."""
+    """Return a folder with one simulated log as plant.csv, plant.parquet and plant.mcap."""
     folder = tmp_path_factory.mktemp('logs')
     for name in ('plant.csv', 'plant.parquet', 'plant.mcap'):
         words = ['simulate', '-o', str(folder / name), '--days', DAYS, '--seed', SEED, '--quiet']
@@ -71,7 +71,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope='session')
 def shared_data() -> Path:
-    """Measured data that are not part of the project."""
+    """Return the folder of measured data that are not part of the project."""
     place = os.environ.get('VALVEFLOW_SHARED_DATA')
     folder = Path(place) if place else Path(__file__).resolve().parents[3] / 'shared' / 'data'
     if not folder.is_dir():
@@ -79,6 +79,11 @@ def shared_data() -> Path:
     return folder
 
 
-def write_csv(path: Path, header: str, rows: list[str]) -> Path:
-    path.write_text('\n'.join([header, *rows]) + '\n', encoding='utf-8')
-    return path
+@pytest.fixture
+def write_csv(tmp_path: Path) -> Callable[[str, list[str]], Path]:
+    def write(header: str, rows: list[str]) -> Path:
+        path = tmp_path / 'history.csv'
+        path.write_text('\n'.join([header, *rows]) + '\n', encoding='utf-8')
+        return path
+
+    return write

@@ -7,7 +7,6 @@ import json
 import numpy as np
 import pytest
 
-from conftest import write_csv
 from valveflow_ros.core.units import UNITS
 from valveflow_ros.logs import open_log
 from valveflow_ros.records import SIGNALS, Signal
@@ -21,15 +20,16 @@ OPTIONS = [
 
 
 def rows(number=50, step_s=60):
-    return [
-        f'{1700000000 + k * step_s},x,{0.5 + 0.001 * k},{130 + 0.1 * k},{812 + 0.1 * k},{200000 + k}'
-        for k in range(number)
-    ]
+    def row(k):
+        values = (1700000000 + k * step_s, 'x', 0.5 + 0.001 * k, 130 + 0.1 * k, 812 + 0.1 * k)
+        return ','.join(map(str, (*values, 200000 + k)))
+
+    return [row(k) for k in range(number)]
 
 
 @pytest.fixture
-def history(tmp_path):
-    return write_csv(tmp_path / 'history.csv', HEADER, rows())
+def history(write_csv):
+    return write_csv(HEADER, rows())
 
 
 def values(log, signal):
@@ -73,19 +73,19 @@ def test_constants_stand_in_every_row(run, tmp_path, history):
     assert 'constant' in ran.out
 
 
-def test_gaps_and_repeated_times_are_counted(run, tmp_path):
+def test_gaps_and_repeated_times_are_counted(run, tmp_path, write_csv):
     lines = rows(20)
-    history = write_csv(tmp_path / 'h.csv', HEADER, [*lines[:8], lines[7], *lines[12:]])
+    history = write_csv(HEADER, [*lines[:8], lines[7], *lines[12:]])
     ran = run('import', history, '-o', tmp_path / 'x.mcap', *OPTIONS)
     assert '1 row had a time that stood there before' in ran.out
     assert '1 gap, the longest 5 min from' in ran.out
 
 
-def test_missing_values_are_counted(run, tmp_path):
+def test_missing_values_are_counted(run, tmp_path, write_csv):
     lines = rows(20)
     lines[3] = lines[3].rsplit(',', 1)[0] + ',Bad Input'
     lines[4] = lines[4].rsplit(',', 1)[0] + ','
-    history = write_csv(tmp_path / 'h.csv', HEADER, lines)
+    history = write_csv(HEADER, lines)
     ran = run('import', history, '-o', tmp_path / 'x.mcap', *OPTIONS)
     assert '2 values missing' in ran.out
     assert 'Bad Input' in ran.err
@@ -113,8 +113,8 @@ def test_a_wrong_unit_is_said_aloud_with_the_option_that_helps(
     assert 'Warning' not in right.err
 
 
-def test_a_column_whose_name_holds_a_colon(run, tmp_path):
-    history = write_csv(tmp_path / 'h.csv', HEADER.replace('CV', 'U3:CV'), rows())
+def test_a_column_whose_name_holds_a_colon(run, tmp_path, write_csv):
+    history = write_csv(HEADER.replace('CV', 'U3:CV'), rows())
     words = [w.replace('=CV:fraction', '=U3:CV:fraction') for w in OPTIONS]
     assert run('import', history, '-o', tmp_path / 'x.mcap', *words).status == 0
     words = [w.replace('=CV:fraction', '=U3:CV') for w in OPTIONS]
@@ -138,10 +138,11 @@ def test_an_unknown_unit_is_wrong_usage_and_the_known_ones_are_listed(
 @pytest.mark.parametrize(
     ('words', 'part'),
     [
-        ([], "no column 'time'"),
+        ([], "no column 'valve_opening_percent'"),
+        (OPTIONS[2:], "no column 'time'"),
         (['--column', 'time=Zeit'], "no column 'valve_opening_percent'"),
         ([*OPTIONS[:2], '--column', 'valve_opening=VALVE'], "no column 'VALVE'"),
-        (['--column', 'time=Spare'], 'holds no time'),
+        (['--column', 'time=Spare', *OPTIONS[2:]], 'holds no time'),
     ],
 )
 def test_missing_columns_are_named(run, tmp_path, history, words, part):
@@ -157,7 +158,7 @@ def test_missing_columns_are_named(run, tmp_path, history, words, part):
         ('none.csv', None, 'no such file'),
         ('empty.csv', '', 'empty'),
         ('empty.parquet', '', 'empty'),
-        ('head.csv', HEADER + '\n', 'no row'),
+        ('head.csv', HEADER + '\n', 'without rows'),
         ('picture.csv', '\x00\x01\x02\x03', ''),
         ('table.xlsx', 'PK', 'no .csv or .parquet'),
         ('text.parquet', 'no parquet at all', ''),
@@ -178,9 +179,9 @@ def test_an_impossible_constant_is_refused_with_the_units(run, tmp_path, history
     assert 'bar' in sentence
 
 
-def test_a_column_of_words_only_is_refused(run, tmp_path):
+def test_a_column_of_words_only_is_refused(run, tmp_path, write_csv):
     lines = [f'{1700000000 + k},a,b,c,d,e' for k in range(5)]
-    history = write_csv(tmp_path / 'h.csv', HEADER, lines)
+    history = write_csv(HEADER, lines)
     sentence = run('import', history, '-o', tmp_path / 'x.mcap', *OPTIONS).refused()
     assert 'no number' in sentence
 

@@ -35,7 +35,8 @@ def test_values_in_their_own_unit_raise_no_doubt(signal, unit):
 @pytest.mark.parametrize(('signal', 'unit'), CASES)
 def test_values_in_another_unit_are_recognised(signal, unit):
     for taken, factor in UNITS[signal].items():
-        if factor == UNITS[signal][unit]:
+        # 812 K read as degF is 433 degC, which a small unit may have.
+        if factor == UNITS[signal][unit] or (unit, taken) == ('K', 'degF'):
             continue
         found = doubt(signal, written_in(signal, unit), taken, Settings())
         assert found is not None, taken

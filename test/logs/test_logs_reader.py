@@ -433,6 +433,16 @@ def hostile_files():
         struct.pack('<BQ', 4, len(body)) + body for body in (channel, channel.replace(b'x', b'y'))
     )
     record = struct.pack('<BQ', 5, 2**63)
+    schema = struct.pack('<H', 1) + b''.join(
+        struct.pack('<I', len(text)) + text
+        for text in (FLOAT64.encode(), b'ros2msg', b'float64 data')
+    )
+    opening = b'/valve_opening'
+    channel = struct.pack('<HHI14sI3sI', 1, 1, len(opening), opening, 3, b'cdr', 0)
+    topic = b''.join(
+        struct.pack('<BQ', op, len(body)) + body for op, body in ((3, schema), (4, channel))
+    )
+    message = struct.pack('<BQHIQQ', 5, 34, 1, 0, 1, 1) + float64(1.0)
     return {
         'honest zstd bomb': chunk(b'', size=gib, packed=packed),
         'lying zstd bomb': chunk(b'', size=100, packed=packed),
@@ -448,6 +458,7 @@ def hostile_files():
         'endless lengths': (b'\x06' + b'\xff' * 8) * 10000,
         'records of no length': struct.pack('<BQ', 12, 0) * 50000,
         'a chunk of nothing': chunk(b''),
+        'the same message without end': chunk(topic + message * 1_500_000) * 20,
     }
 
 
@@ -472,10 +483,12 @@ HOSTILE = (
     'records of no length',
     'a chunk of nothing',
 )
+# Read in part, as far as their size justifies.
+CUT_SHORT = ('the same message without end',)
 
 
 def test_all_hostile_files_are_tried(hostile):
-    assert sorted(hostile) == sorted(HOSTILE)
+    assert sorted(hostile) == sorted(HOSTILE + CUT_SHORT)
 
 
 @pytest.mark.parametrize('name', HOSTILE)
@@ -484,3 +497,12 @@ def test_hostile_files_are_refused(tmp_path, hostile, name):
     path.write_bytes(b'\x89MCAP0\r\n' + hostile[name])
     with pytest.raises(RecordingError):
         open_log(path)
+
+
+@pytest.mark.parametrize('name', CUT_SHORT)
+def test_hostile_files_are_cut_short_and_it_is_told(tmp_path, hostile, name):
+    path = tmp_path / 'hostile.mcap'
+    path.write_bytes(b'\x89MCAP0\r\n' + hostile[name])
+    contents = open_log(path)
+    assert 0 < len(contents.readings) < 4_000_000
+    assert any('far more than its size justifies' in warning for warning in contents.warnings)

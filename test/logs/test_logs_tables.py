@@ -263,7 +263,7 @@ def test_columns_by_other_names(tmp_path):
     [
         (
             {},
-            r"no column 'main_steam_pressure_mpa'; the columns are: time, valve_opening_percent, p",
+            r"no column 'main_steam_pressure_mpa'; the columns are: time, valve_opening_percent",
         ),
         ({'generated_power': 'P'}, r"no column 'main_steam|no column 'P'"),
         ({'time': 'Zeit'}, r'no column|--column time=THEIRS'),

@@ -344,6 +344,16 @@ def test_region_lag_begins_at_its_level() -> None:
     assert d[high].mean() > 10.0 * d[low].mean()
 
 
+@pytest.mark.parametrize('level', [200.0, 240.0, 270.0])
+def test_region_lag_takes_the_place_of_all_regions_above(level: float) -> None:
+    first, second = UnitDescription().regions
+    below = (first,) if level <= first.power_to_mw else (first, second)
+    below = (*below[:-1], dataclasses.replace(below[-1], power_to_mw=level))
+    built = UnitDescription(regions=(*below, Region(np.inf, 30.0, 3.0)))
+    log = simulate(DAYS, 3, effects=[spec('region_lag', f'level_mw={level}')])
+    np.testing.assert_array_equal(log.table.values, simulate(DAYS, 3, built).table.values)
+
+
 @pytest.mark.parametrize('seconds', [12.0, 3.0, -12.0, 2.5])
 def test_the_clock_moves_the_power_only(seconds: float) -> None:
     none = simulate(DAYS, 5)
@@ -422,6 +432,8 @@ def test_the_order_of_effects_makes_no_difference() -> None:
     effects = [spec(name, SOMETHING[name]) for name in SEVERAL]
     one, other = (simulate(DAYS, 8, effects=e) for e in (effects, effects[::-1]))
     np.testing.assert_array_equal(one.table.values, other.table.values)
+    # Before rounding, too: the last bit of a product knows the order of its factors.
+    np.testing.assert_array_equal(one.true_power_mw, other.true_power_mw)
     assert set(one.active) == set(other.active)
 
 

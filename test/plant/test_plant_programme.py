@@ -9,7 +9,7 @@ import pytest
 
 from valveflow_ros.errors import InputError
 from valveflow_ros.plant.hooks import DAY_S
-from valveflow_ros.plant.programme import Pulses, load_knots
+from valveflow_ros.plant.programme import LoadProgramme, Pulses, load_knots
 from valveflow_ros.plant.random_unit import random_unit
 from valveflow_ros.plant.recorder import SimulatedLog
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate, simulate_parts
@@ -68,6 +68,15 @@ def test_the_load_follows_the_clock(clock_h: float) -> None:
     # A target holds for a while, so the load follows the wave late, and clipped.
     assert 0.0 < late_h < 1.5
     assert 20.0 < np.hypot(a, b) < 32.0
+
+
+@pytest.mark.parametrize('start_h', [0, 9])
+def test_the_clock_is_read_from_the_stamps(start_h: int) -> None:
+    unit, hour_ns = UnitDescription(), 3600 * NS_PER_S
+    log = simulate(0.5, 3, start_ns=DEFAULT_START_NS + start_h * hour_ns)
+    # The record begins an hour after the plant does.
+    drive = LoadProgramme(unit, 3, 13 * 3600.0, (start_h - 1) * 3600.0)
+    np.testing.assert_array_equal(log.load_mw, drive.advance(0, 13 * 3600).load_mw[3600:])
 
 
 def test_pulses_of_primary_frequency_control() -> None:

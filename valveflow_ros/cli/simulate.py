@@ -51,6 +51,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     """Simulate and write."""
     from valveflow_ros.cli.outputs import check_log, write_log
     from valveflow_ros.cli.usage import UsageError
+    from valveflow_ros.errors import InputError
     from valveflow_ros.plant.simulator import simulate
     from valveflow_ros.plant.spec import EffectSpec
 
@@ -58,10 +59,13 @@ def run(options: Namespace, console: Console) -> Outcome:
         return _catalogue()
     if options.output is None:
         raise UsageError('Where to? Name the log with -o LOG.')
-    effects = [EffectSpec.parse(text) for text in options.effect]
     check_log(options.output, overwrite=options.overwrite)
     console.progress(0.1, 'simulating')
-    log = simulate(options.days, options.seed, effects=effects)
+    try:
+        effects = [EffectSpec.parse(text) for text in options.effect]
+        log = simulate(options.days, options.seed, effects=effects)
+    except InputError as error:
+        raise UsageError(str(error)) from None
     console.progress(0.6, 'writing')
     written, notes = write_log(log.table, options.output, overwrite=options.overwrite)
     for note in notes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -140,7 +141,12 @@ class Characteristic:
             )
         x, u = _rising_points(m)
         power = np.asarray(power_mw, dtype=np.float64)
-        return np.where((power >= x[0]) & (power <= x[-1]), np.interp(power, x, u), np.nan)
+        # Of equal x the first counts: the smallest u that reaches the power.
+        i = np.clip(np.searchsorted(x, power, side='left'), 1, len(x) - 1)
+        with np.errstate(invalid='ignore'):
+            share = (power - x[i - 1]) / (x[i] - x[i - 1])
+        found = u[i - 1] + share * (u[i] - u[i - 1])
+        return np.where((power >= x[0]) & (power <= x[-1]), found, np.nan)
 
     def with_id(self) -> Characteristic:
         """Return a copy whose `model_id` is a hash of its numbers."""
@@ -154,10 +160,13 @@ def _rising_points(m: RegionalModel) -> tuple[FloatArray, FloatArray]:
     At a jump up the knot answers for all powers inside it; after a jump down a
     piece counts only from where it goes beyond what was reached before.
     """
-    x, u = [float(m.left[0])], [float(m.knots[0])]
+    points = [(float(m.left[0]), float(m.knots[0]))]
     for k, slope in enumerate(m.slopes()):
-        low = max(float(m.left[k]), x[-1])
+        reached = points[-1][0]
+        low = max(float(m.left[k]), reached)
         if m.right[k] > low:
-            x += [low, float(m.right[k])]
-            u += [float(m.knots[k] + (low - m.left[k]) / slope), float(m.knots[k + 1])]
-    return np.array(x), np.array(u)
+            begin = float(m.knots[k] + (low - m.left[k]) / slope)
+            # Powers inside a jump, or skipped by lower pieces, are answered by where this begins.
+            points += [(reached, begin), (low, begin), (float(m.right[k]), float(m.knots[k + 1]))]
+    points = [points[0], *(b for a, b in itertools.pairwise(points) if a != b)]
+    return np.array([x for x, _ in points]), np.array([u for _, u in points])

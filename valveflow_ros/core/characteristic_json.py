@@ -18,6 +18,8 @@ from valveflow_ros.errors import DataError
 FORMAT = 'valveflow/characteristic'
 VERSION = 1
 
+_LARGEST = 1e30  # no number of a plant is larger; products of two still are finite
+
 
 def _number(value: float) -> float | None:
     """JSON has neither NaN nor infinity: absent is null."""
@@ -119,8 +121,8 @@ class _Field:
         value = self._value
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise self.fail('is not a number')
-        if not (math.isfinite(value) and low <= value <= high):
-            raise self.fail(f'is {value}, out of range')
+        if not low <= value <= high or abs(value) > _LARGEST:
+            raise self.fail('is out of range')
         return float(value)
 
     def real_or_nan(self, low: float = -math.inf) -> float:

@@ -44,7 +44,7 @@ from valveflow_ros.records import ByteArray, FloatArray, IntArray
 ) = range(11)
 INT_STATE = 11
 
-# The block that is filling: sums of u, power and temperature, and how many temperatures there were.
+# The block that is filling: sums of u, power, temperature, and the count of temperatures.
 BLOCK_T_COUNT = 3
 SUMS = 4
 

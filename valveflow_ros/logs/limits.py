@@ -22,7 +22,7 @@ class Limits:
     channels: int = 1024
     definition_bytes: int = 4 * MIB
     attachment_bytes: int = 64 * MIB
-    work_floor_bytes: int = 192 * MIB
+    work_floor_bytes: int = 96 * MIB
     work_per_byte: int = 128
     failed_floor_bytes: int = 128 * MIB
     failed_per_byte: int = 2

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-from valveflow_ros.core.jit import JIT
+from valveflow_ros.core.jit import jit
 from valveflow_ros.plant.hooks import Bank
 from valveflow_ros.records import FloatArray
 
@@ -28,7 +27,7 @@ def settings(bank: Bank, step_s: float) -> FloatArray:
     )
 
 
-@numba.njit(**JIT)
+@jit
 def rate_limited(wanted: float, before: float, largest: float) -> float:
     """Move towards ``wanted`` by at most ``largest``."""
     if wanted > before + largest:
@@ -38,7 +37,7 @@ def rate_limited(wanted: float, before: float, largest: float) -> float:
     return wanted
 
 
-@numba.njit(**JIT)
+@jit
 def stick_slip(wanted: float, before: float, off: float, to: float) -> float:
     """Stay until the pull exceeds ``off`` = (S + J)/2, then slip to ``to`` = (S - J)/2 from it.
 
@@ -53,13 +52,13 @@ def stick_slip(wanted: float, before: float, off: float, to: float) -> float:
     return before
 
 
-@numba.njit(**JIT)
+@jit
 def play(wanted: float, before: float, half: float) -> float:
     """Follow only when pushed by either flank of a slack of width ``2 half``."""
     return min(max(before, wanted - half), wanted + half)
 
 
-@numba.njit(**JIT)
+@jit
 def move(wanted: float, positions: FloatArray, bank: FloatArray) -> float:
     """Return where a bank lets the position go, remembering its inner positions.
 

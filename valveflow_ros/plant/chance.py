@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import enum
 
-import numba
 import numpy as np
 
-from valveflow_ros.core.jit import JIT
+from valveflow_ros.core.jit import jit
 from valveflow_ros.records import FloatArray
 
 
@@ -38,7 +37,7 @@ def generator(seed: int, source: Source) -> np.random.Generator:
     return np.random.default_rng([seed, int(source)])
 
 
-@numba.njit(**JIT)
+@jit
 def _filter(drive: FloatArray, decay: float, gain: float, state: float) -> FloatArray:
     """Return s with ``s[t] = decay s[t-1] + gain drive[t]``, where s[-1] is ``state``."""
     out = np.empty_like(drive)

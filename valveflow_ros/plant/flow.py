@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from valveflow_ros.core.jit import JIT
+from valveflow_ros.core.jit import jit
 from valveflow_ros.plant.hooks import AddedCurve, Hooks
 from valveflow_ros.records import FloatArray
 
@@ -53,7 +52,7 @@ def flow_law(hooks: Hooks) -> FlowLaw:
     return FlowLaw(curve_u, curve_x, *_same_length(hooks.added_curves), since, np.array(nozzle))
 
 
-@numba.njit(**JIT)
+@jit
 def interpolate(x: float, xs: FloatArray, ys: FloatArray) -> float:
     """Interpolate linearly; beyond the ends the outer pieces go on."""
     k = 0
@@ -62,7 +61,7 @@ def interpolate(x: float, xs: FloatArray, ys: FloatArray) -> float:
     return float(ys[k] + (ys[k + 1] - ys[k]) * (x - xs[k]) / (xs[k + 1] - xs[k]))
 
 
-@numba.njit(**JIT)
+@jit
 def subcritical_factor(ratio: float, critical: float) -> float:
     """Return the flow relative to the choked flow at a pressure ratio behind/before."""
     if ratio <= critical:
@@ -71,7 +70,7 @@ def subcritical_factor(ratio: float, critical: float) -> float:
     return float(np.sqrt(1.0 - share * share))
 
 
-@numba.njit(**JIT)
+@jit
 def nozzle_factor(x: float, pressure: float, nozzle: FloatArray) -> float:
     """Return what the pressure behind the valve makes of u, against the sliding line."""
     kappa, critical = nozzle[0], nozzle[1]
@@ -81,7 +80,7 @@ def nozzle_factor(x: float, pressure: float, nozzle: FloatArray) -> float:
     return float(subcritical_factor(kappa * x / pressure, critical) / usual)
 
 
-@numba.njit(**JIT)
+@jit
 def added(
     u: float, time_s: float, curve_u: FloatArray, curve_x: FloatArray, from_s: FloatArray
 ) -> float:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from valveflow_ros.core.jit import JIT
+from valveflow_ros.core.jit import jit
 from valveflow_ros.plant.unit import Region
 from valveflow_ros.records import FloatArray
 
@@ -35,7 +34,7 @@ def lag_table(regions: tuple[Region, ...], step_s: float) -> tuple[FloatArray, i
     return np.array(rows), int(max(row[4] for row in rows)) + 3
 
 
-@numba.njit(**JIT)
+@jit
 def _late(flow: FloatArray, now: int, delay: float) -> float:
     """Return the flow ``delay`` samples before ``now``, linear between samples."""
     whole = int(delay)
@@ -43,7 +42,7 @@ def _late(flow: FloatArray, now: int, delay: float) -> float:
     return float(flow[now - whole] * (1.0 - part) + flow[now - whole - 1] * part)
 
 
-@numba.njit(**JIT)
+@jit
 def answer(flow: FloatArray, now: int, before: float, lags: FloatArray) -> float:
     """Return the answer of G_i at ``now``, i being the region of the present flow, eq. (3)."""
     i = 0

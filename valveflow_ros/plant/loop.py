@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from valveflow_ros.core.jit import JIT
+from valveflow_ros.core.jit import jit
 from valveflow_ros.plant import actuator
 from valveflow_ros.plant.flow import FlowLaw, added, flow_law, interpolate, nozzle_factor
 from valveflow_ros.plant.hooks import Hooks
@@ -67,7 +66,7 @@ class Memory(NamedTuple):
     after_sensor: FloatArray
 
 
-@numba.njit(**JIT)
+@jit
 def _command(
     load: float, move: float, density: float, correction: float, flow: FlowLaw, manual: float
 ) -> float:
@@ -79,7 +78,7 @@ def _command(
     return min(max(wanted, 0.0), 100.0)
 
 
-@numba.njit(**JIT)
+@jit
 def _corrected(correction: float, load: float, error: float, control: FloatArray) -> float:
     """Let the power control integrate its error in MW into a correction of u."""
     if control[0] == 0.0:
@@ -90,7 +89,7 @@ def _corrected(correction: float, load: float, error: float, control: FloatArray
     return float(correction * (1.0 - control[3]))
 
 
-@numba.njit(**JIT)
+@jit
 def _run(series: Series, law: Law, memory: Memory, flow: FloatArray, out: FloatArray) -> None:
     """Fill ``out`` (5, n) as `Motion`; ``flow`` begins with the flow of the past."""
     n = series.load.size

@@ -6,7 +6,7 @@ compares it with what comes out when a recording is fed again.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -79,13 +79,37 @@ class Outputs:
         """Yield what stands there before anything has happened."""
         yield from self._curve_messages()
 
-    def of(self, event: engine.Event) -> Iterator[Output]:
-        """Yield the messages of an event."""
+    def of(self, events: Sequence[engine.Event]) -> Iterator[Output]:
+        """Yield the messages of the events of one call of the engine.
+
+        A block of predictions and the changes of the alarm among its rows are
+        put in the order of their rows, so that the cutting into blocks leaves no trace.
+        """
+        k = 0
+        while k < len(events):
+            event = events[k]
+            k += 1
+            if isinstance(event, PredictionBlock):
+                changes: list[AlarmChange] = []
+                while k < len(events) and isinstance(change := events[k], AlarmChange):
+                    changes.append(change)
+                    k += 1
+                yield from self._rows(event, changes)
+            else:
+                yield from self._single(event)
+
+    def _rows(self, block: PredictionBlock, changes: list[AlarmChange]) -> Iterator[Output]:
+        left = iter(changes)
+        change = next(left, None)
+        for time_ns, message in conversions.predictions(block, self._tag):
+            yield _output('prediction', message, time_ns)
+            while change is not None and change.time_ns <= time_ns:
+                yield from self._single(change)
+                change = next(left, None)
+
+    def _single(self, event: engine.Event) -> Iterator[Output]:
         tag = self._tag
-        if isinstance(event, PredictionBlock):
-            for time_ns, message in conversions.predictions(event, tag):
-                yield _output('prediction', message, time_ns)
-        elif isinstance(event, engine.SegmentClosed):
+        if isinstance(event, engine.SegmentClosed):
             message = conversions.segment(event.segment, tag)
             yield _output('segments', message, event.segment.end_ns)
         elif isinstance(event, AlarmChange):

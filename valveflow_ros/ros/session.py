@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from rclpy.node import Node
@@ -121,10 +121,9 @@ class Session:
         self.tell(self.engine.feed(self._intake.rows(arrivals)))
         return bool(arrivals)
 
-    def tell(self, events: Iterable[Event]) -> None:
+    def tell(self, events: Sequence[Event]) -> None:
         """Publish and record what a call of the engine brought."""
-        for event in events:
-            self._say(self._outputs.of(event))
+        self._say(self._outputs.of(events))
 
     def reconfigure(self, settings: Settings) -> None:
         """Take settings of which only live ones differ."""

@@ -128,8 +128,7 @@ def _replayed(
         result.inputs += len(block)
         rows = [row for message in block for row in _rows(decoder, inputs, message)]
         # Restarts of the clock stand in the journal, so the rows alone are enough here.
-        for event in _fed(replayer, aligner, rows):
-            yield from speaker.of(event)
+        yield from speaker.of(_fed(replayer, aligner, rows))
         result.rows = monitor.rows
         progress(result.inputs)
 

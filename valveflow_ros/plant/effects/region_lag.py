@@ -20,11 +20,11 @@ def install(values: Values, hooks: Hooks) -> None:
     """Replace all regions above the level by one."""
     hooks.claim('region_lag')
     level = values['level_mw']
-    kept = []
-    for region in hooks.regions:
-        kept.append(dataclasses.replace(region, power_to_mw=min(region.power_to_mw, level)))
-        if region.power_to_mw >= level:
-            break
+    # A region that lay above the level keeps no power at which it would act.
+    kept = [
+        dataclasses.replace(region, power_to_mw=min(region.power_to_mw, level))
+        for region in hooks.regions
+    ]
     above = Region(np.inf, values['time_s'], values['delay_s'])
     hooks.regions = (*kept, above)
 

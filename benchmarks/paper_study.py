@@ -1,0 +1,98 @@
+"""The paper's simulation study, many times over: how far the curve found is from the true one.
+
+Run: ``python -m benchmarks.paper_study --seeds 20 --first 1000``. Each seed is ten days at 1 s
+of the plant of eqs. (30)-(31). Both curves are judged: the published one, and the exact
+partition's of the special segments alone with the paper's rule (24).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.characteristic import Piece
+from valveflow_ros.core.events import FitRequested
+from valveflow_ros.core.fit import fit
+from valveflow_ros.core.monitor import Monitor
+from valveflow_ros.plant.simulator import simulate
+from valveflow_ros.plant.unit import paper_curve
+
+RESULTS = Path(__file__).parent / 'results'
+
+
+def errors(pieces: tuple[Piece, ...]) -> dict[str, float]:
+    """Return the largest errors against the true curve; slopes and knees only if J is right."""
+    truth = paper_curve()
+    u = np.linspace(pieces[0].u_from, pieces[-1].u_to, 2000)
+    knees = np.array([p.u_to for p in pieces[:-1]])
+    slopes = np.array([p.slope for p in pieces])
+    k = np.searchsorted(knees, u, side='right')
+    found = slopes[k] * u + np.array([p.intercept for p in pieces])[k]
+    out = {
+        'pieces': len(pieces),
+        'curve_rmse_mw': float(np.sqrt(np.mean((found - truth(u)) ** 2))),
+    }
+    if len(pieces) == len(truth.slopes):
+        out['slope'] = float(np.abs(slopes - truth.slopes).max())
+        out['knee'] = float(np.abs(knees - truth.knots[1:-1]).max())
+    return out
+
+
+def study(seed: int, days: float) -> dict[str, object]:
+    """Simulate one plant and identify it."""
+    log = simulate(days, seed)
+    begin = time.perf_counter()
+    monitor = Monitor(Settings({'refit_period': 0.0, 'window_days': max(days, 0.1)}))
+    monitor.feed(log.table)
+    (task,) = (e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
+    found = fit(task)
+    return {
+        'seed': seed,
+        'seconds': round(time.perf_counter() - begin, 2),
+        'special_samples': found.source.samples,
+        'published': errors(found.pieces),
+        'partition': errors(found.partition_pieces),
+    }
+
+
+def summary(rows: list[dict[str, object]], which: str) -> str:
+    """Return one line on one of the curves."""
+    found = [row[which] for row in rows]
+    right = [f for f in found if 'slope' in f]  # type: ignore[operator]
+    slopes = np.array([f['slope'] for f in right])  # type: ignore[index]
+    knees = np.array([f['knee'] for f in right])  # type: ignore[index]
+    curve = np.array([f['curve_rmse_mw'] for f in found])  # type: ignore[index]
+    return (
+        f'{which}: J right {len(right)}/{len(found)}; largest slope error median '
+        f'{np.median(slopes):.4f} worst {slopes.max():.4f}; largest knee error median '
+        f'{np.median(knees):.1f} worst {knees.max():.1f}; curve rmse median '
+        f'{np.median(curve):.3f} worst {curve.max():.3f} MW'
+    )
+
+
+def main() -> None:
+    """Run the study, print it, and write it beside the other results."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--seeds', type=int, default=10)
+    parser.add_argument('--first', type=int, default=1)
+    parser.add_argument('--days', type=float, default=10.0)
+    args = parser.parse_args()
+    rows = []
+    for seed in range(args.first, args.first + args.seeds):
+        rows.append(study(seed, args.days))
+        print(json.dumps(rows[-1]), flush=True)
+    lines = [summary(rows, which) for which in ('published', 'partition')]
+    print('\n'.join(lines))
+    RESULTS.mkdir(exist_ok=True)
+    name = f'paper_study_{args.first}_{args.first + args.seeds - 1}.json'
+    text = json.dumps({'days': args.days, 'summary': lines, 'rows': rows}, indent=1)
+    (RESULTS / name).write_text(text + '\n', encoding='utf-8')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,269 @@
+"""``valveflow identify``: from any log to the curve, its files and its words."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from valveflow_ros.core.characteristic_json import from_json
+from valveflow_ros.logs import open_log, write_table
+from valveflow_ros.plant.unit import UnitDescription
+from valveflow_ros.records import NS_PER_S, SampleTable, Signal
+
+START_NS = 1_700_000_000 * NS_PER_S
+
+
+@pytest.fixture(scope='module')
+def results(tmp_path_factory):
+    return tmp_path_factory.mktemp('results')
+
+
+@pytest.fixture(scope='module')
+def curves():
+    """Hold what was identified in this module, so that no log is identified twice."""
+    return {}
+
+
+def identified(run, logs, results, curves, name):
+    if name not in curves:
+        ran = run('identify', logs / name, '-o', results / name)
+        assert ran.status == 0, ran.err
+        curves[name] = (ran, json.loads((results / name / 'characteristic.json').read_text()))
+    return curves[name]
+
+
+def test_the_curve_is_the_plants(run, logs, results, curves):
+    _, content = identified(run, logs, results, curves, 'plant.mcap')
+    found = from_json(content)
+    truth = UnitDescription().curve
+    u = np.linspace(found.breakpoints[0], found.breakpoints[-1], 200)
+    # Ten hours under 3 MW of noise: the curve is near, its pieces need not be all there.
+    assert np.sqrt(np.mean((found(u) - truth(u)) ** 2)) < 4.0
+    assert content['format'] == 'valveflow/characteristic'
+    assert content['version'] == 1
+    assert content['optimal'] is True
+
+
+@pytest.mark.parametrize('name', ['plant.csv', 'plant.parquet'])
+def test_any_kind_of_log_gives_the_same_curve_to_the_last_bit(run, logs, results, curves, name):
+    _, first = identified(run, logs, results, curves, 'plant.mcap')
+    _, other = identified(run, logs, results, curves, name)
+    assert other == first
+
+
+def test_there_and_back_again_gives_the_same_curve(run, logs, results, curves, tmp_path):
+    _, first = identified(run, logs, results, curves, 'plant.mcap')
+    assert run('export', logs / 'plant.mcap', '-o', tmp_path / 'a.parquet').status == 0
+    assert run('import', tmp_path / 'a.parquet', '-o', tmp_path / 'b.mcap').status == 0
+    ran = run('identify', tmp_path / 'b.mcap', '-o', tmp_path / 'out', '--json')
+    assert ran.json['model_id'] == first['model_id']
+    assert {k: ran.json[k] for k in first} == first
+
+
+def test_words_and_report_tell_the_numbers_of_the_json(run, logs, results, curves):
+    ran, content = identified(run, logs, results, curves, 'plant.mcap')
+    report = (results / 'plant.mcap' / 'report.html').read_text()
+    for text in (ran.out, report):
+        assert f'{len(content["pieces"])} piece' in text
+        for piece in content['pieces']:
+            assert f'{piece["u_from"]:.1f} to {piece["u_to"]:.1f}' in text
+        for region in content['dynamics']:
+            assert f'{region["time_constant_s"]:.0f}'[:2] in text
+    assert content['model_id'] in report
+    assert 'plant.mcap' in report
+    assert re.search(r'\bnan\b', ran.out) is None
+
+
+def test_nothing_but_the_result_stands_on_stdout(run, logs, tmp_path):
+    quick = ['--set', 'refine=false', '--set', 'selection_rule=paper']
+    ran = run('identify', logs / 'plant.csv', '-o', tmp_path / 'out', '--json', *quick)
+    assert ran.json['files']['report.html'] == str(tmp_path / 'out' / 'report.html')
+    assert ran.json['dynamics'] == []
+    assert ran.json['sample_period_s'] == 1.0
+    assert '\r' not in ran.err, 'a progress bar is for terminals'
+    assert sorted(p.name for p in (tmp_path / 'out').iterdir()) == [
+        'characteristic.json', 'report.html',
+    ]  # fmt: skip
+    again = run('identify', logs / 'plant.csv', '-o', tmp_path / 'out', '--json', *quick)
+    assert again.json == ran.json, 'a result may be written again'
+
+
+def test_units_and_constants_reach_the_engine(run, logs, results, curves, tmp_path):
+    """The same plant written in other units, under other names, gives the same curve."""
+    _, first = identified(run, logs, results, curves, 'plant.csv')
+    text = (logs / 'plant.csv').read_text().splitlines()
+    names = text[0].split(',')
+    column = names.index('generated_power_mw')
+    lines = [text[0].replace('generated_power_mw', 'P gross')]
+    for line in text[1:]:
+        cells = line.split(',')
+        cells[column] = repr(float(cells[column]) * 1000.0)
+        lines.append(','.join(cells))
+    other = tmp_path / 'other.csv'
+    other.write_text('\n'.join(lines) + '\n')
+    ran = run('identify', other, '-o', tmp_path / 'out', '--column', 'generated_power=P gross:kW')
+    assert ran.status == 0, ran.err
+    content = json.loads((tmp_path / 'out' / 'characteristic.json').read_text())
+    assert len(content['pieces']) == len(first['pieces'])
+    for mine, theirs in zip(content['pieces'], first['pieces'], strict=True):
+        assert mine['slope'] == pytest.approx(theirs['slope'], rel=1e-6)
+
+
+def table(hours, opening, power=None, pressure=12.0, step_s=1):
+    """Make a log by hand; ``opening`` and ``power`` are functions of the seconds."""
+    t = np.arange(0, int(hours * 3600), step_s)
+    rng = np.random.default_rng(5)
+    v = opening(t) + 0.0 * t
+    made = 4.0 * v if power is None else power(t, rng) + 0.0 * t
+    return SampleTable.from_columns(
+        START_NS + t.astype(np.int64) * NS_PER_S,
+        {
+            Signal.VALVE_OPENING: v,
+            Signal.MAIN_STEAM_PRESSURE: np.full(len(t), pressure),
+            Signal.MAIN_STEAM_TEMPERATURE: np.full(len(t), 540.0),
+            Signal.GENERATED_POWER: made,
+        },
+    )
+
+
+def stairs(t):
+    """Rest twenty minutes at each of many openings."""
+    return 40.0 + 5.0 * ((t // 1200) % 9)
+
+
+def wiggle(t):
+    """Never rest."""
+    return 60.0 + 15.0 * np.sin(2.0 * np.pi * t / 240.0)
+
+
+@pytest.mark.parametrize(
+    ('log', 'options', 'part'),
+    [
+        (table(3, lambda t: 55.0), [], 'never changes'),
+        (table(0.2, stairs), [], 'samples|segment'),
+        (table(2, wiggle), [], 'must rest, or move along a straight ramp'),
+        (table(6, stairs, lambda t, rng: 200.0 + 5.0 * rng.standard_normal(len(t))), [],
+         'hardly follows the valve'),
+        (table(1, stairs, pressure=120.0), [], 'main_steam_pressure has no usable value: 3600 imp'),
+        (table(1, lambda t: np.full(len(t), np.nan)), [], 'valve_opening has no usable value'),
+        (table(6, stairs), ['--set', 'min_fit_samples=1000000'], 'at least 1000000 needed'),
+    ],
+    ids=['constant', 'short', 'restless', 'loose', 'impossible', 'absent', 'few'],
+)  # fmt: skip
+def test_what_carries_no_curve_is_refused_and_nothing_is_written(
+    run, tmp_path, log, options, part
+):
+    write_table(log, tmp_path / 'log.parquet')
+    sentence = run(
+        'identify', tmp_path / 'log.parquet', '-o', tmp_path / 'out', *options
+    ).refused()  # fmt: skip
+    assert re.search(part, sentence), sentence
+    assert [p.name for p in tmp_path.iterdir()] == ['log.parquet']
+
+
+def test_a_log_without_a_signal_names_the_two_options(run, logs, tmp_path):
+    ran = run('identify', logs / 'plant.mcap', '-o', tmp_path, '--column', 'valve_opening=/none')
+    assert "no topic '/none'" in ran.refused()
+    text = (logs / 'plant.csv').read_text().replace('main_steam_pressure_mpa', 'P', 1)
+    (tmp_path / 'x.csv').write_text(text)
+    sentence = run('identify', tmp_path / 'x.csv', '-o', tmp_path / 'out').refused()
+    assert '--column main_steam_pressure_mpa=THEIRS' in sentence
+
+
+@pytest.mark.parametrize(
+    ('name', 'content'),
+    [
+        ('none.mcap', None),
+        ('empty.mcap', b''),
+        ('text.mcap', b'this is no recording at all'),
+        ('cut.mcap', b'\x89MCAP0\r\n'),
+        ('folder', 'folder'),
+        ('log.bag', b'#ROSBAG V2.0'),
+    ],
+)
+@pytest.mark.parametrize('verb', ['identify', 'info', 'export', 'recover'])
+def test_files_that_are_no_logs(run, tmp_path, verb, name, content):
+    place = tmp_path / name
+    if content == 'folder':
+        place.mkdir()
+    elif content is not None:
+        place.write_bytes(content)
+    output = {'identify': 'out', 'export': 'o.csv', 'recover': 'o.mcap'}.get(verb)
+    words = [verb, place] + (['-o', tmp_path / output] if output else [])
+    sentence = run(*words).refused()
+    assert name in sentence
+    if output:
+        assert not (tmp_path / output).exists()
+
+
+def test_wrong_parameters_are_wrong_usage(run, logs, tmp_path):
+    words = ['identify', logs / 'plant.csv', '-o', tmp_path / 'out', '--set']
+    assert "did you mean 'time_constant'" in run(*words, 'time_constnt=3').refused(2)
+    assert 'must be from' in run(*words, 'time_constant=1e9').refused(2)
+    assert 'NAME=VALUE' in run(*words, 'time_constant').refused(2)
+    sentence = run(*words, 'hold_limit=1', '--set', 'sample_period=5').refused()
+    assert 'must not be below sample_period' in sentence
+    assert not (tmp_path / 'out').exists()
+
+
+def test_a_place_that_cannot_be_a_folder_is_refused_before_the_work(run, logs, tmp_path):
+    (tmp_path / 'file').write_text('mine')
+    for place in (tmp_path / 'file', tmp_path / 'file' / 'deeper'):
+        sentence = run('identify', logs / 'plant.csv', '-o', place).refused()
+        assert 'is not a folder' in sentence
+    assert (tmp_path / 'file').read_text() == 'mine'
+
+
+def test_slow_data_are_met_with_fitting_parameters(run, tmp_path):
+    log = table(240, stairs, lambda t, rng: 4.0 * stairs(t) + rng.standard_normal(len(t)),
+                step_s=60)  # fmt: skip
+    write_table(log, tmp_path / 'log.csv')
+    ran = run('identify', tmp_path / 'log.csv', '-o', tmp_path / 'out', '--json')
+    assert ran.status == 0, ran.err
+    assert ran.json['sample_period_s'] == 60.0
+    assert 'a value every 60 s' in ran.err
+    assert 'hold_limit 150 s' in ran.err
+    slope = 4.0 / 12.0**1.125
+    for piece in ran.json['pieces']:
+        assert piece['slope'] == pytest.approx(slope, rel=0.05)
+
+
+def test_only_what_follows_the_last_step_back_of_the_clock_counts(run, tmp_path):
+    from valveflow_ros.cli.engine import watch
+    from valveflow_ros.config import Settings
+    from valveflow_ros.records import Readings, table_to_readings
+
+    first = table_to_readings(table(3, stairs))
+    second = table_to_readings(table(2, stairs))
+    joined = Readings(*(
+        np.concatenate([getattr(first, name), getattr(second, name)])
+        for name in ('time_ns', 'signal', 'value', 'quality')
+    ))  # fmt: skip
+    watched = watch(joined, Settings({'refit_period': 0.0}))
+    alone = watch(second, Settings({'refit_period': 0.0}))
+    assert watched.clock_resets == 1
+    assert (np.diff(watched.table.time_ns) > 0).all()
+    assert len(alone.table) - 30 < len(watched.table) <= len(alone.table)
+    assert watched.segments
+    assert all(s.end_ns <= watched.table.time_ns[-1] for s in watched.segments)
+    inside = {s.start_ns for s in watched.segments}
+    assert len(inside) == len(watched.segments), 'no segment of the forgotten rows'
+
+
+def test_readings_that_were_not_used_are_told(run, logs, tmp_path):
+    contents = open_log(logs / 'plant.csv').readings
+    assert len(contents) > 1000
+    lines = (logs / 'plant.csv').read_text().splitlines()
+    names = lines[0].split(',')
+    column = names.index('generated_power_mw')
+    for k in range(5000, 5010):
+        cells = lines[k].split(',')
+        cells[column] = '99999'
+        lines[k] = ','.join(cells)
+    (tmp_path / 'x.csv').write_text('\n'.join(lines) + '\n')
+    quick = ['--set', 'refine=false', '--set', 'selection_rule=paper']
+    ran = run('identify', tmp_path / 'x.csv', '-o', tmp_path / 'out', *quick)
+    assert 'generated_power: 10 impossible value' in ran.out

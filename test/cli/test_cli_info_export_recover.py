@@ -1,0 +1,107 @@
+"""``valveflow info``, ``export`` and ``recover``."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from valveflow_ros.logs import open_log, read_table
+from valveflow_ros.records import SIGNALS, Signal
+
+
+def test_info_tells_what_is_there(run, logs):
+    ran = run('info', logs / 'plant.mcap')
+    data = run('info', logs / 'plant.mcap', '--json').json
+    readings = open_log(logs / 'plant.mcap').readings
+    assert data['duration_s'] == 0.4 * 86400.0 - 1.0
+    assert {t['name'] for t in data['topics']} == {f'/{i.topic}' for i in SIGNALS}
+    for info in SIGNALS:
+        values = readings.value[readings.signal == info.signal]
+        told = data['signals'][info.topic]
+        assert (told['low'], told['high']) == (values.min(), values.max())
+        assert told['median'] == np.median(values)
+        assert told['readings'] == len(values)
+        assert told['step_s'] == 1.0
+        assert data['readings'][info.topic]['accepted'] == len(values)
+        assert f'/{info.topic}' in ran.out
+    assert 'std_msgs/msg/Float64' in ran.out
+    assert 'No gaps.' in ran.out
+    assert 'Every reading was used.' in ran.out
+
+
+def test_info_of_a_table_tells_gaps_and_values_that_will_be_rejected(run, logs, tmp_path):
+    lines = (logs / 'plant.csv').read_text().splitlines()
+    column = lines[0].split(',').index('main_steam_pressure_mpa')
+    cells = lines[50].split(',')
+    cells[column] = '-5'
+    lines[50] = ','.join(cells)
+    (tmp_path / 'x.csv').write_text('\n'.join([*lines[:100], *lines[700:1000]]) + '\n')
+    ran = run('info', tmp_path / 'x.csv')
+    assert 'main_steam_pressure: 1 impossible value' in ran.out
+    assert 'valve_opening: 1 gap, the longest 10 min 1 s from' in ran.out
+    data = run('info', tmp_path / 'x.csv', '--json').json
+    assert data['signals']['valve_opening']['longest_gap_s'] == 601.0
+    assert data['readings']['main_steam_pressure']['impossible'] == 1
+
+
+def test_info_of_a_cut_off_recording_says_so(run, logs, tmp_path):
+    whole = (logs / 'plant.mcap').read_bytes()
+    (tmp_path / 'cut.mcap').write_bytes(whole[: len(whole) // 2])
+    ran = run('info', tmp_path / 'cut.mcap')
+    assert ran.status == 0
+    assert 'Warning: ' in ran.err
+
+
+def test_export_gives_the_values_back(run, logs, tmp_path):
+    for name in ('a.csv', 'a.parquet'):
+        ran = run('export', logs / 'plant.mcap', '-o', tmp_path / name)
+        assert ran.status == 0, ran.err
+        written, source = read_table(tmp_path / name), read_table(logs / 'plant.csv')
+        assert np.array_equal(written.time_ns, source.time_ns)
+        for info in SIGNALS:
+            assert np.array_equal(written.columns[info.column], source.columns[info.column])
+    data = run('export', logs / 'plant.csv', '-o', tmp_path / 'b.csv', '--json').json
+    assert data['rows'] == len(source.time_ns)
+
+
+def test_export_takes_a_step(run, logs, tmp_path):
+    words = ['export', logs / 'plant.csv', '-o', tmp_path / 'a.csv', '--set', 'sample_period=10']
+    assert run(*words).status == 0
+    written = read_table(tmp_path / 'a.csv')
+    assert set(np.diff(written.time_ns)) == {10_000_000_000}
+
+
+@pytest.mark.parametrize(
+    ('output', 'part'),
+    [('a.mcap', 'must end in .csv or .parquet'), ('no/a.csv', 'there is no folder')],
+)
+def test_export_to_where_it_cannot(run, logs, tmp_path, output, part):
+    assert part in run('export', logs / 'plant.csv', '-o', tmp_path / output).refused()
+
+
+def test_export_does_not_replace_by_accident(run, logs, tmp_path):
+    table = tmp_path / 'a.csv'
+    table.write_text('mine')
+    assert '--overwrite' in run('export', logs / 'plant.csv', '-o', table).refused()
+    assert table.read_text() == 'mine'
+    assert run('export', logs / 'plant.csv', '-o', table, '--overwrite').status == 0
+    assert [p.name for p in tmp_path.iterdir()] == ['a.csv']
+
+
+def test_recover_makes_a_whole_file_of_half_of_one(run, logs, tmp_path):
+    whole = (logs / 'plant.mcap').read_bytes()
+    broken = tmp_path / 'cut.mcap'
+    broken.write_bytes(whole[: len(whole) // 2])
+    data = run('recover', broken, '-o', tmp_path / 'b.mcap', '--json').json
+    ran = run('recover', broken, '-o', tmp_path / 'c.mcap')
+    assert ran.status == 0
+    assert 'Kept ' in ran.out
+    after = open_log(tmp_path / 'b.mcap')
+    assert not after.warnings
+    assert len(after.readings) == data['messages'] > 1000
+    assert broken.read_bytes() == whole[: len(whole) // 2]
+    values = open_log(logs / 'plant.mcap').readings
+    mine = after.readings.value[after.readings.signal == Signal.GENERATED_POWER]
+    theirs = values.value[values.signal == Signal.GENERATED_POWER]
+    assert np.array_equal(mine, theirs[: len(mine)])
+    assert 'exists already' in run('recover', broken, '-o', tmp_path / 'b.mcap').refused()
