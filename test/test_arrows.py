@@ -143,7 +143,11 @@ def test_the_pure_rooms_have_no_clock_and_no_files():
         ('cli/x.py', 'def f():\n    import valveflow_ros.ros.node', True),
         ('cli/x.py', 'from valveflow_ros import ros', True),
         ('cli/x.py', 'from ..ros import node', True),
-        ('cli/x.py', 'from importlib import import_module\nimport_module("valveflow_ros.ros")', True),
+        (
+            'cli/x.py',
+            'from importlib import import_module\nimport_module("valveflow_ros.ros")',
+            True,
+        ),
         ('cli/x.py', 'from valveflow_ros.logs import mcap', False),
         ('cli/x.py', 'from . import table', False),
         ('cli/x.py', 'from valveflow_ros import __version__', False),

@@ -20,7 +20,12 @@ def house(tmp_path):
     """A folder that looks like a tree after the set-up."""
     house = tmp_path / 'house'
     site = house / '.venv' / 'lib' / 'python3.11' / 'site-packages'
-    for folder in (house / 'tools', house / '.venv' / 'bin', site / 'ros_a.libs', house / 'install'):
+    for folder in (
+        house / 'tools',
+        house / '.venv' / 'bin',
+        site / 'ros_a.libs',
+        house / 'install',
+    ):
         folder.mkdir(parents=True)
     shutil.copy(ROOT / 'env.sh', house)
     (house / 'package.xml').touch()
@@ -95,8 +100,10 @@ def test_it_leaves_no_names_behind(house, shell):
 
 @each_shell
 def test_what_was_there_stays(house, shell):
-    there = {name: '/a:/b c:/a' for name in PATHS[1:]}
-    done = run(shell, house, f'. {house}/env.sh; env', **there, ROS_AUTOMATIC_DISCOVERY_RANGE='OFF')
+    there = dict.fromkeys(PATHS[1:], '/a:/b c:/a')
+    done = run(
+        shell, house, f'. {house}/env.sh; env', **there, ROS_AUTOMATIC_DISCOVERY_RANGE='OFF'
+    )
     env = variables(done.stdout)
     for name in PATHS[1:]:
         assert env[name].endswith(':/a:/b c:/a')

@@ -167,7 +167,7 @@ def test_the_platform_of_the_wheels(monkeypatch, system, processor, libc, fits):
     if fits:
         machine.check_platform()
         return
-    with pytest.raises(tree.SetupError, match='colcon build --base-paths . msg') as caught:
+    with pytest.raises(tree.SetupError, match=r'colcon build --base-paths \. msg') as caught:
         machine.check_platform()
     assert f'this is {system} {processor}' in str(caught.value)
 

@@ -81,7 +81,9 @@ def test_licence_text():
 
 
 def test_executables_are_those_of_the_contract(arguments):
-    scripts = dict(re.split(r'\s*=\s*', line) for line in arguments['entry_points']['console_scripts'])
+    scripts = dict(
+        re.split(r'\s*=\s*', line) for line in arguments['entry_points']['console_scripts']
+    )
     assert set(scripts) == {'monitor', 'plant_simulator', 'replay', 'valveflow'}
     assert all(re.fullmatch(r'valveflow_ros(\.\w+)+:main', target) for target in scripts.values())
 
@@ -135,7 +137,11 @@ def test_the_lock_names_no_registry():
 def test_one_version_of_each_for_every_python(version):
     """The markers of a name's entries do not overlap, and one of them fits."""
     markers = pytest.importorskip('packaging.markers')
-    env = {'python_version': version, 'python_full_version': f'{version}.5', 'sys_platform': 'linux'}
+    env = {
+        'python_version': version,
+        'python_full_version': f'{version}.5',
+        'sys_platform': 'linux',
+    }
     for name, texts in entries().items():
         found = [re.match(r'\S+( ; (.*))? \\', text)[2] for text in texts]
         fits = [m for m in found if m is None or markers.Marker(m).evaluate(env)]
@@ -166,10 +172,15 @@ def test_no_dependency_asks_for_a_gpl(arguments):
     assert len(found) >= len(arguments['install_requires'])
     for name, distribution in found.items():
         metadata = distribution.metadata
-        stated = [metadata.get('License-Expression') or '', *(metadata.get_all('Classifier') or [])]
+        stated = [
+            metadata.get('License-Expression') or '',
+            *(metadata.get_all('Classifier') or []),
+        ]
         licences = [text for text in stated if 'License' in text or text == stated[0]]
         # Compilers' run-time libraries inside wheels come with an exception that allows it.
-        text = re.sub(r'GPL-[\d.]+(-or-later)? ?(WITH |-with-)GCC-exception\S*', '', ' '.join(licences))
+        text = re.sub(
+            r'GPL-[\d.]+(-or-later)? ?(WITH |-with-)GCC-exception\S*', '', ' '.join(licences)
+        )
         assert 'GPL' not in text, f'{name}: {text}'
 
 
@@ -184,7 +195,15 @@ def test_the_wheel_of_the_pure_part(tmp_path):
             shutil.copytree(ROOT / name, tree / name, ignore=ignore)
     for name in ('setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml', 'LICENSE'):
         shutil.copy(ROOT / name, tree)
-    command = [sys.executable, '-m', 'pip', 'wheel', '--no-deps', '--no-build-isolation', '--no-index']
+    command = [
+        sys.executable,
+        '-m',
+        'pip',
+        'wheel',
+        '--no-deps',
+        '--no-build-isolation',
+        '--no-index',
+    ]
     done = subprocess.run(
         [*command, '-w', tmp_path, tree], capture_output=True, text=True, check=False
     )
@@ -201,7 +220,9 @@ def test_the_wheel_of_the_pure_part(tmp_path):
     share = f'valveflow_ros-{version}.data/data/share'
     assert f'{share}/ament_index/resource_index/packages/valveflow_ros' in names
     assert f'{share}/valveflow_ros/msg/Alarm.msg' in names
-    points = (tmp_path / 'out' / f'valveflow_ros-{version}.dist-info' / 'entry_points.txt').read_text()
+    points = (
+        tmp_path / 'out' / f'valveflow_ros-{version}.dist-info' / 'entry_points.txt'
+    ).read_text()
     assert 'valveflow = valveflow_ros.cli.main:main' in points
     loaded = subprocess.run(
         [sys.executable, '-c', 'import valveflow_ros; print(valveflow_ros.__file__)'],

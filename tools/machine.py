@@ -31,7 +31,7 @@ def check_machine() -> None:
 
 
 def check_platform() -> None:
-    """The wheels of ROS 2 exist for one kind of machine only."""
+    """Refuse a machine for which there are no wheels of ROS 2."""
     libc, version = platform.libc_ver()
     numbers = tuple(int(x) for x in re.findall(r'\d+', version)[:2])
     right = sys.platform == 'linux' and platform.machine() == 'x86_64' and sys.maxsize > 2**32
@@ -45,7 +45,7 @@ def check_platform() -> None:
 
 
 def check_path() -> None:
-    """Neither the scripts' first lines nor the ROS build can take a blank or a colon."""
+    """Refuse a path that scripts' first lines or the ROS build cannot take."""
     if re.search(r'[\s:;]', str(ROOT)):
         raise SetupError(
             'the path of this folder holds a blank, a colon or a semicolon, which the ROS build '
@@ -54,7 +54,7 @@ def check_path() -> None:
 
 
 def check_compiler(language: str, variable: str, names: tuple[str, ...]) -> None:
-    """CMake takes the compiler of the variable, else one of the usual names."""
+    """Look for the compiler as CMake does: the variable, else one of the usual names."""
     chosen = os.environ.get(variable, '').split()[:1]
     if any(shutil.which(name) for name in chosen or names):
         return
@@ -66,7 +66,7 @@ def check_compiler(language: str, variable: str, names: tuple[str, ...]) -> None
 
 
 def check_headers() -> None:
-    """Message packages are C extensions of this Python."""
+    """Look for Python.h: message packages are C extensions of this Python."""
     if Path(str(sysconfig.get_config_var('INCLUDEPY')), 'Python.h').is_file():
         return
     name = f'python{sys.version_info.major}.{sys.version_info.minor}'

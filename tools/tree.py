@@ -46,7 +46,10 @@ KNOWN = (
     (r'certificate', 'the certificate of the registry was not accepted'),
     (r'timed out', 'the registry did not answer in time'),
     (r'connection (broken|refused|reset)|unreachable', 'no connection to the registry'),
-    (r'do not match the hashes|hash mismatch', 'a file has another hash than in requirements.lock'),
+    (
+        r'do not match the hashes|hash mismatch',
+        'a file has another hash than in requirements.lock',
+    ),
 )
 
 

@@ -53,7 +53,10 @@ def install_wheels(log: Path) -> None:
     first.write_text(locked(('setuptools', 'uv')), encoding='utf-8')
     problem = run([*pip, '-r', first], log)
     if problem is None:
-        build = ['--no-build-isolation', *(x for name in SOURCE_ONLY for x in ('--no-binary', name))]
+        build = [
+            '--no-build-isolation',
+            *(x for name in SOURCE_ONLY for x in ('--no-binary', name)),
+        ]
         uv: list[str | Path] = [VENV / 'bin' / 'uv', 'pip', 'install', '--python', PYTHON]
         uv += ['--no-deps', '--require-hashes', '--only-binary', ':all:', *build, '-r', LOCK]
         if run(uv, log) is not None:
@@ -82,7 +85,9 @@ def repair_cmake() -> int:
     for path in sorted(VENV.glob('share/*/cmake/*.cmake')):
         text = path.read_text(encoding='utf-8')
         right = re.sub(builder + r'/include/python3\.\d+(?=[;"])', lambda _: include, text)
-        right = re.sub(builder + r'/lib/python3\.\d+/site-packages(?=[;"/])', lambda _: site, right)
+        right = re.sub(
+            builder + r'/lib/python3\.\d+/site-packages(?=[;"/])', lambda _: site, right
+        )
         if right != text:
             fresh = path.with_suffix('.new')
             fresh.write_text(right, encoding='utf-8')

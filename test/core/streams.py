@@ -152,3 +152,67 @@ def first_difference(a, b):
     if len(a.others) != len(b.others):
         return f'{len(a.others)} events != {len(b.others)}'
     return ''
+
+
+# A monitor that lives in seconds instead of hours: a few hundred rows hold many fits.
+QUICK_MONITOR = {
+    'block': 1.0,
+    'time_constant': 2.0,
+    'delay': 1.0,
+    'steady_min': 6.0,
+    'slope_min': 6.0,
+    'longest_segment': 60.0,
+    'input_noise': 1.0,
+    'power_noise': 0.3,
+    'refine': False,
+    'selection_rule': 'paper',
+    'min_fit_samples': 20,
+    'refit_segments': 3,
+    'refit_period': 150.0,
+    'window_days': 0.02,
+    'max_pieces': 3,
+    'min_piece_share': 0.05,
+    'alarm_average': 10.0,
+    'alarm_on_delay': 5.0,
+    'alarm_off_delay': 8.0,
+    'alarm_limit': 3.0,
+}
+
+
+def plant_table(seed, n, harms=(), start_ns=START_NS, fault_mw=8.0):
+    """Return rows of a small plant with a fault of the power now and then, and bad rows.
+
+    ``harms`` are (what, row, rows): ``nan_u``, ``nan_power``, ``nan_temperature``,
+    ``no_pressure``, ``inf``, ``fault`` or ``leap`` (seconds without rows).
+    """
+    rng = np.random.default_rng(seed)
+    u = steps_and_ramps(rng, n, hold=(30, 90))
+    power = lagged(20.0 + 0.1 * u, 2.0, 1.0) + 0.15 * rng.normal(0.0, 1.0, n)
+    time_ns = grid_ns(n, start_ns=start_ns)
+    table = table_of(time_ns, u + 0.5 * rng.normal(0.0, 1.0, n), power,
+                     540.0 + 0.2 * rng.normal(0.0, 1.0, n))  # fmt: skip
+    values = table.values
+    for what, at, length in harms:
+        rows = slice(at, at + length)
+        if what == 'fault':
+            values[rows, Signal.GENERATED_POWER] += fault_mw
+        elif what == 'leap':
+            time_ns[at:] += length * NS_PER_S
+        elif what == 'inf':
+            values[rows, Signal.VALVE_OPENING] = np.inf
+        elif what == 'no_pressure':
+            values[rows, Signal.MAIN_STEAM_PRESSURE] = 0.0
+        else:
+            signal = {'nan_u': Signal.VALVE_OPENING, 'nan_power': Signal.GENERATED_POWER,
+                      'nan_temperature': Signal.MAIN_STEAM_TEMPERATURE}[what]  # fmt: skip
+            values[rows, signal] = np.nan
+    return SampleTable(time_ns, values, np.where(np.isnan(values), 2, 0).astype(np.uint8))
+
+
+def table_harms(n, most=5):
+    """Strategy for what befalls a `plant_table` of n rows."""
+    kinds = ['nan_u', 'nan_power', 'nan_temperature', 'no_pressure', 'inf', 'fault', 'fault',
+             'leap']  # fmt: skip
+    return st.lists(
+        st.tuples(st.sampled_from(kinds), st.integers(0, n - 1), st.integers(1, 60)), max_size=most
+    )

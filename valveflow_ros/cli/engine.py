@@ -13,6 +13,7 @@ from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.events import FitRequested, JournalEntry, JournalKind, SegmentClosed
 from valveflow_ros.core.fit import FitTask, fit
 from valveflow_ros.core.monitor import Monitor
+from valveflow_ros.core.noise import WARM_UP, WINDOW
 from valveflow_ros.core.offline import feed_aligned
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import SIGNALS, Readings, SampleTable, SpecialSegment
@@ -71,7 +72,7 @@ def watch(readings: Readings, settings: Settings, progress: Progress = quiet) ->
     table, counts = SampleTable.concatenate(tables), aligner.counts()
     _check_signals(table, counts)
     if not monitor.segments:
-        raise DataError(_no_segment(table, settings))
+        raise DataError(_no_segment(table, settings, monitor.noise().learnt))
     task = next(e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
     # A log longer than the window is longer than what the fit sees.
     first = int(task.contents.time_ns[0])
@@ -100,11 +101,20 @@ def _check_signals(table: SampleTable, counts: dict[str, dict[str, int]]) -> Non
         raise DataError(f'{info.topic} has no usable value: {told}.')
 
 
-def _no_segment(table: SampleTable, settings: Settings) -> str:
-    span = duration((int(table.time_ns[-1]) - int(table.time_ns[0])) / 1e9)
+def _no_segment(table: SampleTable, settings: Settings, learnt: bool) -> str:
+    needed = [info.signal for info in _NEEDED]
+    usable = int(np.isfinite(table.values[:, needed]).all(axis=1).sum())
+    span = duration(usable * settings.real('sample_period'))
+    if not learnt:
+        first = duration(WARM_UP * WINDOW * settings.real('block'))
+        return (
+            f'The log holds {span} of usable data; it takes {first} without gaps to learn the '
+            'noise of the signals, and special segments after that to find the curve.'
+        )
     least = settings.settle_s + min(settings.real('steady_min'), settings.real('slope_min'))
     return (
         f'No steady-state or slope-response segment was found in {span} of data: the valve must '
-        f'rest, or move along a straight ramp, for at least {duration(least)} at a time. '
-        'A longer log, or shorter times by --set time_constant, delay and steady_min, may help.'
+        f'rest, or move along a straight ramp, for {duration(least)} or longer at a time. '
+        'A longer log, or shorter times by --set time_constant, delay, steady_min and slope_min, '
+        'may help.'
     )

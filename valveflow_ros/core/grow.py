@@ -17,6 +17,7 @@ import numpy as np
 
 from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.problem import Problem, free_parameters, move
+from valveflow_ros.core.sums import gram, product
 from valveflow_ros.core.whitening import whitened
 from valveflow_ros.records import FloatArray
 
@@ -71,18 +72,24 @@ def _best_knee(problem: Problem, model: RegionalModel, ar: FloatArray) -> tuple[
         dense = _insert(dense, float(place))
     _, hats, _ = problem.tangents(dense)
     hats = hats[:, : dense.pieces + 1]
-    hinges = hats @ np.maximum(dense.knots[:, None] - places[None, :], 0.0)
+    hinges = product(
+        np.ascontiguousarray(hats), np.maximum(dense.knots[:, None] - places[None, :], 0.0)
+    )
     residual, own, weight = problem.tangents(model)
     own = own[:, free_parameters(model.pieces, model.regions)]
     table = whitened(np.column_stack([own, hinges, residual]), weight, ar)
-    n_own = own.shape[1]
-    own, hinges, e = table[:, :n_own], table[:, n_own:-1], table[:, -1]
-    basis, _ = np.linalg.qr(own / np.maximum(np.linalg.norm(own, axis=0), 1e-300))
-    hinges = hinges - basis @ (basis.T @ hinges)
-    e = e - basis @ (basis.T @ e)
+    # What the model explains already is taken out of hinges and residual alike.
+    n = own.shape[1]
+    sums = gram(table)
+    scale = np.sqrt(np.maximum(np.diag(sums)[:n], 1e-300))
+    explained = np.linalg.pinv(sums[:n, :n] / np.outer(scale, scale)) @ (
+        sums[:n, n:] / scale[:, None]
+    )
+    rest = table[:, n:] - product(np.ascontiguousarray(table[:, :n] / scale), explained)
+    hinges, e = rest[:, :-1], rest[:, -1]
     scores = hinges * e[:, None]
     total = scores.sum(axis=0) ** 2
-    plain = (hinges**2).sum(axis=0) * float(e @ e) / len(e)
+    plain = (hinges**2).sum(axis=0) * float((e * e).sum()) / len(e)
     blocks = np.array([part.sum(axis=0) for part in np.array_split(scores, _BLOCKS)])
     # What the AR model leaves of correlation shows between blocks; the larger variance counts.
     variance = np.maximum(plain, (blocks**2).sum(axis=0) - total / _BLOCKS)

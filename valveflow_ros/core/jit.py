@@ -28,10 +28,19 @@ def kernel(function: _Function) -> _Function:
     return cast(_Function, numba.njit(**_KERNEL_JIT)(function))
 
 
+# Not callable from Python, which saves compiling a wrapper for each.
+_INLINED_JIT: dict[str, Any] = {
+    **_KERNEL_JIT,
+    'forceinline': True,
+    'no_cpython_wrapper': True,
+    'no_cfunc_wrapper': True,
+}
+
+
 def inlined(function: _Function) -> _Function:
     """Compile a part of a `kernel` into its caller.
 
     A call that hands over records of arrays costs more than a short loop does:
     every array is passed as seven numbers and its reference count goes up and down.
     """
-    return cast(_Function, numba.njit(**_KERNEL_JIT, forceinline=True)(function))
+    return cast(_Function, numba.njit(**_INLINED_JIT)(function))

@@ -133,8 +133,9 @@ def partition(
     most = max(1, min(int(max_pieces), len(x) // least))
     if threads is None:
         threads = (os.cpu_count() or 1) if len(x) >= _SERIAL_BELOW else 1
-    line = np.polynomial.polynomial.polyfit(x, mean, 1, w=np.sqrt(weight))
-    rest = mean - (line[0] + line[1] * x)
+    centre_x, centre_y = np.average(x, weights=weight), np.average(mean, weights=weight)
+    dx, dy = x - centre_x, mean - centre_y
+    rest = dy - float((weight * dx * dy).sum() / (weight * dx * dx).sum()) * dx
     scale = float(np.sqrt(np.average(rest**2, weights=weight)))
     # Without residual there is nothing to scale, and any partition is exact.
     scaled = (
@@ -184,10 +185,11 @@ def _centred(u: FloatArray, y: FloatArray) -> tuple[float, float, float, float]:
     """Return mean u, mean y, slope and sum of squares about the line, in two passes."""
     mean_u, mean_y = float(u.mean()), float(y.mean())
     du, dy = u - mean_u, y - mean_y
-    sxx = float(du @ du)
-    slope = float(du @ dy) / sxx if sxx > 0.0 else 0.0
+    # Not a dot product: its last bits would depend on the number of threads.
+    sxx = float((du * du).sum())
+    slope = float((du * dy).sum()) / sxx if sxx > 0.0 else 0.0
     rest = dy - slope * du
-    return mean_u, mean_y, slope, float(rest @ rest)
+    return mean_u, mean_y, slope, float((rest * rest).sum())
 
 
 def _cost(u: FloatArray, y: FloatArray, starts: IntArray) -> float:

@@ -59,7 +59,7 @@ SLOTS = 6
 SHARE = 0.499999
 
 
-@inlined
+@kernel
 def _window_prior(tree: Tree, first: int, last: int, limit: float, out: FloatArray) -> None:
     """Gram matrix and line of the blocks ``[first, last)`` about the sample before them."""
     m = blocks_moments(tree, first, last)
@@ -94,7 +94,7 @@ def fill_priors(tree: Tree, limit: float, prior: FloatArray) -> None:
         size *= BRANCH
 
 
-@inlined
+@kernel
 def _candidate_costs(
     leaf: FloatArray,
     prior: FloatArray,
@@ -183,7 +183,7 @@ def _between(lo: float, hi: float, factor: float) -> tuple[float, float]:
     return min(a, b), max(a, b)
 
 
-@inlined
+@kernel
 def _lift(
     tree: Tree,
     prior: FloatArray,

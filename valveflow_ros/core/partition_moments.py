@@ -105,7 +105,7 @@ def fit(m: Moments) -> tuple[float, float, float, bool]:
     return max(cost, 0.0), mean - slope * x1 / n, slope, True
 
 
-@inlined
+@kernel
 def blocks_moments(tree: Tree, first: int, last: int) -> Moments:
     """Return the moments of the blocks ``[first, last)``, origin at the last sample."""
     origin = tree.x[LEAF * last - 1]
@@ -124,7 +124,7 @@ def blocks_moments(tree: Tree, first: int, last: int) -> Moments:
     return total
 
 
-@inlined
+@kernel
 def stretch_moments(tree: Tree, sample: int, last: int) -> Moments:
     """Return the moments from ``sample`` to the end of block ``last - 1``."""
     block = sample // LEAF

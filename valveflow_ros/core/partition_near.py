@@ -39,7 +39,7 @@ class Near(NamedTuple):
     edge: FloatArray
 
 
-@inlined
+@kernel
 def running_costs(tree: Tree, sample: int, last: int, out: FloatArray) -> None:
     """Fill ``out[k]`` with the cost of the samples ``sample..sample + k`` up to ``last``.
 
@@ -125,7 +125,7 @@ def _adopt_row(
                 breaks[k] = break_
 
 
-@inlined
+@kernel
 def _search_edge(
     tree: Tree,
     edge: FloatArray,
@@ -152,7 +152,7 @@ def _search_edge(
             _adopt_row(cost, before[i], from_, first + i, best, breaks)
 
 
-@inlined
+@kernel
 def search_near(
     tree: Tree,
     near: Near,

@@ -126,7 +126,7 @@ def _adopt(group: _Group, break_: int, first: int) -> bool:
     return better > 0
 
 
-@inlined
+@kernel
 def _open_group(tree: Tree, layer: Layer, block: int, group: _Group) -> None:
     """Set up the tail's moments and the breaks inside the group's own block."""
     first = LEAF * block
@@ -324,7 +324,7 @@ def _node_part(
     return b[0] + (min(b[1] * dr, b[2] * dr) + min(b[3] * dl, b[4] * dl))
 
 
-@inlined
+@kernel
 def _descend(tree: Tree, layer: Layer, block: int, group: _Group) -> int:
     """Go through all breaks left of a group, near ones first; return the leaves opened."""
     origin = tree.x[LEAF * block - 1]
@@ -375,7 +375,7 @@ def _descend(tree: Tree, layer: Layer, block: int, group: _Group) -> int:
     return leaves
 
 
-@inlined
+@kernel
 def _sow(tree: Tree, layer: Layer, block: int, seeds: IntArray, count: int, group: _Group) -> None:
     """Try the breaks that were best for the group before this one."""
     for q in range(count):

@@ -8,6 +8,7 @@ import numpy as np
 
 from valveflow_ros.core import regional_kernel as kernel
 from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.core.sums import gram
 from valveflow_ros.core.whitening import whitened
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
@@ -120,8 +121,8 @@ def move(
     for _ in range(steps):
         residual, jacobian, weight = problem.tangents(model)
         both = whitened(np.column_stack([jacobian[:, free], residual]), weight, ar)
-        j, e = both[:, :-1], both[:, -1]
-        normal, slope = j.T @ j, j.T @ e
+        sums = gram(both)
+        normal, slope = sums[:-1, :-1], sums[:-1, -1]
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-12 * np.diag(normal).max()))
         normal = normal / np.outer(scale, scale)
         better = None

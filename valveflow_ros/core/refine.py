@@ -19,6 +19,7 @@ from valveflow_ros.core.grow import choose_pieces
 from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.problem import Problem, Samples, free_parameters, move, search_levels
 from valveflow_ros.core.regions import find_regions
+from valveflow_ros.core.sums import gram
 from valveflow_ros.core.whitening import whitened
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
@@ -97,13 +98,13 @@ def _jumps_supported(problem: Problem, model: RegionalModel, ar: FloatArray) -> 
     """Test each inner knot for a jump by its Wald statistic in the joint regression."""
     residual, jacobian, weight = problem.tangents(model)
     both = whitened(np.column_stack([jacobian, residual]), weight, ar)
-    j, e = both[:, :-1], both[:, -1]
-    used = np.linalg.norm(j, axis=0) > 0.0
-    inverse = np.linalg.pinv(j[:, used].T @ j[:, used])
-    step = np.zeros(j.shape[1])
-    variance = np.full(j.shape[1], np.inf)
-    step[used] = inverse @ (j[:, used].T @ e)
-    variance[used] = np.diag(inverse) * float(e @ e) / max(len(e), 1)
+    sums = gram(both)
+    used = np.append(np.diag(sums)[:-1] > 0.0, False)
+    inverse = np.linalg.pinv(sums[np.ix_(used, used)])
+    step = np.zeros(len(used) - 1)
+    variance = np.full(len(used) - 1, np.inf)
+    step[used[:-1]] = inverse @ sums[used, -1]
+    variance[used[:-1]] = np.diag(inverse) * sums[-1, -1] / max(len(both), 1)
     places = slice(2 * model.pieces, 3 * model.pieces - 1)
     return np.asarray(step[places] ** 2 / variance[places] > _JUMP_WALD)
 
@@ -113,11 +114,12 @@ def _conclude(problem: Problem, model: RegionalModel, free: BoolArray, ar: Float
     residual, jacobian, weight = problem.tangents(model)
     both = whitened(np.column_stack([jacobian[:, free], residual]), weight, ar)
     j, e = both[:, :-1], both[:, -1]
-    inverse = np.linalg.pinv(j.T @ j)
-    variance = float(e @ e) / max(len(e) - j.shape[1], 1)
+    sums = gram(both)
+    inverse = np.linalg.pinv(sums[:-1, :-1])
+    variance = float(sums[-1, -1]) / max(len(e) - j.shape[1], 1)
     blocks = max(1, min(60, len(e) // 50))
     scores = np.array([s.sum(axis=0) for s in np.array_split(j * e[:, None], blocks)])
-    robust = inverse @ (scores.T @ scores) @ inverse
+    robust = inverse @ gram(scores) @ inverse
     plain = inverse * variance
     # Few blocks make the robust form noisy; it may widen, never narrow.
     widen = np.sqrt(np.maximum(1.0, np.diag(robust) / np.maximum(np.diag(plain), 1e-300)))

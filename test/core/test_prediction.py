@@ -1,0 +1,264 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from naive_stream import naive_curve, naive_respond
+from streams import START_NS, blocks_of, cuts, examples, frozen, grid_ns, steps_and_ramps
+from test_characteristic import DYNAMICS, curve
+
+from valveflow_ros.core.prediction import PredictionState, Predictor, no_prediction
+from valveflow_ros.core.segmenter_kernel import NO_DATA, SETTLED_SLOPE, SETTLED_STEADY, TRANSIENT
+from valveflow_ros.records import NS_PER_S
+
+N = 260
+NAN = math.nan
+SETTLE, AVERAGE = 25, 40.0
+
+
+def paper(dynamic=True):
+    """Return a curve with a jump, from 1050 to 1900."""
+    return curve(
+        [1050.0, 1250.0, 1600.0, 1900.0], [0.24, 0.18, 0.09], [0.0, 3.0], 152.0,
+        dynamics=DYNAMICS if dynamic else (),
+    ).with_id()  # fmt: skip
+
+
+harm = st.lists(
+    st.tuples(st.sampled_from(['nan_u', 'nan_power', 'no_data', 'leap', 'back', 'inf']),
+              st.integers(0, N - 1), st.integers(1, 30)),
+    max_size=5,
+)  # fmt: skip
+
+
+def rows_of(seed, harms, step_s=1.0):
+    """Return time, u, power and kinds of rows, some of them bad; u leaves the curve at times."""
+    rng = np.random.default_rng(seed)
+    time_ns = grid_ns(N, step_s)
+    u = steps_and_ramps(rng, N, 1000.0, 1950.0, hold=(20, 60), rate=8.0)
+    power = 0.15 * u + rng.normal(0.0, 1.0, N)
+    kinds = rng.choice([TRANSIENT, SETTLED_STEADY, SETTLED_SLOPE], N).astype(np.uint8)
+    for what, at, length in harms:
+        rows = slice(at, at + length)
+        if what == 'nan_u':
+            u[rows] = np.nan
+        elif what == 'nan_power':
+            power[rows] = np.nan
+        elif what == 'inf':
+            power[at] = np.inf
+        elif what == 'no_data':
+            kinds[rows] = NO_DATA
+        else:
+            time_ns[at:] += round((length if what == 'leap' else -length) * step_s * NS_PER_S)
+    return time_ns, u, power, kinds
+
+
+def naive_predictions(c, time_ns, u, power, kinds, step_s=1.0):
+    """Return one dict a row, from the words of the records alone."""
+    knots, m = c.breakpoints, c.model
+    good = np.isfinite(u) & np.isfinite(power) & (kinds != NO_DATA)
+    ages, runs = [], []
+    for k in range(len(u)):
+        step = time_ns[k] - time_ns[k - 1] if k else 0
+        joins = ages and ages[-1] > 0 and 0 < step <= 1.5 * step_s * NS_PER_S
+        ages.append((ages[-1] if joins else 0) + 1 if good[k] else 0)
+        if ages[-1] == 1:
+            runs.append([])
+        if good[k]:
+            runs[-1].append(k)
+    answers = {}
+    for run in runs if m.regions else []:
+        x = [naive_curve(u[k], m.knots, m.left, m.right) for k in run]
+        true = [True] * len(run)
+        answer = naive_respond(x, true, m.levels, m.time_constants, m.delays, step_s)
+        answers.update(zip(run, answer, strict=True))
+    rows, mean = [], NAN
+    for k in range(len(u)):
+        row = dict.fromkeys(('static', 'dynamic', 'residual'), NAN)
+        inside = good[k] and knots[0] <= u[k] <= knots[-1]
+        if not good[k]:
+            row['state'] = PredictionState.BAD_DATA
+        elif not inside:
+            row['state'] = PredictionState.OUTSIDE
+        else:
+            row['state'] = {
+                SETTLED_STEADY: PredictionState.STEADY, SETTLED_SLOPE: PredictionState.SLOPE,
+                TRANSIENT: PredictionState.TRANSIENT,
+            }[int(kinds[k])]  # fmt: skip
+            row['static'] = naive_curve(u[k], m.knots, m.left, m.right)
+            if m.regions and ages[k] > SETTLE:
+                row['dynamic'] = answers[k]
+                row['residual'] = power[k] - answers[k]
+            elif not m.regions and kinds[k] != TRANSIENT:
+                row['residual'] = power[k] - row['static']
+        if math.isfinite(row['residual']):
+            forget = math.exp(-step_s / AVERAGE)
+            mean = forget * (0.0 if math.isnan(mean) else mean)
+            mean += (1.0 - forget) * row['residual']
+        row['average'] = mean
+        rows.append(row)
+    return rows
+
+
+def predictor(c, step_s=1.0):
+    return Predictor(c, step_s, SETTLE * step_s, AVERAGE)
+
+
+@examples(25)
+@given(st.integers(0, 2**32 - 1), harm, st.booleans(), st.sampled_from([0.5, 1.0, 60.0]), st.data())
+def test_every_block_gives_what_the_slow_truth_gives(seed, harms, dynamic, step_s, data):
+    c = paper(dynamic)
+    rows = rows_of(seed, harms, step_s)
+    expected = naive_predictions(c, *rows, step_s)
+    p = predictor(c, step_s)
+    for start, end in blocks_of(N, data.draw(cuts(N))):
+        block = p.predict(*(a[start:end] for a in rows), 2.5)
+        assert (len(block), block.limit_mw, block.model_id) == (end - start, 2.5, c.model_id)
+        for name in ('static', 'dynamic', 'residual', 'average'):
+            wanted = [r[name] for r in expected[start:end]]
+            got = getattr(block, f'{name}_mw')
+            assert got == pytest.approx(wanted, rel=1e-9, abs=1e-9, nan_ok=True), name
+        assert block.state.tolist() == [r['state'] for r in expected[start:end]]
+        assert np.array_equal(block.time_ns, rows[0][start:end])
+
+
+@examples(40)
+@given(st.integers(0, 2**32 - 1), harm, st.booleans(), st.data())
+def test_any_cutting_gives_the_same_bits(seed, harms, dynamic, data):
+    rows = rows_of(seed, harms)
+    whole = predictor(paper(dynamic)).predict(*rows, 1.0)
+    p = predictor(paper(dynamic))
+    parts = [p.predict(*(a[s:e] for a in rows), 1.0)
+             for s, e in blocks_of(N, data.draw(cuts(N, most=20)))]  # fmt: skip
+    for name in ('static_mw', 'dynamic_mw', 'residual_mw', 'average_mw', 'state'):
+        joined = np.concatenate([getattr(part, name) for part in parts])
+        assert frozen(joined) == frozen(getattr(whole, name)), name
+
+
+@examples(30)
+@given(st.integers(0, 2**32 - 1), harm)
+def test_bad_rows_poison_nothing_after_the_settling(seed, harms):
+    p = predictor(paper())
+    p.predict(*rows_of(seed, harms), 1.0)
+    _, u, power, kinds = rows_of(seed + 1, [])
+    time_ns = grid_ns(N, start_ns=START_NS + 10**15)
+    here = p.predict(time_ns, u, power, kinds, 1.0)
+    fresh = predictor(paper()).predict(time_ns, u, power, kinds, 1.0)
+    for name in ('static_mw', 'dynamic_mw', 'residual_mw', 'state'):
+        assert frozen(getattr(here, name)) == frozen(getattr(fresh, name)), name
+    assert np.isfinite(here.residual_mw).sum() > 0
+    assert np.isfinite(here.average_mw[-1])
+
+
+def test_rows_missing_without_a_trace_are_a_gap():
+    """Nobody sends rows in an outage: only the times tell."""
+    n = 400
+    time_ns = grid_ns(n)
+    time_ns[200:] += 3600 * NS_PER_S
+    u = np.where(np.arange(n) < 200, 1100.0, 1800.0)
+    c = paper()
+    power = c(u)
+    kinds = np.full(n, SETTLED_STEADY, dtype=np.uint8)
+    block = predictor(c).predict(time_ns, u, power, kinds, 1.0)
+    assert np.isnan(block.residual_mw[200 : 200 + SETTLE]).all()
+    scored = np.isfinite(block.residual_mw)
+    assert scored[SETTLE:200].all()
+    assert scored[200 + SETTLE :].all()
+    assert np.abs(block.residual_mw[scored]).max() < 1e-9
+
+
+def test_a_plant_that_is_the_model_has_no_residual():
+    c = paper()
+    rng = np.random.default_rng(0)
+    u = 1475.0 + 400.0 * np.sin(np.arange(600) / 40.0) + rng.normal(0.0, 3.0, 600)
+    power, _ = c.model.respond(u, np.ones(600, dtype=np.uint8), 1.0, 0.0)
+    block = predictor(c).predict(
+        grid_ns(600), u, power, np.zeros(600, dtype=np.uint8), 1.0
+    )
+    assert np.nanmax(np.abs(block.residual_mw)) < 1e-9
+    assert np.abs(block.average_mw[-1]) < 1e-9
+
+
+@examples(20)
+@given(st.integers(0, 2**32 - 1), st.floats(-20.0, 20.0))
+def test_a_constant_error_of_the_power_is_the_residual(seed, error):
+    rows = rows_of(seed, [])
+    here = predictor(paper()).predict(*rows, 1.0)
+    there = predictor(paper()).predict(rows[0], rows[1], rows[2] + error, rows[3], 1.0)
+    assert there.residual_mw == pytest.approx(here.residual_mw + error, abs=1e-9, nan_ok=True)
+    assert np.array_equal(there.dynamic_mw, here.dynamic_mw, equal_nan=True)
+
+
+def test_the_mean_of_a_constant_residual_rises_to_it_with_its_time_constant():
+    c = paper(dynamic=False)
+    n = 200
+    u = np.full(n, 1400.0)
+    kinds = np.full(n, SETTLED_STEADY, dtype=np.uint8)
+    block = predictor(c).predict(grid_ns(n), u, c(u) + 5.0, kinds, 1.0)
+    expected = 5.0 * (1.0 - np.exp(-np.arange(1, n + 1) / AVERAGE))
+    assert block.average_mw == pytest.approx(expected, rel=1e-9)
+
+
+def test_warmed_up_it_goes_on_as_if_it_had_always_run():
+    c = paper()
+    rows = rows_of(5, [])
+    whole = predictor(c).predict(*rows, 1.0)
+    p = predictor(c)
+    start = 2 * p.warm_up_rows
+    assert p.warm_up_rows > SETTLE
+    p.warm_up(*(a[:start] for a in rows[:3]))
+    later = p.predict(*(a[start:] for a in rows), 1.0)
+    assert np.array_equal(later.dynamic_mw, whole.dynamic_mw[start:], equal_nan=True)
+    first = np.flatnonzero(np.isfinite(later.residual_mw))[0]
+    forget = math.exp(-1.0 / AVERAGE)
+    assert np.isnan(later.average_mw[:first]).all()
+    assert later.average_mw[first] == pytest.approx((1 - forget) * later.residual_mw[first])
+
+
+def test_without_a_curve_rows_are_unknown_or_bad():
+    kinds = np.array([TRANSIENT, NO_DATA, SETTLED_STEADY], dtype=np.uint8)
+    u = np.array([1.0, np.nan, 3.0])
+    block = no_prediction(grid_ns(3), u, u, kinds)
+    assert block.state.tolist() == [
+        PredictionState.UNKNOWN, PredictionState.BAD_DATA, PredictionState.UNKNOWN,
+    ]  # fmt: skip
+    for name in ('static_mw', 'dynamic_mw', 'residual_mw', 'average_mw'):
+        assert np.isnan(getattr(block, name)).all()
+    assert math.isnan(block.limit_mw)
+    assert block.model_id == ''
+
+
+@pytest.mark.parametrize('n', [0, 1])
+def test_hardly_any_rows(n):
+    block = predictor(paper()).predict(
+        grid_ns(n), np.full(n, 1400.0), np.full(n, 200.0), np.ones(n, dtype=np.uint8), 1.0
+    )
+    assert len(block) == n
+    assert np.isnan(block.residual_mw).all()
+
+
+def test_read_only_and_single_precision_columns():
+    time_ns, u, power, kinds = rows_of(1, [])
+    u32, power32 = u.astype(np.float32), power.astype(np.float32)
+    for array in (u32, power32, time_ns, kinds):
+        array.setflags(write=False)
+    got = predictor(paper()).predict(time_ns, u32, power32, kinds, 1.0)
+    wanted = predictor(paper()).predict(
+        time_ns, u32.astype(np.float64), power32.astype(np.float64), kinds, 1.0
+    )
+    assert np.array_equal(got.residual_mw, wanted.residual_mw, equal_nan=True)
+
+
+def test_the_longest_delay_a_file_may_name_is_remembered():
+    slow = curve([0.0, 1000.0], [0.1], dynamics=(
+        type(DYNAMICS[0])(0.0, 100.0, 5.0, 600.0, NAN, NAN),))  # fmt: skip
+    n = 1500
+    u = np.where(np.arange(n) < 700, 200.0, 800.0)
+    block = predictor(slow).predict(
+        grid_ns(n), u, np.zeros(n), np.ones(n, dtype=np.uint8), 1.0
+    )
+    assert block.dynamic_mw[700 + 599] == pytest.approx(20.0)
+    assert block.dynamic_mw[700 + 660] == pytest.approx(80.0, abs=0.01)

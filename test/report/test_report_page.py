@@ -1,0 +1,260 @@
+"""The page: whole, small, closed to the network, and telling the right numbers."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import html
+import json
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from valveflow_ros.config import Settings
+from valveflow_ros.errors import InputError
+from valveflow_ros.report import library
+from valveflow_ros.report.curve import band
+from valveflow_ros.report.figure import Figure, packed, rounded
+from valveflow_ros.report.identification import identification_report
+from valveflow_ros.report.identified import Identified
+from valveflow_ros.report.library import packed_plotly, read_text
+from valveflow_ros.report.quality import gaps, rejected, usable_share
+
+MEGABYTE = 1_000_000
+
+
+@pytest.fixture(scope='module')
+def report(identified):
+    return identification_report(identified)
+
+
+def words_of(page):
+    """Return what a person reads."""
+    body = page.split('<body>')[1].split('<script')[0]
+    return re.sub(r'\s+', ' ', html.unescape(re.sub(r'<[^>]+>', ' ', body)))
+
+
+def figures_of(page):
+    text = page.split('<script id="figures" type="application/json">')[1].split('</script>')[0]
+    return json.loads(text, parse_constant=pytest.fail)
+
+
+def test_it_is_one_page_that_asks_for_nothing(report):
+    own = report.replace(packed_plotly(), '')
+    assert own.startswith('<!DOCTYPE html>')
+    assert own.rstrip().endswith('</html>')
+    assert not re.search(r'https?:|wss?:', own)
+    links = re.findall(r'(?:src|href)\s*=\s*"([^"]*)"', own)
+    assert links == ['data:,'], 'only the empty icon'
+    assert not re.search(r'@import|url\(', own)
+    assert "default-src 'none'" in own
+
+
+def test_the_drawing_library_inside_is_the_installed_one():
+    script = gzip.decompress(base64.b64decode(packed_plotly())).decode()
+    assert 'plotly.js' in script[:200]
+    assert 'Licensed under the MIT license' in script[:300]
+
+
+def test_the_answer_comes_first_with_its_numbers(report):
+    words = words_of(report)
+    assert words.index('The answer') < words.index('The moments that carry it')
+    for part in (
+        '2 pieces', 'from 800 to 1500', '100 to 195 MW', '0.2000 ± 0.0012', '−60.0 ± 1.4',
+        '800.0 to 1200.0', '1189 to 1211', '4.0 times less', '11.50 ± 0.40', '3.25 ± 0.30',
+        '540.0 °C', 'plant.mcap', '2023-11-14 22:13:20 UTC',
+    ):  # fmt: skip
+        assert part in words, part
+    assert not re.search(r'\b(nan|None|inf)\b', words)
+
+
+def test_gain_of_one_percent_of_opening_is_slope_times_pressure(report):
+    assert f'{0.2 * 12.0**1.125:.2f} at 12.0 MPa' in words_of(report)
+
+
+def test_pictures_hold_the_curve_the_segments_and_the_choice(report, identified):
+    figures = figures_of(report)
+    assert list(figures) == ['curve', 'signals', 'choice', 'dynamics']
+    for name in figures:
+        assert f'id="{name}"' in report
+    curve = next(t for t in figures['curve']['data'] if t['name'] == 'flow characteristic')
+    assert curve['x'] == [800.0, 1200.0, None, 1200.0, 1500.0, None]
+    assert curve['y'] == [100.0, 180.0, None, 180.0, 195.0, None]
+    heat = next(t for t in figures['curve']['data'] if t['type'] == 'heatmap')
+    assert sum(c or 0 for row in heat['z'] for c in row) == len(identified.special)
+    point = next(t for t in figures['curve']['data'] if t['name'].startswith('breakpoints'))
+    assert (point['error_x']['array'], point['error_x']['arrayminus']) == ([11.0], [11.0])
+    costs = figures['choice']['data'][0]
+    assert dict(zip(costs['x'], costs['y'], strict=True)) == {
+        int(j): v for j, v in identified.characteristic.choice.cost.items()
+    }
+    names = [t['name'] for t in figures['signals']['data']]
+    assert names == 2 * ['measured', 'steady state', 'slope response']
+
+
+def test_colours_of_the_pictures_are_in_the_style_sheet(report):
+    style = read_text('style.css')
+    tokens = set(re.findall(r'token:([a-z0-9-]+)', json.dumps(figures_of(report))))
+    assert 'steady' in tokens
+    for look in style.split('@media screen')[:2]:
+        for name in tokens:
+            assert f'--{name}:' in look, name
+
+
+def test_a_page_of_ten_days_is_small(make):
+    data = make(days=10.0, period_s=1)
+    assert len(data.table) == 864_000
+    page = identification_report(data)
+    assert len(page.encode()) < 5 * MEGABYTE
+    assert len(page.encode()) - len(packed_plotly()) < MEGABYTE
+
+
+def test_what_comes_from_outside_is_escaped(make):
+    evil = '<script>alert(1)</script>"\'&'
+    data = make(
+        source=evil, notes=(evil,), settings=Settings({'unit_tag': evil, 'sample_period': 10.0})
+    )
+    data = replace_characteristic(data, notes=(evil,))
+    page = identification_report(data)
+    assert '<script>alert' not in page
+    assert page.count('&lt;script&gt;alert(1)') >= 4
+    assert page.count('</script>') == 3
+    assert 'A &lt;note&gt;.' in page
+
+
+def replace_characteristic(data, **changes):
+    return Identified(
+        data.source, replace(data.characteristic, **changes), data.table, data.segments,
+        data.counts, data.settings, data.notes,
+    )  # fmt: skip
+
+
+def test_what_is_not_known_is_called_unknown(make):
+    base = make()
+    c = base.characteristic
+    unknown = tuple(replace(p, slope_stderr=math.nan, intercept_stderr=math.nan) for p in c.pieces)
+    data = replace_characteristic(
+        base, pieces=unknown, breakpoint_intervals=((math.nan, math.nan),), dynamics=(),
+        source=replace(c.source, temperature_mean_degc=math.nan, temperature_spread_k=math.nan),
+    )  # fmt: skip
+    page = identification_report(data)
+    words = words_of(page)
+    assert 'unknown' in words
+    assert 'Time constants and delays were not estimated' in words
+    assert 'The main steam temperature is not known.' in words
+    assert not re.search(r'\bnan\b', words, re.IGNORECASE)
+    assert 'dynamics' not in figures_of(page)
+    assert not [t for t in figures_of(page)['curve']['data'] if t['name'] == '95 % band']
+
+
+def test_a_straight_curve_has_no_breakpoints(make):
+    base = make()
+    c = base.characteristic
+    data = replace_characteristic(
+        base, pieces=c.pieces[:1], partition_pieces=c.pieces[:1], breakpoint_intervals=()
+    )
+    page = identification_report(data)
+    assert 'It is straight' in words_of(page)
+    assert '95 % interval' not in page
+    names = [t['name'] for t in figures_of(page)['curve']['data']]
+    assert 'before refining' not in names
+
+
+def test_what_endangers_the_answer_stands_beside_it(make):
+    base = make()
+    c = base.characteristic
+    falling = (c.pieces[0], replace(c.pieces[1], slope=-0.05, intercept=240.0))
+    data = replace_characteristic(
+        base, pieces=falling, notes=('Not refined.',),
+        source=replace(c.source, temperature_spread_k=31.0, temperature_flag=True),
+    )  # fmt: skip
+    words = words_of(identification_report(data))
+    answer = words[: words.index('The moments that carry it')]
+    for part in ('31.0 K', 'does not rise', 'Not refined.', 'does not raise the power'):
+        assert part in answer
+
+
+def test_no_segment_and_no_value_still_make_a_page(make):
+    base = make()
+    table = base.table.part(0, 40)
+    table.values[:] = np.nan
+    page = identification_report(make(table=table, segments=()))
+    assert 'unknown' in words_of(page)
+    figures_of(page)
+
+
+def test_quality_tells_what_was_not_used(make):
+    counts = {'generated_power': {'accepted': 90, 'impossible': 7, 'late': 3, 'duplicate': 0}}
+    data = make(counts=counts)
+    words = words_of(identification_report(data))
+    assert 'Readings not used: 7 impossible value.' in words
+    assert 'too late for its row' in words
+    assert 'time given twice' not in words
+    assert rejected(counts) == {'impossible': 7}
+
+
+def test_gaps_are_found_the_longest_first():
+    time_ns = np.array([0, 1, 2, 5, 6, 16, 17], dtype=np.int64) * 10**9
+    assert [g.seconds for g in gaps(time_ns, 10**9)] == [10.0, 3.0]
+    assert gaps(time_ns[:3], 10**9) == []
+
+
+def test_rows_without_a_needed_value_do_not_count(make):
+    data = make()
+    table = data.table.part(0, 100)
+    values = table.values.copy()
+    values[:25, 1] = np.nan
+    values[:50, 2] = np.nan
+    assert usable_share(replace(table, values=values)) == 0.75
+
+
+def test_the_band_is_that_of_a_straight_line(identified):
+    """Ordinary least squares gives slope error and band; ours must come from the first."""
+    rng = np.random.default_rng(2)
+    u = rng.uniform(900.0, 1100.0, 400)
+    design = np.column_stack([u, np.ones_like(u)])
+    inverse = np.linalg.inv(design.T @ design)
+    sigma = 1.7
+    piece = replace(
+        identified.characteristic.pieces[0], u_from=float(u.min()), u_to=float(u.max()),
+        slope_stderr=sigma * math.sqrt(inverse[0, 0]),
+    )  # fmt: skip
+    at = np.linspace(900.0, 1100.0, 7)
+    rows = np.column_stack([at, np.ones_like(at)])
+    expected = sigma * np.sqrt(np.einsum('ij,jk,ik->i', rows, inverse, rows))
+    assert band(piece, u, at) == pytest.approx(expected, rel=1e-9)
+
+
+def test_numbers_of_a_picture_are_short_and_gaps_are_null():
+    assert rounded(np.array([1234.5678, np.nan, 0.1])) == [1234.6, None, 0.1]
+    assert rounded(np.array([np.inf])) == [None]
+    values = np.array([1.5, np.nan, -2.0])
+    raw = np.frombuffer(base64.b64decode(packed(values)['bdata']), '<f8')
+    assert np.array_equal(raw, values, equal_nan=True)
+
+
+def test_a_picture_cannot_close_its_script():
+    figure = Figure('x', '', '', [{'name': '</script><b>&', 'y': [float('nan')]}])
+    text = figure.to_json()
+    assert '<' not in text
+    assert json.loads(text)['data'][0] == {'name': '</script><b>&', 'y': [None]}
+
+
+def test_a_missing_library_is_one_sentence(monkeypatch, tmp_path):
+    library.packed_plotly.cache_clear()
+    try:
+        monkeypatch.setattr(library, 'find_spec', lambda name: None)
+        with pytest.raises(InputError, match='pip install plotly'):
+            library.packed_plotly()
+
+        class Spec:
+            origin = str(tmp_path / '__init__.py')
+
+        monkeypatch.setattr(library, 'find_spec', lambda name: Spec)
+        with pytest.raises(InputError, match='incomplete'):
+            library.packed_plotly()
+    finally:
+        library.packed_plotly.cache_clear()
