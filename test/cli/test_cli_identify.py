@@ -139,7 +139,7 @@ def stairs(t):
     [
         (table(3, lambda t: 55.0), [], 'never changes'),
         (table(0.15, stairs), [], 'holds 9 min of usable data; .* to learn the noise'),
-        (table(3, stairs), ['--set', 'steady_min=3600'], 'in 3 h of data: the valve must rest'),
+        (table(3, stairs), ['--set', 'steady_min=1500'], 'in 3 h of data: the valve must rest'),
         (table(6, stairs, lambda t, rng: 200.0 + 5.0 * rng.standard_normal(len(t))), [],
          'hardly follows the valve'),
         (table(1, stairs, pressure=120.0), [], 'main_steam_pressure has no usable value: 3600'),

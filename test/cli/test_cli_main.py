@@ -132,3 +132,19 @@ def test_no_module_of_the_command_or_the_report_knows_ros():
             if isinstance(node, ast.ImportFrom):
                 names = [node.module or '']
             assert not [n for n in names if n.startswith(('rclpy', 'valveflow_ros.ros'))], path
+
+
+def test_ctrl_c_in_the_middle_of_the_work_leaves_nothing(logs, tmp_path):
+    """Stop a real process as soon as it tells that it has begun."""
+    words = ['identify', str(logs / 'plant.csv'), '-o', str(tmp_path / 'out')]
+    code = (
+        'import os, signal, sys\n'
+        'from valveflow_ros.cli import engine\n'
+        'from valveflow_ros.cli.main import main\n'
+        'engine.fit = lambda task, progress: os.kill(os.getpid(), signal.SIGINT)\n'
+        f'sys.exit(main({words!r}))'
+    )
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert done.returncode == 130
+    assert 'Traceback' not in done.stderr
+    assert not (tmp_path / 'out').exists()

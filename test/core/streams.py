@@ -10,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
+from valveflow_ros.core.alarms import AlarmChange
 from valveflow_ros.core.prediction import PredictionBlock
 from valveflow_ros.records import NS_PER_S, SampleTable, Signal
 
@@ -61,17 +62,17 @@ def steps_and_ramps(rng, n, low=1100.0, high=1900.0, hold=(40, 120), rate=4.0):
 
 def lagged(x, time_constant, delay, step=1.0):
     """Filter x by a first-order lag with a delay of whole steps."""
-    late = np.concatenate([np.full(round(delay / step), x[0]), x])[: len(x)]
+    late = np.concatenate([np.full(round(delay / step), x[:1].sum()), x])[: len(x)]
     a = np.exp(-step / time_constant)
     y = np.empty(len(x))
-    state = late[0]
+    state = late[:1].sum()
     for t, value in enumerate(late):
         state = a * state + (1.0 - a) * value
         y[t] = state
     return y
 
 
-def table_of(time_ns, u, power, temperature=None, pressure=10.0, exponent=1.125):
+def table_of(time_ns, u, power, temperature=None, pressure=16.0, exponent=1.125):
     """Return rows whose integrated input is ``u``, at a constant pressure."""
     n = len(time_ns)
     return SampleTable.from_columns(
@@ -110,7 +111,7 @@ class Story:
     """Events in a form that does not show how the stream was cut.
 
     ``columns`` has one entry a row; ``others`` has every other event with the
-    number of rows predicted before it.
+    number of rows predicted before it (an alarm's change has a time of its own).
     """
 
     columns: dict
@@ -134,7 +135,7 @@ def story(events):
                 columns[name] += [frozen(v) for v in (
                     value.tolist() if isinstance(value, np.ndarray) else value)]  # fmt: skip
         else:
-            others.append((rows, frozen(event)))
+            others.append((None if isinstance(event, AlarmChange) else rows, frozen(event)))
     return Story(columns, others)
 
 

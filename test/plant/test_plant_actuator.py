@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from valveflow_ros.plant import actuator
@@ -21,20 +21,17 @@ def through(bank: Bank, path: list[float], step_s: float = 1.0) -> np.ndarray:
     return np.array([actuator.move(v, positions, settings) for v in path])
 
 
-@settings(deadline=None)
 @given(paths)
 def test_a_bank_without_faults_changes_nothing(path: list[float]) -> None:
     np.testing.assert_array_equal(through(Bank(), path), path)
 
 
-@settings(deadline=None)
 @given(paths, widths)
 def test_play_stays_within_half_its_width(path: list[float], width: float) -> None:
     gap = through(Bank(slack_percent=width), path) - path
     assert np.all(np.abs(gap) <= width / 2 + 1e-9)
 
 
-@settings(deadline=None)
 @given(paths, widths, st.integers(2, 5))
 def test_play_does_not_know_how_fast_it_was_driven(
     path: list[float], width: float, times: int
@@ -47,14 +44,12 @@ def test_play_does_not_know_how_fast_it_was_driven(
     )
 
 
-@settings(deadline=None)
 @given(paths, widths)
 def test_stick_slip_without_a_jump_is_play(path: list[float], width: float) -> None:
     sticking = through(Bank(band_percent=width), path)
     np.testing.assert_allclose(sticking, through(Bank(slack_percent=width), path), atol=1e-9)
 
 
-@settings(deadline=None)
 @given(paths, widths, st.floats(0.0, 1.0))
 def test_a_sticking_valve_stays_or_jumps(path: list[float], band: float, share: float) -> None:
     jump = share * band
@@ -65,7 +60,6 @@ def test_a_sticking_valve_stays_or_jumps(path: list[float], band: float, share: 
     assert np.all(np.abs(position - path) <= (band + jump) / 2 + 1e-9)
 
 
-@settings(deadline=None)
 @given(paths, st.floats(0.01, 10.0), st.sampled_from([0.5, 1.0, 2.0]))
 def test_a_limited_rate_is_kept(path: list[float], rate: float, step_s: float) -> None:
     position = through(Bank(rate_percent_per_s=rate), path, step_s)
@@ -75,7 +69,6 @@ def test_a_limited_rate_is_kept(path: list[float], rate: float, step_s: float) -
     assert settled[-1] == 50.0
 
 
-@settings(deadline=None)
 @given(paths, st.floats(1.0, 100.0))
 def test_a_stop_is_the_smaller_of_two(path: list[float], top: float) -> None:
     np.testing.assert_array_equal(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from valveflow_ros.errors import InputError
@@ -78,7 +78,6 @@ def specs(draw: st.DrawFn) -> EffectSpec:
     return EffectSpec.of(effect, **given_values)
 
 
-@settings(deadline=None)
 @given(specs())
 def test_its_text_is_read_back_as_itself(spec: EffectSpec) -> None:
     assert EffectSpec.parse(str(spec)) == spec
@@ -117,7 +116,6 @@ def test_nonsense_gets_one_sentence(text: str, sentence: str) -> None:
     assert str(caught.value)[-1] in '.?'
 
 
-@settings(deadline=None)
 @given(st.text(max_size=40))
 def test_any_text_is_either_an_effect_or_a_sentence(text: str) -> None:
     for candidate in (text, f'gain_step:{text}', f'gain_step:g={text}'):

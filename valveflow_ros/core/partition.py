@@ -1,15 +1,17 @@
 """The exact partition: the best J straight pieces through samples, for all J in one pass.
 
 Solves eqs. (19)-(23) of the paper. The samples are sorted by u, equal u are
-merged into one weighted sample (a break inside equal u is meaningless), and
-the dynamic programme of `partition_layers` finds, for every J up to the
-largest, the breaks of least cost. Every candidate it does not look at is
-discarded by a proven bound, so the result is the optimum and not an estimate.
+merged into one weighted level (a break inside equal u is meaningless), and the
+dynamic programme of `partition_layers` finds, for every J up to the largest,
+the breaks of least cost. Candidates are left out only where a proven lower
+bound (`partition_bounds`) shows that they cannot be better, so the result is
+the optimum and not an estimate.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 import os
 from dataclasses import dataclass
 
@@ -17,22 +19,40 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from valveflow_ros.core.partition_layers import best_partitions, prepare
-from valveflow_ros.errors import DataError, TooFewSamplesError
+from valveflow_ros.core.partition_levels import Levels, make_levels
+from valveflow_ros.errors import DataError, ParameterError, TooFewSamplesError
 from valveflow_ros.records import FloatArray, IntArray
 
-# Distinct u closer than this share of the range are one u: no plant resolves them.
-_SAME_U = 1e-9
-# A layer may stop at costs this much above the optimum, as a share of the total sum of squares.
-_SLACK = 1e-12
-# Below this many samples starting threads costs more than it gains.
-_SERIAL_BELOW = 50_000
+# A bound counts as reached within this share of the sum of squares about one line. It lies
+# ten times above the search's rounding: without it, exact ties (data without noise) would
+# all have to be looked at.
+_SLACK = 2e-14
+# The search's own cost and the cost of its breaks, recomputed from the samples, agree
+# within this share of Omega(1), or the result is not called certified.
+_AGREE = 1e-10
+# Below this many levels starting threads costs more than it gains.
+_SERIAL_BELOW = 20_000
 
 
 @dataclass(frozen=True, slots=True)
 class FittedPiece:
     """One piece of a partition, fitted by least squares, eq. (20).
 
-    Standard errors take the samples for independent.
+    Attributes
+    ----------
+    u_from, u_to : float
+        The piece's range in % MPa^m. A piece begins at its own first sample, as in
+        the paper, and ends where the next begins, so ranges join without gap.
+    slope : float
+        K_f in MW per unit of u.
+    intercept : float
+        C in MW.
+    samples : int
+    sse : float
+        Sum of squared residuals in MW^2.
+    slope_stderr, intercept_stderr : float
+        Standard errors for independent samples; NaN where two samples leave nothing
+        to judge them by.
     """
 
     u_from: float
@@ -45,22 +65,26 @@ class FittedPiece:
     intercept_stderr: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Partition:
-    """The best partitions into 1, 2, ... pieces.
+    """The best partitions into 1, 2, ... J_max pieces.
 
     Attributes
     ----------
     cost : float64 (J_max,)
-        Omega(J) of eq. (19) in MW^2, recomputed from the samples.
+        Omega(J) of eq. (19) in MW^2, recomputed in two passes from the samples.
+        Where the smallest piece binds, it can rise with J.
     u, y : float64 (n,)
-        The samples in ascending order of u.
+        The samples in ascending order of u; read-only.
     starts : tuple of int64 arrays
         For each J the first sample of each piece, and n.
     n_distinct : int
         Number of different u.
     certified : bool
-        Always true: every candidate discarded was discarded by a proven bound.
+        The search's own costs agree with `cost`. With exact lower bounds this means:
+        no partition costs less than ``cost[J - 1] - tolerance``.
+    limited : str
+        Why there are fewer partitions than asked for, as a sentence; else empty.
     """
 
     cost: FloatArray
@@ -69,11 +93,17 @@ class Partition:
     starts: tuple[IntArray, ...]
     n_distinct: int
     certified: bool = True
+    limited: str = ''
 
     @property
     def n_samples(self) -> int:
         """Return the number of samples."""
         return len(self.u)
+
+    @property
+    def tolerance(self) -> float:
+        """Return in MW^2 how far a certified cost may lie above the optimum."""
+        return _AGREE * float(self.cost[0])
 
     def breaks(self, pieces: int) -> IntArray:
         """Return where the pieces begin among the sorted samples, and n: int64 (pieces + 1,)."""
@@ -84,7 +114,7 @@ class Partition:
         return self.starts[pieces - 1]
 
     def pieces(self, pieces: int) -> tuple[FittedPiece, ...]:
-        """Return the fitted pieces; each ends where the next begins."""
+        """Return the fitted pieces in ascending order of u."""
         starts = self.breaks(pieces)
         ends = [*self.u[starts[1:-1]].tolist(), float(self.u[-1])]
         return tuple(
@@ -106,104 +136,110 @@ def partition(
     Parameters
     ----------
     u, y : array_like (n,)
-        Integrated input in % MPa^m and power in MW, in any order.
+        Integrated input in % MPa^m and power in MW, in any order; not changed.
     max_pieces : int
-        Largest J, R_max of the paper. Fewer come out when there are not enough distinct u.
+        Largest J, R_max of the paper, at least 1. Fewer come out, and `Partition.limited`
+        says so, when there are fewer than ``max_pieces * min_distinct`` distinct u.
     min_distinct : int
-        Fewest distinct u in a piece, at least 2.
+        Fewest distinct u in a piece, at least 2: with one, a piece has no slope.
     threads : int, optional
-        1 starts none. By default as many as there are cores, for large inputs.
+        1 starts none. By default as many as the process may use, for large inputs.
+        The result does not depend on it.
 
     Raises
     ------
     DataError
-        The arrays do not match, hold NaN or infinity, or u never changes.
+        The arrays do not match, hold something that is not a finite number, or u
+        never changes.
     TooFewSamplesError
         There are fewer distinct u than one piece needs.
+    ParameterError
+        ``max_pieces``, ``min_distinct`` or ``threads`` is too small.
 
     Notes
     -----
-    Complexity: in practice somewhat above linear in n for each J; O(J n^2) at worst.
+    Departures from the paper: equal u are merged before the search; a piece holds at
+    least ``min_distinct`` distinct u; a sample belongs to one piece only (in eqs.
+    (21)-(23) the sample at a break ends one piece and begins the next); u closer than
+    1e-9 of the range count as equal, also for the breaks.
+
+    Among partitions of equal cost any one may come out: the cost is unique, the breaks
+    are not.
+
+    Time grows slightly faster than n for each J in practice, O(J n^2) at worst; memory
+    is about 300 bytes a sample for 10 pieces.
     """
-    u_sorted, y_sorted = _checked(u, y)
-    least = max(2, int(min_distinct))
-    x, mean, weight, first = _merge(u_sorted, y_sorted)
-    if len(x) < least:
-        raise TooFewSamplesError('Distinct values of u for one piece', len(x), least)
-    most = max(1, min(int(max_pieces), len(x) // least))
+    _at_least('max_pieces', max_pieces, 1)
+    _at_least('min_distinct', min_distinct, 2)
+    _at_least('threads', 1 if threads is None else threads, 1)
+    levels = make_levels(u, y)
+    if len(levels) < min_distinct:
+        raise TooFewSamplesError('Distinct values of u for one piece', len(levels), min_distinct)
+    most = min(max_pieces, len(levels) // min_distinct)
     if threads is None:
-        threads = (os.cpu_count() or 1) if len(x) >= _SERIAL_BELOW else 1
-    centre_x, centre_y = np.average(x, weights=weight), np.average(mean, weights=weight)
-    dx, dy = x - centre_x, mean - centre_y
-    rest = dy - float((weight * dx * dy).sum() / (weight * dx * dx).sum()) * dx
-    scale = float(np.sqrt(np.average(rest**2, weights=weight)))
-    # Without residual there is nothing to scale, and any partition is exact.
-    scaled = (
-        rest / scale if scale > 1e-13 * max(1.0, float(np.abs(y_sorted).max())) else 0.0 * rest
+        threads = _cores() if len(levels) >= _SERIAL_BELOW else 1
+    slack = _SLACK * len(levels.u)  # the scaled sum of squares about one line
+    problem = prepare(levels.x, levels.residual, levels.weight, min_distinct, slack, threads)
+    found, starts = best_partitions(problem, most)
+    original = tuple(levels.first[s] for s in starts)
+    cost = np.array([_cost(levels, s) for s in original])
+    claimed = found * levels.scale**2 + levels.within
+    return Partition(
+        cost=cost,
+        u=levels.u,
+        y=levels.y,
+        starts=original,
+        n_distinct=len(levels),
+        certified=bool(np.all(np.abs(claimed - cost) <= _AGREE * cost[0])),
+        limited=_limit(len(levels), most, max_pieces, min_distinct),
     )
-    slack = _SLACK * float(weight.sum())
-    _, starts = best_partitions(prepare(x, scaled, weight, least, slack, threads), most)
-    bounds = np.append(first, len(u_sorted))
-    original = tuple(bounds[s] for s in starts)
-    cost = np.array([_cost(u_sorted, y_sorted, s) for s in original])
-    # Costs cannot rise with J; where rounding says so, the poorer partition is as good.
-    cost = np.minimum.accumulate(cost)
-    return Partition(cost, u_sorted, y_sorted, original, len(x))
 
 
-def _checked(u: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return float64 copies in ascending order of u, or say what is wrong."""
-    a, b = np.asarray(u, dtype=np.float64), np.asarray(y, dtype=np.float64)
-    if a.ndim != 1 or a.shape != b.shape:
-        raise DataError(
-            f'u and y must be one-dimensional and equally long, not {a.shape} and {b.shape}.'
-        )
-    for name, values in (('u', a), ('y', b)):
-        bad = np.flatnonzero(~np.isfinite(values))
-        if len(bad):
-            raise DataError(f'{name}[{bad[0]}] is {values[bad[0]]}: every sample must be finite.')
-    if len(a) < 2:
-        raise TooFewSamplesError('Samples', len(a), 2)
-    if a.min() == a.max():
-        raise DataError(f'u is {a[0]:g} in all {len(a)} samples: a slope needs it to change.')
-    order = np.lexsort((b, a))
-    return a[order], b[order]
+def _at_least(name: str, value: int, least: int) -> None:
+    if not value >= least:
+        raise ParameterError(name, f'is {value}, but must be at least {least}')
 
 
-def _merge(u: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-    """Merge equal u; return u scaled to [-1, 1], mean y, weight and the first sample of each."""
-    tolerance = _SAME_U * (u[-1] - u[0])
-    first = np.flatnonzero(np.append(True, np.diff(u) > tolerance))
-    weight = np.diff(np.append(first, len(u))).astype(np.float64)
-    centre = y.mean()
-    mean = np.add.reduceat(y - centre, first) / weight + centre
-    middle, half = 0.5 * (u[0] + u[-1]), 0.5 * (u[-1] - u[0])
-    return (u[first] - middle) / half, mean, weight, first.astype(np.int64)
+def _cores() -> int:
+    """Return how many cores this process may use."""
+    if hasattr(os, 'sched_getaffinity'):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
-def _centred(u: FloatArray, y: FloatArray) -> tuple[float, float, float, float]:
-    """Return mean u, mean y, slope and sum of squares about the line, in two passes."""
-    mean_u, mean_y = float(u.mean()), float(y.mean())
+def _limit(distinct: int, most: int, asked: int, least: int) -> str:
+    if most == asked:
+        return ''
+    return (
+        f'{asked} pieces of {least} distinct u each were asked for, but there are only '
+        f'{distinct} distinct u: {most} is the largest number of pieces.'
+    )
+
+
+def _centred(u: FloatArray, y: FloatArray) -> tuple[float, float, float, float, float]:
+    """Return mean u, mean y, slope, spread of u and sum of squares about the line, in two passes.
+
+    No dot products: their last bits would depend on the number of threads.
+    """
+    mean_u = float((u - u[0]).mean() + u[0])
+    mean_y = float((y - y[0]).mean() + y[0])
     du, dy = u - mean_u, y - mean_y
-    # Not a dot product: its last bits would depend on the number of threads.
-    sxx = float((du * du).sum())
-    slope = float((du * dy).sum()) / sxx if sxx > 0.0 else 0.0
+    spread = float((du * du).sum())
+    slope = float((du * dy).sum()) / spread if spread > 0.0 else 0.0
     rest = dy - slope * du
-    return mean_u, mean_y, slope, float((rest * rest).sum())
+    return mean_u, mean_y, slope, spread, float((rest * rest).sum())
 
 
-def _cost(u: FloatArray, y: FloatArray, starts: IntArray) -> float:
+def _cost(levels: Levels, starts: IntArray) -> float:
     """Return the cost of a partition from the samples themselves."""
-    return sum(_centred(u[a:b], y[a:b])[3] for a, b in itertools.pairwise(starts))
+    return sum(_centred(levels.u[a:b], levels.y[a:b])[4] for a, b in itertools.pairwise(starts))
 
 
 def _fit_piece(u: FloatArray, y: FloatArray, begin: float, end: float) -> FittedPiece:
     """Fit one piece."""
-    mean_u, mean_y, slope, sse = _centred(u, y)
-    spread = float(((u - mean_u) ** 2).sum())
+    mean_u, mean_y, slope, spread, sse = _centred(u, y)
     n = len(u)
-    variance = sse / (n - 2) if n > 2 else float('nan')
-    slope_error = float(np.sqrt(variance / spread)) if spread > 0.0 else float('nan')
+    variance = sse / (n - 2) if n > 2 else math.nan
     return FittedPiece(
         u_from=begin,
         u_to=end,
@@ -211,6 +247,6 @@ def _fit_piece(u: FloatArray, y: FloatArray, begin: float, end: float) -> Fitted
         intercept=mean_y - slope * mean_u,
         samples=n,
         sse=sse,
-        slope_stderr=slope_error,
-        intercept_stderr=float(np.sqrt(variance / n + (slope_error * mean_u) ** 2)),
+        slope_stderr=math.sqrt(variance / spread),
+        intercept_stderr=math.sqrt(variance * (1.0 / n + mean_u * mean_u / spread)),
     )

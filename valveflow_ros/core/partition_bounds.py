@@ -45,12 +45,9 @@ from valveflow_ros.core.jit import inlined, kernel
 from valveflow_ros.core.partition_moments import (
     BRANCH,
     LEAF,
-    Moments,
     Tree,
     blocks_moments,
     fit,
-    joined,
-    node_moments,
 )
 from valveflow_ros.records import FloatArray
 
@@ -81,7 +78,7 @@ def _window_prior(tree: Tree, first: int, last: int, limit: float, out: FloatArr
 @kernel
 def fill_priors(tree: Tree, limit: float, prior: FloatArray) -> None:
     """Fill ``prior[node, slot]``: Gram matrix (3 numbers) and line (2) of each window."""
-    blocks = tree.leaf.shape[0]
+    blocks = tree.start[1]
     size = 1
     for level in range(tree.levels):
         for number in range(tree.start[level], tree.start[level + 1]):
@@ -152,14 +149,14 @@ def least_and_most(row: FloatArray) -> tuple[float, float]:
 def fill_leaf_bounds(
     tree: Tree, prior: FloatArray, before: FloatArray, first: int, last: int, bound: FloatArray
 ) -> None:
-    """Fill ``bound[block, slot]`` of the blocks ``[first, last)`` from their candidates.
+    """Fill ``bound[block, slot]`` of the full blocks in ``[first, last)`` from their candidates.
 
     The five numbers are P, then the box of slopes: least and most along the
     line's value at the node's last sample, least and most along that at its first.
     """
-    blocks = tree.leaf.shape[0]
+    blocks = tree.start[1]
     out = np.empty((3, LEAF))
-    for block in range(first, last):
+    for block in range(first, min(last, blocks)):
         per_width = 1.0 / (tree.x[LEAF * block + LEAF - 1] - tree.x[LEAF * block])
         mine = before[LEAF * block : LEAF * block + LEAF]
         window = 0
@@ -174,125 +171,6 @@ def fill_leaf_bounds(
                 b[1], b[2] = least_and_most(out[1])
                 b[3], b[4] = least_and_most(out[2])
             window = window * BRANCH if slot else 1
-
-
-@inlined
-def _between(lo: float, hi: float, factor: float) -> tuple[float, float]:
-    a = lo * factor
-    b = hi * factor
-    return min(a, b), max(a, b)
-
-
-@kernel
-def _lift(
-    tree: Tree,
-    prior: FloatArray,
-    child: FloatArray,
-    child_prior: FloatArray,
-    ends: tuple[float, float, float, float],
-    between: Moments,
-    out: FloatArray,
-) -> None:
-    """Turn the bound of a child into one of its parent and widen ``out`` by it.
-
-    ``between`` are the samples from the child's end to the parent's. They and the
-    parent's prior are the child's core: its best line ``k`` is an affine function
-    of the parent's line, and the child's bound is taken about ``k``.
-    ``ends``: distances, left of the parent's last sample, of the parent's first
-    sample, the child's last and first; and the smallest usable determinant ratio.
-    """
-    width, near, far, _ = ends
-    hn = prior[0]
-    h1 = prior[1]
-    h2 = prior[2]
-    a = prior[3]
-    b = prior[4]
-    r0 = between[3] - a * between[0] - b * between[1]
-    r1 = between[4] - a * between[1] - b * between[2]
-    r2 = (between[5] - a * between[3] - b * between[4]) - a * r0 - b * r1
-    p = hn + between[0]
-    q = h1 + between[1]
-    s = h2 + between[2]
-    det = p * s - q * q
-    inverse = 1.0 / det
-    za = (s * r0 - q * r1) * inverse
-    zb = (p * r1 - q * r0) * inverse
-    right = a + za + near * (b + zb) - child_prior[3]
-    left = a + za + far * (b + zb) - child_prior[3] - (far - near) * child_prior[4]
-    box = min(child[1] * right, child[2] * right) + min(child[3] * left, child[4] * left)
-    out[0] = min(out[0], max(r2 - r0 * za - r1 * zb, 0.0) + child[0] + box)
-    per_width = 1.0 / width
-    # The columns of H A^-1 for the child's two values, as slopes along the parent's two.
-    ua = (s - q * near) * inverse
-    ub = (p * near - q) * inverse
-    va = (s - q * far) * inverse
-    vb = (p * far - q) * inverse
-    zl = -2.0 * (h1 * za + h2 * zb) * per_width
-    ul = (h1 * ua + h2 * ub) * per_width
-    vl = (h1 * va + h2 * vb) * per_width
-    zr = -2.0 * (hn * za + h1 * zb) - zl
-    ur = (hn * ua + h1 * ub) - ul
-    vr = (hn * va + h1 * vb) - vl
-    lo1, hi1 = _between(child[1], child[2], ur)
-    lo2, hi2 = _between(child[3], child[4], vr)
-    out[1] = min(out[1], zr + lo1 + lo2)
-    out[2] = max(out[2], zr + hi1 + hi2)
-    lo1, hi1 = _between(child[1], child[2], ul)
-    lo2, hi2 = _between(child[3], child[4], vl)
-    out[3] = min(out[3], zl + lo1 + lo2)
-    out[4] = max(out[4], zl + hi1 + hi2)
-
-
-@inlined
-def _lift_flat(child: FloatArray, out: FloatArray) -> None:
-    """Widen ``out`` by a child's bound that depends on no line: cost(B) >= cost(part of B)."""
-    out[0] = min(out[0], child[0])
-    out[1] = min(out[1], 0.0)
-    out[2] = max(out[2], 0.0)
-    out[3] = min(out[3], 0.0)
-    out[4] = max(out[4], 0.0)
-
-
-@kernel
-def fill_node_bounds(
-    tree: Tree, prior: FloatArray, level: int, first: int, last: int, bound: FloatArray
-) -> None:
-    """Fill ``bound`` of the nodes ``[first, last)`` of a level from the level below."""
-    blocks = tree.leaf.shape[0]
-    size = BRANCH**level
-    part = size // BRANCH
-    for i in range(first, last):
-        end = (i + 1) * size
-        number = tree.start[level] + i
-        origin = tree.x[LEAF * end - 1]
-        width = origin - tree.x[LEAF * (end - size)]
-        window = 0
-        for slot in range(SLOTS):
-            out = bound[number, slot]
-            out[0] = -np.inf
-            if end + window > blocks:
-                continue
-            out[0] = np.inf
-            out[1] = out[3] = np.inf
-            out[2] = out[4] = -np.inf
-            between = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-            for c in range(BRANCH - 1, -1, -1):
-                child = tree.start[level - 1] + BRANCH * i + c
-                stop = end - (BRANCH - 1 - c) * part
-                near = origin - tree.x[LEAF * stop - 1]
-                far = origin - tree.x[LEAF * (stop - part)]
-                wide = min(slot + 1, SLOTS - 1) if slot or c < BRANCH - 1 else 0
-                p = prior[number, slot, 0] + between[0]
-                q = prior[number, slot, 1] + between[1]
-                s = prior[number, slot, 2] + between[2]
-                if bound[child, 0, 0] < np.inf:
-                    if wide and p * s - q * q > 1e-12 * p * s:
-                        _lift(tree, prior[number, slot], bound[child, wide], prior[child, wide],
-                              (width, near, far, 0.0), between, out)  # fmt: skip
-                    else:
-                        _lift_flat(bound[child, 0], out)
-                between = joined(node_moments(tree, child), near, between)
-            window = window * BRANCH if slot else size
 
 
 def make_priors(tree: Tree, limit: float) -> NDArray[np.float64]:

@@ -62,7 +62,7 @@
       const waiting = place.querySelector('.waiting');
       if (waiting) waiting.remove();
       const look = layout(figures[name].layout, colour, narrow);
-      if (printing) look.width = paperWidth;
+      if (printing) Object.assign(look, { width: paperWidth, height: Math.min(look.height, 400) });
       return Plotly.react(place, painted(figures[name].data, colour), look, settings);
     });
     return Promise.all(jobs);

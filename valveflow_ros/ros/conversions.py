@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 from builtin_interfaces.msg import Time
 from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension
-from valveflow_msgs.msg import Alarm, FlowCharacteristic, Prediction
+from valveflow_msgs.msg import Alarm, FlowCharacteristic
 from valveflow_msgs.msg import JournalEntry as JournalMessage
 from valveflow_msgs.msg import SpecialSegment as SegmentMessage
 
@@ -15,16 +15,15 @@ from valveflow_ros.core.alarms import AlarmChange
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.events import JournalEntry, JournalKind
 from valveflow_ros.core.monitor import CurveStatus
-from valveflow_ros.core.prediction import PredictionBlock
 from valveflow_ros.records import NS_PER_S, FloatArray, SpecialSegment
 
-# What the seconds of a stamp can hold.
-_LAST_NS = (1 << 31) * NS_PER_S - 1
+# The latest time whose seconds a stamp can hold.
+LAST_NS = (1 << 31) * NS_PER_S - 1
 
 
 def to_time(time_ns: int) -> Time:
     """Return a stamp; times before 1970 or after 2038 become the nearest one there is."""
-    sec, nanosec = divmod(min(max(time_ns, 0), _LAST_NS), NS_PER_S)
+    sec, nanosec = divmod(min(max(time_ns, 0), LAST_NS), NS_PER_S)
     return Time(sec=sec, nanosec=nanosec)
 
 
@@ -36,29 +35,6 @@ def from_time(stamp: Time) -> int:
 def header(time_ns: int, tag: str) -> Header:
     """Return the head of a message."""
     return Header(stamp=to_time(time_ns), frame_id=tag)
-
-
-def predictions(block: PredictionBlock, tag: str) -> Iterator[tuple[int, Prediction]]:
-    """Yield a message for each row, with the row's time in ns."""
-    columns = (
-        block.time_ns, block.u, block.measured_mw, block.static_mw, block.dynamic_mw,
-        block.residual_mw, block.state,
-    )  # fmt: skip
-    for row in zip(*(column.tolist() for column in columns), strict=True):
-        time_ns, u, measured, static, dynamic, residual, state = row
-        message = Prediction(
-            header=header(time_ns, tag),
-            state=state,
-            model_id=block.model_id,
-            integrated_input=u,
-            measured_mw=measured,
-            static_mw=static,
-            dynamic_mw=dynamic,
-            residual_mw=residual,
-            limit_low_mw=-block.limit_mw,
-            limit_high_mw=block.limit_mw,
-        )
-        yield time_ns, message
 
 
 def segment(found: SpecialSegment, tag: str) -> SegmentMessage:

@@ -75,7 +75,7 @@ class LiveEngine:
 
     def reconfigure(self, settings: Settings) -> list[Event]:
         """Take settings of which only live ones differ."""
-        return self.monitor.reconfigure(settings) or []
+        return self.monitor.reconfigure(settings)
 
     def _feed_rows(self, table: SampleTable) -> list[Event]:
         events: list[Event] = []

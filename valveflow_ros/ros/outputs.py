@@ -21,6 +21,7 @@ from valveflow_ros.core.monitor import CurveStatus
 from valveflow_ros.core.prediction import PredictionBlock
 from valveflow_ros.ros import conversions
 from valveflow_ros.ros.encoding import encode
+from valveflow_ros.ros.prediction_bytes import prediction_bytes
 
 NO_CURVE_YET = 'No curve yet: not enough special segments.'
 
@@ -101,8 +102,8 @@ class Outputs:
     def _rows(self, block: PredictionBlock, changes: list[AlarmChange]) -> Iterator[Output]:
         left = iter(changes)
         change = next(left, None)
-        for time_ns, message in conversions.predictions(block, self._tag):
-            yield _output('prediction', message, time_ns)
+        for time_ns, data in prediction_bytes(block, self._tag):
+            yield Output('prediction', data, max(0, time_ns))
             while change is not None and change.time_ns <= time_ns:
                 yield from self._single(change)
                 change = next(left, None)

@@ -1,0 +1,97 @@
+"""Messages, progress and results go where they belong."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from valveflow_ros.cli.console import Console, Outcome
+from valveflow_ros.cli.report_words import columns
+
+
+class Terminal(io.StringIO):
+    """A stream that says it is a terminal."""
+
+    def isatty(self):
+        return True
+
+
+def shown(text):
+    """Return what stays on a terminal's lines after all returns and erasures."""
+    return [line.split('\r')[-1].replace('\x1b[K', '') for line in text.split('\n')]
+
+
+@pytest.fixture(autouse=True)
+def usual_terminal(monkeypatch):
+    monkeypatch.setenv('TERM', 'xterm')
+
+
+def test_progress_is_for_terminals_only():
+    err = io.StringIO()
+    Console(io.StringIO(), err).progress(0.5, 'working')
+    assert err.getvalue() == ''
+    err = Terminal()
+    Console(io.StringIO(), err).progress(0.5, 'working')
+    assert '50 %  working' in err.getvalue()
+
+
+@pytest.mark.parametrize('setting', ['quiet', 'dumb'])
+def test_progress_can_be_silenced(monkeypatch, setting):
+    monkeypatch.setenv('TERM', 'dumb' if setting == 'dumb' else 'xterm')
+    err = Terminal()
+    Console(io.StringIO(), err, quiet=setting == 'quiet').progress(0.5, 'working')
+    assert err.getvalue() == ''
+
+
+def test_a_message_takes_the_place_of_the_bar():
+    err = Terminal()
+    console = Console(io.StringIO(), err)
+    console.progress(0.1, 'first')
+    console.say('Found something.')
+    console.progress(0.2, 'second')
+    console.warn('Look here.')
+    console.progress(0.3, 'third')
+    console.finish(Outcome('done', {}))
+    assert shown(err.getvalue()) == ['Found something.', 'Warning: Look here.', '']
+
+
+def test_a_bar_of_one_piece_of_work_is_not_redrawn_all_the_time():
+    err = Terminal()
+    console = Console(io.StringIO(), err)
+    for k in range(10_000):
+        console.progress(k / 10_000, 'working')
+    assert err.getvalue().count('\r') < 100
+
+
+def test_quiet_keeps_warnings():
+    err = io.StringIO()
+    console = Console(io.StringIO(), err, quiet=True)
+    console.say('Nice to know.')
+    console.warn('Need to know.')
+    assert err.getvalue() == 'Warning: Need to know.\n'
+
+
+def test_results_go_to_stdout_as_text_or_json():
+    outcome = Outcome('A text.', {'a': [1.5, float('nan'), (float('inf'), 'ü')], 'b': {'c': None}})
+    for as_json, expected in ((False, 'A text.\n'), (True, None)):
+        out, err = io.StringIO(), io.StringIO()
+        Console(out, err, as_json=as_json).finish(outcome)
+        assert err.getvalue() == ''
+        if expected:
+            assert out.getvalue() == expected
+        else:
+            assert json.loads(out.getvalue()) == {'a': [1.5, None, [None, 'ü']], 'b': {'c': None}}
+
+
+@given(st.lists(st.lists(st.text('abc 12', max_size=9), min_size=3, max_size=3), max_size=6))
+def test_columns_line_up(rows):
+    lines = columns(rows, ['one', 'two', 'three'], indent='').split('\n')
+    assert len(lines) == len(rows) + 1
+    width = max(map(len, lines))
+    for line, row in zip(lines[1:], rows, strict=True):
+        assert line.ljust(width).endswith(row[2].rjust(5)) or row[2] != row[2].rstrip()
+        assert line.startswith(row[0].rstrip())

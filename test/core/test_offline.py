@@ -1,0 +1,293 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from streams import (
+    QUICK_MONITOR,
+    START_NS,
+    blocks_of,
+    cuts,
+    examples,
+    first_difference,
+    plant_table,
+    story,
+    table_harms,
+)
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.align import Aligner
+from valveflow_ros.core.events import CurveAdopted, FitRequested, JournalEntry, JournalKind
+from valveflow_ros.core.fit import fit
+from valveflow_ros.core.monitor import Monitor
+from valveflow_ros.core.offline import (
+    CLOCK_BACK,
+    JournalReplayer,
+    align_all,
+    feed_aligned,
+    feed_rows,
+)
+from valveflow_ros.errors import DataError, ValveflowError
+from valveflow_ros.records import NS_PER_S, Readings, SampleTable, table_to_readings
+
+SETTINGS = Settings(QUICK_MONITOR)
+N = 700
+
+
+class LiveRun:
+    """A run as a node has it: fits come back late, people press buttons, clocks go back."""
+
+    def __init__(self, settings, table):
+        self.monitor = Monitor(settings)
+        self.table = table
+        self.done = 0
+        self.events = []
+        self.waiting = []  # (rows at which the outcome comes back, task)
+
+    def rows(self, count, late):
+        """Feed rows; every fit asked for on the way comes back ``late`` rows later."""
+        end = min(self.done + count, len(self.table))
+        while self.done < end:
+            due = min((row for row, _ in self.waiting), default=end)
+            until = max(self.done + 1, min(end, due))
+            fed = self.monitor.feed(self.table.part(self.done, until))
+            self.done += fed.rows
+            self.take(fed.events, late)
+            self.bring_back()
+
+    def take(self, events, late):
+        self.events += events
+        self.waiting += [
+            (self.done + late, e.task) for e in events if isinstance(e, FitRequested)
+        ]
+
+    def bring_back(self):
+        for row, task in list(self.waiting):
+            if row <= self.done:
+                self.waiting.remove((row, task))
+                try:
+                    curve = fit(task)
+                except DataError as error:
+                    self.events += self.monitor.refuse(task.request_ns, str(error))
+                else:
+                    self.events += self.monitor.adopt(task.request_ns, curve)
+
+    def press(self, button, late):
+        """Do what a person, a worker or a clock does between two rows."""
+        monitor = self.monitor
+        try:
+            if button == 'acknowledge':
+                self.events += monitor.acknowledge()
+            elif button == 'request':
+                self.take(monitor.request_fit(), late)
+            elif button == 'time out' and self.waiting:
+                self.events += monitor.refuse(self.waiting[-1][1].request_ns, 'Took too long.')
+            elif button == 'restart':
+                self.events += monitor.restart(CLOCK_BACK)
+            elif button == 'limit':
+                changes = {'alarm_limit': 4.0 if monitor.limit_mw() == 3.0 else 3.0}
+                self.events += monitor.reconfigure(monitor.settings.changed(changes))
+            elif button == 'period':
+                changes = {'refit_period': 90.0, 'refit_segments': 2}
+                self.events += monitor.reconfigure(monitor.settings.changed(changes))
+        except DataError as error:
+            assert str(error)  # refused with a sentence, and nothing is written down
+
+    def journal(self):
+        return [e for e in self.events if isinstance(e, JournalEntry)]
+
+
+def replayed(settings, table, journal, places=()):
+    """Repeat a run from its rows and journal, cut anywhere."""
+    replayer = JournalReplayer(Monitor(settings), journal)
+    events = []
+    for start, end in blocks_of(len(table), list(places)):
+        events += replayer.feed(table.part(start, end))
+    return events
+
+
+def same(live, again):
+    """Assert that two lists of events tell the same, bit for bit."""
+    a, b = story(live), story(again)
+    difference = first_difference(a, b)
+    assert not difference, difference
+
+
+BUTTONS = ['nothing', 'acknowledge', 'request', 'time out', 'restart', 'limit', 'period']
+plan = st.lists(
+    st.tuples(st.integers(1, 250), st.integers(0, 120), st.sampled_from(BUTTONS)), max_size=10
+)
+
+
+@examples(30)
+@given(st.integers(0, 2**32 - 1), table_harms(N), plan, st.data())
+def test_rows_and_journal_repeat_any_run_bit_for_bit(seed, harms, steps, data):
+    live = LiveRun(SETTINGS, plant_table(seed, N, harms))
+    for count, late, button in steps:
+        live.rows(count, late)
+        live.press(button, late)
+    live.rows(N, 40)
+    places = data.draw(cuts(N, most=8))
+    same(live.events, replayed(SETTINGS, live.table, live.journal(), places))
+
+
+@pytest.mark.parametrize('late', [0, 1, 7, 100])
+def test_fits_adopted_late_are_adopted_at_the_same_row_again(late):
+    live = LiveRun(SETTINGS, plant_table(2, N))
+    live.rows(N, late)
+    assert any(isinstance(e, CurveAdopted) for e in live.events)
+    same(live.events, replayed(SETTINGS, live.table, live.journal()))
+
+
+@pytest.mark.parametrize('at', range(290, 330, 3))
+def test_a_segment_closed_by_an_outage_asks_at_the_same_row_again(at):
+    """What shows the outage is the row after it."""
+    for late in (0, 1, 5):
+        live = LiveRun(SETTINGS.changed({'refit_segments': 1}),
+                       plant_table(4, 500, [('leap', at, 60)]))  # fmt: skip
+        live.rows(500, late)
+        again = replayed(live.monitor.settings, live.table, live.journal())
+        same(live.events, again)
+
+
+def test_a_run_with_every_button_pressed_is_repeated():
+    live = LiveRun(SETTINGS, plant_table(3, 900, [('fault', 400, 120), ('nan_power', 560, 30)]))
+    live.rows(300, 30)
+    live.press('request', 20)
+    live.press('time out', 20)
+    live.rows(200, 30)
+    live.press('acknowledge', 0)
+    live.press('limit', 0)
+    live.rows(150, 30)
+    live.press('acknowledge', 0)
+    live.press('restart', 0)
+    live.rows(300, 10)
+    kinds = {e.kind for e in live.journal()}
+    assert kinds >= {JournalKind.FIT_REQUESTED, JournalKind.FIT_ADOPTED, JournalKind.FIT_REFUSED,
+                     JournalKind.ACKNOWLEDGE, JournalKind.SETTINGS, JournalKind.RESET}  # fmt: skip
+    same(live.events, replayed(SETTINGS, live.table, live.journal(), range(0, 900, 37)))
+
+
+def test_a_refined_fit_is_repeated_bit_for_bit():
+    settings = SETTINGS.changed(
+        {'refine': True, 'selection_rule': 'prediction_error', 'window_days': 0.05,
+         'refit_period': 1500.0, 'refit_segments': 0}
+    )  # fmt: skip
+    live = LiveRun(settings, plant_table(6, 4600))
+    live.rows(4600, 50)
+    curves = [e.characteristic for e in live.events if isinstance(e, CurveAdopted)]
+    assert any(c.dynamics for c in curves)
+    same(live.events, replayed(settings, live.table, live.journal()))
+
+
+@examples(10)
+@given(st.integers(0, 2**32 - 1), table_harms(N))
+def test_fits_in_place_are_a_live_run_with_outcomes_at_once(seed, harms):
+    table = plant_table(seed, N, harms)
+    events = feed_rows(Monitor(SETTINGS), table)
+    journal = [e for e in events if isinstance(e, JournalEntry)]
+    same(events, replayed(SETTINGS, table, journal))
+
+
+def test_the_journal_ends_before_the_rows_do():
+    """Rows after the last entry are fed; a fit asked for there has no outcome."""
+    live = LiveRun(SETTINGS, plant_table(2, N))
+    live.rows(400, 10**6)
+    same(live.events, replayed(SETTINGS, live.table.part(0, 400), live.journal()))
+
+
+def journal_of(events):
+    return [e for e in events if isinstance(e, JournalEntry)]
+
+
+@pytest.mark.parametrize('lost', [0, 100, 250])
+def test_a_recording_whose_beginning_is_lost_is_told_with_a_sentence(lost):
+    """The rows before are missing, so the requests of the journal never come."""
+    table = plant_table(2, N)
+    journal = journal_of(feed_rows(Monitor(SETTINGS), table))
+    broken = [
+        dataclasses.replace(e, request_ns=e.request_ns + lost + 1)
+        if e.kind == JournalKind.FIT_ADOPTED else e
+        for e in journal
+    ]  # fmt: skip
+    with pytest.raises(ValveflowError) as caught:
+        replayed(SETTINGS, table, broken)
+    assert str(caught.value).endswith('.')
+
+
+def test_another_curve_than_the_journals_is_noticed():
+    """A replay that is not the live run must not pass for it."""
+    table = plant_table(2, N)
+    journal = journal_of(feed_rows(Monitor(SETTINGS), table))
+    forged = [
+        dataclasses.replace(e, model_id='000000000000')
+        if e.kind == JournalKind.FIT_ADOPTED else e
+        for e in journal
+    ]  # fmt: skip
+    with pytest.raises(ValveflowError, match='000000000000'):
+        replayed(SETTINGS, table, forged)
+
+
+@pytest.mark.parametrize('text', ['', '{', '[]', '{"sample_period": 2.0}', '{"nonsense": 1}'])
+def test_settings_that_no_journal_can_have_are_told_with_a_sentence(text):
+    entry = JournalEntry(START_NS, JournalKind.SETTINGS, 0, 100, '', text)
+    with pytest.raises(ValveflowError):
+        replayed(SETTINGS, plant_table(2, 200), [entry])
+
+
+# --- readings to events ---------------------------------------------------------------------
+
+
+def through_aligner(settings, readings, places=()):
+    aligner, monitor, events = Aligner(settings), Monitor(settings), []
+    for start, end in blocks_of(len(readings), list(places)):
+        events += feed_aligned(monitor, aligner.feed(readings.part(start, end)))
+    return events + feed_aligned(monitor, aligner.finish())
+
+
+def joined(*tables):
+    """Return the readings of tables one after the other, whatever their times."""
+    parts = [table_to_readings(t) for t in tables]
+    return Readings(*(np.concatenate([getattr(p, name) for p in parts])
+                      for name in ('time_ns', 'signal', 'value', 'quality')))  # fmt: skip
+
+
+@examples(8)
+@given(st.integers(0, 2**32 - 1), table_harms(400, most=3), st.data())
+def test_any_cutting_of_the_readings_gives_the_same_events(seed, harms, data):
+    harms = [h for h in harms if h[0] != 'inf']
+    readings = joined(plant_table(seed, 400, harms))
+    whole = through_aligner(SETTINGS, readings)
+    same(whole, through_aligner(SETTINGS, readings, data.draw(cuts(len(readings), most=15))))
+
+
+@pytest.mark.parametrize('cut', [[], [700], list(range(0, 2400, 111))])
+def test_a_clock_set_back_restarts_the_engine_once_at_the_right_row(cut):
+    first = plant_table(1, 300)
+    second = plant_table(2, 300, start_ns=START_NS - 7200 * NS_PER_S)
+    events = through_aligner(SETTINGS, joined(first, second), cut)
+    resets = [e for e in journal_of(events) if e.kind == JournalKind.RESET]
+    assert [(e.rows, e.text) for e in resets] == [(300, CLOCK_BACK)]
+    expected = Monitor(SETTINGS)
+    told = feed_rows(expected, first)
+    told += expected.restart(CLOCK_BACK)
+    told += feed_rows(expected, second)
+    same(told, events)
+
+
+def test_all_rows_of_a_finished_list_come_out():
+    table = plant_table(0, 50)
+    parts = list(align_all(Aligner(SETTINGS), table_to_readings(table)))
+    rows = SampleTable.concatenate([p.table for p in parts])
+    assert rows.time_ns.tolist() == table.time_ns.tolist()
+    assert np.array_equal(rows.values, table.values, equal_nan=True)
+
+
+def test_no_rows_no_events():
+    empty = plant_table(0, 0)
+    assert feed_rows(Monitor(SETTINGS), empty) == []
+    assert replayed(SETTINGS, empty, []) == []
+    assert through_aligner(SETTINGS, table_to_readings(empty)) == []
