@@ -1,5 +1,6 @@
 """The ament_python package valveflow_ros; its metadata stand in package.xml, once."""
 
+import sys
 from glob import glob
 from pathlib import Path
 from xml.etree import ElementTree
@@ -11,6 +12,16 @@ PACKAGE = 'valveflow_ros'
 # must be relative to it.
 MANIFEST = ElementTree.parse(Path(__file__).with_name('package.xml')).getroot()
 MAINTAINER = MANIFEST.find('maintainer')
+
+COMMAND = ['valveflow = valveflow_ros.cli.main:main']
+NODES = [
+    'monitor = valveflow_ros.ros.monitor_main:main',
+    'plant_simulator = valveflow_ros.ros.simulator_main:main',
+    'replay = valveflow_ros.ros.replay_main:main',
+]
+# pip would put the nodes beside the command, under names as plain as `monitor`, also
+# where there is no ROS. ros2 looks for them in lib/valveflow_ros, where colcon puts them.
+BY_PIP = {'bdist_wheel', 'dist_info', 'editable_wheel'}.intersection(sys.argv)
 
 
 def files(pattern: str) -> list[str]:
@@ -50,12 +61,5 @@ setup(
         # not built.
         (f'share/{PACKAGE}/msg', files('msg/*.msg')),
     ],
-    entry_points={
-        'console_scripts': [
-            'monitor = valveflow_ros.ros.monitor_main:main',
-            'plant_simulator = valveflow_ros.ros.simulator_main:main',
-            'replay = valveflow_ros.ros.replay_main:main',
-            'valveflow = valveflow_ros.cli.main:main',
-        ],
-    },
+    entry_points={'console_scripts': COMMAND if BY_PIP else NODES + COMMAND},
 )

@@ -64,7 +64,7 @@ class Stopwatch:
 
     def total(self, clock: str) -> float:
         """Return the sum over all steps of 'wall_s' or 'cpu_s'."""
-        return sum(row[clock] for row in self.rows)
+        return float(sum(row[clock] for row in self.rows))
 
 
 def record(folder: Path, days: float, seed: int, effects: list[str]) -> Path:

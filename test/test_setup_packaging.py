@@ -217,13 +217,19 @@ def test_the_wheel_of_the_pure_part(tmp_path):
     assert {n.split('/')[0] for n in names} == {
         'valveflow_ros', f'valveflow_ros-{version}.data', f'valveflow_ros-{version}.dist-info',
     }  # fmt: skip
+    files = {
+        str(path.relative_to(ROOT))
+        for path in (ROOT / 'valveflow_ros').rglob('*')
+        if path.is_file() and '__pycache__' not in path.parts
+    }
+    assert {n for n in names if n.startswith('valveflow_ros/')} == files
     share = f'valveflow_ros-{version}.data/data/share'
     assert f'{share}/ament_index/resource_index/packages/valveflow_ros' in names
     assert f'{share}/valveflow_ros/msg/Alarm.msg' in names
     points = (
         tmp_path / 'out' / f'valveflow_ros-{version}.dist-info' / 'entry_points.txt'
     ).read_text()
-    assert 'valveflow = valveflow_ros.cli.main:main' in points
+    assert points.split() == '[console_scripts] valveflow = valveflow_ros.cli.main:main'.split()
     loaded = subprocess.run(
         [sys.executable, '-c', 'import valveflow_ros; print(valveflow_ros.__file__)'],
         cwd=tmp_path, env=os.environ | {'PYTHONPATH': str(tmp_path / 'out')},

@@ -8,10 +8,13 @@ import re
 import numpy as np
 import pytest
 
+from valveflow_ros.cli.engine import watch
+from valveflow_ros.config import Settings
 from valveflow_ros.core.characteristic_json import from_json
+from valveflow_ros.errors import DataError
 from valveflow_ros.logs import open_log, write_table
 from valveflow_ros.plant.unit import UnitDescription
-from valveflow_ros.records import NS_PER_S, SampleTable, Signal
+from valveflow_ros.records import NS_PER_S, Readings, SampleTable, Signal, table_to_readings
 
 START_NS = 1_700_000_000 * NS_PER_S
 
@@ -227,10 +230,6 @@ def test_slow_data_are_met_with_fitting_parameters(run, tmp_path):
 
 
 def test_only_what_follows_the_last_step_back_of_the_clock_counts(run, tmp_path):
-    from valveflow_ros.cli.engine import watch
-    from valveflow_ros.config import Settings
-    from valveflow_ros.records import Readings, table_to_readings
-
     first = table_to_readings(table(3, stairs))
     second = table_to_readings(table(2, stairs))
     joined = Readings(*(
@@ -246,6 +245,11 @@ def test_only_what_follows_the_last_step_back_of_the_clock_counts(run, tmp_path)
     assert all(s.end_ns <= watched.table.time_ns[-1] for s in watched.segments)
     inside = {s.start_ns for s in watched.segments}
     assert len(inside) == len(watched.segments), 'no segment of the forgotten rows'
+
+
+def test_a_log_without_any_reading_is_refused():
+    with pytest.raises(DataError, match='The log has no valve_opening; name yours with --column'):
+        watch(Readings.of([]), Settings())
 
 
 def test_readings_that_were_not_used_are_told(run, logs, tmp_path):

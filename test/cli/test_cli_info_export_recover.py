@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from valveflow_ros.cli.alignment import align
+from valveflow_ros.cli.inspection import fates
+from valveflow_ros.config import Settings
 from valveflow_ros.logs import open_log, read_table
-from valveflow_ros.records import SIGNALS, Signal
+from valveflow_ros.records import NS_PER_S, SIGNALS, Readings, Signal
 
 
 def test_info_tells_what_is_there(run, logs):
@@ -105,3 +110,41 @@ def test_recover_makes_a_whole_file_of_half_of_one(run, logs, tmp_path):
     theirs = values.value[values.signal == Signal.GENERATED_POWER]
     assert np.array_equal(mine, theirs[: len(mine)])
     assert 'exists already' in run('recover', broken, '-o', tmp_path / 'b.mcap').refused()
+
+
+READINGS = st.lists(
+    st.tuples(
+        st.integers(0, 50), st.integers(0, len(SIGNALS) - 1),
+        st.sampled_from([50.0, 100.0, -200.0, np.nan, 1e9]) | st.floats(50.0, 60.0),
+        st.sampled_from([0, 0, 0, 1, 2]),
+    ),
+    max_size=60,
+)  # fmt: skip
+
+
+@given(READINGS, st.booleans())
+def test_what_looks_in_order_is_what_the_engine_accepts(rows, tidy):
+    """The quick look may ask the engine too often, but may never say other than it."""
+    limits = {f'{i.topic}_high': 60.0 for i in SIGNALS if i.required and 'power' in i.topic}
+    settings = Settings(limits)
+    if tidy:
+        rows = sorted(
+            {(t, s): (t, s, 55.0 if s == 2 else 30.0, 0) for t, s, _, _ in rows}.values()
+        )
+    readings = Readings.of([(t * NS_PER_S, s, v, q) for t, s, v, q in rows])
+    told = fates(readings, settings)
+    if tidy:
+        assert all(set(by_reason) == {'accepted'} for by_reason in told.values())
+    _, _, counts = align(readings, settings)
+    for topic, by_reason in counts.items():
+        for reason, n in by_reason.items():
+            if reason != 'late':
+                assert told[topic].get(reason, 0) == n, (topic, reason)
+
+
+def test_info_names_what_is_attached(run, logs, tmp_path):
+    assert run('import', logs / 'plant.csv', '-o', tmp_path / 'a.mcap').status == 0
+    assert 'Attached: import.json (' in run('info', tmp_path / 'a.mcap').out
+    data = run('info', tmp_path / 'a.mcap', '--json').json
+    attached = open_log(tmp_path / 'a.mcap').attachments
+    assert data['attachments'] == {name: len(text) for name, text in attached.items()}

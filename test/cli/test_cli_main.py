@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -132,6 +133,20 @@ def test_no_module_of_the_command_or_the_report_knows_ros():
             if isinstance(node, ast.ImportFrom):
                 names = [node.module or '']
             assert not [n for n in names if n.startswith(('rclpy', 'valveflow_ros.ros'))], path
+
+
+def test_the_first_run_is_known_by_the_empty_cache(tmp_path):
+    code = 'from valveflow_ros.cli.first_run import is_first_run; print(is_first_run())'
+
+    def ask(**changes):
+        done = subprocess.run(
+            [sys.executable, '-c', code], capture_output=True, text=True, check=True,
+            env={**os.environ, 'NUMBA_CACHE_DIR': str(tmp_path), **changes},
+        )  # fmt: skip
+        return done.stdout.strip()
+
+    assert ask() == 'True'
+    assert ask(NUMBA_DISABLE_JIT='1') == 'False'
 
 
 def test_ctrl_c_in_the_middle_of_the_work_leaves_nothing(logs, tmp_path):

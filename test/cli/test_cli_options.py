@@ -146,6 +146,13 @@ def test_what_follows_from_the_data_is_always_valid(steps, span_s):
         assert value != PARAMETERS[name].default
 
 
+@given(STEPS, st.floats(0.0, 6e4), st.floats(0.01, 3600.0))
+def test_any_step_a_person_sets_is_met_with_fitting_parameters(steps, span_s, period):
+    settings, _ = settings_for(steps, span_s, {'sample_period': period})
+    assert settings.real('sample_period') == period
+    assert 86400.0 * settings.real('window_days') >= span_s
+
+
 @given(STEPS, st.floats(0.0, 1e9), st.sampled_from(['hold_limit', 'block', 'sample_period']))
 def test_what_a_person_sets_is_not_adapted(steps, span_s, name):
     assert name not in fitting(steps, span_s, {name: 50.0})

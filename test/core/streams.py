@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 
 import numpy as np
@@ -12,6 +13,9 @@ from hypothesis import strategies as st
 
 from valveflow_ros.core.alarms import AlarmChange
 from valveflow_ros.core.prediction import PredictionBlock
+from valveflow_ros.core.units import integrated_input
+from valveflow_ros.plant.simulator import simulate
+from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.records import NS_PER_S, SampleTable, Signal
 
 START_NS = 1_700_006_400 * NS_PER_S
@@ -217,3 +221,17 @@ def table_harms(n, most=5):
     return st.lists(
         st.tuples(st.sampled_from(kinds), st.integers(0, n - 1), st.integers(1, 60)), max_size=most
     )
+
+
+def simulated(days, seed, effects=()):
+    """Return a run of the simulated plant and its measured u; shared, so not to be written."""
+    log = _simulated(days, seed, tuple(effects))
+    u = integrated_input(
+        log.table.column(Signal.VALVE_OPENING), log.table.column(Signal.MAIN_STEAM_PRESSURE)
+    )
+    return log, u
+
+
+@functools.lru_cache(maxsize=3)
+def _simulated(days, seed, effects):
+    return simulate(days, seed, effects=[EffectSpec.parse(e) for e in effects])

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
@@ -17,13 +18,14 @@ from streams import (
     grid_ns,
     lagged,
     needs_jit,
+    simulated,
     steps_and_ramps,
 )
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.segmenter import Segmenter
 from valveflow_ros.core.segmenter_kernel import NO_DATA, SETTLED_SLOPE, SETTLED_STEADY, TRANSIENT
-from valveflow_ros.records import NS_PER_S, SegmentKind
+from valveflow_ros.records import NS_PER_S, SegmentKind, Signal
 
 # Seconds instead of minutes, so that a few hundred rows hold many segments.
 QUICK = {
@@ -347,6 +349,56 @@ def test_no_segment_begins_or_ends_in_the_transient_of_a_ramp(seed, rate):
             assert not (first < start and end > start + 10), (first, end, kind, start)
     assert kinds[SegmentKind.STEADY] > 1500
     assert kinds[SegmentKind.SLOPE] > 600
+
+
+@functools.cache
+def segments_of_the_simulated_plant(seed):
+    log, u = simulated(3, seed)
+    table = log.table
+    stream = Stream(table.time_ns, u, table.column(Signal.GENERATED_POWER),
+                    table.column(Signal.MAIN_STEAM_TEMPERATURE))  # fmt: skip
+    out, segmenter = whole(Settings(), stream)
+    return log, u, spans(out.found), segmenter.noise()
+
+
+@needs_jit
+@pytest.mark.parametrize('seed', [1, 5])
+def test_no_segment_of_the_simulated_plant_begins_in_the_transient_of_a_clear_ramp(seed):
+    """A move of u is seen to the minute, so the first 5 T + tau less a minute must be free."""
+    log, _, found, noise = segments_of_the_simulated_plant(seed)
+    moving = np.abs(np.diff(log.load_mw)) > 1e-6
+    starts = np.flatnonzero(moving[1:] & ~moving[:-1]) + 1
+    ends = np.flatnonzero(~moving[1:] & moving[:-1]) + 1
+    clear = 0
+    for start in starts:
+        end = min([*ends[ends > start][:1], start + 300, len(log) - 1])
+        if abs(log.true_u[end] - log.true_u[start]) < 15.0 * noise.input:
+            continue
+        clear += 1
+        for first, last, kind in found:
+            assert not start < first < start + Settings().settle_s - 60, (start, first, kind)
+            if kind == SegmentKind.STEADY and first < start:
+                assert last <= start + 60, (start, first, last)
+    assert clear > 60
+
+
+@needs_jit
+@pytest.mark.parametrize('seed', [1, 2])
+def test_steady_segments_of_the_simulated_plant_tell_its_true_curve(seed):
+    """Over three days the power without noise in them is F(u), without bias."""
+    log, u, found, _ = segments_of_the_simulated_plant(seed)
+    truth = log.unit.curve
+    steady = [(a, b) for a, b, kind in found if kind == SegmentKind.STEADY]
+    assert len(steady) > 60
+    assert sum(b - a for a, b in steady) > 0.15 * len(log)
+    error = np.array(
+        [(log.true_power_mw[a:b] - truth(log.true_u[a:b])).mean() for a, b in steady]
+    )
+    assert abs(error.mean()) < 4.0 * error.std() / np.sqrt(len(error))
+    assert error.std() < 0.3
+    power = log.table.column(Signal.GENERATED_POWER)
+    measured = np.array([(power[a:b] - truth(u[a:b])).mean() for a, b in steady])
+    assert abs(measured.mean()) < 4.0 * measured.std() / np.sqrt(len(measured))
 
 
 def test_a_ramp_too_short_for_the_transient_gives_no_slope_segment():

@@ -10,6 +10,7 @@ from typing import Any
 
 from valveflow_ros.cli import engine
 from valveflow_ros.cli.console import Console, Outcome
+from valveflow_ros.cli.first_run import SENTENCE, is_first_run
 from valveflow_ros.cli.log_input import LogInput, steps_of
 from valveflow_ros.cli.parameters import settings_for
 from valveflow_ros.cli.report_words import columns, rejected_words
@@ -48,6 +49,8 @@ def found_in(
     notes += _constant_notes(log)
     for sentence in notes:
         console.say(sentence)
+    if is_first_run():
+        console.say(SENTENCE)
     watched = engine.watch(log.readings, settings, console.progress)
     if watched.clock_resets:
         told = 'The clock went back within the log; only what follows the last time counts.'

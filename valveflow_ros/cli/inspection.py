@@ -167,7 +167,7 @@ def inspect(log: LogInput) -> Inspected:
     """Look through a log that was read."""
     steps = steps_of(log.readings)
     settings, _ = settings_for(steps, 0.0, {})
-    counts = _fates(log.readings, settings)
+    counts = fates(log.readings, settings)
     facts = [
         _facts(log, signal, steps.get(signal, float('nan')))
         for signal in sorted({*log.contents.signals, *log.constants})
@@ -175,7 +175,7 @@ def inspect(log: LogInput) -> Inspected:
     return Inspected(log, [f for f in facts if f.readings], counts)
 
 
-def _fates(readings: Readings, settings: Settings) -> dict[str, dict[str, int]]:
+def fates(readings: Readings, settings: Settings) -> dict[str, dict[str, int]]:
     """Return how many readings of each signal are accepted or rejected, by reason.
 
     Where it can be seen at once that nothing is wrong, the engine need not be asked.

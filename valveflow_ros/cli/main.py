@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except MemoryError:
         console.fail('There is not enough memory for this log; use a shorter part of it.')
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 - the last line: a person gets a sentence
         _show_traceback()
         console.fail(_sentence(error))
     return NOT_DONE

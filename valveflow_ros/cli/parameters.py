@@ -57,14 +57,15 @@ def fitting(
         return {}
     slowest = max([period, *steps.values()])
     block = max(float(default['block']), float(period))
+    longest = max(float(default['longest_segment']), 30.0 * block)
     wanted = {
         'sample_period': float(period),
         'hold_limit': max(float(default['hold_limit']), 2.5 * slowest),
         'lateness': max(float(default['lateness']), float(period)),
         'block': block,
-        'longest_segment': max(float(default['longest_segment']), 30.0 * block),
+        'longest_segment': longest,
         'alarm_average': max(float(default['alarm_average']), 5.0 * float(period)),
-        'window_days': _window_days(span_s),
+        'window_days': _window_days(span_s, float(period), longest),
         'refit_period': 0.0,
         'refit_segments': 0,
     }
@@ -75,10 +76,14 @@ def fitting(
     }
 
 
-def _window_days(span_s: float) -> float:
-    """Return a window that holds the whole log, not shorter than the default."""
-    default = float(PARAMETERS['window_days'].default)
-    return max(default, math.ceil(100.0 * (span_s / 86400.0 + 0.01)) / 100.0)
+def _window_days(span_s: float, period: float, longest_s: float) -> float:
+    """Return a window that holds the whole log, not shorter than the default.
+
+    Of rows finer than usual only as many as the log has, for the sake of memory.
+    """
+    fine = period < float(PARAMETERS['sample_period'].default)
+    least = longest_s / 86400.0 if fine else float(PARAMETERS['window_days'].default)
+    return max(least, math.ceil(100.0 * (span_s / 86400.0 + 0.01)) / 100.0)
 
 
 def read_parameters(file: Path | None, pairs: Sequence[str]) -> dict[str, Any]:

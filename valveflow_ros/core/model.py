@@ -58,9 +58,9 @@ class RegionalModel:
         w = (u - self.knots[piece]) / width
         return np.asarray(self.left[piece] + (self.right - self.left)[piece] * w)
 
-    def decays(self, step_s: float) -> FloatArray:
-        """Return exp(-h / T_i), shape (I,)."""
-        return np.asarray(np.exp(-step_s / self.time_constants))
+    def taps(self, step_s: float) -> FloatArray:
+        """Return the filter of each region as the kernels want it, shape (I, 7)."""
+        return kernel.make_taps(self.time_constants, self.delays, step_s)
 
     def respond(
         self, u: FloatArray, usable: ByteArray, step_s: float, settle_s: float
@@ -69,7 +69,7 @@ class RegionalModel:
         answer = np.empty(len(u))
         settled = np.empty(len(u), dtype=np.uint8)
         kernel.respond(
-            self.static(u), usable, self.levels, self.decays(step_s), self.delays / step_s,
+            self.static(u), usable, self.levels, self.taps(step_s),
             round(settle_s / step_s), answer, settled,
         )  # fmt: skip
         return answer, settled

@@ -115,7 +115,7 @@ class JournalReplayer:
             self._keep(events)
             return events
         if entry.kind == JournalKind.FIT_ADOPTED:
-            return monitor.adopt(entry.request_ns, fit(self._tasks.pop(entry.request_ns)))
+            return self._adopt(entry)
         if entry.kind == JournalKind.FIT_REFUSED:
             self._tasks.pop(entry.request_ns, None)
             return monitor.refuse(entry.request_ns, entry.text)
@@ -124,5 +124,32 @@ class JournalReplayer:
         if entry.kind == JournalKind.RESET:
             return monitor.restart(entry.text)
         if entry.kind == JournalKind.SETTINGS:
-            return monitor.reconfigure(monitor.settings.changed(json.loads(entry.text)))
+            return monitor.reconfigure(monitor.settings.changed(_settings(entry)))
         return []
+
+    def _adopt(self, entry: JournalEntry) -> list[Event]:
+        """Compute the fit that was adopted; it must be the one that was."""
+        task = self._tasks.pop(entry.request_ns, None)
+        if task is None:
+            raise DataError(
+                f'The journal adopts curve {entry.model_id} for a request that never came: '
+                'the readings before it are not complete.'
+            )
+        found = fit(task)
+        if entry.model_id and found.model_id != entry.model_id:
+            raise DataError(
+                f'The fit gives curve {found.model_id} where the journal has {entry.model_id}: '
+                'the readings, the settings or the program are not those of the run.'
+            )
+        return self._monitor.adopt(entry.request_ns, found)
+
+
+def _settings(entry: JournalEntry) -> dict[str, object]:
+    """Return the parameters a journal entry changes."""
+    try:
+        changed = json.loads(entry.text)
+    except ValueError:
+        changed = None
+    if not isinstance(changed, dict):
+        raise DataError(f"The journal's change of parameters cannot be read: '{entry.text}'.")
+    return changed

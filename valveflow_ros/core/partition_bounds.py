@@ -164,9 +164,7 @@ def fill_leaf_bounds(
             b = bound[block, slot]
             b[0] = -np.inf
             if block + 1 + window <= blocks:
-                _candidate_costs(
-                    tree.leaf[block], prior[block, slot], per_width, mine, out
-                )
+                _candidate_costs(tree.leaf[block], prior[block, slot], per_width, mine, out)
                 b[0], _ = least_and_most(out[0])
                 b[1], b[2] = least_and_most(out[1])
                 b[3], b[4] = least_and_most(out[2])

@@ -207,4 +207,4 @@ def tail_part(group: Group, value: float, slope: float) -> float:
     begin = value - line[0]
     end = begin + line[7] * (slope - line[1])
     box = min(line[2] * begin, line[3] * begin) + min(line[4] * end, line[5] * end)
-    return line[6] + box
+    return float(line[6] + box)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from valveflow_ros.core.jit import kernel
 from valveflow_ros.core.partition_bounds import fill_leaf_bounds, make_priors
 from valveflow_ros.core.partition_lift import fill_node_bounds
-from valveflow_ros.core.partition_moments import BRANCH, LEAF, Tree, build_tree, stretch_moments
+from valveflow_ros.core.partition_moments import LEAF, Tree, build_tree, stretch_moments
 from valveflow_ros.core.partition_near import Near, fill_near, make_near
 from valveflow_ros.core.partition_search import Layer, search_groups
 from valveflow_ros.core.partition_threads import runs, share

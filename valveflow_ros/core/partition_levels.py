@@ -29,8 +29,8 @@ class Levels:
     first : int64 (levels + 1,)
         The first sample of each level, and n.
     x : float64 (levels,)
-        Mean u of each level times a power of two that makes the range about 1, which
-        changes no digit.
+        The u of each level times a power of two that makes the range about 1, which
+        changes no digit; where `rough`, the mean distance from the first sample, so scaled.
     residual : float64 (levels,)
         Mean y of each level about one line through all, over `scale`.
     weight : float64 (levels,)
@@ -39,6 +39,10 @@ class Levels:
         Root mean square of the levels' residual in the unit of y, or 1 if that is 0.
     within : float
         Sum of squares inside levels, which no partition changes.
+    rough : bool
+        Some levels hold u that are not quite equal.
+    floor : float
+        Costs up to here are rounding of u and y, in the square of the unit of y.
     """
 
     u: FloatArray
@@ -49,6 +53,8 @@ class Levels:
     weight: FloatArray
     scale: float
     within: float
+    rough: bool
+    floor: float
 
     def __len__(self) -> int:
         """Return the number of levels."""
@@ -66,6 +72,7 @@ def make_levels(u: ArrayLike, y: ArrayLike) -> Levels:
     TooFewSamplesError
         There are fewer than two samples.
     """
+    grain = max(_grain(u), _grain(y))
     a, b = _numbers('u', u), _numbers('y', y)
     if a.ndim != 1 or a.shape != b.shape:
         raise DataError(
@@ -81,7 +88,7 @@ def make_levels(u: ArrayLike, y: ArrayLike) -> Levels:
     a, b = a[order], b[order]
     a.flags.writeable = False
     b.flags.writeable = False
-    return _merged(a, b)
+    return _merged(a, b, grain)
 
 
 def _numbers(name: str, values: ArrayLike) -> FloatArray:
@@ -91,6 +98,13 @@ def _numbers(name: str, values: ArrayLike) -> FloatArray:
         raise DataError(f'{name} must hold real numbers, not {array.dtype}.')
     with np.errstate(over='ignore'):  # becomes infinite, which is refused with its place
         return np.asarray(array, dtype=np.float64)
+
+
+def _grain(values: ArrayLike) -> float:
+    """Return the relative rounding with which values came: that of float32 is much coarser."""
+    dtype = np.asarray(values).dtype
+    finest = float(np.finfo(np.float64).eps)
+    return max(finest, float(np.finfo(dtype).eps)) if dtype.kind == 'f' else finest
 
 
 def _check_values(name: str, values: FloatArray) -> None:
@@ -118,7 +132,8 @@ def _level_starts(u: FloatArray, tolerance: float, first: IntArray) -> int:
     return count
 
 
-def _merged(u: FloatArray, y: FloatArray) -> Levels:
+def _merged(u: FloatArray, y: FloatArray, grain: float) -> Levels:
+    """Merge sorted samples into levels."""
     n = len(u)
     span = float(u[-1] - u[0])
     first = np.empty(n + 1, dtype=np.int64)
@@ -127,8 +142,11 @@ def _merged(u: FloatArray, y: FloatArray) -> Levels:
     first[count] = n
     size = np.diff(first)
     weight = size.astype(np.float64)
-    begin = u[first[:-1]]
-    x = begin + np.add.reduceat(u - np.repeat(begin, size), first[:-1]) / weight
+    x = u[first[:-1]]
+    rough = bool((u != np.repeat(x, size)).any())
+    if rough:
+        # Relative to the first sample: a mean of large u would round to their last digit.
+        x = np.add.reduceat(u - u[0], first[:-1]) / weight
     # Two lines' worth of digits are kept by never adding an offset back.
     dx = x - float((weight * (x - x[0])).sum() / n + x[0])
     dy = y - float((y - y[0]).mean() + y[0])
@@ -146,4 +164,6 @@ def _merged(u: FloatArray, y: FloatArray) -> Levels:
         weight=weight,
         scale=scale,
         within=float((inside * inside).sum()),
+        rough=rough,
+        floor=n * (4.0 * grain * (np.abs(y).max() + abs(slope) * np.abs(u).max())) ** 2,
     )

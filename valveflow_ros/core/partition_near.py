@@ -181,9 +181,7 @@ def search_near(
         mine_breaks = breaks[CELL * c : CELL * c + CELL]
         for i in range(CELL - shortest + 1):
             if before[at + i] < np.inf:
-                _adopt_row(
-                    square[i], before[at + i], i + shortest - 1, at + i, mine, mine_breaks
-                )
+                _adopt_row(square[i], before[at + i], i + shortest - 1, at + i, mine, mine_breaks)
         if c > 0:
             low = np.inf
             for k in range(CELL):

@@ -154,11 +154,11 @@ def _node_part(
     slot = min(wide - level, SLOTS - 1) if wide > level else 0
     b = layer.bound[number, slot]
     if slot == 0 or b[0] == np.inf:
-        return b[0]
+        return float(b[0])
     width = tree.x[LEAF * end - 1] - tree.x[LEAF * (end - size)]
     dr = right - layer.prior[number, slot, 3]
     dl = dr + width * (slope - layer.prior[number, slot, 4])
-    return b[0] + (min(b[1] * dr, b[2] * dr) + min(b[3] * dl, b[4] * dl))
+    return float(b[0] + (min(b[1] * dr, b[2] * dr) + min(b[3] * dl, b[4] * dl)))
 
 
 @kernel

@@ -11,7 +11,15 @@ import numpy as np
 
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.jit import jit
-from valveflow_ros.core.regional_kernel import curve, region_of
+from valveflow_ros.core.regional_kernel import (
+    TAP_0,
+    TAP_1,
+    TAP_2,
+    TAP_A,
+    TAP_WHOLE,
+    curve,
+    region_of,
+)
 from valveflow_ros.core.segmenter_kernel import NO_DATA, SETTLED_SLOPE, SETTLED_STEADY
 from valveflow_ros.records import NS_PER_S, ByteArray, FloatArray, IntArray
 
@@ -75,8 +83,7 @@ class _Filter(NamedTuple):
     left: FloatArray
     right: FloatArray
     levels: FloatArray
-    decay: FloatArray
-    delay: FloatArray  # rows
+    taps: FloatArray  # (I, 7), empty when the dynamics are not known
     settle: int  # rows
     forget: float
     gap_ns: int  # rows further apart than this have a gap between them
@@ -102,16 +109,17 @@ def _filter(f: _Filter, x: float) -> None:
     room = f.past.size
     place = f.place[_PLACE]
     f.past[place] = x
-    if f.decay.size > 0:
-        r = region_of(x, f.levels)
-        whole = int(f.delay[r])
-        part = f.delay[r] - whole
-        near = f.past[(place - min(whole, age)) % room]
-        far = f.past[(place - min(whole + 1, age)) % room]
-        late = near * (1.0 - part) + far * part
+    if f.taps.shape[0] > 0:
+        tap = f.taps[region_of(x, f.levels)]
+        whole = int(tap[TAP_WHOLE])
         if age == 0:
             f.memory[_ANSWER] = x
-        f.memory[_ANSWER] = f.decay[r] * f.memory[_ANSWER] + (1.0 - f.decay[r]) * late
+        f.memory[_ANSWER] = (
+            tap[TAP_A] * f.memory[_ANSWER]
+            + tap[TAP_0] * f.past[(place - min(whole, age)) % room]
+            + tap[TAP_1] * f.past[(place - min(whole + 1, age)) % room]
+            + tap[TAP_2] * f.past[(place - min(whole + 2, age)) % room]
+        )
     f.place[_PLACE] = (place + 1) % room
     f.place[_AGE] = age + 1
 
@@ -131,7 +139,7 @@ def _predict(
     time_ns: IntArray, u: FloatArray, y: FloatArray, kinds: ByteArray, f: _Filter, out: _Columns
 ) -> None:
     """Predict rows."""
-    known = f.decay.size > 0
+    known = f.taps.shape[0] > 0
     for t in range(u.size):
         out.static[t] = out.dynamic[t] = out.residual[t] = np.nan
         out.average[t] = f.memory[_AVERAGE]
@@ -182,7 +190,7 @@ class Predictor:
         self.characteristic = characteristic
         m = characteristic.model
         self._filter = _Filter(
-            m.knots, m.left, m.right, m.levels, m.decays(step_s), m.delays / step_s,
+            m.knots, m.left, m.right, m.levels, m.taps(step_s),
             settle=round(settle_s / step_s),
             forget=math.exp(-step_s / average_s),
             gap_ns=round(1.5 * step_s * NS_PER_S),

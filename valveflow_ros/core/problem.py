@@ -65,7 +65,7 @@ class Problem:
         weight = np.empty(s.means, dtype=np.uint8)
         kernel.answer_means(
             self.u, self.usable, model.knots, model.left, model.right, model.levels,
-            model.decays(s.step_s), model.delays / s.step_s, self.settle, s.group,
+            model.taps(s.step_s), self.settle, s.group,
             self._flow, means, weight,
         )  # fmt: skip
         return np.where(weight > 0, self.power - means, 0.0), weight

@@ -1,10 +1,12 @@
 """Run curve and regional dynamics over measured inputs, with derivatives, in one pass.
 
-The model is eqs. (2)-(5) of the paper with K_g = 1: x = F(u), and
-``y[t] = a_i y[t-1] + (1 - a_i) x(t - tau_i)`` with ``a_i = exp(-h / T_i)``,
-the exact discretisation of eq. (3); region i is the one x(t) lies in. Delays
-need not be whole steps. While the derivatives are formed the sequence of
-regions is taken as it is: letting it flip would turn tangents into spikes.
+The model is eqs. (2)-(5) of the paper with K_g = 1: x = F(u), and G_i of eq. (3)
+in the region i that x(t) lies in, discretised exactly for a flow that is
+straight between two rows: ``y[t] = a y[t-1] + b x(t-h-tau) + c x(t-tau)`` with
+``a = exp(-h/T)``, ``b = (1-a) T/h - a`` and ``c = 1 - (1-a) T/h``. Delays need not be
+whole steps; with the two rows around each delayed instant that makes three
+taps. While the derivatives are formed the sequence of regions is taken as it
+is: letting it flip would turn tangents into spikes.
 """
 
 from __future__ import annotations
@@ -41,20 +43,44 @@ def region_of(x: float, levels: FloatArray) -> int:
     return r
 
 
+# Columns of a table of taps, one row a region: decay, weights of the flows at `TAP_WHOLE`
+# steps back and one and two before, b and c as above.
+TAP_A, TAP_0, TAP_1, TAP_2, TAP_WHOLE, TAP_B, TAP_C = range(7)
+TAPS = 7
+
+
+@jit
+def make_taps(time_constants: FloatArray, delays: FloatArray, step_s: float) -> FloatArray:
+    """Return the taps of each region, shape (I, 7)."""
+    taps = np.empty((time_constants.size, TAPS))
+    for r in range(time_constants.size):
+        a = np.exp(-step_s / time_constants[r])
+        mean = (1.0 - a) * time_constants[r] / step_s
+        b, c = mean - a, 1.0 - mean
+        whole = np.floor(delays[r] / step_s)
+        part = delays[r] / step_s - whole
+        taps[r, TAP_A] = a
+        taps[r, TAP_0] = c * (1.0 - part)
+        taps[r, TAP_1] = c * part + b * (1.0 - part)
+        taps[r, TAP_2] = b * part
+        taps[r, TAP_WHOLE] = whole
+        taps[r, TAP_B], taps[r, TAP_C] = b, c
+    return taps
+
+
 @jit
 def respond(
     x: FloatArray,
     usable: ByteArray,
     levels: FloatArray,
-    decay: FloatArray,
-    delay: FloatArray,
+    taps: FloatArray,
     settle: int,
     answer: FloatArray,
     settled: ByteArray,
 ) -> None:
     """Filter the flow ``x`` (n,) into the power ``answer`` (n,).
 
-    ``delay`` is in steps. After a gap the filter starts in equilibrium, and
+    After a gap the filter starts in equilibrium, and
     ``settled`` is 0 for ``settle`` rows.
     """
     state = 0.0
@@ -67,13 +93,14 @@ def respond(
             continue
         if age == 0:
             state = x[t]
-        r = region_of(x[t], levels)
-        whole = int(delay[r])
-        part = delay[r] - whole
-        back = min(whole, age)
-        further = min(whole + 1, age)
-        late = x[t - back] * (1.0 - part) + x[t - further] * part
-        state = decay[r] * state + (1.0 - decay[r]) * late
+        tap = taps[region_of(x[t], levels)]
+        whole = int(tap[TAP_WHOLE])
+        state = (
+            tap[TAP_A] * state
+            + tap[TAP_0] * x[t - min(whole, age)]
+            + tap[TAP_1] * x[t - min(whole + 1, age)]
+            + tap[TAP_2] * x[t - min(whole + 2, age)]
+        )
         answer[t] = state
         age += 1
         settled[t] = 1 if age > settle else 0
@@ -87,8 +114,7 @@ def answer_means(
     left: FloatArray,
     right: FloatArray,
     levels: FloatArray,
-    decay: FloatArray,
-    delay: FloatArray,
+    taps: FloatArray,
     settle: int,
     group: int,
     flow: FloatArray,
@@ -111,13 +137,16 @@ def answer_means(
                 continue
             x = curve(u[t], knots, left, right)
             flow[t] = x
-            r = region_of(x, levels)
-            whole = int(delay[r])
-            part = delay[r] - whole
-            late = flow[t - min(whole, age)] * (1.0 - part) + flow[t - min(whole + 1, age)] * part
             if age == 0:
                 state = x
-            state = decay[r] * state + (1.0 - decay[r]) * late
+            tap = taps[region_of(x, levels)]
+            whole = int(tap[TAP_WHOLE])
+            state = (
+                tap[TAP_A] * state
+                + tap[TAP_0] * flow[t - min(whole, age)]
+                + tap[TAP_1] * flow[t - min(whole + 1, age)]
+                + tap[TAP_2] * flow[t - min(whole + 2, age)]
+            )
             age += 1
             good = good and age > settle
             total += state
@@ -147,6 +176,36 @@ def _slopes_of_curve(
         gains[2 * pieces - 1 + k] += share * (1.0 - w)
     if k < pieces - 1:
         gains[pieces + k + 1] -= share * slope * w
+
+
+@jit
+def _turn(
+    tangent: FloatArray,
+    gains: FloatArray,
+    past: FloatArray,
+    tap: FloatArray,
+    state: float,
+    region: int,
+    part: float,
+    slowing: float,
+    step_s: float,
+) -> None:
+    """Advance the derivatives by one row; ``slowing`` is da / d ln T, ``state`` the answer before.
+
+    After the curve's columns come ln T of each region, then tau of each region.
+    """
+    n_curve = gains.size
+    regions = (tangent.size - n_curve) // 2
+    a, b, c = tap[TAP_A], tap[TAP_B], tap[TAP_C]
+    for p in range(n_curve):
+        tangent[p] = a * tangent[p] + gains[p]
+    for p in range(n_curve, tangent.size):
+        tangent[p] *= a
+    late = past[0] * (1.0 - part) + past[1] * part
+    before = past[1] * (1.0 - part) + past[2] * part
+    tangent[n_curve + region] += slowing * state + (b - slowing) * before - b * late
+    later = (c * (past[1] - past[0]) + b * (past[2] - past[1])) / step_s
+    tangent[n_curve + regions + region] += later
 
 
 @jit
@@ -184,7 +243,8 @@ def tangents(
     gains = np.zeros(n_curve)
     tangent = np.zeros(columns)
     sums = np.zeros(columns)
-    decay = np.exp(-step_s / time_constants)
+    past = np.empty(3)
+    taps = make_taps(time_constants, delays, step_s)
     age = 0
     for b in range(answer.size):
         total = 0.0
@@ -195,30 +255,26 @@ def tangents(
                 age = 0
                 good = False
                 continue
-            x = curve(u[t], knots, left, right)
-            r = region_of(x, levels)
-            a = decay[r]
-            whole = int(delays[r] / step_s)
-            part = delays[r] / step_s - whole
-            back, further = min(whole, age), min(whole + 1, age)
-            near = curve(u[t - back], knots, left, right)
-            far = curve(u[t - further], knots, left, right)
-            late = near * (1.0 - part) + far * part
-            for p in range(n_curve):
-                gains[p] = 0.0
-            _slopes_of_curve(u[t - back], knots, left, right, 1.0 - part, gains)
-            _slopes_of_curve(u[t - further], knots, left, right, part, gains)
+            r = region_of(curve(u[t], knots, left, right), levels)
+            tap = taps[r]
+            a, whole = tap[TAP_A], int(tap[TAP_WHOLE])
+            past[0] = curve(u[t - min(whole, age)], knots, left, right)
+            past[1] = curve(u[t - min(whole + 1, age)], knots, left, right)
+            past[2] = curve(u[t - min(whole + 2, age)], knots, left, right)
+            gains[:] = 0.0
+            for k in range(3):
+                share = tap[TAP_0 + k]
+                _slopes_of_curve(u[t - min(whole + k, age)], knots, left, right, share, gains)
             if age == 0:
-                state = late
+                state = past[0]
                 tangent[:] = 0.0
-                tangent[:n_curve] = gains
-            for p in range(n_curve):
-                tangent[p] = a * tangent[p] + (1.0 - a) * gains[p]
-            for p in range(n_curve, columns):
-                tangent[p] *= a
-            tangent[n_curve + r] += a * step_s / time_constants[r] * (state - late)
-            tangent[n_curve + regions + r] += (1.0 - a) * (far - near) / step_s
-            state = a * state + (1.0 - a) * late
+                tangent[:n_curve] = gains / (1.0 - a)
+            part = delays[r] / step_s - whole
+            slowing = a * step_s / time_constants[r]
+            _turn(tangent, gains, past, tap, state, r, part, slowing, step_s)
+            state = a * state
+            for k in range(3):
+                state += tap[TAP_0 + k] * past[k]
             age += 1
             good = good and age > settle
             total += state

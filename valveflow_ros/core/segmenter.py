@@ -101,11 +101,11 @@ class Segmenter:
         self._period_s = period
         self._block_rows = rows
         self._state = np.zeros(kernel.INT_STATE, dtype=np.int64)
-        self._state[kernel.FRESH] = 1
+        self._state[kernel.SKIP] = int(setting[kernel.SETTLE])
         self._state[kernel.LAST_NS] = -(2**62)
         self._sums = np.zeros(kernel.SUMS)
         self._lines = np.zeros((kernel.LINES, LINE_SIZE))
-        room = int(setting[kernel.LONGEST] + setting[kernel.SETTLE]) + 8
+        room = int(setting[kernel.LONGEST] + setting[kernel.SETTLE] + setting[kernel.TRIM]) + 32
         self._blocks = np.zeros((3, room))
         self._histograms = np.zeros((2, BINS))
         self._found = np.zeros(kernel.SEG_SIZE)

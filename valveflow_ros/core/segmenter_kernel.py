@@ -34,7 +34,7 @@ from valveflow_ros.records import ByteArray, FloatArray, IntArray
     ROWS_IN_BLOCK,
     BLOCKS,
     FIRST_ROW,
-    FRESH,
+    SKIP,
     RUN_U,
     RUN_Y,
     STRETCHES,
@@ -121,32 +121,33 @@ def _learn(state: IntArray, lines: FloatArray, histograms: FloatArray, u: float,
 
 
 @jit
-def _begin(
-    state: IntArray, lines: FloatArray, blocks: FloatArray, drop: int, fresh: bool, settle: int
-) -> None:
-    """Begin a segment ``drop`` blocks after the old one's first, keeping the blocks behind."""
+def _begin(state: IntArray, lines: FloatArray, blocks: FloatArray, drop: int, skip: int) -> None:
+    """Begin a segment ``drop`` blocks after the old one's first, keeping the blocks behind.
+
+    The first ``skip`` blocks do not count: they are transient, or counted before.
+    """
     keep = state[BLOCKS] - drop
     for k in range(keep):
         for row in range(3):
             blocks[row, k] = blocks[row, drop + k]
     state[BLOCKS] = 0
-    state[FRESH] = 1 if fresh else 0
+    state[SKIP] = skip
     state[RUN_U] = 0
     state[RUN_Y] = 0
     for row in range(3):
         line_reset(lines[row])
     for _ in range(keep):
-        _grow(state, lines, blocks, settle)
+        _grow(state, lines, blocks)
 
 
 @jit
-def _grow(state: IntArray, lines: FloatArray, blocks: FloatArray, settle: int) -> None:
+def _grow(state: IntArray, lines: FloatArray, blocks: FloatArray) -> None:
     """Let the lines take the block that stands at the end of ``blocks``."""
     k = state[BLOCKS]
     line_add(lines[LINE_U], blocks[BLOCK_U, k])
     if k >= _BEHIND:
         line_add(lines[LINE_U_BEHIND], blocks[BLOCK_U, k - _BEHIND])
-    if k >= settle * state[FRESH]:
+    if k >= state[SKIP]:
         line_add(lines[LINE_Y], blocks[BLOCK_Y, k])
     state[BLOCKS] = k + 1
 
@@ -230,7 +231,7 @@ def _close(
     found: FloatArray,
 ) -> bool:
     """Judge what is open, up to block ``end``; True when it is a special segment."""
-    first = int(setting[SETTLE]) if state[FRESH] else 0
+    first = state[SKIP]
     least = min(setting[STEADY_MIN], setting[SLOPE_MIN])
     if end - first < max(least, 3):
         return False
@@ -269,26 +270,48 @@ def _take_block(
     noise_u, noise_y = noise_now(histograms, setting)
     state[RUN_U] = _leaves(lines[LINE_U], u, noise_u, setting[BREAK], state[RUN_U])
     state[RUN_Y] = _leaves(lines[LINE_Y], y, noise_y, setting[BREAK], state[RUN_Y])
-    back = -1
+    back = 0
     if abs(state[RUN_U]) >= 2 or abs(state[RUN_Y]) >= 2:
         back = 1
     elif _drifts(lines, blocks, k, noise_u):
         back = _BEHIND
-    if back < 0:
-        _grow(state, lines, blocks, settle)
-        if state[BLOCKS] < int(setting[LONGEST]) + settle * state[FRESH]:
-            return False
-        closed = _close(state, blocks, state[BLOCKS], noise_u, noise_y, setting, found)
-        state[FIRST_ROW] += state[BLOCKS] * rows
-        _begin(state, lines, blocks, state[BLOCKS], False, settle)
-        return closed
-    at = max(k - back, 0)
-    closed = _close(
-        state, blocks, max(at - int(setting[TRIM]), 0), noise_u, noise_y, setting, found
-    )
+    if back == 0:
+        _grow(state, lines, blocks)
+        return _cut_if_long(state, lines, blocks, noise_u, noise_y, setting, found)
+    end = k - back - int(setting[TRIM])
+    closed = _close(state, blocks, end, noise_u, noise_y, setting, found)
+    # What moved moved by now: the transient counts from the block before this one.
+    at = max(k - 1, 0)
     state[FIRST_ROW] += at * rows
     state[BLOCKS] = k + 1
-    _begin(state, lines, blocks, at, True, settle)
+    _begin(state, lines, blocks, at, settle)
+    return closed
+
+
+@jit
+def _cut_if_long(
+    state: IntArray,
+    lines: FloatArray,
+    blocks: FloatArray,
+    noise_u: float,
+    noise_y: float,
+    setting: FloatArray,
+    found: FloatArray,
+) -> bool:
+    """Close a segment that has become too long; True when that made a special segment.
+
+    The next one goes on without a transient. Its line keeps some blocks from
+    before the cut, and the last minute is left to it, so that a move that began
+    there is still seen as a break.
+    """
+    trim = int(setting[TRIM])
+    if state[BLOCKS] < int(setting[LONGEST]) + state[SKIP] + trim:
+        return False
+    closed = _close(state, blocks, state[BLOCKS] - trim, noise_u, noise_y, setting, found)
+    keep = min(3 * _BEHIND, state[BLOCKS])
+    drop = state[BLOCKS] - keep
+    state[FIRST_ROW] += drop * int(setting[BLOCK_ROWS])
+    _begin(state, lines, blocks, drop, max(keep - trim, 0))
     return closed
 
 
@@ -297,7 +320,7 @@ def _kind_now(
     state: IntArray, lines: FloatArray, histograms: FloatArray, setting: FloatArray
 ) -> int:
     """Say what the newest row is, from what is known by now."""
-    if state[BLOCKS] < int(setting[SETTLE]) * state[FRESH] or state[BLOCKS] < _LEAST:
+    if state[BLOCKS] < max(state[SKIP], _LEAST):
         return TRANSIENT
     if state[RUN_U] != 0 or state[RUN_Y] != 0:
         return TRANSIENT
@@ -326,7 +349,7 @@ def _break_off(
     if state[BLOCKS] > 0:
         noise_u, noise_y = noise_now(histograms, setting)
         closed = _close(state, blocks, state[BLOCKS], noise_u, noise_y, setting, found)
-    _begin(state, lines, blocks, state[BLOCKS], True, int(setting[SETTLE]))
+    _begin(state, lines, blocks, state[BLOCKS], int(setting[SETTLE]))
     state[FIRST_ROW] = state[ROW]
     state[ROWS_IN_BLOCK] = 0
     sums[:] = 0.0

@@ -99,7 +99,7 @@ class RecorderLoop:
                     self._wake.wait(self._settings.flush_period_s)
                     self._wake.clear()
             self._ledger.stopped(self._finish())
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001
             # Whatever it is, a dead thread must not look alive.
             self._ledger.stopped(f'the recorder failed: {type(error).__name__}: {error}')
 

@@ -39,7 +39,7 @@ def load_frame(path: Path) -> tuple[pd.DataFrame, str, list[str]]:
             raise
         except MemoryError:
             raise RecordingError(path, 'is too large for the memory of this machine') from None
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001
             # pandas and pyarrow raise what they like for a file they do not understand.
             reason = str(error).strip().split('\n')[0][:160] or type(error).__name__
             raise RecordingError(path, f'cannot be read as a table ({reason})') from None

@@ -75,11 +75,15 @@ def _from_stamps(column: pd.Series[Any]) -> IntArray:
     if column.dtype.kind == 'M' and not isinstance(column.dtype, pd.DatetimeTZDtype):
         column = column.dt.tz_localize('UTC')
     bare = column.dt.tz_convert('UTC').dt.tz_localize(None)
-    coarse: IntArray = bare.to_numpy().astype('datetime64[s]').astype(np.int64)
-    stamps: IntArray = bare.to_numpy().astype('datetime64[ns]').astype(np.int64)
-    # numpy lets a year beyond 2262 run over in silence.
-    stamps[np.abs(coarse.astype(np.float64)) * NS_PER_S >= _WHOLE_LIMIT] = _NEVER
-    return stamps
+    stamps: NDArray[np.datetime64] = bare.to_numpy()
+    seconds = stamps.astype('datetime64[s]').astype(np.int64).astype(np.float64)
+    # A year beyond 2262 does not fit into nanoseconds; some numpy let it run over in silence.
+    beyond = np.abs(seconds) * NS_PER_S >= _WHOLE_LIMIT
+    return (
+        np.where(beyond, np.datetime64('NaT', 's'), stamps)
+        .astype('datetime64[ns]')
+        .astype(np.int64)
+    )
 
 
 def _from_whole(numbers: NDArray[np.integer[Any]]) -> tuple[IntArray, list[str]]:

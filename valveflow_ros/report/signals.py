@@ -56,7 +56,7 @@ def _buttons(days: float) -> Spec | None:
         return None
     steps.append({'step': 'all', 'label': 'all'})
     return {
-        'buttons': steps, 'x': 1, 'xanchor': 'right', 'y': -0.1, 'yanchor': 'top',
+        'buttons': steps, 'x': 1, 'xanchor': 'right', 'y': -0.16, 'yanchor': 'top',
         'bgcolor': token('panel'), 'activecolor': token('rule'), 'bordercolor': token('rule'),
         'borderwidth': 1, 'font': {'color': token('ink')},
     }  # fmt: skip
@@ -76,6 +76,7 @@ def signals_figure(data: Identified) -> Figure:
     power = exponent(data.characteristic.pressure_exponent)
     layout = {
         'xaxis': axis,
+        'margin': {'l': 60, 'r': 12, 't': 34, 'b': 96 if buttons else 46},
         'yaxis': {'domain': [0.54, 1.0], 'title': {'text': f'u (% MPa<sup>{power}</sup>)'}},
         'yaxis2': {'domain': [0.0, 0.48], 'title': {'text': 'power (MW)'}},
     }

@@ -153,7 +153,5 @@ def plain_array(values: FloatArray | Sequence[float], label: str) -> Float64Mult
     """Return numbers for clients without our messages; the label says what they are."""
     numbers = [float(value) for value in values]
     message = Float64MultiArray(data=numbers)
-    message.layout.dim = [
-        MultiArrayDimension(label=label, size=len(numbers), stride=len(numbers))
-    ]
+    message.layout.dim = [MultiArrayDimension(label=label, size=len(numbers), stride=len(numbers))]
     return message

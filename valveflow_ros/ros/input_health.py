@@ -16,7 +16,7 @@ from valveflow_ros.ros.inputs import PLANT_SAMPLE, Row, plausible_range, plausib
 from valveflow_ros.ros.tallies import Tally
 
 _REJECTED = tuple(reason for reason in REASONS if reason not in ('accepted', 'late'))
-_PATIENCE_S = 2.0
+_PATIENCE_S = 5.0
 
 
 @dataclass(slots=True)
@@ -129,7 +129,7 @@ class InputHealth:
             return Level.ERROR, f'{topic} comes without a time; is /clock published?'
         if lost:
             return Level.WARN, f'{lost} messages of {topic} were lost on the way.'
-        return Level.OK, f'{tally.rate_hz():.3g} Hz.'
+        return Level.OK, f'{_hertz(tally.rate_hz())}.'
 
     def _silent(
         self, info: SignalInfo, name: str, seen: Publishers, listening_s: float
@@ -189,3 +189,7 @@ def _speaking(
 
 def _rejected(counts: Mapping[str, int]) -> int:
     return sum(counts[reason] for reason in _REJECTED)
+
+
+def _hertz(rate: float) -> str:
+    return f'{rate:.0f} Hz' if rate >= 100.0 else f'{rate:.3g} Hz'

@@ -108,7 +108,7 @@ class MonitorNode(LifecycleNode):
         del state
         log = self.get_logger()
         log.info('Loading and compiling the engine; the first time this takes a minute.')
-        self.session = session = Session(self, self.settings, self._stop)
+        self.session = session = Session(self, self.settings, self._stop, self._log)
         log.info(f'Ready after {session.warm_up_s:.1f} s of loading and compiling.')
         if session.recording.problem:
             log.warning(session.recording.problem)
@@ -191,15 +191,18 @@ class MonitorNode(LifecycleNode):
         self._health.publish(data)
         if session is not None:
             session.record(DIAGNOSTICS, data, now_ns)
-        for item in self._changes.pick(items, now_s):
-            self._log(item)
+        alike: dict[tuple[Level, str], list[str]] = {}
+        # The alarm has its own line in the log, when it happens.
+        for item in self._changes.pick((i for i in items if i.name != 'alarm'), now_s):
+            alike.setdefault((item.level, item.sentence), []).append(item.name)
+        for (level, sentence), names in alike.items():
+            self._log(level, f'{", ".join(names)}: {sentence}')
 
-    def _log(self, item: Item) -> None:
+    def _log(self, level: Level, text: str) -> None:
         # One call each: rclpy ties a severity to the place it is called from.
-        text = f'{item.name}: {item.sentence}'
-        if item.level == Level.OK:
+        if level == Level.OK:
             self.get_logger().info(text)
-        elif item.level == Level.ERROR:
+        elif level == Level.ERROR:
             self.get_logger().error(text)
         else:
             self.get_logger().warning(text)

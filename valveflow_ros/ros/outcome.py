@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -47,7 +48,7 @@ def objection(task: FitTask, result: object) -> str:
     if not all(map(math.isfinite, numbers)):
         return 'The fit gave numbers that are not finite.'
     knots = result.breakpoints
-    joined = all(a.u_to == b.u_from for a, b in zip(pieces, pieces[1:], strict=False))
+    joined = all(a.u_to == b.u_from for a, b in itertools.pairwise(pieces))
     if not joined or np.any(np.diff(knots) <= 0.0):
         return 'The fit gave breakpoints that do not increase.'
     if any(d.time_constant_s <= 0.0 or d.delay_s < 0.0 for d in result.dynamics):

@@ -26,9 +26,7 @@ def _layout(tag_bytes: int, model_bytes: int) -> struct.Struct:
     before_model = -size % 4
     size += before_model + 4 + model_bytes
     before_numbers = -size % 8
-    return struct.Struct(
-        f'<4siII{tag_bytes}sB{before_model}xI{model_bytes}s{before_numbers}x7d'
-    )
+    return struct.Struct(f'<4siII{tag_bytes}sB{before_model}xI{model_bytes}s{before_numbers}x7d')
 
 
 def prediction_bytes(block: PredictionBlock, tag: str) -> Iterator[tuple[int, bytes]]:
@@ -43,6 +41,19 @@ def prediction_bytes(block: PredictionBlock, tag: str) -> Iterator[tuple[int, by
     for row in zip(*(column.tolist() for column in columns), strict=True):
         time_ns, state, *numbers = row
         sec, nanosec = divmod(min(max(time_ns, 0), LAST_NS), NS_PER_S)
-        yield time_ns, pack(
-            _HEAD, sec, nanosec, len(frame), frame, state, len(model), model, *numbers, low, high
+        yield (
+            time_ns,
+            pack(
+                _HEAD,
+                sec,
+                nanosec,
+                len(frame),
+                frame,
+                state,
+                len(model),
+                model,
+                *numbers,
+                low,
+                high,
+            ),
         )

@@ -1,4 +1,4 @@
-"""The executable `replay`: a log on the input topics again, or the proof that it repeats itself."""
+"""The executable `replay`: a log on the input topics again, or proof that it repeats itself."""
 
 from __future__ import annotations
 

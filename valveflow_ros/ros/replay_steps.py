@@ -53,7 +53,7 @@ def steps_of(log: LogContents) -> tuple[list[str], Iterator[Step]]:
         names = list(dict.fromkeys(topics.values()))
         messages = _recorded_messages(log, topics)
     if not names:
-        raise DataError(f'{log.path}: no input of the monitor is in it, so there is nothing to play.')
+        raise DataError(f'{log.path}: there is nothing to play, no input of the monitor is in it.')
     return names, _in_steps(messages)
 
 

@@ -14,7 +14,8 @@ from valveflow_ros.config import Settings
 from valveflow_ros.core.events import Event
 from valveflow_ros.logs import RecorderStatus
 from valveflow_ros.ros import graph, work_health
-from valveflow_ros.ros.diagnostics import Item
+from valveflow_ros.ros.chronicle import line_of
+from valveflow_ros.ros.diagnostics import Item, Level
 from valveflow_ros.ros.input_health import InputHealth
 from valveflow_ros.ros.inputs import INPUTS, Decoder
 from valveflow_ros.ros.intake import Clock, Intake
@@ -40,10 +41,19 @@ class Session:
     settings : Settings
     stop : callable
         Tells whether to give up waiting.
+    log : callable
+        Takes how grave something is and a sentence.
     """
 
-    def __init__(self, node: Node, settings: Settings, stop: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        settings: Settings,
+        stop: Callable[[], bool],
+        log: Callable[[Level, str], None],
+    ) -> None:
         self._node = node
+        self._log = log
         self._settings = settings
         self._log_clock = LogClock()
         self.inputs = {topic.name: node.resolve_topic_name(topic.name) for topic in INPUTS}
@@ -87,8 +97,7 @@ class Session:
         sources = {topic.name: taker(topic.message_type, topic.name) for topic in INPUTS}
         clock = None
         if node.get_parameter('use_sim_time').value:
-            clock = Taker(node, Clock, '/clock')
-            self._takers.append(clock)
+            clock = taker(Clock, '/clock')
         self._intake = Intake(
             sources, Decoder(settings), self._log_clock, settings.text('stamp_source'), clock,
             self._health.note,
@@ -123,6 +132,10 @@ class Session:
 
     def tell(self, events: Sequence[Event]) -> None:
         """Publish and record what a call of the engine brought."""
+        for event in events:
+            line = line_of(event)
+            if line is not None:
+                self._log(*line)
         self._say(self._outputs.of(events))
 
     def reconfigure(self, settings: Settings) -> None:

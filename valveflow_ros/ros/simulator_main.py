@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from typing import cast
 
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
@@ -22,8 +23,8 @@ from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.stops import StopFlag
 
 _EFFECTS = ParameterDescriptor(
-    description="What is wrong with the plant: texts of the form name or name:key=value,... as "
-    "in 'valveflow simulate --effect'.",
+    description='What is wrong with the plant: texts of the form name or name:key=value,... as '
+    'for `valveflow simulate --effect`.',
     dynamic_typing=True,
     read_only=True,
 )
@@ -50,23 +51,22 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def _run(node: Node, stop: StopFlag) -> int:
     values = declare(node, steps.TABLE)
+    days, seed = cast(float, values['days']), cast(int, values['seed'])
+    rate, wait_s = cast(float, values['rate']), cast(float, values['wait'])
     effects = steps.effects_of(_texts(node.declare_parameter('effects', [], _EFFECTS).value))
     log = node.get_logger()
     for sentence in unknown_overrides(node, [*values, 'effects']):
         log.warning(f'{sentence} It is ignored.')
-    rate, wait_s = float(values['rate']), float(values['wait'])  # type: ignore[arg-type]
     steps.check_together(rate, bool(values['stamped']), bool(values['use_clock']))
     start_ns = steps.start_ns_of(str(values['start']), rate, time.time_ns())
-    parts = simulate_parts(
-        float(values['days']), int(values['seed']), start_ns=start_ns, effects=effects  # type: ignore[arg-type,call-overload]
-    )
+    parts = simulate_parts(days, seed, start_ns=start_ns, effects=effects)
     names, made = _steps((part.table for part in parts), values)
     player = Player(node, names, rate, bool(values['use_clock']), lambda: bool(stop))
     missing = player.wait_for_listeners(wait_s)
     if missing and wait_s > 0 and not stop:
         log.warning(f'Nobody listens to {", ".join(missing)}.')
     wrong = ', '.join(str(effect) for effect in effects) or 'nothing'
-    log.info(f'{float(values["days"]):g} days of plant, seed {values["seed"]}; wrong with it: {wrong}.')  # type: ignore[arg-type]
+    log.info(f'{days:g} days of plant, seed {seed}; wrong with it: {wrong}.')
     count = player.play(made)
     end = 'Stopped' if stop else 'Finished'
     log.info(f'{end} after {count} samples, {sum(player.sent.values())} messages.')
@@ -80,9 +80,7 @@ def _steps(
     command = bool(values['command'])
     if values['stamped']:
         return [PLANT_SAMPLE], steps.stamped_steps(parts, command, str(values['unit_tag']))
-    names = [
-        info.topic for info in SIGNALS if command or info.signal != Signal.VALVE_COMMAND
-    ]
+    names = [info.topic for info in SIGNALS if command or info.signal != Signal.VALVE_COMMAND]
     return names, steps.plain_steps(parts, command)
 
 

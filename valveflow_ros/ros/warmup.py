@@ -38,7 +38,8 @@ def made_up_task(settings: Settings) -> FitTask:
     row = np.arange(_ROWS)
     stretch = row // _STRETCH
     # Even stretches stand still, odd ones go up to the next level.
-    level = 900.0 + 150.0 * ((stretch + 1) // 2 + np.where(stretch % 2, row % _STRETCH, 0) / _STRETCH)
+    moved = (stretch + 1) // 2 + np.where(stretch % 2, row % _STRETCH, 0) / _STRETCH
+    level = 900.0 + 150.0 * moved
     chance = np.random.default_rng(1)
     u = level + 0.5 * chance.standard_normal(_ROWS)
     power = 0.2 * level - 0.1 * np.maximum(level - 1200.0, 0.0) + chance.standard_normal(_ROWS)

@@ -87,5 +87,6 @@ def recorder_item(recording: Recording) -> Item:
     if status.state != RecorderState.RECORDING:
         return Item('recorder', Level.ERROR, f'Not recording: {status.reason}', values)
     if dropped or status.lost:
-        return Item('recorder', Level.WARN, f'{dropped + status.lost} messages are missing.', values)
+        missing = dropped + status.lost
+        return Item('recorder', Level.WARN, f'{missing} messages are missing.', values)
     return Item('recorder', Level.OK, 'Recording.', values)

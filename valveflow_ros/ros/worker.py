@@ -26,7 +26,7 @@ from valveflow_ros.ros.outcome import FitOutcome, objection
 FIT_JOB = 'valveflow_ros.core.fit:fit'
 _FIRST_PAUSE_S = 0.5
 _LONGEST_PAUSE_S = 60.0
-# One core is what the machine can spare; the parent's and an idle desktop's settings do not matter.
+# One core is what the machine can spare, and one thread adds up in one order only.
 _ONE_THREAD = dict.fromkeys(
     ('NUMBA_NUM_THREADS', 'OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1'
 )
@@ -198,7 +198,8 @@ class FitWorker:
         with contextlib.suppress(ProcessLookupError):
             process.kill()
         code = process.wait()
-        assert process.stdin is not None and process.stdout is not None
+        assert process.stdin is not None
+        assert process.stdout is not None
         process.stdout.close()
         process.stdin.close()
         return f'signal {signal.Signals(-code).name}' if code < 0 else f'exit status {code}'

@@ -1,0 +1,80 @@
+"""A simulated plant and a monitor; ends when the plant has run."""
+
+from launch.actions import (
+    DeclareLaunchArgument,
+    IncludeLaunchDescription,
+    OpaqueFunction,
+    Shutdown,
+)
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
+
+from launch import LaunchContext, LaunchDescription
+
+PLANT = {
+    'days': ('3.0', 'How many days the plant is simulated.'),
+    'seed': ('1', 'Seed of every random number.'),
+    'rate': ('0.0', 'Plant seconds in a second; 0: as fast as the monitor takes them.'),
+    'effects': (
+        'curve_step:s_mw=-12,t0_days=2.7',
+        'What is wrong with the plant: name:key=value,...; several with semicolons between '
+        'them; empty: nothing.',
+    ),
+}
+MONITOR = {
+    'namespace': ('', 'Namespace of both nodes.'),
+    'unit_tag': ('demo', 'Tag of the unit.'),
+    'record': ('true', 'Whether to record inputs and outputs to MCAP (true, false).'),
+    'record_directory': ('', 'Folder of the recordings; empty: valveflow_recordings here.'),
+    'log_level': ('info', 'debug, info, warn, error or fatal.'),
+}
+
+
+def plant(context: LaunchContext) -> list[Node]:
+    """Make the plant; everything ends when it has run."""
+
+    def given(name: str) -> str:
+        return LaunchConfiguration(name).perform(context)
+
+    return [
+        Node(
+            package='valveflow_ros',
+            executable='plant_simulator',
+            name='plant_simulator',
+            namespace=given('namespace'),
+            parameters=[
+                {
+                    'days': float(given('days')),
+                    'seed': int(given('seed')),
+                    'rate': float(given('rate')),
+                    'effects': given('effects'),
+                    'unit_tag': given('unit_tag'),
+                    'stamped': True,
+                }
+            ],
+            output='screen',
+            on_exit=[Shutdown(reason='the plant has run')],
+        )
+    ]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Describe the launch."""
+    monitor = PathJoinSubstitution(
+        [FindPackageShare('valveflow_ros'), 'launch', 'monitor.launch.py']
+    )
+    return LaunchDescription(
+        [
+            *(
+                DeclareLaunchArgument(name, default_value=default, description=about)
+                for name, (default, about) in (PLANT | MONITOR).items()
+            ),
+            IncludeLaunchDescription(
+                PythonLaunchDescriptionSource(monitor),
+                launch_arguments=[(name, LaunchConfiguration(name)) for name in MONITOR],
+            ),
+            OpaqueFunction(function=plant),
+        ]
+    )

@@ -1,0 +1,72 @@
+"""Start the monitor; the option --show-args of `ros2 launch` explains the arguments."""
+
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
+
+from launch import LaunchContext, LaunchDescription
+
+# Arguments that stand above the parameter file where they are given, and the type of each.
+OVERRIDES = {
+    'unit_tag': (str, 'Tag of the unit; frame_id and hardware_id of messages.'),
+    'record': (bool, 'Whether to record inputs and outputs to MCAP (true, false).'),
+    'record_directory': (str, 'Folder of the recordings.'),
+    'autostart': (bool, 'Whether the node configures and activates itself (true, false).'),
+}
+
+
+def argument(name: str, about: str, default: object = '') -> DeclareLaunchArgument:
+    """Declare an argument."""
+    return DeclareLaunchArgument(name, default_value=default, description=about)
+
+
+def typed(kind: type, text: str) -> object:
+    """Turn an argument's text into a parameter's value."""
+    return text.strip().lower() in ('true', '1', 'yes', 'on') if kind is bool else text
+
+
+def monitor(context: LaunchContext) -> list[Node]:
+    """Make the node, with those parameters that were given."""
+
+    def given(name: str) -> str:
+        return LaunchConfiguration(name).perform(context)
+
+    overrides = {
+        name: typed(kind, given(name)) for name, (kind, _) in OVERRIDES.items() if given(name)
+    }
+    overrides['use_sim_time'] = typed(bool, given('use_sim_time'))
+    return [
+        Node(
+            package='valveflow_ros',
+            executable='monitor',
+            name='valveflow_monitor',
+            namespace=given('namespace'),
+            parameters=[given('params_file'), overrides],
+            arguments=['--ros-args', '--log-level', given('log_level')],
+            respawn=typed(bool, given('use_respawn')),
+            respawn_delay=2.0,
+            output='screen',
+        )
+    ]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Describe the launch."""
+    defaults = PathJoinSubstitution([FindPackageShare('valveflow_ros'), 'config', 'monitor.yaml'])
+    return LaunchDescription(
+        [
+            argument('namespace', 'Namespace of the node and its relative topics.'),
+            argument('params_file', 'Parameter file (YAML).', defaults),
+            argument('use_sim_time', 'Whether to take times from /clock (true, false).', 'false'),
+            argument('log_level', 'debug, info, warn, error or fatal.', 'info'),
+            argument(
+                'use_respawn', 'Whether to start it again when it dies (true, false).', 'false'
+            ),
+            *(
+                argument(name, f'{about} Empty: as in the parameter file.')
+                for name, (_, about) in OVERRIDES.items()
+            ),
+            OpaqueFunction(function=monitor),
+        ]
+    )

@@ -1,0 +1,131 @@
+"""The search against the plain dynamic programme: every number of pieces, every end."""
+
+from __future__ import annotations
+
+import threading
+
+import naive
+import numba
+import numpy as np
+import pytest
+from partition_kinds import KINDS, samples
+
+from valveflow_ros.core import partition_layers
+from valveflow_ros.core.partition_layers import best_partitions, layers, prepare
+from valveflow_ros.core.partition_levels import make_levels
+
+COMPILED = not numba.config.DISABLE_JIT
+PIECES = 10
+
+
+def problem(levels, shortest, threads=1, slack=2e-14):
+    total = slack * len(levels.u)
+    return prepare(levels.x, levels.residual, levels.weight, shortest, total, threads)
+
+
+def compare(kind, n, shortest, seed=0):
+    """Compare all layers with the slow truth; costs within 1e-12 of the sum of squares."""
+    levels = make_levels(*samples(kind, n, seed))
+    table = naive.piece_costs(levels.x, levels.residual, levels.weight)
+    pieces = min(PIECES, len(levels) // shortest)
+    truth = naive.best_costs(table, pieces, shortest)
+    close = 1e-12 * len(levels.u)
+    ends = np.arange(len(levels) + 1)
+    # One layer more is asked for, because the last one is worked out at its end only.
+    for j, (cost, breaks) in enumerate(layers(problem(levels, shortest), pieces + 1)):
+        if j == pieces:
+            return
+        cost, breaks = cost[ends], breaks[ends]
+        possible = np.isfinite(truth[j])
+        assert np.array_equal(np.isfinite(cost), possible)
+        assert np.abs(cost[possible] - truth[j][possible]).max() <= close
+        if j > 0:  # and the breaks give those costs
+            at = ends[possible]
+            given = truth[j - 1][breaks[at]] + table[breaks[at], at]
+            assert np.abs(given - truth[j][at]).max() <= close
+            assert (at - breaks[at]).min() >= shortest
+    pytest.fail('the search ended early')
+
+
+@pytest.mark.parametrize('shortest', [2, 7, 33])
+@pytest.mark.parametrize('kind', KINDS)
+def test_every_layer_and_end_is_optimal(kind, shortest):
+    compare(kind, 500 if COMPILED else 140, shortest, seed=shortest)
+
+
+@pytest.mark.parametrize('n', [2, 3, 20, 63, 64, 65, 127, 128, 129, 130])
+def test_blocks_begin_and_end_anywhere(n):
+    compare('noise', n, 2, seed=n)
+
+
+@pytest.mark.skipif(not COMPILED, reason='too slow without the compiler')
+@pytest.mark.parametrize('kind', ['valve', 'clumps', 'square'])
+def test_several_levels_of_nodes(kind):
+    compare(kind, 1700, 2)
+
+
+@pytest.mark.skipif(not COMPILED, reason='too slow without the compiler')
+def test_a_long_shortest_piece_spans_blocks():
+    compare('valve', 1500, 140)
+
+
+def test_the_result_does_not_depend_on_the_threads():
+    levels = make_levels(*samples('valve', 20_000 if COMPILED else 150))
+    cost, starts = best_partitions(problem(levels, 2, threads=1), 6)
+    for threads in (2, 5):
+        other, other_starts = best_partitions(problem(levels, 2, threads=threads), 6)
+        assert np.array_equal(cost, other)
+        assert all(np.array_equal(a, b) for a, b in zip(starts, other_starts, strict=True))
+
+
+def test_searches_may_run_side_by_side():
+    levels = [make_levels(*samples('root', 6000 if COMPILED else 140, seed)) for seed in (1, 2)]
+    alone = [best_partitions(problem(x, 2), 5)[0] for x in levels]
+    found = [None, None]
+
+    def work(k):
+        found[k] = best_partitions(problem(levels[k], 2, threads=2), 5)[0]
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert np.array_equal(found[0], alone[0])
+    assert np.array_equal(found[1], alone[1])
+
+
+def test_one_thread_starts_none(monkeypatch):
+    def refuse(*_args, **_kwargs):
+        pytest.fail('a thread was started')
+
+    levels = make_levels(*samples('valve', 300))
+    monkeypatch.setattr(threading, 'Thread', refuse)
+    cost, _ = best_partitions(problem(levels, 2, threads=1), 4)
+    assert np.isfinite(cost).all()
+
+
+@pytest.mark.skipif(not COMPILED, reason='counts are those of the compiled search')
+@pytest.mark.parametrize('kind', ['valve', 'noise', 'noiseless', 'straight'])
+def test_far_breaks_are_passed_over(kind, monkeypatch):
+    """The work must stay far below every break for every end, also for exact ties."""
+    levels = make_levels(*samples(kind, 20_000))
+    opened = []
+    search = partition_layers.search_groups
+    monkeypatch.setattr(
+        partition_layers, 'search_groups', lambda *args: opened.append(search(*args))
+    )
+    best_partitions(problem(levels, 2), 4)
+    groups = 20_000 / 64
+    assert sum(opened) < 0.1 * 3 * groups * groups / 2
+
+
+def test_the_tables_of_the_naive_truth_are_right():
+    u, y = samples('valve', 40)
+    order = np.argsort(u)
+    u, y = u[order], y[order]
+    table = naive.piece_costs(u, y, np.ones(40))
+    for a, b in ((0, 40), (3, 7), (10, 12), (20, 35)):
+        assert float(table[a, b]) == pytest.approx(
+            float(naive.line_cost(u[a:b], y[a:b])), rel=1e-12, abs=1e-12
+        )

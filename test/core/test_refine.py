@@ -1,0 +1,177 @@
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+from streams import lagged, needs_jit, steps_and_ramps
+
+from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.core.problem import Samples
+from valveflow_ros.core.refine import refine
+
+pytestmark = needs_jit
+
+TRUE = RegionalModel(
+    knots=np.array([1000.0, 1300.0, 1600.0, 2000.0]),
+    left=np.array([100.0, 172.0, 220.0]),
+    right=np.array([172.0, 220.0, 240.0]),
+    levels=np.array([190.0]),
+    time_constants=np.array([5.0, 20.0]),
+    delays=np.array([2.3, 6.6]),
+)
+
+
+def straight(knots, values):
+    """Return a curve without jumps and without dynamics, to start from."""
+    values = np.asarray(values, dtype=np.float64)
+    empty = np.empty(0)
+    return RegionalModel(
+        np.asarray(knots, dtype=np.float64), values[:-1].copy(), values[1:].copy(),
+        empty, empty, empty,
+    )  # fmt: skip
+
+
+START = straight([1000.0, 1320.0, 1580.0, 2000.0], [101.0, 175.0, 219.0, 239.0])
+
+
+def measured(model, seed, n=8000, noise=1.0, gaps=0):
+    """Return rows of a plant that is ``model``, with white and slow noise of the power."""
+    rng = np.random.default_rng(seed)
+    u = steps_and_ramps(rng, n, 1000.0, 2000.0, hold=(60, 200), rate=3.0)
+    usable = np.ones(n, dtype=np.uint8)
+    for at in rng.integers(0, n, gaps):
+        usable[at : at + 30] = 0
+    power, _ = model.respond(u, np.ones(n, dtype=np.uint8), 1.0, 0.0)
+    slow = lagged(rng.normal(0.0, 1.0, n), 20.0, 0.0)
+    power = power + noise * (0.5 * rng.normal(0.0, 1.0, n) + slow)
+    return Samples(u=u, power_mw=power, usable=usable, step_s=1.0, settle_s=110.0, group=5)
+
+
+@functools.cache
+def refined(seed):
+    return refine(measured(TRUE, seed), START)
+
+
+def deviations(result, true=TRUE):
+    """Return how many standard errors each free parameter is off."""
+    error = np.sqrt(np.diag(result.covariance))
+    off = result.model.pack() - true.pack()
+    return (off / np.where(error > 0.0, error, 1.0))[result.free]
+
+
+SEEDS = range(6)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_curve_dynamics_and_level_are_recovered_within_their_errors(seed):
+    result = refined(seed)
+    assert (result.model.pieces, result.model.regions) == (3, 2)
+    assert np.abs(deviations(result)).max() < 4.5
+    assert result.model.levels == pytest.approx([190.0], abs=1.5)
+    assert result.model.time_constants == pytest.approx([5.0, 20.0], rel=0.15)
+    assert result.model.delays == pytest.approx([2.3, 6.6], abs=1.0)
+    assert result.model.slopes() == pytest.approx(TRUE.slopes(), abs=0.01)
+
+
+def test_the_standard_errors_are_neither_boast_nor_excuse():
+    every = np.concatenate([deviations(refined(seed)) for seed in SEEDS])
+    assert 0.5 < np.sqrt(np.mean(every**2)) < 1.7
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+def test_what_is_left_is_white_and_as_large_as_the_noise(seed):
+    result = refined(seed)
+    assert 0 < result.innovation_mw < result.residual_mw[result.weight > 0].std()
+    assert np.isfinite(result.covariance).all()
+    eigenvalues = np.linalg.eigvalsh(result.covariance)
+    assert eigenvalues.min() > -1e-9 * eigenvalues.max()
+
+
+def test_without_noise_it_is_exact():
+    result = refine(measured(TRUE, 3, noise=1e-6), START)
+    assert result.model.pack() == pytest.approx(TRUE.pack(), abs=2e-2)
+    assert result.model.levels == pytest.approx(TRUE.levels, abs=1.0)
+    assert result.innovation_mw < 1e-2
+
+
+@pytest.mark.parametrize(
+    'start',
+    [
+        straight([1000.0, 2000.0], [100.0, 240.0]),
+        START,
+        straight(
+            [1000.0, 1100.0, 1290.0, 1450.0, 1610.0, 1800.0, 2000.0],
+            [100.0, 125.0, 170.0, 195.0, 220.0, 230.0, 240.0],
+        ),
+    ],
+    ids=['one', 'three', 'six'],
+)
+def test_the_number_of_pieces_is_found_from_too_few_and_too_many(start):
+    result = refine(measured(TRUE, 2), start, most_pieces=8)
+    assert result.model.pieces == 3
+    assert result.model.knots[1:-1] == pytest.approx([1300.0, 1600.0], abs=25.0)
+
+
+@pytest.mark.parametrize('most', [1, 2])
+def test_no_more_pieces_than_allowed(most):
+    result = refine(measured(TRUE, 2), straight([1000.0, 2000.0], [100.0, 240.0]), most)
+    assert result.model.pieces <= most
+
+
+def test_a_straight_valve_stays_one_piece_and_one_region():
+    true = RegionalModel(
+        np.array([1000.0, 2000.0]), np.array([100.0]), np.array([240.0]), np.empty(0),
+        np.array([12.0]), np.array([4.0]),
+    )  # fmt: skip
+    for seed in range(3):
+        result = refine(measured(true, seed), straight([1000.0, 2000.0], [100.0, 240.0]), 8)
+        assert (result.model.pieces, result.model.regions) == (1, 1)
+        assert np.abs(deviations(result, true)).max() < 4.5
+
+
+def test_a_jump_is_found_where_there_is_one_and_not_where_there_is_none():
+    left = TRUE.left.copy()
+    left[1] += 8.0
+    right = TRUE.right.copy()
+    right[1] += 8.0
+    jumping = RegionalModel(TRUE.knots, left, right, np.empty(0), np.array([8.0]), np.array([2.0]))
+    result = refine(measured(jumping, 1), START)
+    jumps = result.model.left[1:] - result.model.right[:-1]
+    assert jumps[0] == pytest.approx(8.0, abs=2.0)
+    assert not refined(0).free[2 * 3 : 2 * 3 + 2].any()
+
+
+def test_a_constant_error_of_the_power_lifts_the_curve_and_nothing_else():
+    samples = measured(TRUE, 1)
+    lifted = Samples(samples.u, samples.power_mw + 50.0, samples.usable, 1.0, 110.0, 5)
+    start = straight(START.knots, np.append(START.left, START.right[-1]) + 50.0)
+    here, there = refined(1), refine(lifted, start)
+    assert there.model.knots == pytest.approx(here.model.knots, abs=0.05)
+    assert there.model.left - 50.0 == pytest.approx(here.model.left, abs=0.02)
+    assert there.model.time_constants == pytest.approx(here.model.time_constants, rel=1e-2)
+    assert there.model.levels - 50.0 == pytest.approx(here.model.levels, abs=0.5)
+
+
+def test_gaps_cost_rows_and_no_accuracy_and_what_stands_in_them_does_not_matter():
+    samples = measured(TRUE, 4, gaps=12)
+    result = refine(samples, START)
+    assert result.model.regions == 2
+    assert np.abs(deviations(result)).max() < 4.5
+    wild = Samples(
+        np.where(samples.usable > 0, samples.u, 1e9),
+        np.where(samples.usable > 0, samples.power_mw, np.nan),
+        samples.usable, 1.0, 110.0, 5,
+    )  # fmt: skip
+    again = refine(wild, START)
+    assert again.model.pack().tolist() == result.model.pack().tolist()
+    assert again.model.levels.tolist() == result.model.levels.tolist()
+
+
+def test_the_same_rows_give_the_same_bits_and_are_not_written():
+    samples = measured(TRUE, 1)
+    for array in (samples.u, samples.power_mw, samples.usable):
+        array.setflags(write=False)
+    again = refine(samples, START)
+    assert again.model.pack().tolist() == refined(1).model.pack().tolist()
+    assert again.covariance.tolist() == refined(1).covariance.tolist()

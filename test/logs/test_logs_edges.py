@@ -1,0 +1,120 @@
+"""Corners that the broad tests do not reach."""
+
+import lz4.frame
+import pytest
+import zstandard
+from log_files import FLOAT64, START_NS, STOCK, float64, write_chunks
+
+from valveflow_ros.errors import RecordingError
+from valveflow_ros.logs import Decoder, RecordingWriter, open_log, recover
+from valveflow_ros.logs.compression import Unpacker
+from valveflow_ros.logs.layout import Channel, LayoutError, Op, Schema
+from valveflow_ros.logs.limits import Limits
+from valveflow_ros.logs.part_file import PartFile
+from valveflow_ros.logs.topic_book import REPEAT_CHUNKS, TableSchedule
+from valveflow_ros.logs.topic_table import TopicTable
+
+PACKED = zstandard.ZstdCompressor().compress(bytes(100))
+UNSIZED = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(100))
+
+
+@pytest.mark.parametrize(
+    ('compression', 'packed', 'size'),
+    [
+        ('zstd', PACKED, 99),
+        ('zstd', PACKED, 101),
+        ('zstd', UNSIZED, 99),
+        ('zstd', UNSIZED, 101),
+        ('zstd', b'no frame', 100),
+        ('lz4', lz4.frame.compress(bytes(100)), 99),
+        ('lz4', lz4.frame.compress(bytes(100)), 101),
+        ('lz4', b'no frame', 100),
+        ('', bytes(99), 100),
+        ('bz2', bytes(100), 100),
+    ],
+)
+def test_a_wrong_claim_is_never_believed(compression, packed, size):
+    with pytest.raises(LayoutError):
+        Unpacker().unpack(compression, packed, size)
+
+
+@pytest.mark.parametrize('packed', [PACKED, UNSIZED])
+def test_a_right_claim_is_met(packed):
+    assert Unpacker().unpack('zstd', packed, 100) == bytes(100)
+
+
+def test_nothing_unpacks_to_nothing():
+    assert Unpacker().unpack('zstd', zstandard.ZstdCompressor().compress(b''), 0) == b''
+
+
+def test_one_id_never_means_two_things():
+    table = TopicTable(Limits(channels=2, definition_bytes=20))
+    first = Schema(1, 'a/msg/A', 'ros2msg', b'int8 a')
+    table.add(Op.SCHEMA, first.pack()[9:])
+    table.add(Op.SCHEMA, first.pack()[9:])
+    with pytest.raises(LayoutError, match='schema 1 twice'):
+        table.add(Op.SCHEMA, Schema(1, 'a/msg/A', 'ros2msg', b'int8 b').pack()[9:])
+    with pytest.raises(LayoutError, match='larger'):
+        table.add(Op.SCHEMA, Schema(2, 'a/msg/B', 'ros2msg', bytes(30)).pack()[9:])
+    for number in (1, 2):
+        table.add(Op.CHANNEL, Channel(number, 1, f'/{number}', 'cdr').pack()[9:])
+    with pytest.raises(LayoutError, match='more than 2 topics'):
+        table.add(Op.CHANNEL, Channel(3, 1, '/3', 'cdr').pack()[9:])
+
+
+def test_the_table_of_topics_stands_in_two_chunks_and_then_now_and_then():
+    schedule, due = TableSchedule(), []
+    for chunk in range(2 * REPEAT_CHUNKS + 2):
+        topics = 1 if chunk < 5 else 2
+        due.append(schedule.due(topics))
+        schedule.done(topics, due[-1])
+    first = [k for k, table in enumerate(due) if table]
+    assert first == [0, 1, 5, 6, 6 + REPEAT_CHUNKS]
+
+
+def test_a_half_written_draft_does_not_stay(tmp_path, monkeypatch):
+    path, _, _ = write_chunks(tmp_path / 'log')
+
+    def full(self, data):
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr(PartFile, 'write', full)
+    with pytest.raises(RecordingError, match=r'cannot be written \(no space left on device\)'):
+        recover(path, tmp_path / 'out.mcap')
+    assert sorted(p.name for p in tmp_path.iterdir()) == ['log']
+
+
+def test_a_file_that_changes_while_it_is_read_is_one_sentence(tmp_path):
+    path, _, _ = write_chunks(tmp_path / 'log')
+    contents = open_log(path)
+    path.write_bytes(bytes(path.stat().st_size))
+    with pytest.raises(RecordingError, match='has changed while it was read'):
+        list(contents.iter_messages())
+
+
+def test_a_device_that_fails_while_flushing_is_one_sentence(tmp_path, monkeypatch):
+    with RecordingWriter(tmp_path / 'log', definitions=STOCK) as writer:
+        writer.add_topic('/x', FLOAT64)
+        writer.write('/x', float64(1.0), START_NS, START_NS)
+        writer.flush()
+
+        def broken(self):
+            raise OSError(5, 'Input/output error')
+
+        monkeypatch.setattr(PartFile, 'sync', broken)
+        with pytest.raises(RecordingError, match=r'cannot be written \(input/output error\)'):
+            writer.sync()
+        monkeypatch.undo()
+        writer.write('/x', float64(2.0), START_NS + 1, START_NS)
+    assert [m.data for m in open_log(tmp_path / 'log').iter_messages()] == [
+        float64(1.0),
+        float64(2.0),
+    ]
+
+
+def test_bytes_that_are_no_cdr_and_types_that_are_not_read():
+    with pytest.raises(RecordingError, match='not plain CDR'):
+        Decoder(FLOAT64, 'float64 data').decode(b'\x07\x00\x00\x00')
+    with pytest.raises(RecordingError, match='wstring'):
+        Decoder('a/msg/A', 'wstring text').decode(b'\0\1\0\0' + bytes(8))
+    assert Decoder('a/msg/A', '').decode(b'\0\1\0\0\0') == {}
