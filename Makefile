@@ -19,6 +19,7 @@ PYTEST_ARGS ?=
 # Checked as strictly as mypy can; ros/ is not, because rclpy carries no annotations.
 STRICT := $(wildcard $(addprefix valveflow_ros/,errors.py records.py config.py \
   core plant logs report cli compare diagnosis) tools)
+BENCHMARKS := $(filter-out __init__,$(basename $(notdir $(wildcard benchmarks/*.py))))
 
 help:
 	@sed -n 's/^# //p;/^$$/q' Makefile
@@ -30,7 +31,7 @@ demo: setup
 	@$(VALVEFLOW_DEMO)
 
 test: setup
-	@$(ENV) python -m pytest $(PYTEST_ARGS)
+	@$(ENV) VALVEFLOW_REQUIRE_ROS=1 python -m pytest $(PYTEST_ARGS)
 
 lint: setup
 	@$(ENV) ruff check .
@@ -42,7 +43,7 @@ format: setup
 	@$(ENV) ruff format .
 
 bench: setup
-	@$(ENV) python -m benchmarks
+	@$(ENV) for name in $(BENCHMARKS); do python -m benchmarks.$$name || exit 1; done
 
 lock: setup
 	@$(ENV) uv pip compile --quiet --universal --python-version 3.10 --generate-hashes \

@@ -225,7 +225,7 @@ class NaiveSegmenter:
         self.filling = []  # rows of the block that fills
         self.open = []  # blocks of the open segment
         self.stretch = []
-        self.fresh = True
+        self.skip = self.settle  # blocks of the open segment that do not count
         self.run_u = self.run_y = 0
 
     def feed(self, time_ns, u, y, temperature):
@@ -275,21 +275,22 @@ class NaiveSegmenter:
             return
         noise_u, noise_y = self.noise()
         us = [b[0] for b in self.open]
-        ys = [b[1] for b in self.open[self.settle if self.fresh else 0 :]]
+        ys = [b[1] for b in self.open[self.skip :]]
         self.run_u = self.leaves(us, mean[0], noise_u, self.run_u)
         self.run_y = self.leaves(ys, mean[1], noise_y, self.run_y)
-        at = None
+        old_end = None
         if abs(self.run_u) >= 2 or abs(self.run_y) >= 2:
-            at = len(us) - 1
+            old_end = len(us) - 1
         elif self.drifts(us, noise_u):
-            at = len(us) - 6
+            old_end = len(us) - 6
         self.open.append(mean)
-        if at is not None:
-            self.close(max(at - self.trim, 0))
-            self.cut(at, fresh=True)
-        elif len(self.open) == self.longest + (self.settle if self.fresh else 0):
-            self.close(len(self.open))
-            self.cut(len(self.open), fresh=False)
+        if old_end is not None:
+            self.close(old_end - self.trim)
+            self.cut(max(len(us) - 1, 0), self.settle)
+        elif len(self.open) == self.longest + self.skip + self.trim:
+            self.close(len(self.open) - self.trim)
+            keep = min(18, len(self.open))
+            self.cut(len(self.open) - keep, max(keep - self.trim, 0))
 
     def leaves(self, line, value, noise, run):
         if len(line) < 6:
@@ -313,15 +314,15 @@ class NaiveSegmenter:
         sd = noise * math.sqrt(0.5 + 6 * leverage(n, n - 1 + 3.5) / 2.0)
         return abs(off) > 2.5 * sd
 
-    def cut(self, at, fresh):
+    def cut(self, at, skip):
         self.first_row += at * self.rows
         self.open = self.open[at:]
-        self.fresh = fresh
+        self.skip = skip
         self.run_u = self.run_y = 0
 
     def close(self, end):
-        first = self.settle if self.fresh else 0
-        part = self.open[first:end]
+        first = self.skip
+        part = self.open[first : max(end, 0)]
         if len(part) < 3:
             return
         noise_u, noise_y = self.noise()
@@ -358,7 +359,7 @@ class NaiveSegmenter:
         )
 
     def kind_now(self):
-        if len(self.open) < max(self.settle if self.fresh else 0, 6):
+        if len(self.open) < max(self.skip, 6):
             return 0
         if self.run_u or self.run_y:
             return 0
@@ -395,10 +396,13 @@ def naive_respond(x, usable, levels, time_constants, delays, step):
         back = delays[region] / step
         place = len(run) - 1 - back
         # Before the run began the flow is taken to have been what it was at its first row.
-        late = float(np.interp(place, range(len(run)), run))
-        decay = math.exp(-step / time_constants[region])
+        before, late = np.interp([place - 1, place], range(len(run)), run)
+        constant = time_constants[region] / step
+        decay = math.exp(-1.0 / constant)
         state = now if len(run) == 1 else state
-        state = decay * state + (1.0 - decay) * late
+        # The exact answer to a flow that runs straight from `before` to `late` in a step.
+        slope = late - before
+        state = decay * (state - before + constant * slope) + before + slope - constant * slope
         answer.append(state)
     return answer
 

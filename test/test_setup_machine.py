@@ -281,16 +281,14 @@ def test_keys_change_with_what_they_depend_on_and_nothing_else(monkeypatch, tmp_
 
 def test_a_build_of_somebody_else_is_not_removed(monkeypatch, tmp_path):
     monkeypatch.setattr(packages, 'INSTALL', tmp_path / 'install')
-    theirs = tmp_path / 'install' / 'valveflow_ros'
-    theirs.mkdir(parents=True)
+    packages.check_install()
+    (tmp_path / 'install').mkdir()
+    packages.check_install()
+    (tmp_path / 'install' / 'valveflow_ros').mkdir()
     with pytest.raises(tree.SetupError, match='did not make'):
-        packages.claim_install()
-    assert theirs.is_dir()
-    theirs.rmdir()
-    packages.claim_install()
-    theirs.mkdir()
-    packages.claim_install()
-    assert theirs.is_dir()
+        packages.check_install()
+    tree.stamp(tmp_path / 'install', 'unfinished')
+    packages.check_install()
 
 
 def test_only_the_installers_are_taken_from_the_lock_first():

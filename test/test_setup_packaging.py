@@ -229,7 +229,7 @@ def test_the_wheel_of_the_pure_part(tmp_path):
     points = (
         tmp_path / 'out' / f'valveflow_ros-{version}.dist-info' / 'entry_points.txt'
     ).read_text()
-    assert points.split() == '[console_scripts] valveflow = valveflow_ros.cli.main:main'.split()
+    assert points.strip() == '[console_scripts]\nvalveflow = valveflow_ros.cli.main:main'
     loaded = subprocess.run(
         [sys.executable, '-c', 'import valveflow_ros; print(valveflow_ros.__file__)'],
         cwd=tmp_path, env=os.environ | {'PYTHONPATH': str(tmp_path / 'out')},

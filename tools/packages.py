@@ -59,7 +59,8 @@ def packages_done(wheels: str) -> bool:
 
 def build_packages(wheels: str, log: Path) -> None:
     """Build what is not up to date, and try to load it."""
-    claim_install()
+    INSTALL.mkdir(exist_ok=True)
+    stamp(INSTALL, 'unfinished')
     messages = messages_key(wheels)
     for package, key in ((MESSAGES, messages), (NODE, node_key(messages))):
         if stamped(INSTALL / package, key):
@@ -80,14 +81,12 @@ def build_packages(wheels: str, log: Path) -> None:
         raise SetupError(f'what was built does not load ({problem}); details in {log}')
 
 
-def claim_install() -> None:
+def check_install() -> None:
     """Keep off an install/ that somebody made with their own colcon and their own ROS."""
     if INSTALL.exists() and any(INSTALL.iterdir()) and not (INSTALL / STAMP).exists():
         raise SetupError(
             'install/ holds a build that make setup did not make; move it away or run make clean'
         )
-    INSTALL.mkdir(exist_ok=True)
-    stamp(INSTALL, 'unfinished')
 
 
 def link_command() -> None:

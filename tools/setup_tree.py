@@ -13,7 +13,7 @@ import sys
 import time
 
 from machine import check_machine
-from packages import build_packages, packages_done
+from packages import build_packages, check_install, packages_done
 from tree import LOG, ROOT, VENV, SetupError, say, stamp, stamped
 from wheels import install_wheels, make_venv, repair_cmake, wheels_key
 
@@ -24,6 +24,7 @@ def steps() -> None:
     if stamped(VENV, wheels) and packages_done(wheels):
         return
     check_machine()
+    check_install()
     LOG.mkdir(exist_ok=True)
     log = LOG / 'setup.log'
     log.write_text('', encoding='utf-8')

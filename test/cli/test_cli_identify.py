@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 
 import numpy as np
@@ -16,6 +17,9 @@ from valveflow_ros.logs import open_log, write_table
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import NS_PER_S, Readings, SampleTable, Signal, table_to_readings
 
+pytestmark = pytest.mark.skipif(
+    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
+)
 START_NS = 1_700_000_000 * NS_PER_S
 
 

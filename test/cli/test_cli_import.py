@@ -47,6 +47,7 @@ def test_columns_are_converted_and_told(run, tmp_path, history):
     assert np.allclose(values(log, Signal.MAIN_STEAM_TEMPERATURE), 538.85 + 0.1 * k)
     assert np.allclose(values(log, Signal.GENERATED_POWER), 200.0 + 0.001 * k)
     assert not len(values(log, Signal.VALVE_COMMAND))
+    assert 'Not used: Spare.\n' in ran.out
     for word in ('50 rows', '1 min', 'CV', 'from bar', '13.00 to 13.49', '2023-11-14 22:13:20'):
         assert word in ran.out
     told = json.loads(open_log(log).attachments['import.json'])
@@ -58,6 +59,7 @@ def test_json_tells_the_same(run, tmp_path, history):
     data = run('import', history, '-o', tmp_path / 'x.mcap', *OPTIONS, '--json').json
     assert data['rows'] == 50
     assert data['period_s'] == 60.0
+    assert data['ignored'] == ['Spare']
     assert data['gaps'] == data['duplicates'] == 0
     assert [s['topic'] for s in data['signals']] == [i.topic for i in SIGNALS if i.required]
 
@@ -193,3 +195,29 @@ def test_the_output_is_checked_before_the_work(run, tmp_path, history):
     sentence = run('import', log, '-o', log, *OPTIONS).refused()
     assert 'is the log that is read' in sentence
     assert log.read_text() == history.read_text()
+
+
+def test_columns_that_are_not_used_are_named_for_parquet_and_semicolons_too(run, tmp_path):
+    import pandas as pd
+
+    names = [i.column for i in SIGNALS if i.required]
+    frame = pd.DataFrame({'time': 1700000000 + np.arange(5), 'A;B': 1.0, 'Note': 'x'})
+    for name, value in zip(names, (50.0, 12.0, 540.0, 200.0), strict=True):
+        frame[name] = value
+    frame.to_parquet(tmp_path / 'h.parquet')
+    frame.drop(columns='A;B').to_csv(tmp_path / 'h.csv', sep=';', decimal=',', index=False)
+    ran = run('import', tmp_path / 'h.parquet', '-o', tmp_path / 'a.mcap', '--json')
+    assert ran.json['ignored'] == ['A;B', 'Note']
+    ran = run('import', tmp_path / 'h.csv', '-o', tmp_path / 'b.mcap', '--json')
+    assert ran.json['ignored'] == ['Note']
+    assert ran.json['signals'][1]['high'] == 12.0
+
+
+def test_a_column_that_gives_way_to_a_constant_is_not_used(run, tmp_path, write_csv):
+    header = 'time,' + ','.join(i.column for i in SIGNALS if i.required)
+    table = write_csv(header, [f'{1700000000 + k},50,12,540,200' for k in range(5)])
+    log = tmp_path / 'x.mcap'
+    ran = run('import', table, '-o', log, '--constant', 'main_steam_pressure=9')
+    assert 'the constant is used instead' in ran.err
+    assert 'Not used: main_steam_pressure_mpa.' in ran.out
+    assert values(log, Signal.MAIN_STEAM_PRESSURE).tolist() == [9.0] * 5

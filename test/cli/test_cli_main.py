@@ -145,7 +145,7 @@ def test_the_first_run_is_known_by_the_empty_cache(tmp_path):
         )  # fmt: skip
         return done.stdout.strip()
 
-    assert ask() == 'True'
+    assert ask(NUMBA_DISABLE_JIT='0') == 'True'
     assert ask(NUMBA_DISABLE_JIT='1') == 'False'
 
 

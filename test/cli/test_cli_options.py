@@ -180,6 +180,11 @@ def test_minute_data_as_the_documentation_says():
     assert fitting({}, 30 * 86400.0, {})['window_days'] >= 30.0
 
 
+def test_a_finished_log_is_fitted_once_whatever_the_file_says():
+    settings, _ = settings_for({}, 1e5, {'refit_period': 600.0, 'refit_segments': 5})
+    assert settings['refit_period'] == settings['refit_segments'] == 0
+
+
 def test_a_table_finer_than_the_data_is_said_aloud():
     _, said = settings_for({Signal.VALVE_OPENING: 60.0}, 1e5, {'sample_period': 1.0})
     assert any('held in between' in sentence for sentence in said)

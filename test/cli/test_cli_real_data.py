@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
+pytestmark = pytest.mark.skipif(
+    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='a week of data needs the compiled engine'
+)
 CONSTANTS = ['--constant', 'main_steam_pressure=1', '--constant', 'main_steam_temperature=540']
 
 

@@ -15,13 +15,13 @@ from streams import (
     lagged,
     needs_jit,
     simulated,
-    steps_and_ramps,
 )
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.characteristic_json import from_json, to_json
-from valveflow_ros.core.fit import FitTask, fit
+from valveflow_ros.core.fit import fit
+from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.offline import feed_rows
 from valveflow_ros.core.window import WindowContents
@@ -40,7 +40,7 @@ def knee(u):
 def window(seed=0, n=2400, noise=0.3, flow=knee, time_constant=0.0, temperature=540.0):
     """Return rows in holds of 60, of which the last 45 of each are a special segment."""
     rng = np.random.default_rng(seed)
-    u = np.repeat(rng.uniform(1100.0, 1900.0, n // 60), 60)
+    u = np.repeat(rng.permutation(np.linspace(1100.0, 1900.0, n // 60)), 60)
     x = flow(u)
     power = x if time_constant == 0.0 else lagged(x, time_constant, 1.0)
     spans = [[k + 15, k + 60, 1] for k in range(0, n, 60)]
@@ -358,10 +358,3 @@ def test_four_days_of_the_simulated_plant_give_its_curve_and_dynamics():
         assert found.delay_stderr_s < 2.0
     u = np.linspace(c.breakpoints[0], c.breakpoints[-1], 200)
     assert np.abs(c(u) - truth(u)).max() < 2.5
-
-
-def test_steps_are_what_they_seem():
-    """The generator these tests stand on: holds and ramps, nothing else."""
-    u = steps_and_ramps(np.random.default_rng(0), 500)
-    rates = np.unique(np.round(np.diff(u), 9))
-    assert set(np.abs(rates[np.abs(rates) <= 4.0])) <= {0.0, 4.0}

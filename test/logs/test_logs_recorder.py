@@ -15,6 +15,7 @@ from valveflow_ros.logs import (
     RecorderState,
     open_log,
 )
+from valveflow_ros.logs.ledger import DROPS_SHOWN_S, Ledger
 from valveflow_ros.logs.part_file import PartFile
 
 QUICK = RecorderSettings(
@@ -237,24 +238,29 @@ def test_too_many_waiting_messages_are_dropped_by_topic_and_counted(tmp_path):
     }
 
 
-def test_dropping_is_a_degraded_state(tmp_path):
-    gate = threading.Event()
+def test_dropping_is_a_degraded_state_for_a_while():
+    now = [100.0]
+    ledger = Ledger(1, clock=lambda: now[0])
+    assert [ledger.admit('/x') for _ in range(3)] == [True, False, False]
+    ledger.settle(1, '', 0, 0)
+    ledger.well()
+    status = ledger.status()
+    assert status.state == RecorderState.DEGRADED
+    assert status.reason == '2 messages were dropped, too many were waiting'
+    now[0] += DROPS_SHOWN_S
+    ledger.well()
+    assert (ledger.status().state, ledger.status().reason) == (RecorderState.RECORDING, '')
+    assert is_balanced(ledger.status())
 
-    def slow(path):
-        gate.wait(LIMIT_S)
-        return PartFile(path)
 
-    settings = RecorderSettings(queue_limit=1, flush_period_s=60, free_floor_bytes=0)
-    recorder = recorder_of(tmp_path / 'log', settings, open_file=slow)
-    record(recorder, 0, 3)
+def test_asking_for_a_split_of_nothing_does_nothing(tmp_path):
+    recorder = recorder_of(tmp_path / 'log')
     recorder.rotate()
-    gate.set()
-    wait_for(lambda: recorder.status().written == 1)
-    wait_for(lambda: recorder.status().state == RecorderState.DEGRADED)
-    assert '2 messages were dropped' in recorder.status().reason
-    recorder.rotate()
-    wait_for(lambda: recorder.status().state == RecorderState.RECORDING)
-    recorder.close()
+    wait_for(lambda: not recorder.is_rotating)
+    record(recorder, 0, 5)
+    wait_for(lambda: recorder.status().written == 5)
+    record(recorder, 5, 5)
+    assert recorder.close().files_finished == 1
 
 
 def test_a_hundred_rotations_lose_nothing(tmp_path):

@@ -11,7 +11,8 @@ from valveflow_ros.config import Settings
 from valveflow_ros.core.align import Aligner
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.events import FitRequested, JournalEntry, JournalKind, SegmentClosed
-from valveflow_ros.core.fit import FitTask, fit
+from valveflow_ros.core.fit import fit
+from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.noise import WARM_UP, WINDOW
 from valveflow_ros.core.offline import feed_aligned

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from valveflow_ros.cli.console import Console
+from valveflow_ros.cli.header import unused_columns
 from valveflow_ros.cli.log_input import (
     advice,
     check_constants,
@@ -34,6 +35,8 @@ from valveflow_ros.records import (
 )
 from valveflow_ros.report.quality import Gap, gaps
 
+_TIMES = ('time', 'date')
+_QUALITY = '_quality'  # what stands behind the name of a column of marks
 _TABLES = ('.csv', '.tsv', '.txt', '.parquet', '.pq')
 
 
@@ -134,7 +137,7 @@ def read_historian(path: Path, mapping: Mapping, console: Console) -> Imported:
     period_s = float(np.median(np.diff(time_ns))) / 1e9 if len(time_ns) > 1 else 0.0
     return Imported(
         path, table, sources, len(raw.time_ns), len(raw.time_ns) - len(time_ns), period_s,
-        gaps(time_ns, max(1, round(period_s * 1e9))), tuple(getattr(raw, 'ignored', ())),
+        gaps(time_ns, max(1, round(period_s * 1e9))), _ignored(raw, mapping),
         raw.notes,
     )  # fmt: skip
 
@@ -147,6 +150,20 @@ def _read(path: Path, mapping: Mapping) -> RawTable:
         if not strange:
             raise
         raise unknown_unit(strange[0]) from error
+
+
+def _ignored(raw: RawTable, mapping: Mapping) -> tuple[str, ...]:
+    """Return the columns that stand for nothing here."""
+    used = [name for column, name in raw.names.items() if not _is_constant(column, mapping)]
+    unused = unused_columns(Path(raw.path), used)
+    times = {mapping.columns[key].theirs for key in _TIMES if key in mapping.columns}
+    times |= set(_TIMES) - set(mapping.columns)
+    marks = {f'{name}{_QUALITY}' for name in used}
+    return tuple(name for name in unused if name not in times | marks)
+
+
+def _is_constant(column: str, mapping: Mapping) -> bool:
+    return any(i.column == column and i.topic in mapping.constants for i in SIGNALS)
 
 
 def _signals(

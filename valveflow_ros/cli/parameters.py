@@ -16,6 +16,8 @@ from valveflow_ros.records import Signal
 
 _ROUND_S = (1.0, 2.0, 5.0, 6.0, 10.0, 12.0, 15.0, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0, 900.0,
             1800.0, 3600.0)  # fmt: skip
+# A finished log is fitted once, at its end, whatever a live monitor would do.
+_OFFLINE = {'refit_period': 0.0, 'refit_segments': 0}
 _TRUE, _FALSE = ('true', 'yes', 'on'), ('false', 'no', 'off')
 
 
@@ -66,8 +68,6 @@ def fitting(
         'longest_segment': longest,
         'alarm_average': max(float(default['alarm_average']), 5.0 * float(period)),
         'window_days': _window_days(span_s, float(period), longest),
-        'refit_period': 0.0,
-        'refit_segments': 0,
     }
     return {
         name: min(max(value, PARAMETERS[name].low or value), PARAMETERS[name].high or value)
@@ -170,7 +170,7 @@ def settings_for(
         Values are at odds with each other.
     """
     adapted = fitting(steps, span_s, given)
-    settings = Settings({**adapted, **given})
+    settings = Settings({**adapted, **given, **_OFFLINE})
     return settings, _words(adapted, given, settings, steps, span_s)
 
 

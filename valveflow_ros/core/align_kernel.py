@@ -289,7 +289,7 @@ def align(  # noqa: C901 - one loop over all that can meet a reading
             written = _close_ready(state, rules, rows, written, _LATEST_NS, final and last)
         if written >= limit or last:
             break
-        t, s, v, q = time_ns[i], np.int64(signal[i]), value[i], quality[i]
+        t, s, v, q = time_ns[i], int(signal[i]), value[i], quality[i]
         newest = clock[_NEWEST]
         why = _refusal(t, v, q, rules.limits[s, 0], rules.limits[s, 1])
         if why != _ACCEPTED:

@@ -200,7 +200,7 @@ def from_json(raw: object) -> Characteristic:
 
 
 def _pieces(field: _Field, touching: bool = True) -> tuple[Piece, ...]:
-    pieces = []
+    pieces: list[Piece] = []
     for f in field.items():
         if pieces and touching and f.key('u_from').real() != pieces[-1].u_to:
             raise f.key('u_from').fail('is not where the piece before it ends')

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from valveflow_ros.core.alarms import AlarmChange
 from valveflow_ros.core.characteristic import Characteristic
-from valveflow_ros.core.fit import FitTask
+from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.prediction import PredictionBlock
 from valveflow_ros.records import SpecialSegment
 

@@ -4,56 +4,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from valveflow_ros.config import Settings
 from valveflow_ros.core.characteristic import (
     Characteristic,
     Choice,
     Piece,
-    RegionDynamics,
     ResidualStatistics,
     Source,
 )
-from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.core.fit_result import from_refined, residual_statistics
+from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.partition import Partition, partition
 from valveflow_ros.core.problem import Samples
-from valveflow_ros.core.refine import Refined, refine
+from valveflow_ros.core.refine import refine
 from valveflow_ros.core.selection import Selection, select
 from valveflow_ros.core.whitening import inflation
 from valveflow_ros.core.window import WindowContents
 from valveflow_ros.errors import DataError, TooFewSamplesError
-from valveflow_ros.records import ByteArray, FloatArray, SegmentKind
+from valveflow_ros.records import FloatArray, SegmentKind
 
 _EXPLAINED_LEAST = 0.5  # share of the power's variance a curve must explain to be one
-_REFINE_LEAST_ROWS = 3600  # scored rows below which the dynamics are not asked for
-_Z95 = 1.959963984540054
-_MAD_TO_SD = 1.4826022185056018
+_RICHER = 3  # pieces more than the paper's rule takes, before pruning
+
 
 Progress = Callable[[str], None]
-
-
-@dataclass(frozen=True, slots=True)
-class FitTask:
-    """Everything a fit depends on.
-
-    Attributes
-    ----------
-    request_ns : int
-        Time of the row after which the fit was asked for; its name.
-    contents : WindowContents
-    settings : Settings
-    input_noise, power_noise_mw : float
-        The segmenter's noise levels at that moment.
-    """
-
-    request_ns: int
-    contents: WindowContents
-    settings: Settings
-    input_noise: float
-    power_noise_mw: float
 
 
 def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
@@ -73,11 +50,7 @@ def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
     part = partition(u, power, settings.whole('max_pieces'), least)
     growth = _inflation(contents, part)
     selection = select(part, rule='paper', correlation_inflation=growth)
-    chosen = tuple(
-        Piece(p.u_from, p.u_to, p.slope, p.intercept, p.slope_stderr * math.sqrt(growth),
-              p.intercept_stderr * math.sqrt(growth), p.samples)
-        for p in part.pieces(selection.pieces)
-    )  # fmt: skip
+    chosen = _pieces_of(part, selection.pieces, growth)
     _carries_a_curve(chosen, u, power)
     source = _source(task, rows)
     choice = Choice(
@@ -94,7 +67,17 @@ def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
     )
     if not settings.flag('refine'):
         return static.with_id()
-    return _refined(task, static, u, progress).with_id()
+    return _refined(task, static, part, u, progress).with_id()
+
+
+def _pieces_of(part: Partition, pieces: int, inflation: float = 1.0) -> tuple[Piece, ...]:
+    """Return a partition's pieces, their errors widened for correlation in time."""
+    wider = math.sqrt(inflation)
+    return tuple(
+        Piece(p.u_from, p.u_to, p.slope, p.intercept, p.slope_stderr * wider,
+              p.intercept_stderr * wider, p.samples)
+        for p in part.pieces(pieces)
+    )  # fmt: skip
 
 
 def _enough(task: FitTask, samples: int) -> None:
@@ -142,10 +125,7 @@ def _inflation(contents: WindowContents, part: Partition) -> float:
     Judged on the residual of the richest partition, so that a missing piece is
     not taken for correlation, within segments only.
     """
-    most = part.pieces(len(part.cost))
-    pieces = tuple(
-        Piece(p.u_from, p.u_to, p.slope, p.intercept, 0.0, 0.0, p.samples) for p in most
-    )
+    pieces = _pieces_of(part, len(part.cost))
     series: list[FloatArray] = []
     for a, b, _ in contents.spans:
         series += [contents.power_mw[a:b] - _evaluate(pieces, contents.u[a:b]), np.zeros(1)]
@@ -194,34 +174,20 @@ def _static_residuals(
     c = task.contents
     rest = c.power_mw[rows] - _evaluate(pieces, c.u[rows])
     weight = np.ones(len(rest), dtype=np.uint8)
-    return _statistics(task, rest, weight, task.settings.real('sample_period'))
+    return residual_statistics(task, rest, weight, task.settings.real('sample_period'))
 
 
-def _statistics(
-    task: FitTask, residual: FloatArray, weight: ByteArray, step_s: float
-) -> ResidualStatistics:
-    """Return rmse, and the sd that the running mean of the alarm has on these residuals."""
-    average_s = task.settings.real('alarm_average')
-    keep = weight > 0
-    rest = residual[keep]
-    forget = math.exp(-step_s / average_s)
-    run, mean = np.empty(len(rest)), 0.0
-    for k, value in enumerate(rest):
-        mean = forget * mean + (1.0 - forget) * value
-        run[k] = mean
-    settled = run[min(len(run) // 4, int(3.0 * average_s / step_s)) :]
-    sd = _MAD_TO_SD * float(np.median(np.abs(settled - np.median(settled))))
-    return ResidualStatistics(
-        rmse_mw=float(np.sqrt(np.mean(rest**2))),
-        average_sd_mw=max(sd, 1e-9),
-        average_s=average_s,
-        input_noise=task.input_noise,
-        power_noise_mw=task.power_noise_mw,
-    )
+def _rich(part: Partition, pieces: int) -> tuple[Piece, ...]:
+    """Return the exact partition with some pieces more than chosen, to be pruned."""
+    return _pieces_of(part, min(len(part.cost), pieces + _RICHER))
 
 
 def _refined(
-    task: FitTask, static: Characteristic, u_special: FloatArray, progress: Progress
+    task: FitTask,
+    static: Characteristic,
+    part: Partition,
+    u_special: FloatArray,
+    progress: Progress,
 ) -> Characteristic:
     """Refine on all rows; where that is not possible the partition's curve stands, and says so."""
     c, settings = task.contents, task.settings
@@ -229,8 +195,6 @@ def _refined(
     step = settings.real('sample_period')
     # A jump in time is a gap even where no row stands in it.
     usable[1:][np.diff(c.time_ns) > 1.5e9 * step] = 0
-    if int(usable.sum()) < _REFINE_LEAST_ROWS:
-        return replace(static, notes=('Too few rows to estimate dynamics; curve not refined.',))
     progress('curve and dynamics together')
     samples = Samples(
         u=np.where(usable > 0, c.u, 0.0),
@@ -240,76 +204,13 @@ def _refined(
         settle_s=settings.settle_s,
         group=max(1, round(settings.real('block') / step)),
     )
-    by_paper = settings.text('selection_rule') == 'paper'
-    most = None if by_paper else settings.whole('max_pieces')
+    most, start = None, static.model
+    if settings.text('selection_rule') != 'paper':
+        most = settings.whole('max_pieces')
+        start = replace(static, pieces=_rich(part, len(static.pieces))).model
     try:
-        result = refine(samples, static.model, most)
-    except np.linalg.LinAlgError:
-        return replace(static, notes=('The dynamics could not be estimated; curve not refined.',))
-    return _from_refined(task, static, result, samples, u_special)
-
-
-def _from_refined(
-    task: FitTask, static: Characteristic, result: Refined, samples: Samples, u: FloatArray
-) -> Characteristic:
-    """Put a refined model into the form of the result, with its uncertainties."""
-    m = result.model
-    slopes, intercepts = m.slopes(), m.intercepts()
-    slope_se, intercept_se = _line_errors(m, result.covariance)
-    knots = m.knots.copy()
-    counts = np.histogram(u, bins=np.concatenate([[-np.inf], knots[1:-1], [np.inf]]))[0]
-    pieces = tuple(
-        Piece(float(knots[k]), float(knots[k + 1]), float(slopes[k]), float(intercepts[k]),
-              float(slope_se[k]), float(intercept_se[k]), int(counts[k]))
-        for k in range(m.pieces)
-    )  # fmt: skip
-    j = m.pieces
-    knot_se = np.sqrt(np.diag(result.covariance))[j + 1 : 2 * j]
-    intervals = tuple(
-        (float(b - _Z95 * s), float(b + _Z95 * s))
-        for b, s in zip(knots[1:-1], knot_se, strict=True)
-    )
-    edges = [float(m.left[0]), *m.levels.tolist(), float(m.right[-1])]
-    error = np.sqrt(np.diag(result.covariance))[3 * j - 1 :]
-    dynamics = tuple(
-        RegionDynamics(
-            edges[i], edges[i + 1], float(m.time_constants[i]), float(m.delays[i]),
-            float(m.time_constants[i] * error[i]), float(error[m.regions + i]),
-        )
-        for i in range(m.regions)
-    )  # fmt: skip
-    choice = static.choice
-    if task.settings.text('selection_rule') != 'paper':
-        note = f"The paper's rule (24) takes J = {len(static.pieces)}."
-        choice = replace(choice, rule='prediction_error', note=f'{note} {choice.note}'.strip())
-    return replace(
-        static,
-        choice=choice,
-        pieces=pieces,
-        breakpoint_intervals=intervals,
-        dynamics=dynamics,
-        residuals=_statistics(
-            task, result.residual_mw, result.weight, samples.step_s * samples.group
-        ),
-    )
-
-
-def _line_errors(m: RegionalModel, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return standard errors of slopes and intercepts by the delta method."""
-    packed = m.pack()
-    size = len(packed)
-    slope_of, intercept_of = np.empty((m.pieces, size)), np.empty((m.pieces, size))
-    for p in range(size):
-        h = 1e-6 * max(1.0, abs(packed[p]))
-        up, down = packed.copy(), packed.copy()
-        up[p] += h
-        down[p] -= h
-        high, low = m.unpack(up), m.unpack(down)
-        slope_of[:, p] = (high.slopes() - low.slopes()) / (2.0 * h)
-        intercept_of[:, p] = (high.intercepts() - low.intercepts()) / (2.0 * h)
-
-    def errors(gradient: FloatArray) -> FloatArray:
-        variance = np.einsum('ip,pq,iq->i', gradient, covariance, gradient)
-        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
-
-    return errors(slope_of), errors(intercept_of)
+        result = refine(samples, start, most)
+    except (np.linalg.LinAlgError, TooFewSamplesError) as error:
+        why = str(error).rstrip('.')
+        return replace(static, notes=(f'The curve is not refined by dynamics: {why}.',))
+    return from_refined(task, static, result, samples, u_special)

@@ -18,6 +18,7 @@ import numpy as np
 from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.problem import Problem, free_parameters, move
 from valveflow_ros.core.sums import gram, product
+from valveflow_ros.core.uncertainty import bend_certainty
 from valveflow_ros.core.whitening import whitened
 from valveflow_ros.records import FloatArray
 
@@ -102,7 +103,9 @@ def _gain(problem: Problem, small: RegionalModel, large: RegionalModel, ar: Floa
     """Return the log-likelihood that ``large`` gains over ``small``."""
     residual, weight = problem.answer(large)
     count = len(whitened(residual, weight, ar))
-    return float(0.5 * count * np.log(problem.cost(small, ar) / problem.cost(large, ar)))
+    return float(
+        0.5 * count * np.log(problem.cost(small, ar) / max(problem.cost(large, ar), 1e-300))
+    )
 
 
 def choose_pieces(
@@ -129,10 +132,11 @@ def choose_pieces(
             break
         model = trial
     while model.pieces > 1:
-        trials = [_remove(model, k) for k in range(model.pieces - 1)]
-        refitted = [move(problem, t, ar, free_parameters(t.pieces, t.regions), 6) for t in trials]
-        best = min(range(len(trials)), key=lambda k: refitted[k][1])
-        if _gain(problem, refitted[best][0], model, ar) >= KNEE_GAIN:
+        worth = bend_certainty(problem, model, ar)
+        weakest = int(np.argmin(worth))
+        trial = _remove(model, weakest)
+        trial, _ = move(problem, trial, ar, free_parameters(trial.pieces, trial.regions), 8)
+        if min(worth[weakest], _gain(problem, trial, model, ar)) >= KNEE_GAIN:
             break
-        model = refitted[best][0]
+        model = trial
     return model

@@ -20,7 +20,7 @@ from valveflow_ros.core.events import (
     JournalKind,
     SegmentClosed,
 )
-from valveflow_ros.core.fit import FitTask
+from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.prediction import PredictionBlock, Predictor, no_prediction
 from valveflow_ros.core.segmenter import NoiseLevel, Segmented, Segmenter
 from valveflow_ros.core.units import integrated_input

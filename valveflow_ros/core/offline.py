@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 
 from valveflow_ros.core.align import Aligned, Aligner
 from valveflow_ros.core.events import Event, FitRequested, JournalEntry, JournalKind
-from valveflow_ros.core.fit import FitTask, fit
+from valveflow_ros.core.fit import fit
+from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.monitor import BY_HAND, Monitor
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import Readings, SampleTable

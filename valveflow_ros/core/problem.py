@@ -12,7 +12,7 @@ from valveflow_ros.core.sums import gram
 from valveflow_ros.core.whitening import whitened
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
-_LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4)
+_LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4, 0.2, 0.1, 0.05)
 
 
 @dataclass(frozen=True, slots=True)

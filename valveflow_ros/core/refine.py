@@ -20,9 +20,12 @@ from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.problem import Problem, Samples, free_parameters, move, search_levels
 from valveflow_ros.core.regions import find_regions
 from valveflow_ros.core.sums import gram
+from valveflow_ros.core.uncertainty import covariance_of
 from valveflow_ros.core.whitening import whitened
+from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
+LEAST_ROWS = 3600
 _JUMP_WALD = 20.0
 
 
@@ -64,12 +67,26 @@ def refine(samples: Samples, start: RegionalModel, most_pieces: int | None = Non
         The curve of the exact partition; its dynamics are not used.
     most_pieces : int, optional
         Choose the number of pieces too, up to this many; without it ``start``'s number stays.
+        ``start`` should then have rather too many pieces than too few: the AR model takes the
+        misfit of a curve that is too simple for noise.
+
+    Raises
+    ------
+    TooFewSamplesError
+        Too few rows lie far enough behind a gap.
 
     Returns
     -------
     Refined
     """
     problem = Problem(samples)
+    _, weight = problem.answer(replace(start, levels=np.empty(0), time_constants=np.ones(1),
+                                       delays=np.zeros(1)))  # fmt: skip
+    if int(weight.sum()) * samples.group < LEAST_ROWS:
+        raise TooFewSamplesError(
+            'Rows that follow each other for longer than the transient',
+            int(weight.sum()) * samples.group, LEAST_ROWS,
+        )  # fmt: skip
     model, ar = find_regions(problem, _join(start))
     if most_pieces is not None:
         chosen = choose_pieces(problem, model, ar, most_pieces)
@@ -110,19 +127,7 @@ def _jumps_supported(problem: Problem, model: RegionalModel, ar: FloatArray) -> 
 
 
 def _conclude(problem: Problem, model: RegionalModel, free: BoolArray, ar: FloatArray) -> Refined:
-    """Form the covariance: inverse normal matrix, widened by block scores."""
-    residual, jacobian, weight = problem.tangents(model)
-    both = whitened(np.column_stack([jacobian[:, free], residual]), weight, ar)
-    j, e = both[:, :-1], both[:, -1]
-    sums = gram(both)
-    inverse = np.linalg.pinv(sums[:-1, :-1])
-    variance = float(sums[-1, -1]) / max(len(e) - j.shape[1], 1)
-    blocks = max(1, min(60, len(e) // 50))
-    scores = np.array([s.sum(axis=0) for s in np.array_split(j * e[:, None], blocks)])
-    robust = inverse @ gram(scores) @ inverse
-    plain = inverse * variance
-    # Few blocks make the robust form noisy; it may widen, never narrow.
-    widen = np.sqrt(np.maximum(1.0, np.diag(robust) / np.maximum(np.diag(plain), 1e-300)))
-    covariance = np.zeros((len(free), len(free)))
-    covariance[np.ix_(free, free)] = plain * np.outer(widen, widen)
-    return Refined(model, covariance, free, ar, float(np.sqrt(variance)), residual, weight)
+    """Add what is left over, and how sure the parameters are."""
+    covariance, innovation = covariance_of(problem, model, free, ar)
+    residual, weight = problem.answer(model)
+    return Refined(model, covariance, free, ar, innovation, residual, weight)

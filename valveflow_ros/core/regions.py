@@ -92,6 +92,13 @@ def _settle_down(
     return model, cost, ar
 
 
+def _thinnest(problem: Problem, model: RegionalModel) -> float:
+    """Return the least share of rows that a region has."""
+    flow = model.static(problem.u[problem.usable > 0])
+    region = np.searchsorted(model.levels, flow, side='right')
+    return float(np.bincount(region, minlength=model.regions).min() / max(len(flow), 1))
+
+
 def find_regions(problem: Problem, model: RegionalModel) -> tuple[RegionalModel, FloatArray]:
     """Add regions while each gains enough; return the model and the AR of its residual.
 
@@ -110,7 +117,9 @@ def find_regions(problem: Problem, model: RegionalModel) -> tuple[RegionalModel,
             small, large = problem.cost(best[0], ar), problem.cost(trial, ar)
             residual, weight = problem.answer(trial)
             count = len(whitened(residual, weight, ar))
-            if 0.5 * count * np.log(small / large) < _REGION_GAIN:
+            if 0.5 * count * np.log(small / max(large, 1e-300)) < _REGION_GAIN:
+                break
+            if _thinnest(problem, trial) < _LEAST_CELLS / _CELLS:
                 break
         best = (trial, ar)
     assert best is not None

@@ -9,6 +9,7 @@ from valveflow_ros.core.regional_kernel import lagged_products, whiten
 from valveflow_ros.records import ByteArray, FloatArray
 
 ORDER = 4
+_LARGEST_SUM = 0.95
 
 
 def fit_ar(residual: FloatArray, weight: ByteArray, order: int = ORDER) -> FloatArray:
@@ -22,7 +23,11 @@ def fit_ar(residual: FloatArray, weight: ByteArray, order: int = ORDER) -> Float
         return np.zeros(order)
     # A touch of white noise keeps the system solvable for a residual that hardly varies.
     products[0] *= 1.0 + 1e-9
-    return np.asarray(solve_toeplitz(products[:order], products[1:]))
+    ar = np.asarray(solve_toeplitz(products[:order], products[1:]))
+    # A residual that still holds a misfit looks like a random walk, and whitening by a
+    # root at one would make levels, and with them the misfit, invisible.
+    total = float(ar.sum())
+    return ar * (_LARGEST_SUM / total) if total > _LARGEST_SUM else ar
 
 
 def whitened(columns: FloatArray, weight: ByteArray, ar: FloatArray) -> FloatArray:

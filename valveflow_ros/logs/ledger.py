@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+import math
 import threading
+import time
+from collections.abc import Callable
 
 from valveflow_ros.logs.recorder_status import RecorderState, RecorderStatus
 from valveflow_ros.logs.recover import RecoveryReport
+
+# So long after the last drop the state says so, for those who look once a second.
+DROPS_SHOWN_S = 2.0
 
 
 class Ledger:
     """Shared by the recorder's thread and everyone who asks; nobody holds it for long."""
 
-    def __init__(self, limit: int) -> None:
+    def __init__(self, limit: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._dropped_at = -math.inf
         self._lock = threading.Lock()
         self._limit = limit
         self._open = True
         self._received = self._written = self._queued = self._lost = 0
         self._dropped: dict[str, int] = {}
         self._drops = 0
-        self._drops_told = 0
         self._state, self._reason = RecorderState.RECORDING, ''
         self._file, self._files, self._bytes = '', 0, 0
         self._recovered: tuple[RecoveryReport, ...] = ()
@@ -32,6 +39,7 @@ class Ledger:
                 return True
             self._dropped[topic] = self._dropped.get(topic, 0) + 1
             self._drops += 1
+            self._dropped_at = self._clock()
             return False
 
     def refuse(self) -> None:
@@ -49,10 +57,9 @@ class Ledger:
     def well(self) -> None:
         """All that waited could be written."""
         with self._lock:
-            fresh, self._drops_told = self._drops - self._drops_told, self._drops
-            if fresh and self._open:
+            if self._clock() - self._dropped_at < DROPS_SHOWN_S:
                 self._state = RecorderState.DEGRADED
-                self._reason = f'{fresh} messages were dropped because too many were waiting'
+                self._reason = f'{self._drops} messages were dropped, too many were waiting'
             else:
                 self._state, self._reason = RecorderState.RECORDING, ''
 

@@ -159,6 +159,11 @@ class Recorder:
         """Ask for a new split; returns at once."""
         self._loop.ask_rotation()
 
+    @property
+    def is_rotating(self) -> bool:
+        """Whether a split that was asked for has yet to be begun."""
+        return self._loop.rotation_asked
+
     def status(self) -> RecorderStatus:
         """Return the account as it is now."""
         return self._ledger.status()

@@ -58,7 +58,7 @@ class RecorderLoop:
         self._path: Path | None = None
         self._begun_at = self._synced_at = self._retry_at = 0.0
         self._retry_wait = settings.retry_s
-        self._rotation_asked = False
+        self.rotation_asked = False
         self._stopping = False
         self._wake = threading.Event()
         self._thread = threading.Thread(target=self._run, name='recorder', daemon=True)
@@ -79,7 +79,7 @@ class RecorderLoop:
 
     def ask_rotation(self) -> None:
         """Begin a new split at the next opportunity."""
-        self._rotation_asked = True
+        self.rotation_asked = True
         self._wake.set()
 
     def stop(self, timeout_s: float) -> None:
@@ -178,8 +178,8 @@ class RecorderLoop:
             self._path, self._begun_at = writer.path, now
         old = now - self._begun_at >= self._settings.rotate_s
         large = writer.file_bytes >= self._settings.rotate_bytes
-        if writer.file_bytes and (old or large or self._rotation_asked):
-            self._rotation_asked = False
+        asked, self.rotation_asked = self.rotation_asked, False
+        if writer.file_bytes and (old or large or asked):
             writer.rotate()
             self._retire(writer)
 

@@ -88,7 +88,7 @@ def _settings(data: Identified) -> str:
             text(_shown(row.default)),
         ]
         for name, row in PARAMETERS.items()
-        if data.settings[name] != row.default
+        if data.settings[name] != row.default and not name.startswith('refit_')
     ]
     if not rows:
         return paragraph('Every parameter has its default value.')

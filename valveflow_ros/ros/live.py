@@ -8,7 +8,7 @@ from valveflow_ros.config import Settings
 from valveflow_ros.core.align import Aligner
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.events import Event, FitRequested
-from valveflow_ros.core.fit import FitTask
+from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.offline import CLOCK_BACK
 from valveflow_ros.records import Readings, SampleTable

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from valveflow_ros.core.characteristic import Characteristic
-from valveflow_ros.core.fit import FitTask
+from valveflow_ros.core.fit_task import FitTask
 
 
 @dataclass(frozen=True, slots=True)

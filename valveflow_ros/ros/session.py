@@ -60,14 +60,18 @@ class Session:
         self.outputs = {name: node.resolve_topic_name(f'~/{name}') for name in OUTPUTS}
         self.worker = FitWorker(settings.real('refit_timeout'))
         self.worker.start()
-        self.warm_up_s = warm_up(settings, self.worker, stop)
-        self.engine = LiveEngine(settings, self.worker)
+        try:
+            self.warm_up_s = warm_up(settings, self.worker, stop)
+            self.engine = LiveEngine(settings, self.worker)
+            self._publishers = {
+                name: node.create_publisher(topic.message_type, f'~/{name}', _qos(topic.latched))
+                for name, topic in OUTPUTS.items()
+            }
+            self.recording = self._open_recording()
+        except BaseException:
+            self.worker.close()
+            raise
         self._outputs = Outputs(settings.text('unit_tag'))
-        self._publishers = {
-            name: node.create_publisher(topic.message_type, f'~/{name}', _qos(topic.latched))
-            for name, topic in OUTPUTS.items()
-        }
-        self.recording = self._open_recording()
         self._takers: list[Taker] = []
         self._intake: Intake | None = None
         self._health = InputHealth(settings, self.inputs)
@@ -84,10 +88,10 @@ class Session:
         """Subscribe."""
         node, settings = self._node, self._settings
         reliable = settings.text('input_reliability') == 'reliable'
-        by_name = {name: name for name in self.inputs} | {v: k for k, v in self.inputs.items()}
+        names = {topic: name for name, topic in self.inputs.items()}
 
         def mismatch(topic: str) -> None:
-            self._health.mismatched.add(by_name.get(topic, topic))
+            self._health.mismatched.add(names.get(topic, topic))
 
         def taker(message_type: type, topic: str) -> Taker:
             made = Taker(node, message_type, topic, reliable=reliable, on_mismatch=mismatch)

@@ -18,7 +18,7 @@ from valveflow_ros.core.characteristic import (
     ResidualStatistics,
     Source,
 )
-from valveflow_ros.core.fit import FitTask
+from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.prediction import Predictor
 from valveflow_ros.core.window import WindowContents

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from valveflow_ros.core.characteristic import Characteristic
-from valveflow_ros.core.fit import FitTask
+from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.ros.frames import FrameReader, send
 from valveflow_ros.ros.outcome import FitOutcome, objection
 

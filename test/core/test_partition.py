@@ -1,0 +1,388 @@
+"""The partition as its users see it: truth, relations, hostile input, the trap."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import naive
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from partition_kinds import KINDS, samples, valve
+
+from valveflow_ros.core.partition import partition
+from valveflow_ros.errors import DataError, ParameterError, TooFewSamplesError
+
+COMPILED = not numba.config.DISABLE_JIT
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES = settings(max_examples=25 if COMPILED else 3)
+SEEDS = st.integers(0, 10**6)
+
+
+def random_samples(seed, most=150):
+    """Return samples of a random kind and size."""
+    r = np.random.default_rng(seed)
+    kind = list(KINDS)[r.integers(len(KINDS))]
+    return samples(kind, int(r.integers(8, most)), seed)
+
+
+def noisy_samples(seed):
+    """Return samples whose best breaks are unique, sorted."""
+    r = np.random.default_rng(seed)
+    u = np.sort(r.uniform(0.0, 1.0, int(r.integers(10, 150))))
+    return u, np.abs(u - 0.4) + 0.1 * r.normal(size=len(u))
+
+
+# --- truth ----------------------------------------------------------------------------------
+
+
+@EXAMPLES
+@given(SEEDS, st.integers(2, 5))
+def test_costs_are_the_least(seed, shortest):
+    r = np.random.default_rng(seed)
+    u = np.sort(r.choice(np.arange(400), int(r.integers(20, 60)), replace=False) / 7.0)
+    y = r.normal(size=len(u)) + np.abs(u - 20.0)
+    found = partition(u, y, 4, shortest)
+    truth = naive.best_costs(naive.piece_costs(u, y, np.ones(len(u))), 4, shortest)
+    assert found.cost == pytest.approx([float(row[-1]) for row in truth], rel=1e-10)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_a_partition_is_what_it_says(kind):
+    u, y = samples(kind, 300 if COMPILED else 70)
+    found = partition(u, y, 6)
+    assert found.certified
+    assert found.limited == ''
+    assert found.n_samples == len(u)
+    assert np.all(np.diff(found.u) >= 0)
+    for j in range(1, 7):
+        breaks, pieces = found.breaks(j), found.pieces(j)
+        assert len(pieces) == j
+        assert breaks.dtype == np.int64
+        assert breaks[0] == 0
+        assert breaks[-1] == len(u)
+        assert pieces[0].u_from == u.min()
+        assert pieces[-1].u_to == u.max()
+        assert all(a.u_to == b.u_from for a, b in itertools.pairwise(pieces))
+        assert [p.samples for p in pieces] == np.diff(breaks).tolist()
+        assert sum(p.sse for p in pieces) == pytest.approx(found.cost[j - 1], abs=found.floor)
+        assert all(len(np.unique(found.u[a:b])) >= 2 for a, b in itertools.pairwise(breaks))
+
+
+def test_a_piece_is_the_least_squares_line_with_its_errors():
+    u, y = samples('valve', 200)
+    found = partition(u, y, 3)
+    for (a, b), piece in zip(itertools.pairwise(found.breaks(3)), found.pieces(3), strict=True):
+        table = np.column_stack([found.u[a:b], np.ones(b - a)])
+        (slope, intercept), rest, *_ = np.linalg.lstsq(table, found.y[a:b])
+        variance = rest[0] / (b - a - 2) * np.linalg.inv(table.T @ table)
+        assert piece.slope == pytest.approx(slope)
+        assert piece.intercept == pytest.approx(intercept)
+        assert piece.sse == pytest.approx(rest[0])
+        assert piece.slope_stderr == pytest.approx(np.sqrt(variance[0, 0]))
+        assert piece.intercept_stderr == pytest.approx(np.sqrt(variance[1, 1]))
+
+
+def test_the_paper_s_curve_is_found():
+    r = np.random.default_rng(11)
+    u = r.uniform(1000.0, 2336.0, 4000 if COMPILED else 400)
+    found = partition(u, valve(u) + r.normal(0, 0.5, len(u)), 5)
+    knees = [p.u_to for p in found.pieces(4)[:-1]]
+    assert np.abs(np.array(knees) - [1250.0, 1600.0, 1900.0]).max() < 40.0
+    slopes = [p.slope for p in found.pieces(4)]
+    assert np.abs(np.array(slopes) - [0.24, 0.18, 0.09, 0.01]).max() < 0.01
+
+
+# --- relations ------------------------------------------------------------------------------
+
+
+@EXAMPLES
+@given(SEEDS, st.integers(2, 4))
+def test_repeated_samples_are_weights(seed, times):
+    u, y = noisy_samples(seed)
+    once, often = partition(u, y, 4), partition(np.repeat(u, times), np.repeat(y, times), 4)
+    assert often.cost == pytest.approx(times * once.cost, rel=1e-9)
+    assert often.n_distinct == once.n_distinct
+    for j in range(1, 5):
+        assert np.array_equal(often.breaks(j), times * once.breaks(j))
+
+
+@EXAMPLES
+@given(SEEDS, st.floats(1e-6, 1e6))
+def test_scaling_y_scales_the_cost_by_the_square(seed, factor):
+    u, y = noisy_samples(seed)
+    small, large = partition(u, y, 4), partition(u, factor * y, 4)
+    assert large.cost == pytest.approx(factor**2 * small.cost, rel=1e-9)
+    assert np.array_equal(large.breaks(3), small.breaks(3))
+
+
+@EXAMPLES
+@given(SEEDS)
+def test_reversing_u_mirrors_the_breaks(seed):
+    u, y = noisy_samples(seed)
+    there, back = partition(u, y, 4), partition(-u, y, 4)
+    assert back.cost == pytest.approx(there.cost, rel=1e-9)
+    for j in range(1, 5):
+        assert np.array_equal(back.breaks(j), len(u) - there.breaks(j)[::-1])
+
+
+@EXAMPLES
+@given(SEEDS, st.floats(-1e4, 1e4), st.floats(-1e4, 1e4))
+def test_shifting_changes_intercepts_only(seed, by_u, by_y):
+    u, y = noisy_samples(seed)
+    here, there = partition(u, y, 3), partition(u + by_u, y + by_y, 3)
+    assert there.cost == pytest.approx(here.cost, rel=1e-6)
+    for a, b in zip(here.pieces(3), there.pieces(3), strict=True):
+        assert b.samples == a.samples
+        assert b.slope == pytest.approx(a.slope, rel=1e-5, abs=1e-5)
+        moved = a.intercept + by_y - a.slope * by_u
+        assert b.intercept == pytest.approx(moved, rel=1e-5, abs=1e-5 * (1 + abs(by_u)))
+
+
+@EXAMPLES
+@given(SEEDS)
+def test_the_order_of_the_samples_changes_nothing(seed):
+    u, y = random_samples(seed)
+    order = np.random.default_rng(seed).permutation(len(u))
+    one, other = partition(u, y, 4), partition(u[order], y[order], 4)
+    assert np.array_equal(one.cost, other.cost)
+    assert all(np.array_equal(a, b) for a, b in zip(one.starts, other.starts, strict=True))
+
+
+@EXAMPLES
+@given(SEEDS)
+def test_a_line_added_to_y_changes_no_cost(seed):
+    u, y = noisy_samples(seed)
+    flat, tilted = partition(u, y, 4), partition(u, y + 30.0 * u - 7.0, 4)
+    assert tilted.cost == pytest.approx(flat.cost, rel=1e-8)
+    assert np.array_equal(tilted.breaks(4), flat.breaks(4))
+
+
+@EXAMPLES
+@given(SEEDS)
+def test_more_pieces_never_cost_more(seed):
+    u, y = random_samples(seed)
+    found = partition(u, y, 5)
+    if len(found.cost) * 4 <= found.n_distinct:  # there is always a piece left to split
+        assert np.all(np.diff(found.cost) <= found.tolerance + found.floor)
+
+
+# --- the trap -------------------------------------------------------------------------------
+
+
+def test_differences_of_prefix_sums_find_an_optimum_that_does_not_exist():
+    """What everybody writes first is wrong on close samples; the exact search is not."""
+    r = np.random.default_rng(5)
+    places = np.sort(r.uniform(0.0, 1.0, 6))
+    u = (places[:, None] + 3e-9 * np.arange(50)).ravel()
+    y = 3.0 * u + r.normal(size=300)
+    ones = np.ones(300)
+    optimum = float(naive.best_costs(naive.piece_costs(u, y, ones), 6, 2)[-1][-1])
+
+    claimed, starts = naive.by_prefix_sums(u, y, 6, 2)
+    really = float(naive.partition_cost(u, y, ones, starts))
+    assert claimed < optimum - 1.0  # an optimum that does not exist
+    assert really > optimum + 1.0  # and breaks that are not the best
+
+    found = partition(u, y, 6)
+    assert found.certified
+    assert found.cost[5] == pytest.approx(optimum, rel=1e-9)
+    assert float(naive.partition_cost(u, y, ones, found.breaks(6))) == pytest.approx(optimum)
+
+
+def test_a_cost_that_its_breaks_do_not_have_is_not_certified(monkeypatch):
+    from valveflow_ros.core import partition as module
+
+    right = module.best_partitions
+
+    def wrong(problem, pieces):
+        cost, starts = right(problem, pieces)
+        return 0.999 * cost, starts
+
+    u, y = samples('valve', 100)
+    monkeypatch.setattr(module, 'best_partitions', wrong)
+    assert not partition(u, y, 3).certified
+
+
+# --- hostile input --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize('name', ['u', 'y'])
+def test_a_value_that_is_not_finite_is_named(name, value):
+    data = {'u': np.arange(9.0), 'y': np.arange(9.0) ** 2}
+    data[name][4] = value
+    with pytest.raises(DataError, match=rf'^{name}\[4\] is -?(nan|inf): every sample must be fin'):
+        partition(data['u'], data['y'])
+
+
+def test_several_bad_values_are_counted():
+    u = np.arange(9.0)
+    u[[2, 5, 6]] = np.nan
+    with pytest.raises(DataError, match=r'^u\[2\] is nan.*\(3 such samples\)\.$'):
+        partition(u, np.arange(9.0))
+
+
+def test_a_value_whose_square_overflows_is_refused():
+    y = np.arange(9.0)
+    y[3] = -1e200
+    with pytest.raises(DataError, match=r'^y\[3\] is -1e\+200: .* within 1e\+100\.$'):
+        partition(np.arange(9.0), y)
+
+
+@pytest.mark.parametrize(
+    ('u', 'y'),
+    [(np.zeros((3, 3)), np.zeros((3, 3))), (np.arange(4.0), np.arange(5.0)), (1.0, 2.0)],
+)
+def test_shapes_must_match(u, y):
+    with pytest.raises(DataError, match='one-dimensional and equally long'):
+        partition(u, y)
+
+
+@pytest.mark.parametrize('bad', [['a', 'b'], [1j, 2j], [None, 1.0]])
+def test_only_real_numbers_are_taken(bad):
+    with pytest.raises(DataError, match='must hold real numbers'):
+        partition([0.0, 1.0], bad)
+
+
+@pytest.mark.parametrize('n', [0, 1])
+def test_nothing_and_one_sample_are_too_few(n):
+    with pytest.raises(TooFewSamplesError, match=f'Samples: {n} found, at least 2 needed'):
+        partition(np.zeros(n), np.zeros(n))
+
+
+@pytest.mark.parametrize('value', [0.0, 5.0, -1e6, 1e-200])
+def test_a_valve_that_does_not_move_has_no_slope(value):
+    with pytest.raises(
+        DataError, match=r'^u is \S+ in all 50 samples: a slope needs it to change'
+    ):
+        partition(np.full(50, value), np.arange(50.0))
+
+
+def test_too_few_distinct_u_for_one_piece():
+    with pytest.raises(TooFewSamplesError, match='Distinct values of u.*: 3 found, at least 5'):
+        partition(np.repeat([1.0, 2.0, 3.0], 20), np.arange(60.0), min_distinct=5)
+
+
+@pytest.mark.parametrize('bad', [{'max_pieces': 0}, {'min_distinct': 1}, {'threads': 0}])
+def test_parameters_out_of_range_are_refused(bad):
+    with pytest.raises(ParameterError, match=next(iter(bad))):
+        partition(np.arange(9.0), np.arange(9.0), **bad)
+
+
+def test_fewer_pieces_than_asked_for_is_said():
+    u = np.repeat(np.arange(7.0), 3)
+    found = partition(u, u**2, max_pieces=10, min_distinct=2)
+    assert len(found.cost) == 3
+    assert '7 distinct u: 3 is the largest number of pieces' in found.limited
+    with pytest.raises(DataError, match='no partition into 4 pieces, only into 1 to 3'):
+        found.breaks(4)
+
+
+def test_two_samples_are_a_line_without_errors():
+    found = partition([2.0, 1.0], [5.0, 3.0])
+    (piece,) = found.pieces(1)
+    assert piece.slope == 2.0
+    assert piece.intercept == 1.0
+    assert found.cost[0] == 0.0
+    assert np.isnan(piece.slope_stderr)
+    assert np.isnan(piece.intercept_stderr)
+
+
+def test_input_is_neither_changed_nor_needed_afterwards():
+    u, y = samples('valve', 90)
+    kept = u.copy(), y.copy()
+    u.flags.writeable = False
+    y.flags.writeable = False
+    found = partition(u, y, 3)
+    assert np.array_equal(u, kept[0])
+    assert np.array_equal(y, kept[1])
+    assert not np.shares_memory(found.u, u)
+    assert not found.u.flags.writeable
+
+
+@pytest.mark.parametrize('kind', [list, np.float32, np.float64, '>f8', np.longdouble])
+def test_any_array_of_numbers_will_do(kind):
+    u, y = samples('valve', 120)
+    truth = partition(u, y, 3)
+    u, y = (u.tolist(), y.tolist()) if kind is list else (u.astype(kind), y.astype(kind))
+    found = partition(u, y, 3)
+    assert found.cost == pytest.approx(truth.cost, rel=1e-4)
+    assert found.certified
+
+
+def test_integers_and_strided_views():
+    u = np.arange(60)[::-1]
+    table = np.column_stack([u, np.abs(u - 20)])
+    found = partition(table[:, 0], table[:, 1], 2)
+    assert found.cost[1] <= found.floor
+    assert found.breaks(2)[1] in (20, 21)
+
+
+@pytest.mark.parametrize('offset', [1e6, -1e6, 1e9])
+def test_a_large_offset_costs_no_digits_that_matter(offset):
+    u = np.arange(200.0)
+    y = np.abs(u - 80.0) + np.sin(u)
+    truth, found = partition(u, y, 4), partition(u + offset, y + offset, 4)
+    assert found.cost == pytest.approx(truth.cost, rel=1e-6)
+    assert found.certified
+
+
+@pytest.mark.parametrize('scale', [1e-90, 1e-30, 1e30, 1e90])
+def test_units_do_not_matter(scale):
+    u, y = noisy_samples(7)
+    truth, found = partition(u, y, 4), partition(scale * u, y, 4)
+    assert found.cost == pytest.approx(truth.cost, rel=1e-9)
+    assert np.array_equal(found.breaks(4), truth.breaks(4))
+
+
+def test_nearly_equal_u_are_one():
+    r = np.random.default_rng(2)
+    u = np.repeat(np.arange(30.0), 10)
+    y = np.abs(u - 12.0) + r.normal(size=300)
+    rough = partition(u + 1e-10 * r.uniform(size=300), y, 4)
+    assert rough.n_distinct == 30
+    assert rough.cost == pytest.approx(partition(u, y, 4).cost, rel=1e-6)
+    assert rough.certified
+
+
+def test_exact_lines_cost_nothing():
+    u, y = samples('noiseless', 500 if COMPILED else 90)
+    found = partition(u, y, 6)
+    assert found.cost[2] > 1.0
+    assert np.all(found.cost[3:] <= found.tolerance)
+
+
+def test_flat_y_costs_nothing():
+    found = partition(np.arange(100.0), np.full(100, 7.5), 3)
+    assert np.all(found.cost == 0.0)
+    assert found.certified
+
+
+def test_it_runs_without_the_compiler():
+    """Coverage is measured that way, and the loops must mean the same in plain Python."""
+    code = (
+        'import numpy as np; from valveflow_ros.core.partition import partition;'
+        'r = np.random.default_rng(1); u = r.uniform(size=150);'
+        'p = partition(u, np.abs(u - .4) + .1 * r.normal(size=150), 4);'
+        'print(p.certified, *(float(c).hex() for c in p.cost))'
+    )
+    outputs = []
+    for disabled in ('0', '1'):
+        done = subprocess.run(
+            [sys.executable, '-W', 'error', '-c', code],
+            env={**os.environ, 'NUMBA_DISABLE_JIT': disabled, 'PYTHONPATH': str(ROOT)},
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=True,
+        )
+        outputs.append(done.stdout)
+    assert outputs[0] == outputs[1]
+    assert outputs[0].startswith('True')

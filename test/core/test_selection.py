@@ -1,0 +1,162 @@
+"""The paper's rule (24) and its guard."""
+
+from __future__ import annotations
+
+import math
+
+import naive
+import numba
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from partition_kinds import samples, valve
+
+from valveflow_ros.core.partition import partition
+from valveflow_ros.core.selection import paper_rule, select
+from valveflow_ros.errors import DataError, InputError, ParameterError
+
+COMPILED = not numba.config.DISABLE_JIT
+N = 2000 if COMPILED else 150
+
+# Any costs at all, zeros, ties and rises among them.
+COSTS = st.lists(
+    st.one_of(st.just(0.0), st.floats(0.0, 1e6), st.sampled_from([1.0, 2.0])),
+    min_size=3,
+    max_size=12,
+)
+# Costs that fall strictly, where eq. (24) is defined as it stands.
+FALLING = st.lists(st.floats(1.001, 100.0), min_size=3, max_size=11).map(
+    lambda factors: (1e9 / np.cumprod(factors)).tolist()
+)
+
+
+@given(FALLING)
+def test_the_rule_is_equation_24(cost):
+    angles, pieces = paper_rule(cost)
+    truth = naive.turning_angle(cost)
+    assert angles == pytest.approx(truth, abs=1e-9)
+    assert truth[pieces] == pytest.approx(max(truth.values()), abs=1e-9)
+
+
+@given(COSTS)
+def test_the_rule_always_answers_within_its_range(cost):
+    angles, pieces = paper_rule(cost)
+    assert list(angles) == list(range(2, len(cost)))
+    assert all(-1.0 <= angle <= 1.0 for angle in angles.values())  # so none is NaN
+    assert 2 <= pieces <= len(cost) - 1
+    assert angles[pieces] == max(angles.values())
+
+
+@given(FALLING, st.floats(1e-9, 1e9))
+def test_the_rule_knows_no_scale(cost, factor):
+    angles, _ = paper_rule(cost)
+    scaled, _ = paper_rule([factor * c for c in cost])
+    assert scaled == pytest.approx(angles, abs=1e-9)
+
+
+def test_the_first_exact_fit_is_the_turn():
+    angles, pieces = paper_rule([100.0, 20.0, 10.0, 0.0, 0.0, 0.0])
+    assert pieces == 4
+    assert angles[4] == 1.0
+    assert angles[3] == -1.0
+    assert angles[5] == -1.0
+    assert paper_rule([100.0, 20.0, 10.0, 1e-9, 1e-10, 1e-12], exact=1e-6)[1] == 4
+
+
+def test_an_exact_fit_at_the_end_is_not_answered():
+    angles, pieces = paper_rule([100.0, 20.0, 10.0, 0.0])
+    assert pieces == 2
+    assert angles[3] == -1.0
+
+
+def test_of_equal_turns_the_fewest_pieces_win():
+    assert paper_rule([27.0, 9.0, 9.0, 3.0, 3.0])[1] == 2
+
+
+@pytest.mark.parametrize('cost', [[], [1.0], [2.0, 1.0]])
+def test_two_costs_have_no_turn(cost):
+    with pytest.raises(DataError, match=f'there are costs for {len(cost)}'):
+        paper_rule(cost)
+
+
+@pytest.mark.parametrize('bad', [math.nan, math.inf, -1.0])
+def test_costs_must_be_numbers(bad):
+    with pytest.raises(DataError, match='finite and not negative'):
+        paper_rule([3.0, bad, 1.0])
+
+
+def test_the_paper_s_curve_has_four_pieces():
+    u, y = samples('valve', N)
+    found = partition(u, y)
+    selection = select(found)
+    assert selection.pieces == 4
+    assert selection.guard_reason == ''
+    assert selection.rule == 'paper'
+    assert list(selection.cost) == list(range(1, 11))
+    assert selection.cost[4] == found.cost[3]
+    assert list(selection.turning_angle) == list(range(2, 10))
+
+
+@pytest.mark.parametrize('kind', ['noise', 'binary', 'cauchy_u'])
+@pytest.mark.parametrize('seed', range(5))
+def test_noise_about_a_line_is_one_piece(kind, seed):
+    u, y = samples(kind, N, seed)
+    selection = select(partition(u, y))
+    assert selection.pieces == 1
+    assert selection.guard_reason.startswith('No break lowers the cost by more than chance')
+    assert len(selection.turning_angle) == 8  # still reported
+
+
+@pytest.mark.parametrize(
+    'y',
+    [
+        lambda u: 0.24 * u - 100.0,
+        lambda u: 0.0 * u,
+        lambda u: 0.0 * u + 1e6,
+        lambda u: 1e-9 * u,
+        lambda u: (0.24 * u - 100.0).astype(np.float32),
+        lambda u: 1e8 + u * 1e-3,
+    ],
+)
+def test_an_exact_line_is_one_piece(y):
+    u, _ = samples('straight', N)
+    selection = select(partition(u, y(u)))
+    assert selection.pieces == 1
+    assert selection.guard_reason == 'One line fits exactly.'
+
+
+def test_an_exact_curve_has_its_own_number_of_pieces():
+    u, y = samples('noiseless', N)
+    assert select(partition(u, y)).pieces == 4
+
+
+def test_correlation_makes_chance_larger():
+    u = np.linspace(1200.0, 1300.0, N)
+    noise = np.random.default_rng(8).normal(0, 1, N)
+    found = partition(u, valve(u) + noise, 5)
+    assert select(found).pieces > 1
+    assert select(found, correlation_inflation=1e4).pieces == 1
+
+
+def test_few_distinct_u_leave_few_choices():
+    r = np.random.default_rng(4)
+    u = np.repeat(np.arange(4.0), 60)
+    kinked = np.abs(u - 1.5) + 0.01 * r.normal(size=240)
+    selection = select(partition(u, kinked))
+    assert selection.pieces == 2
+    assert selection.turning_angle == {}
+    assert 'only 2 are possible' in selection.guard_reason
+    assert select(partition(u, u + 0.01 * r.normal(size=240))).pieces == 1
+    single = select(partition(u[u < 3.0], kinked[u < 3.0]))
+    assert single.pieces == 1
+    assert '3 distinct u' in single.guard_reason
+
+
+def test_unknown_rules_and_impossible_inflations_are_refused():
+    found = partition(np.arange(30.0), np.arange(30.0) ** 2)
+    with pytest.raises(InputError, match="rule 'aic' is unknown"):
+        select(found, rule='aic')
+    for bad in (0.5, math.nan, math.inf):
+        with pytest.raises(ParameterError, match='correlation_inflation'):
+            select(found, correlation_inflation=bad)

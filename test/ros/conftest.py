@@ -1,0 +1,44 @@
+"""What the ROS tests share: a context of their own and processes that are ended."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ros_helpers import Processes
+
+HERE = Path(__file__).resolve().parent
+# Without rclpy nothing here can even be imported. `make test` promises it and then fails loudly.
+if importlib.util.find_spec('rclpy') is None and not os.environ.get('VALVEFLOW_REQUIRE_ROS'):
+    collect_ignore_glob = ['test_*.py']
+
+
+@pytest.fixture
+def context(ros_environment: dict[str, str]) -> Iterator[Any]:
+    """Give a ROS context in the test's own domain."""
+    import rclpy
+    from rclpy.context import Context
+
+    made = Context()
+    rclpy.init(context=made, domain_id=int(ros_environment['ROS_DOMAIN_ID']))
+    yield made
+    rclpy.shutdown(context=made)
+
+
+@pytest.fixture
+def processes(ros_environment: dict[str, str], tmp_path: Path) -> Iterator[Processes]:
+    """Give a way to start processes in the test's own domain."""
+    made = Processes(ros_environment, tmp_path)
+    yield made
+    made.end_all()
+
+
+@pytest.fixture
+def jobs_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let child processes import the module `hurt_jobs` beside this file."""
+    before = os.environ.get('PYTHONPATH', '')
+    monkeypatch.setenv('PYTHONPATH', f'{HERE}{os.pathsep}{before}')

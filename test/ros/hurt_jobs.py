@@ -1,0 +1,89 @@
+"""Jobs that go wrong in every way a fit might."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from dataclasses import replace
+from typing import Any
+
+from valveflow_ros.config import Settings
+from valveflow_ros.ros.warmup import made_up_curve
+
+
+def good(task: Any) -> Any:
+    """Return a curve at once."""
+    curve = made_up_curve(Settings())
+    source = replace(curve.source, window_end_ns=int(task.contents.time_ns[-1]))
+    return replace(curve, source=source).with_id()
+
+
+def raises(task: Any) -> Any:
+    """Fail as code with a fault does."""
+    raise ZeroDivisionError('a fault')
+
+
+def refuses(task: Any) -> Any:
+    """Refuse the data as `fit` does."""
+    from valveflow_ros.errors import DataError
+
+    raise DataError('There is no curve in these data.')
+
+
+def hangs(task: Any) -> Any:
+    """Never come back."""
+    time.sleep(3600.0)
+
+
+def dies(task: Any) -> Any:
+    """Be killed, as by the kernel when memory runs out."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def prints(task: Any) -> Any:
+    """Write to standard output, where the results go, before giving a good one."""
+    print('x' * 10_000, flush=True)
+    os.write(1, b'y' * 10_000)
+    return good(task)
+
+
+def nan(task: Any) -> Any:
+    """Give a slope that is no number."""
+    curve = good(task)
+    return replace(curve, pieces=(replace(curve.pieces[0], slope=float('nan')), curve.pieces[1]))
+
+
+def backwards(task: Any) -> Any:
+    """Give breakpoints that do not increase."""
+    curve = good(task)
+    return replace(curve, pieces=(curve.pieces[1], curve.pieces[0]))
+
+
+def of_other_data(task: Any) -> Any:
+    """Answer for a window that was not asked about."""
+    curve = good(task)
+    return replace(curve, source=replace(curve.source, window_end_ns=1)).with_id()
+
+
+def renamed(task: Any) -> Any:
+    """Give a curve under another curve's name."""
+    return replace(good(task), model_id='000000000000')
+
+
+def nothing(task: Any) -> Any:
+    """Give no curve at all."""
+    return None
+
+
+def greedy(task: Any) -> Any:
+    """Ask for more memory than there is."""
+    raise MemoryError
+
+
+ALL = (good, raises, refuses, greedy, nothing, nan, backwards, of_other_data, renamed, prints)
+
+
+def told(task: Any) -> Any:
+    """Do the one of `ALL` whose number is the task's name."""
+    return ALL[task.request_ns](task)

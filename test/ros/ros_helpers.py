@@ -1,0 +1,61 @@
+"""Waiting for events, and processes that are ended."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+# The limit for waiting on an event: the first run compiles, and the machine may be busy.
+PATIENCE_S = 240.0
+
+
+def wait_until(condition: Callable[[], Any], what: str, patience_s: float = PATIENCE_S) -> Any:
+    """Return what a condition gives once it is true; fail after a generous while."""
+    end_s = time.monotonic() + patience_s
+    while not (found := condition()):
+        if time.monotonic() > end_s:
+            pytest.fail(f'{what} did not come within {patience_s:g} s')
+        time.sleep(0.01)
+    return found
+
+
+class Processes:
+    """Starts modules of ours as processes and ends those that are left."""
+
+    def __init__(self, environment: dict[str, str], folder: Path) -> None:
+        self._environment = environment
+        self._folder = folder
+        self._all: list[subprocess.Popen[bytes]] = []
+
+    def start(self, module: str, *arguments: str, **more: str) -> subprocess.Popen[bytes]:
+        """Start ``python -m module``; its output goes to files."""
+        stem = f'{module.rsplit(".", 1)[-1]}_{len(self._all)}'
+        with (self._folder / f'{stem}.log').open('wb') as out:
+            process = subprocess.Popen(
+                [sys.executable, '-m', module, *arguments],
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                env={**self._environment, **more},
+                cwd=self._folder,
+            )
+        self._all.append(process)
+        return process
+
+    def output(self, process: subprocess.Popen[bytes]) -> str:
+        """Return what a process has said so far."""
+        number = self._all.index(process)
+        (path,) = self._folder.glob(f'*_{number}.log')
+        return path.read_text(errors='replace')
+
+    def end_all(self) -> None:
+        """Kill what still runs."""
+        for process in self._all:
+            if process.poll() is None:
+                process.kill()
+                process.wait()

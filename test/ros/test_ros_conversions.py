@@ -1,0 +1,246 @@
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from rclpy.serialization import deserialize_message, serialize_message
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Float64, Float64MultiArray, MultiArrayDimension
+from valveflow_msgs.msg import (
+    Alarm,
+    Diagnosis,
+    DiagnosisCause,
+    FlowCharacteristic,
+    PlantSample,
+    Prediction,
+    SpecialSegment,
+)
+from valveflow_msgs.msg import JournalEntry as JournalMessage
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.alarms import AlarmChange, AlarmState, Priority
+from valveflow_ros.core.events import JournalEntry, JournalKind
+from valveflow_ros.core.monitor import CurveStatus
+from valveflow_ros.core.prediction import PredictionBlock, PredictionState
+from valveflow_ros.records import NS_PER_S, Quality, SegmentKind
+from valveflow_ros.records import SpecialSegment as SegmentRecord
+from valveflow_ros.ros import conversions
+from valveflow_ros.ros.encoding import encode
+from valveflow_ros.ros.prediction_bytes import prediction_bytes
+from valveflow_ros.ros.warmup import made_up_curve
+from valveflow_ros.ros.wire import clock_bytes, float64_bytes
+
+times = st.integers(0, (1 << 31) * NS_PER_S - 1)
+texts = st.text(st.characters(exclude_characters='\x00', exclude_categories=['Cs']), max_size=20)
+reals = st.floats(allow_nan=True, allow_infinity=True)
+
+
+def bits(value: float) -> bytes:
+    return struct.pack('<d', value)
+
+
+@given(times)
+def test_times_survive_the_way_there_and_back(time_ns: int) -> None:
+    assert conversions.from_time(conversions.to_time(time_ns)) == time_ns
+
+
+@pytest.mark.parametrize('time_ns', [-1, -(10**18), 2**62, (1 << 31) * NS_PER_S])
+def test_times_that_a_stamp_cannot_hold_become_the_nearest_one(time_ns: int) -> None:
+    nearest = 0 if time_ns < 0 else (1 << 31) * NS_PER_S - 1
+    assert conversions.from_time(conversions.to_time(time_ns)) == nearest
+
+
+@given(times, st.sampled_from(JournalKind), times, st.integers(0, 2**63), texts, texts, texts)
+def test_the_journal_survives_the_way_through_bytes(
+    time_ns: int, kind: JournalKind, request_ns: int, rows: int, model: str, text: str, tag: str
+) -> None:
+    entry = JournalEntry(time_ns, kind, request_ns, rows, model, text)
+    data = encode(conversions.journal(entry, tag))
+    message = deserialize_message(data, JournalMessage)
+    assert conversions.journal_entry(message) == entry
+    assert message.header.frame_id == tag
+
+
+@pytest.mark.parametrize(
+    ('numbers', 'message'),
+    [
+        (JournalKind, JournalMessage),
+        (AlarmState, Alarm),
+        (Priority, Alarm),
+        (CurveStatus, FlowCharacteristic),
+        (PredictionState, Prediction),
+        (SegmentKind, SpecialSegment),
+    ],
+)
+def test_the_engine_and_the_messages_mean_the_same_by_a_number(numbers: Any, message: Any) -> None:
+    for member in numbers:
+        assert getattr(message, member.name) == member.value
+
+
+def test_quality_codes_are_the_messages() -> None:
+    for quality in Quality:
+        assert getattr(PlantSample, f'QUALITY_{quality.name}') == quality.value
+
+
+def test_every_field_of_a_segment_is_carried_over() -> None:
+    record = SegmentRecord(
+        7, SegmentKind.SLOPE, 10**18 + 1, 10**18 + 5, 300, 1.5, 2.5, 0.25, 0.125, 100.0, 110.0,
+        0.5, 538.25,
+    )  # fmt: skip
+    message = conversions.segment(record, 'unit 1')
+    assert message.header.frame_id == 'unit 1'
+    assert conversions.from_time(message.header.stamp) == record.end_ns
+    assert conversions.from_time(message.start) == record.start_ns
+    assert conversions.from_time(message.end) == record.end_ns
+    for name in (
+        'number', 'kind', 'samples', 'u_start', 'u_end', 'u_rate_per_s', 'u_rms',
+        'power_start_mw', 'power_end_mw', 'power_rms_mw', 'temperature_mean_degc',
+    ):  # fmt: skip
+        assert getattr(message, name) == getattr(record, name), name
+
+
+def test_every_field_of_an_alarm_is_carried_over() -> None:
+    change = AlarmChange(
+        10**18, 'residual', AlarmState.ACKNOWLEDGED, AlarmState.UNACKNOWLEDGED, Priority.HIGH,
+        5.5, 4.5, 'MW', 'A sentence.', 3, 10**17, 'abc',
+    )  # fmt: skip
+    message = conversions.alarm(change, 'u')
+    assert conversions.from_time(message.header.stamp) == change.time_ns
+    assert conversions.from_time(message.raised) == change.raised_ns
+    assert (message.state, message.previous_state) == (change.state, change.previous)
+    for name in (
+        'name', 'priority', 'value', 'limit', 'unit', 'sentence', 'occurrence', 'model_id',
+    ):  # fmt: skip
+        assert getattr(message, name) == getattr(change, name), name
+
+
+def test_the_curve_is_drawn_by_arrays_that_fit_each_other() -> None:
+    curve = made_up_curve(Settings()).with_id()
+    message = conversions.characteristic(curve, CurveStatus.FRESH, '', 'u')
+    j = len(curve.pieces)
+    assert message.pieces == j
+    assert list(message.breakpoints) == curve.breakpoints.tolist()
+    assert list(message.values) == curve.values().tolist()
+    for name in ('slopes', 'intercepts', 'slope_stderr', 'intercept_stderr'):
+        assert list(getattr(message, name)) == [getattr(p, name.rstrip('s') if name in (
+            'slopes', 'intercepts') else name) for p in curve.pieces]  # fmt: skip
+    assert len(message.breakpoint_low) == len(message.breakpoint_high) == j - 1
+    assert message.model_id == curve.model_id
+    assert message.rmse_mw == curve.residuals.rmse_mw
+    for u in (900.0, 1000.0, 1200.0, 1650.0):
+        drawn = np.interp(u, message.breakpoints, message.values)
+        assert drawn == pytest.approx(float(curve(np.array([u]))[0]))
+
+
+def test_without_a_curve_the_message_says_why_and_gives_no_numbers() -> None:
+    message = conversions.characteristic(None, CurveStatus.REFUSED, 'Too little.', 'u')
+    assert (message.status, message.cause) == (FlowCharacteristic.REFUSED, 'Too little.')
+    assert not message.breakpoints
+    assert not message.slopes
+    assert message.model_id == ''
+    assert math.isnan(message.rmse_mw)
+    assert math.isnan(message.pressure_exponent)
+
+
+@given(
+    times, st.integers(0, 255), texts, texts, st.lists(reals, min_size=5, max_size=5), reals
+)
+def test_predictions_made_by_hand_are_what_the_encoder_makes(
+    time_ns: int, state: int, model: str, tag: str, numbers: list[float], limit: float
+) -> None:
+    columns = [np.array([x]) for x in numbers]
+    block = PredictionBlock(
+        np.array([time_ns]), *columns, np.array([0.0]), np.array([state], dtype=np.uint8), limit,
+        model,
+    )  # fmt: skip
+    ((found_ns, data),) = prediction_bytes(block, tag)
+    message = deserialize_message(data, Prediction)
+    assert found_ns == time_ns
+    assert conversions.from_time(message.header.stamp) == time_ns
+    assert (message.header.frame_id, message.model_id, message.state) == (tag, model, state)
+    names = ('integrated_input', 'measured_mw', 'static_mw', 'dynamic_mw', 'residual_mw')
+    for name, value in zip(names, numbers, strict=True):
+        assert bits(getattr(message, name)) == bits(value), name
+    assert bits(message.limit_high_mw) == bits(limit)
+    assert bits(message.limit_low_mw) == bits(-limit)
+    assert encode(message) == data
+
+
+MESSAGES = [
+    Alarm(name='residual', sentence='äöü', unit='MW', value=math.nan, occurrence=7),
+    Clock(clock=conversions.to_time(5 * NS_PER_S + 7)),
+    Diagnosis(
+        causes=[DiagnosisCause(name='backlash', parameter_names=['a', 'bcd'],
+                               parameter_values=[1.0, 2.0], parameter_units=['', '%'])],
+        not_told_apart=['x'], verdict=2,
+    ),
+    DiagnosticArray(status=[
+        DiagnosticStatus(level=b'\x02', name='n', message='m', hardware_id='h',
+                         values=[KeyValue(key='k', value='v'), KeyValue(key='k2', value='')]),
+        DiagnosticStatus(level=b'\x00'),
+    ]),
+    Float64(data=-0.0),
+    Float64MultiArray(data=[1.0, 2.0]),
+    conversions.plain_array([1.0, 2.0, 3.0], 'label'),
+    conversions.characteristic(made_up_curve(Settings()), CurveStatus.STALE, 'Why.', 'tag'),
+    FlowCharacteristic(),
+    JournalMessage(samples=2**63, text='t'),
+    MultiArrayDimension(label='l', size=1, stride=2),
+    PlantSample(valve_opening=1.5, valve_command_quality=2),
+    Prediction(model_id='m', state=3),
+    SpecialSegment(number=2**40, kind=1),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize('message', MESSAGES, ids=lambda m: type(m).__name__)
+def test_our_encoding_is_read_by_the_middleware_as_its_own_is(message: Any) -> None:
+    kind = type(message)
+    ours = deserialize_message(encode(message), kind)
+    theirs = deserialize_message(serialize_message(message), kind)
+    assert repr(ours) == repr(theirs) == repr(message)
+    assert encode(ours) == encode(message)
+
+
+def test_equal_messages_are_equal_bytes_whatever_was_in_memory() -> None:
+    found = set()
+    for k in range(50):
+        serialize_message(Alarm(sentence='x' * (k * 37)))
+        found.add(encode(Prediction(model_id='m')))
+    assert len(found) == 1
+
+
+def test_a_field_of_an_unknown_kind_is_refused() -> None:
+    class Odd:
+        @classmethod
+        def get_fields_and_field_types(cls) -> dict[str, str]:
+            return {'text': 'wstring'}
+
+    with pytest.raises(TypeError, match='wstring'):
+        encode(Odd())
+
+
+@given(reals)
+def test_float64_bytes(value: float) -> None:
+    assert float64_bytes(value) == encode(Float64(data=value))
+
+
+@given(times)
+def test_clock_bytes(time_ns: int) -> None:
+    assert clock_bytes(time_ns) == encode(Clock(clock=conversions.to_time(time_ns)))
+
+
+@given(arrays.arrays(np.float64, st.integers(0, 50)))
+def test_plain_arrays_say_how_long_they_are(values: np.ndarray) -> None:
+    message = conversions.plain_array(values, 'what')
+    assert bits(0.0).join(map(bits, message.data)) == bits(0.0).join(map(bits, values.tolist()))
+    (dimension,) = message.layout.dim
+    assert (dimension.label, dimension.size, dimension.stride) == (
+        'what', len(values), len(values),
+    )  # fmt: skip

@@ -1,0 +1,279 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from valveflow_msgs.msg import PlantSample
+
+from valveflow_ros.config import Settings
+from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
+from valveflow_ros.ros.conversions import to_time
+from valveflow_ros.ros.encoding import encode
+from valveflow_ros.ros.inputs import INPUT_ORDER, PLANT_SAMPLE, Decoder, header_time_ns
+from valveflow_ros.ros.intake import Arrival, Intake
+from valveflow_ros.ros.stamps import ClockTrack, LogClock
+from valveflow_ros.ros.taking import DEPTH, Taken
+from valveflow_ros.ros.tallies import Tally
+from valveflow_ros.ros.wire import clock_bytes, float64_bytes
+
+T0 = 1_700_000_000 * NS_PER_S
+
+
+class Queue:
+    """A source that gives what was put in."""
+
+    def __init__(self) -> None:
+        self.waiting: list[Taken] = []
+
+    def put(self, data: bytes, sent: int, received: int | None = None, number: int = 0) -> None:
+        self.waiting.append(Taken(data, sent, sent if received is None else received, number))
+
+    def take(self, most: int = DEPTH) -> list[Taken]:
+        taken, self.waiting = self.waiting[:most], self.waiting[most:]
+        return taken
+
+
+def intake_of(names: list[str], clock: Queue | None = None, **values: object
+              ) -> tuple[dict[str, Queue], Intake]:  # fmt: skip
+    settings = Settings(values)
+    queues = {name: Queue() for name in names}
+    made = Intake(queues, Decoder(settings), LogClock(), settings.text('stamp_source'), clock)
+    return queues, made
+
+
+def sample(time_ns: int, **values: float) -> PlantSample:
+    message = PlantSample(valve_command=math.nan)
+    message.header.stamp = to_time(time_ns)
+    for name, value in values.items():
+        setattr(message, name, value)
+    return message
+
+
+@given(st.lists(st.integers(-(10**12), 10**12), max_size=50))
+def test_log_times_increase_strictly_and_are_never_before_the_receipt(offsets: list[int]) -> None:
+    clock, last = LogClock(), -1
+    for offset in offsets:
+        stamp = clock.stamp(T0 + offset)
+        assert stamp > last
+        assert stamp >= T0 + offset
+        last = stamp
+
+
+@given(st.lists(st.tuples(st.integers(0, 30), st.sampled_from([0, 1, 2])), max_size=40))
+def test_arrivals_come_in_the_order_of_receipt_and_then_of_topics(
+    received: list[tuple[int, int]],
+) -> None:
+    names = ['generated_power', 'valve_command', PLANT_SAMPLE]
+    queues, intake = intake_of(names)
+    for at, which in sorted(received):
+        data = encode(sample(T0)) if which == 2 else float64_bytes(1.0)
+        queues[names[which]].put(data, T0 + at)
+    found = intake.collect(0.0, T0)
+    keys = [(arrival.log_ns, arrival.name) for arrival in found]
+    assert len(found) == len(received)
+    assert [k[0] for k in keys] == sorted({k[0] for k in keys})
+    expected = sorted((at, INPUT_ORDER[names[which]]) for at, which in received)
+    assert [INPUT_ORDER[arrival.name] for arrival in found] == [order for _, order in expected]
+
+
+@pytest.mark.parametrize(
+    ('source', 'sent', 'received', 'time_ns'),
+    [
+        ('source', T0, T0 + 5, T0),
+        ('source', 0, T0 + 5, T0 + 5),
+        ('receive', T0, T0 + 5, T0 + 5),
+        ('receive', T0, 0, T0 + 99),
+        ('source', 0, 0, T0 + 99),
+    ],
+)
+def test_the_time_of_a_plain_value(source: str, sent: int, received: int, time_ns: int) -> None:
+    queues, intake = intake_of(['valve_opening'], stamp_source=source)
+    queues['valve_opening'].put(float64_bytes(50.0), sent, received)
+    (arrival,) = intake.collect(0.0, T0 + 99)
+    assert arrival.time_ns == time_ns
+    assert intake.rows([arrival]) == [(time_ns, Signal.VALVE_OPENING, 50.0, Quality.GOOD)]
+
+
+def test_a_stamped_sample_belongs_to_its_own_time_whatever_the_clock_says() -> None:
+    clock = Queue()
+    queues, intake = intake_of([PLANT_SAMPLE], clock)
+    clock.put(clock_bytes(5 * NS_PER_S), T0)
+    queues[PLANT_SAMPLE].put(encode(sample(T0 + 7, valve_opening=50.0)), T0 + 1)
+    intake.collect(0.0, T0)
+    (arrival,) = intake.collect(0.0, T0)
+    assert arrival.time_ns == T0 + 7
+
+
+def test_a_value_gets_the_clock_that_was_sent_before_it_however_late_that_is_taken() -> None:
+    clock = Queue()
+    queues, intake = intake_of(['valve_opening', 'generated_power'], clock)
+    # Three instants are taken at once; the clock message of the last is still on its way.
+    for k in range(3):
+        queues['valve_opening'].put(float64_bytes(k), T0 + 10 * k + 1)
+        queues['generated_power'].put(float64_bytes(k), T0 + 10 * k + 2)
+        if k < 2:
+            clock.put(clock_bytes((100 + k) * NS_PER_S), T0 + 10 * k)
+    assert intake.collect(0.0, T0) == []
+    clock.put(clock_bytes(102 * NS_PER_S), T0 + 20)
+    found = intake.collect(0.0, T0)
+    assert [(a.name, a.time_ns // NS_PER_S) for a in found] == [
+        ('valve_opening', 100), ('generated_power', 100),
+        ('valve_opening', 101), ('generated_power', 101),
+        ('valve_opening', 102), ('generated_power', 102),
+    ]  # fmt: skip
+
+
+def test_the_last_look_holds_nothing_back() -> None:
+    clock = Queue()
+    queues, intake = intake_of(['valve_opening'], clock)
+    clock.put(clock_bytes(NS_PER_S), T0)
+    queues['valve_opening'].put(float64_bytes(1.0), T0 + 1)
+    (arrival,) = intake.collect(0.0, T0, last=True)
+    assert arrival.time_ns == NS_PER_S
+    assert intake.collect(0.0, T0, last=True) == []
+
+
+def test_what_has_no_time_is_logged_counted_and_not_fed() -> None:
+    clock = Queue()
+    queues, intake = intake_of(['valve_opening', PLANT_SAMPLE], clock)
+    queues['valve_opening'].put(float64_bytes(1.0), T0)
+    queues[PLANT_SAMPLE].put(encode(sample(0)), T0)
+    found = intake.collect(0.0, T0, last=True)
+    assert [arrival.time_ns for arrival in found] == [0, 0]
+    assert intake.rows(found) == []
+    assert [intake.tallies[name].without_time for name in queues] == [1, 1]
+
+
+@pytest.mark.parametrize(
+    ('name', 'data'),
+    [
+        ('valve_opening', b''),
+        ('valve_opening', b'\x00\x01\x00\x00\x01'),
+        ('valve_opening', b'\x07\x07\x00\x00' + bytes(8)),
+        (PLANT_SAMPLE, encode(sample(T0))[:40]),
+    ],
+)
+def test_what_cannot_be_read_is_counted_and_not_fed(name: str, data: bytes) -> None:
+    _, intake = intake_of([name])
+    assert intake.rows([Arrival(name, data, T0, T0)]) == []
+    assert intake.tallies[name].malformed == 1
+
+
+def test_units_are_converted_at_the_door() -> None:
+    units = {
+        'valve_opening_unit': 'fraction', 'main_steam_pressure_unit': 'bar',
+        'main_steam_temperature_unit': 'K', 'generated_power_unit': 'kW',
+        'valve_command_unit': 'percent',
+    }  # fmt: skip
+    decoder = Decoder(Settings(units))
+    sent = {
+        'valve_opening': (0.5, 50.0), 'main_steam_pressure': (160.0, 16.0),
+        'main_steam_temperature': (813.15, 540.0), 'generated_power': (3e5, 300.0),
+        'valve_command': (50.0, 50.0),
+    }  # fmt: skip
+    for info in SIGNALS:
+        value, expected = sent[info.topic]
+        ((time_ns, signal, found, quality),) = decoder.rows(info.topic, float64_bytes(value), T0)
+        assert (time_ns, signal, quality) == (T0, info.signal, Quality.GOOD)
+        assert found == pytest.approx(expected, rel=1e-15)
+
+
+def test_both_byte_orders_are_read() -> None:
+    big = b'\x00\x00\x00\x00' + float64_bytes(1.5)[4:][::-1]
+    assert Decoder(Settings()).rows('valve_opening', big, T0)[0][2] == 1.5
+    assert header_time_ns(b'\x00\x00\x00\x00' + (7).to_bytes(4, 'big') + (9).to_bytes(4, 'big')) == (
+        7 * NS_PER_S + 9
+    )
+
+
+def test_a_sample_gives_a_reading_a_signal_the_optional_one_first() -> None:
+    decoder = Decoder(Settings())
+    message = sample(T0, valve_opening=50.0, generated_power=math.nan, valve_command=51.0)
+    message.main_steam_pressure_quality = Quality.UNCERTAIN.value
+    message.main_steam_temperature_quality = 200
+    rows = decoder.rows(PLANT_SAMPLE, encode(message), T0)
+    assert [row[1] for row in rows][0] == Signal.VALVE_COMMAND
+    by_signal = {Signal(row[1]): row for row in rows}
+    assert len(by_signal) == 5
+    assert by_signal[Signal.VALVE_COMMAND][2] == 51.0
+    assert by_signal[Signal.MAIN_STEAM_PRESSURE][3] == Quality.UNCERTAIN
+    assert by_signal[Signal.MAIN_STEAM_TEMPERATURE][3] == Quality.BAD
+    assert math.isnan(by_signal[Signal.GENERATED_POWER][2])
+
+
+def test_a_command_that_is_not_sent_is_no_reading() -> None:
+    rows = Decoder(Settings()).rows(PLANT_SAMPLE, encode(sample(T0, valve_opening=1.0)), T0)
+    assert Signal.VALVE_COMMAND not in {row[1] for row in rows}
+
+
+@given(st.lists(st.tuples(st.integers(0, 1000), st.integers(1, 10**6)), max_size=60))
+def test_the_clock_track_answers_as_a_search_through_all_would(
+    noted: list[tuple[int, int]],
+) -> None:
+    track = ClockTrack()
+    for sent, shown in noted:
+        track.note(sent, shown)
+    for asked in range(0, 1001, 37):
+        before = [(sent, k) for k, (sent, _) in enumerate(noted) if sent <= asked]
+        expected = noted[max(before)[1]][1] if before else 0
+        assert track.at(asked) == expected
+
+
+def test_the_clock_track_stays_bounded() -> None:
+    track = ClockTrack()
+    for k in range(100_000):
+        track.note(k, k + 1)
+    assert len(track._sent_ns) <= 2 * 16384
+    assert track.at(99_999) == 100_000
+
+
+def test_gaps_in_the_publishers_numbers_are_losses() -> None:
+    tally = Tally()
+    for number in (1, 2, 5, 6, 10):
+        tally.note_number(number)
+    assert (tally.received, tally.lost, tally.missed_at_start) == (5, 5, 0)
+
+
+def test_numbers_before_the_first_are_no_losses() -> None:
+    tally = Tally()
+    tally.note_number(8)
+    assert (tally.lost, tally.missed_at_start) == (0, 7)
+
+
+def test_two_publishers_are_irregular_and_no_loss() -> None:
+    tally = Tally()
+    for k in range(50):
+        tally.note_number(1000 + k)
+        tally.note_number(1 + k)
+    assert tally.lost == 0
+    assert tally.irregular == 50
+
+
+def test_a_restarted_publisher_is_one_irregularity() -> None:
+    tally = Tally()
+    for number in (5, 6, 7, 1, 2, 3):
+        tally.note_number(number)
+    assert (tally.irregular, tally.lost) == (1, 0)
+
+
+@pytest.mark.parametrize(('period', 'limit'), [(0.01, 2.0), (1.0, 2.5), (30.0, 75.0)])
+def test_silence_is_told_by_the_topics_own_period(period: float, limit: float) -> None:
+    tally = Tally()
+    assert tally.age_s(0.0) is None
+    for k in range(100):
+        tally.note_arrival(1, k * period)
+    last = 99 * period
+    assert tally.rate_hz() == pytest.approx(1.0 / period)
+    assert not tally.stale(last + 0.98 * limit)
+    assert tally.stale(last + 1.02 * limit)
+
+
+def test_the_rate_does_not_depend_on_how_often_is_looked() -> None:
+    every, rarely = Tally(), Tally()
+    for k in range(1, 1001):
+        every.note_arrival(1, 0.01 * k)
+        if k % 10 == 0:
+            rarely.note_arrival(10, 0.01 * k)
+    assert every.rate_hz() == pytest.approx(rarely.rate_hz())

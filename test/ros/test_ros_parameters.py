@@ -1,0 +1,231 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+from ros_helpers import Processes, wait_until
+
+from valveflow_ros.config import TABLE, Parameter, Settings, as_yaml
+from valveflow_ros.errors import ParameterError
+from valveflow_ros.ros.declare import changed, descriptor, unknown_overrides
+from valveflow_ros.ros.monitor_node import MonitorNode
+
+pytestmark = pytest.mark.ros
+ROOT = Path(__file__).resolve().parents[2]
+LIVE = [row for row in TABLE if row.live]
+FIXED = [row for row in TABLE if not row.live]
+
+
+def ros(name: str, value: object) -> RosParameter:
+    return RosParameter(name, value=value)
+
+
+@pytest.fixture
+def node(context: Any) -> Any:
+    made = MonitorNode(context=context)
+    yield made
+    made.destroy_node()
+
+
+def bad_values(row: Parameter) -> list[object]:
+    """Values that do not fit a row, of every kind that ROS can send."""
+    values: list[object] = ['', [1.0, 2.0], b'\x01', None]
+    if isinstance(row.default, bool):
+        return [*values, 1, 0.5, 'true']
+    if isinstance(row.default, str):
+        return [1, True, 0.5, [row.default], 'a\nb', 'x' * 501]
+    assert row.low is not None
+    assert row.high is not None
+    values += [True, 'abc', math.nan, math.inf, -math.inf]
+    values += [row.low - 1.0, row.high + 1.0, row.high * 2.0 + 1.0]
+    return values if isinstance(row.default, float) else [*values, row.default + 0.5]
+
+
+def good_values(row: Parameter) -> list[object]:
+    if isinstance(row.default, bool | str) or row.low is None or row.high is None:
+        return [not row.default] if isinstance(row.default, bool) else [row.default]
+    return [row.low, row.high, float(row.default)]
+
+
+def test_every_row_is_declared_with_its_default_and_described(node: MonitorNode) -> None:
+    for row in TABLE:
+        assert node.get_parameter(row.name).value == row.default
+        found = node.describe_parameter(row.name)
+        assert row.sentence in found.description
+        assert not row.unit or row.unit in found.description
+        assert found.read_only != row.live
+        for choice in row.choices:
+            assert choice in found.additional_constraints
+        spans = [*found.integer_range, *found.floating_point_range]
+        if row.low is None or row.high is None:
+            assert not spans
+        else:
+            assert (spans[0].from_value, spans[0].to_value) == (row.low, row.high)
+    assert node.settings == Settings()
+
+
+@pytest.mark.parametrize('row', LIVE, ids=lambda row: row.name)
+def test_a_live_parameter_takes_good_values_and_refuses_bad_ones(
+    node: MonitorNode, row: Parameter
+) -> None:
+    for value in good_values(row):
+        result = node.set_parameters_atomically([ros(row.name, value)])
+        assert result.successful, result.reason
+        assert node.settings[row.name] == value
+    before = node.settings
+    for value in bad_values(row):
+        result = node.set_parameters_atomically([ros(row.name, value)])
+        assert not result.successful, value
+        assert result.reason.startswith(f"Parameter '{row.name}' must be"), result.reason
+        with pytest.raises(ParameterError) as error:
+            row.check(ros(row.name, value).value)
+        assert result.reason == str(error.value)
+    assert node.settings is before
+
+
+@pytest.mark.parametrize('row', FIXED, ids=lambda row: row.name)
+def test_a_fixed_parameter_stays_as_it_is(node: MonitorNode, row: Parameter) -> None:
+    for value in [*good_values(row), *bad_values(row)]:
+        result = node.set_parameters_atomically([ros(row.name, value)])
+        assert not result.successful
+        assert row.name in result.reason
+        assert result.reason.endswith('.')
+    assert node.settings == Settings()
+    assert node.get_parameter(row.name).value == row.default
+
+
+def test_setting_one_after_the_other_is_judged_too(node: MonitorNode) -> None:
+    good, bad = node.set_parameters([ros('alarm_limit', 5), ros('alarm_dead_band', 0.95)])
+    assert good.successful
+    assert not bad.successful
+    assert (node.settings['alarm_limit'], node.settings['alarm_dead_band']) == (5.0, 0.3)
+
+
+def test_all_or_nothing(node: MonitorNode) -> None:
+    both = [ros('alarm_limit', 5.0), ros('alarm_off_delay', -1.0)]
+    assert not node.set_parameters_atomically(both).successful
+    assert node.settings == Settings()
+
+
+@pytest.mark.parametrize('row', TABLE, ids=lambda row: row.name)
+def test_bad_values_at_the_start_are_refused_with_the_tables_sentence(
+    context: Any, row: Parameter
+) -> None:
+    value = bad_values(row)[-1]
+    overrides = [ros(row.name, value)]
+    with pytest.raises(ParameterError) as error:
+        MonitorNode(context=context, parameter_overrides=overrides)
+    assert error.value.name == row.name
+
+
+def test_whole_numbers_are_taken_for_real_ones_at_the_start(context: Any) -> None:
+    overrides = [ros('refit_period', 30), ros('max_pieces', 6.0)]
+    node = MonitorNode(context=context, parameter_overrides=overrides)
+    assert node.settings.real('refit_period') == 30.0
+    assert node.settings.whole('max_pieces') == 6
+    node.destroy_node()
+
+
+def test_values_at_odds_are_refused_at_the_start(context: Any) -> None:
+    overrides = [ros('valve_opening_low', 49.0), ros('steady_limit', 9.0)]
+    with pytest.raises(ParameterError):
+        MonitorNode(context=context, parameter_overrides=overrides)
+
+
+def test_misspelt_parameters_are_named(context: Any) -> None:
+    overrides = [ros('refit_periodd', 30.0), ros('use_sim_time', False), ros('record', False)]
+    node = MonitorNode(context=context, parameter_overrides=overrides)
+    (sentence,) = unknown_overrides(node)
+    assert sentence == "Parameter 'refit_periodd' does not exist, did you mean 'refit_period'."
+    node.destroy_node()
+
+
+def test_changes_leave_foreign_parameters_to_ros() -> None:
+    assert changed(Settings(), [ros('use_sim_time', True)]) == Settings()
+
+
+def test_the_description_holds_no_default_beyond_its_range() -> None:
+    for row in TABLE:
+        found = descriptor(row)
+        for span in [*found.integer_range, *found.floating_point_range]:
+            assert span.from_value <= row.default <= span.to_value
+
+
+def test_from_afar_bad_values_come_back_with_the_sentence(context: Any, node: MonitorNode) -> None:
+    asking = Node('asking', context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    executor.add_node(asking)
+    client = asking.create_client(SetParameters, '/valveflow_monitor/set_parameters')
+    wait_until(client.service_is_ready, 'the service', 20.0)
+    wanted = [
+        ros('alarm_limit_sd', math.nan), ros('alarm_limit_sd', 'high'), ros('unit_tag', 'x'),
+        ros('alarm_limit_sd', None), ros('no_such_thing', 1), ros('alarm_limit_sd', 6),
+    ]  # fmt: skip
+    request = SetParameters.Request(parameters=[p.to_parameter_msg() for p in wanted])
+    future = client.call_async(request)
+    wait_until(lambda: executor.spin_once(timeout_sec=0.05) or future.done(), 'the answer', 20.0)
+    results = future.result().results
+    assert [result.successful for result in results] == [False] * 5 + [True]
+    assert results[0].reason == "Parameter 'alarm_limit_sd' must be from 1 to 100 sd, not nan."
+    assert results[1].reason == "Parameter 'alarm_limit_sd' must be a number, not 'high'."
+    assert 'cannot be changed while the monitor runs' in results[2].reason
+    assert 'alarm_limit_sd' in results[3].reason
+    assert 'no_such_thing' in results[4].reason
+    assert node.settings.real('alarm_limit_sd') == 6.0
+    describe = asking.create_client(DescribeParameters, '/valveflow_monitor/describe_parameters')
+    wait_until(describe.service_is_ready, 'the service', 20.0)
+    future = describe.call_async(DescribeParameters.Request(names=['alarm_limit_sd']))
+    wait_until(lambda: executor.spin_once(timeout_sec=0.05) or future.done(), 'the answer', 20.0)
+    assert future.result().descriptors[0].floating_point_range[0].to_value == 100.0
+    executor.shutdown()
+    asking.destroy_node()
+
+
+@pytest.mark.parametrize(
+    ('content', 'words'),
+    [
+        ('/**:\n  ros__parameters:\n    refit_period: -5.0\n', "Parameter 'refit_period' must be"),
+        ('/**:\n  ros__parameters:\n    refit_period: soon\n', "Parameter 'refit_period' must be"),
+        ('/**:\n  ros__parameters:\n    refit_period: .nan\n', "Parameter 'refit_period' must be"),
+        ('/**:\n  ros__parameters: [\n', 'ROS could not be started'),
+    ],
+)
+def test_a_bad_parameter_file_is_one_sentence_and_status_1(
+    processes: Processes, tmp_path: Path, content: str, words: str
+) -> None:
+    path = tmp_path / 'bad.yaml'
+    path.write_text(content)
+    process = processes.start(
+        'valveflow_ros.ros.monitor_main', '--ros-args', '--params-file', str(path)
+    )
+    assert process.wait(120.0) == 1
+    said = processes.output(process)
+    assert words in said
+    assert 'Traceback' not in said
+    assert said.count('valveflow monitor:') == 1
+
+
+def test_the_parameter_file_is_the_table() -> None:
+    # After a change of the table:
+    #   python -c "from valveflow_ros.config import as_yaml; print(as_yaml(), end='')"
+    # goes to config/monitor.yaml.
+    text = (ROOT / 'config' / 'monitor.yaml').read_text()
+    assert text == as_yaml()
+    content = yaml.safe_load(text)
+    assert Settings(content['/**']['ros__parameters']) == Settings()
+
+
+def test_ros_reads_the_parameter_file_as_the_defaults(context: Any) -> None:
+    path = ROOT / 'config' / 'monitor.yaml'
+    node = MonitorNode(context=context, cli_args=['--ros-args', '--params-file', str(path)])
+    assert node.settings == Settings()
+    assert unknown_overrides(node) == []
+    node.destroy_node()

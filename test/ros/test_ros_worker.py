@@ -1,0 +1,233 @@
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import hurt_jobs
+import psutil
+import pytest
+from ros_helpers import wait_until
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.fit import fit
+from valveflow_ros.ros.frames import FrameReader, send
+from valveflow_ros.ros.outcome import FitOutcome
+from valveflow_ros.ros.warmup import made_up_task
+from valveflow_ros.ros.worker import FIT_JOB, FitWorker
+
+pytestmark = pytest.mark.usefixtures('jobs_on_path')
+TASK = made_up_task(Settings())
+
+
+@contextmanager
+def worker(job: str, timeout_s: float = 120.0) -> Iterator[FitWorker]:
+    made = FitWorker(timeout_s, job if ':' in job else f'hurt_jobs:{job}')
+    made.start()
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def outcome_of(made: FitWorker) -> FitOutcome:
+    made.submit(TASK)
+    (outcome,) = wait_until(made.poll, 'the outcome')
+    assert outcome.request_ns == TASK.request_ns
+    assert outcome.seconds >= 0.0
+    return outcome
+
+
+def test_gives_what_a_fit_in_place_gives_bit_for_bit() -> None:
+    with worker(FIT_JOB) as made:
+        result = outcome_of(made).result
+    assert isinstance(result, Characteristic)
+    assert result == fit(TASK)
+
+
+@pytest.fixture(scope='module')
+def told_worker() -> Iterator[FitWorker]:
+    before = os.environ.get('PYTHONPATH', '')
+    os.environ['PYTHONPATH'] = f'{Path(__file__).parent}{os.pathsep}{before}'
+    try:
+        with worker('told') as made:
+            yield made
+    finally:
+        os.environ['PYTHONPATH'] = before
+
+
+@pytest.mark.parametrize(
+    ('job', 'words'),
+    [
+        ('raises', 'failed unexpectedly: a fault (ZeroDivisionError, hurt_jobs.py, line'),
+        ('refuses', 'There is no curve in these data.'),
+        ('greedy', 'more memory than there is'),
+        ('nothing', 'gave no curve'),
+        ('nan', 'not finite'),
+        ('backwards', 'do not increase'),
+        ('of_other_data', 'other data'),
+        ('renamed', 'its own name'),
+    ],
+)
+def test_a_bad_result_is_a_sentence_and_the_process_lives_on(
+    told_worker: FitWorker, job: str, words: str
+) -> None:
+    pid = told_worker.pid
+    number = [work.__name__ for work in hurt_jobs.ALL].index(job)
+    told_worker.submit(replace(TASK, request_ns=number))
+    (outcome,) = wait_until(told_worker.poll, 'the outcome')
+    assert outcome.request_ns == number
+    assert isinstance(outcome.result, str)
+    assert words in outcome.result
+    assert outcome.result.endswith('.')
+    assert told_worker.pid == pid
+    assert told_worker.failures_in_a_row == 0
+
+
+def test_what_a_job_prints_does_not_get_between_the_results(told_worker: FitWorker) -> None:
+    prints = hurt_jobs.ALL.index(hurt_jobs.prints)
+    told_worker.submit(replace(TASK, request_ns=prints))
+    (outcome,) = wait_until(told_worker.poll, 'the outcome')
+    assert isinstance(outcome.result, Characteristic)
+
+
+def test_a_killed_process_is_seen_and_replaced() -> None:
+    with worker('good') as made:
+        outcome_of(made)
+        assert made.pid is not None
+        os.kill(made.pid, signal.SIGKILL)
+        begun = time.monotonic()
+        wait_until(lambda: made.poll() or made.failures_in_a_row, 'the loss', 5.0)
+        assert time.monotonic() - begun < 2.0
+        assert isinstance(outcome_of(made).result, Characteristic)
+        assert made.starts == 2
+        assert made.failures_in_a_row == 0
+
+
+def test_death_during_a_fit_is_its_outcome_and_the_pauses_grow() -> None:
+    now = [0.0]
+    made = FitWorker(120.0, 'hurt_jobs:dies', clock=lambda: now[0])
+    made.start()
+    try:
+        pauses = []
+        for _ in range(4):
+            result = outcome_of(made).result
+            assert isinstance(result, str)
+            assert 'ended unexpectedly (signal SIGKILL)' in result
+            assert made.pid is None
+            begun = now[0]
+            while made.pid is None:
+                made.poll()
+                now[0] += 0.01
+            pauses.append(now[0] - begun)
+        assert pauses == pytest.approx([0.5, 1.0, 2.0, 4.0], abs=0.03)
+        assert made.failures_in_a_row == 4
+    finally:
+        made.close()
+
+
+def test_a_process_that_cannot_start_costs_no_busy_restarts() -> None:
+    now = [0.0]
+    made = FitWorker(120.0, 'no_such_module:job', clock=lambda: now[0])
+    made.start()
+    try:
+        for _ in range(3):
+            wait_until(lambda: made.poll() or made.pid is None, 'the end of the process')
+            for _ in range(100):
+                made.poll()
+            now[0] += 100.0
+            made.poll()
+        assert made.starts == 4
+    finally:
+        made.close()
+
+
+@pytest.mark.parametrize('stopped', [False, True])
+def test_a_hanging_fit_is_ended(stopped: bool) -> None:
+    with worker('hangs', timeout_s=1.0) as made:
+        made.submit(TASK)
+        assert made.pid is not None
+        pid = made.pid
+        if stopped:
+            os.kill(pid, signal.SIGSTOP)
+        (outcome,) = wait_until(made.poll, 'the outcome')
+        assert isinstance(outcome.result, str)
+        assert 'longer than 1 s' in outcome.result
+        assert 1.0 <= outcome.seconds < 5.0
+        assert not psutil.pid_exists(pid)
+
+
+def test_submitting_never_blocks_even_if_nobody_reads() -> None:
+    with worker('good') as made:
+        outcome_of(made)
+        assert made.pid is not None
+        os.kill(made.pid, signal.SIGSTOP)
+        large = made_up_task(Settings())
+        for name in ('u', 'power_mw', 'temperature_degc'):
+            # 24 MB of data: far more than a pipe holds.
+            object.__setattr__(large.contents, name, getattr(large.contents, name).repeat(170))
+        begun = time.monotonic()
+        made.submit(large)
+        made.poll()
+        assert time.monotonic() - begun < 0.1
+        os.kill(made.pid, signal.SIGCONT)
+        (outcome,) = wait_until(made.poll, 'the outcome')
+        assert isinstance(outcome.result, Characteristic)
+
+
+def test_a_late_answer_to_an_older_task_is_not_taken_for_the_newer_one() -> None:
+    with worker('hangs', timeout_s=2.0) as made:
+        made.submit(TASK)
+        first = made.pid
+        made.submit(TASK)
+        assert made.pid != first
+        (outcome,) = wait_until(made.poll, 'the outcome')
+        assert isinstance(outcome.result, str)
+
+
+def test_the_process_ends_with_its_parent() -> None:
+    reader, writer = os.pipe()
+    parent = os.fork()
+    if parent == 0:  # pragma: no cover - another process
+        made = FitWorker(120.0, 'hurt_jobs:hangs')
+        made.start()
+        made.submit(TASK)
+        os.write(writer, str(made.pid).encode())
+        time.sleep(60.0)
+        os._exit(0)
+    child = psutil.Process(int(os.read(reader, 20)))
+    os.close(reader)
+    os.close(writer)
+    os.kill(parent, signal.SIGKILL)
+    os.waitpid(parent, 0)
+    wait_until(
+        lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE, 'its end', 20.0
+    )
+
+
+def test_frames_survive_any_cutting() -> None:
+    reader, writer = os.pipe()
+    items = [('a', 1.5), {'large': TASK}, None, b'x' * 100_000]
+    os.set_blocking(reader, False)
+    frames = FrameReader(reader)
+    found: list[object] = []
+    pid = os.fork()
+    if pid == 0:  # pragma: no cover - another process
+        for item in items:
+            send(writer, item)
+        os._exit(0)
+    os.close(writer)
+    wait_until(lambda: found.extend(frames.ready()) or frames.ended, 'the end of the pipe')
+    os.waitpid(pid, 0)
+    os.close(reader)
+    assert len(found) == len(items)
+    assert found[0] == items[0]
+    assert found[3] == items[3]
+    sent, got = TASK.contents, found[1]['large'].contents  # type: ignore[index]
+    assert (sent.u == got.u).all()
+    assert (sent.spans == got.spans).all()

@@ -1,0 +1,114 @@
+"""Bring a refined model into the form of the result, with its uncertainties."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from valveflow_ros.core.characteristic import (
+    Characteristic,
+    Piece,
+    RegionDynamics,
+    ResidualStatistics,
+)
+from valveflow_ros.core.fit_task import FitTask
+from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.core.problem import Samples
+from valveflow_ros.core.refine import Refined
+from valveflow_ros.records import ByteArray, FloatArray
+
+_Z95 = 1.959963984540054
+_MAD_TO_SD = 1.4826022185056018
+
+
+def residual_statistics(
+    task: FitTask, residual: FloatArray, weight: ByteArray, step_s: float
+) -> ResidualStatistics:
+    """Return rmse, and the sd that the running mean of the alarm has on these residuals."""
+    average_s = task.settings.real('alarm_average')
+    keep = weight > 0
+    rest = residual[keep]
+    forget = math.exp(-step_s / average_s)
+    run, mean = np.empty(len(rest)), 0.0
+    for k, value in enumerate(rest):
+        mean = forget * mean + (1.0 - forget) * value
+        run[k] = mean
+    settled = run[min(len(run) // 4, int(3.0 * average_s / step_s)) :]
+    sd = _MAD_TO_SD * float(np.median(np.abs(settled - np.median(settled))))
+    return ResidualStatistics(
+        rmse_mw=float(np.sqrt(np.mean(rest**2))),
+        average_sd_mw=max(sd, 1e-9),
+        average_s=average_s,
+        input_noise=task.input_noise,
+        power_noise_mw=task.power_noise_mw,
+    )
+
+
+def from_refined(
+    task: FitTask, static: Characteristic, result: Refined, samples: Samples, u: FloatArray
+) -> Characteristic:
+    """Put a refined model into the form of the result, with its uncertainties."""
+    m = result.model
+    slopes, intercepts = m.slopes(), m.intercepts()
+    slope_se, intercept_se = _line_errors(m, result.covariance)
+    knots = m.knots.copy()
+    counts = np.histogram(u, bins=np.concatenate([[-np.inf], knots[1:-1], [np.inf]]))[0]
+    pieces = tuple(
+        Piece(float(knots[k]), float(knots[k + 1]), float(slopes[k]), float(intercepts[k]),
+              float(slope_se[k]), float(intercept_se[k]), int(counts[k]))
+        for k in range(m.pieces)
+    )  # fmt: skip
+    j = m.pieces
+    error = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))
+    knot_se = error[j + 1 : 2 * j]
+    intervals = tuple(
+        (float(b - _Z95 * s), float(b + _Z95 * s))
+        for b, s in zip(knots[1:-1], knot_se, strict=True)
+    )
+    ends = np.concatenate([m.left, m.right, m.levels])
+    edges = [float(ends.min()), *m.levels.tolist(), float(ends.max())]
+    error = error[3 * j - 1 :]
+    dynamics = tuple(
+        RegionDynamics(
+            edges[i], edges[i + 1], float(m.time_constants[i]), float(m.delays[i]),
+            float(m.time_constants[i] * error[i]), float(error[m.regions + i]),
+        )
+        for i in range(m.regions)
+    )  # fmt: skip
+    choice = static.choice
+    if task.settings.text('selection_rule') != 'paper':
+        note = f"The paper's rule (24) takes J = {len(static.pieces)}."
+        choice = replace(choice, rule='prediction_error', note=f'{note} {choice.note}'.strip())
+    return replace(
+        static,
+        choice=choice,
+        pieces=pieces,
+        breakpoint_intervals=intervals,
+        dynamics=dynamics,
+        residuals=residual_statistics(
+            task, result.residual_mw, result.weight, samples.step_s * samples.group
+        ),
+    )
+
+
+def _line_errors(m: RegionalModel, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return standard errors of slopes and intercepts by the delta method."""
+    packed = m.pack()
+    size = len(packed)
+    slope_of, intercept_of = np.empty((m.pieces, size)), np.empty((m.pieces, size))
+    for p in range(size):
+        h = 1e-6 * max(1.0, abs(packed[p]))
+        up, down = packed.copy(), packed.copy()
+        up[p] += h
+        down[p] -= h
+        high, low = m.unpack(up), m.unpack(down)
+        slope_of[:, p] = (high.slopes() - low.slopes()) / (2.0 * h)
+        intercept_of[:, p] = (high.intercepts() - low.intercepts()) / (2.0 * h)
+
+    def errors(gradient: FloatArray) -> FloatArray:
+        variance = np.einsum('ip,pq,iq->i', gradient, covariance, gradient)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+    return errors(slope_of), errors(intercept_of)
