@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -62,7 +63,7 @@ def partition_cost(x, y, weight, starts):
             np.repeat(x[a:b], np.asarray(weight[a:b], dtype=int)),
             np.repeat(y[a:b], np.asarray(weight[a:b], dtype=int)),
         )
-        for a, b in zip(starts[:-1], starts[1:], strict=True)
+        for a, b in itertools.pairwise(starts)
         if b - a > 2
     )
 
@@ -102,7 +103,7 @@ def by_prefix_sums(x, y, pieces, shortest):
 
 def turning_angle(cost):
     """Return Lambda(J) as eq. (24) writes it; ``cost[0]`` is Omega(1)."""
-    omega = {j: c for j, c in enumerate(cost, start=1)}
+    omega = dict(enumerate(cost, start=1))
     angle = {}
     for j in range(2, len(cost)):
         eta_1 = math.log(omega[j - 1] / omega[j])

@@ -232,7 +232,8 @@ _RECORD = (
               0.05, 60.0),
     Parameter('record_rotation', 3600.0, 's', 'A new file begins after this time.',
               1.0, 864000.0),
-    Parameter('record_queue', 200_000, '', 'Messages that may wait for the disk.', 100, 10_000_000),
+    Parameter('record_queue', 200_000, '', 'Messages that may wait for the disk.',
+              100, 10_000_000),
     Parameter('diagnostics_period', 1.0, 's', 'Time between messages on /diagnostics.', 0.1, 60.0,
               live=True),
 )  # fmt: skip

@@ -147,16 +147,39 @@ def test_in_equilibrium_the_answer_is_the_curve(model, seed):
     assert got == pytest.approx(np.full(200, model.static(np.array([level]))[0]), rel=1e-12)
 
 
-def test_a_step_is_answered_after_the_delay_with_the_time_constant():
-    model = RegionalModel(
+def one_region(time_constant, delay):
+    return RegionalModel(
         np.array([0.0, 100.0]), np.array([0.0]), np.array([100.0]), np.empty(0),
-        np.array([10.0]), np.array([3.0]),
+        np.array([time_constant]), np.array([delay]),
     )  # fmt: skip
+
+
+@pytest.mark.parametrize('step', [0.1, 1.0, 2.5, 60.0])
+@pytest.mark.parametrize('delay', [0.0, 3.0, 7.7])
+def test_a_ramp_is_answered_late_by_time_constant_and_delay_at_any_period(step, delay):
+    """Eqs. (13) and (14): y(t) = K_f u(t - T - tau) + C once the transient is over."""
+    n = 3000
+    time_constant = max(4.0, step)
+    time_s = step * np.arange(n)
+    u = 10.0 + 80.0 * time_s / time_s[-1]
+    got, _ = one_region(time_constant, delay).respond(
+        u, np.ones(n, dtype=np.uint8), step, 0.0
+    )
+    late = 10.0 + 80.0 * (time_s - time_constant - delay) / time_s[-1]
+    settled = time_s > 40.0 * time_constant + delay
+    assert settled.any()
+    assert got[settled] == pytest.approx(late[settled], rel=1e-9)
+
+
+def test_a_step_is_answered_after_the_delay_with_the_time_constant():
+    """Between two rows the flow runs straight, so a step takes one row to be there."""
     u = np.where(np.arange(200) < 50, 20.0, 60.0)
-    got, _ = model.respond(u, np.ones(200, dtype=np.uint8), 1.0, 0.0)
-    after = np.arange(1, 148)
+    got, _ = one_region(10.0, 3.0).respond(u, np.ones(200, dtype=np.uint8), 1.0, 0.0)
+    after = np.arange(147)
+    first = 1.0 - 10.0 * (1.0 - np.exp(-0.1))
+    expected = 1.0 - (1.0 - first) * np.exp(-after / 10.0)
     assert got[:53] == pytest.approx(20.0)
-    assert got[53:] == pytest.approx(20.0 + 40.0 * (1.0 - np.exp(-after / 10.0)), rel=1e-12)
+    assert got[53:] == pytest.approx(20.0 + 40.0 * expected, rel=1e-12)
 
 
 @examples(20)

@@ -259,14 +259,12 @@ def test_nothing_and_one_sample_are_too_few(n):
 
 @pytest.mark.parametrize('value', [0.0, 5.0, -1e6, 1e-200])
 def test_a_valve_that_does_not_move_has_no_slope(value):
-    with pytest.raises(
-        DataError, match=r'^u is \S+ in all 50 samples: a slope needs it to change'
-    ):
+    with pytest.raises(DataError, match=r'^u is \S+ in all 50 samples: a slope needs'):
         partition(np.full(50, value), np.arange(50.0))
 
 
 def test_too_few_distinct_u_for_one_piece():
-    with pytest.raises(TooFewSamplesError, match='Distinct values of u.*: 3 found, at least 5'):
+    with pytest.raises(TooFewSamplesError, match=r'Distinct values of u.*: 3 found, at least 5'):
         partition(np.repeat([1.0, 2.0, 3.0], 20), np.arange(60.0), min_distinct=5)
 
 

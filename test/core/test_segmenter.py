@@ -415,7 +415,7 @@ def test_kinds_say_slope_on_a_long_ramp_and_steady_on_a_hold():
     out, _ = whole(Settings(), Stream(grid_ns(9000), u, power, np.full(9000, 540.0)))
     assert (out.kinds[4600:5400] == SETTLED_SLOPE).mean() > 0.95
     assert (out.kinds[3000:3900] == SETTLED_STEADY).mean() > 0.95
-    assert (out.kinds[4100:4400] == TRANSIENT).all()
+    assert (out.kinds[4100:4390] == TRANSIENT).all()
 
 
 @pytest.mark.parametrize('extra', range(-3, 4))
@@ -558,13 +558,16 @@ def test_other_periods_find_the_same_holds_and_ramps(period, block):
     u[at + length :] = u[at + length - 1]
     power = lagged(0.2 * u, 80.0, 10.0, period) + 0.5 * rng.normal(0.0, 1.0, n)
     values = {'sample_period': period, 'block': block, 'hold_limit': 10 * period,
-              'longest_segment': 30 * step * 60, 'input_noise': 0.7, 'power_noise': 0.2}
+              'longest_segment': 30 * step * 60, 'input_noise': 2.0 / np.sqrt(block / period),
+              'power_noise': 0.5 / np.sqrt(block / period)}
     stream = Stream(grid_ns(n, period), u + 2.0 * rng.normal(0.0, 1.0, n), power,
                     np.full(n, 540.0))  # fmt: skip
     out, _ = whole(Settings(values), stream)
     found = spans(out.found)
-    assert any(kind == SegmentKind.SLOPE and a >= at and b <= at + length for a, b, kind in found)
-    assert any(kind == SegmentKind.STEADY and b <= at for _, b, kind in found)
+    late = 6 * round(block / period)  # what belongs to a move before it is seen
+    slopes = [(a, b) for a, b, kind in found if kind == SegmentKind.SLOPE]
+    assert any(a >= at and b <= at + length + late for a, b in slopes)
+    assert any(kind == SegmentKind.STEADY and b <= at + late for _, b, kind in found)
     for _, f in out.found:
         assert f.segment.start_ns == START_NS + round(f.first_row * period * NS_PER_S)
         assert f.segment.end_ns == START_NS + round((f.end_row - 1) * period * NS_PER_S)

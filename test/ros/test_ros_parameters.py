@@ -36,7 +36,7 @@ def node(context: Any) -> Any:
 
 def bad_values(row: Parameter) -> list[object]:
     """Values that do not fit a row, of every kind that ROS can send."""
-    values: list[object] = ['', [1.0, 2.0], b'\x01', None]
+    values: list[object] = ['', [1.0, 2.0], [b'\x01'], None]
     if isinstance(row.default, bool):
         return [*values, 1, 0.5, 'true']
     if isinstance(row.default, str):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-from rclpy.exceptions import InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
@@ -49,12 +48,10 @@ def declare(node: Node, table: Iterable[Parameter] = TABLE) -> dict[str, object]
     """
     values: dict[str, object] = {}
     for row in table:
-        try:
-            given = node.declare_parameter(row.name, row.default, descriptor(row))
-        except InvalidParameterValueException as error:
-            row.check(error.value)
-            raise ParameterError(row.name, f'cannot be {error.value!r}') from None
-        values[row.name] = row.check(given.value)
+        # The table judges first, with its own sentence; then ROS learns the range too.
+        loose = ParameterDescriptor(dynamic_typing=True)
+        values[row.name] = row.check(node.declare_parameter(row.name, row.default, loose).value)
+        node.set_descriptor(row.name, descriptor(row))
     return values
 
 

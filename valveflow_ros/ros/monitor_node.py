@@ -71,7 +71,7 @@ class MonitorNode(LifecycleNode):
         self.add_on_set_parameters_callback(self._judge)
         self.add_post_set_parameters_callback(self._take)
         self._health = self.create_publisher(DiagnosticArray, DIAGNOSTICS, 10)
-        self._services = [
+        self._offered = [
             self.create_service(Trigger, f'~/{name}', self._service(work))
             for name, work in (
                 ('refit', self._refit),

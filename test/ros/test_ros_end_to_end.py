@@ -1,0 +1,342 @@
+"""A plant and a monitor as two real processes, a listener over DDS, and what is on disk afterwards."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.srv import SetParameters
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import deserialize_message
+from ros_helpers import PATIENCE_S, Processes, wait_until
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import Trigger
+from valveflow_msgs.msg import Alarm, FlowCharacteristic, JournalEntry, Prediction
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.events import JournalKind
+from valveflow_ros.logs import LogContents, RecordingWriter, open_log
+from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
+from valveflow_ros.plant.unit import UnitDescription
+from valveflow_ros.records import SIGNALS, SampleTable, Signal
+from valveflow_ros.ros.conversions import from_time
+from valveflow_ros.ros.demo_processes import ros_arguments
+from valveflow_ros.ros.simulator_steps import effects_of
+from valveflow_ros.ros.verify import verify
+from valveflow_ros.ros.wire import float64_bytes
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+DAYS, SEED = 0.3, 7
+FAULT = 'gain_step:g=-0.12,t0_days=0.25'
+FAULT_NS = DEFAULT_START_NS + round(0.25 * 86400e9)
+MONITOR = '/valveflow_monitor'
+LATCHED = QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+SENT = [Signal.VALVE_COMMAND, *(info.signal for info in SIGNALS if info.required)]
+
+
+class Listener:
+    """Hears what the monitor says, and talks to its services."""
+
+    def __init__(self, context: Any) -> None:
+        self.node = Node('listener', context=context)
+        self.executor = SingleThreadedExecutor(context=context)
+        self.executor.add_node(self.node)
+        self.alarms: list[Alarm] = []
+        self.curves: list[FlowCharacteristic] = []
+        self.health: list[DiagnosticArray] = []
+        subscribe = self.node.create_subscription
+        subscribe(Alarm, f'{MONITOR}/alarms', self.alarms.append, LATCHED)
+        subscribe(FlowCharacteristic, f'{MONITOR}/characteristic', self.curves.append, LATCHED)
+        subscribe(DiagnosticArray, '/diagnostics', self.health.append, 10)
+
+    def spin(self) -> None:
+        self.executor.spin_once(timeout_sec=0.02)
+
+    def until(self, condition: Any, what: str, patience_s: float = PATIENCE_S) -> Any:
+        return wait_until(lambda: self.spin() or condition(), what, patience_s)
+
+    def call(self, kind: Any, name: str, request: Any) -> Any:
+        client = self.node.create_client(kind, f'{MONITOR}/{name}')
+        self.until(client.service_is_ready, name)
+        future = client.call_async(request)
+        return self.until(lambda: future.done() and future.result(), name)
+
+    def trigger(self, name: str) -> Trigger.Response:
+        return self.call(Trigger, name, Trigger.Request())
+
+    def latched(self, kind: Any, name: str) -> Any:
+        """Come late to a latched topic."""
+        heard: list[Any] = []
+        self.node.create_subscription(kind, f'{MONITOR}/{name}', heard.append, LATCHED)
+        return self.until(lambda: heard and heard[0], name)
+
+    def value(self, item: str, key: str) -> str:
+        """Return a number of the newest health."""
+        for status in self.health[-1].status if self.health else []:
+            if status.name.endswith(item):
+                return {entry.key: entry.value for entry in status.values}.get(key, '')
+        return ''
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+
+
+@pytest.fixture
+def listener(context: Any) -> Any:
+    made = Listener(context)
+    yield made
+    made.close()
+
+
+def start_monitor(processes: Processes, folder: Path, **more: object) -> Any:
+    parameters = {
+        'record_directory': folder, 'unit_tag': 'unit 1', 'input_reliability': 'reliable',
+        'refit_period': 3600.0, 'refit_segments': 0, **more,
+    }  # fmt: skip
+    # Quotes, so that a text with a blank or of digits stays a text.
+    given = {k: f'"{v}"' if isinstance(v, str) else v for k, v in parameters.items()}
+    return processes.start('valveflow_ros.ros.monitor_main', *ros_arguments(given))
+
+
+def start_plant(processes: Processes, **parameters: object) -> Any:
+    given = {'seed': SEED, 'rate': 0.0, 'wait': PATIENCE_S, **parameters}
+    return processes.start('valveflow_ros.ros.simulator_main', *ros_arguments(given))
+
+
+def test_a_run_from_the_plant_to_the_disk(
+    processes: Processes, listener: Listener, tmp_path: Path
+) -> None:
+    monitor = start_monitor(processes, tmp_path / 'recordings', use_sim_time=True)
+    plant = start_plant(
+        processes, days=DAYS, use_clock=True, command=True, effects=f'"{FAULT}"'
+    )
+    live_parameter_and_acknowledgement(listener, monitor)
+    listener.until(lambda: plant.poll() is not None, 'the end of the plant')
+    assert plant.returncode == 0, processes.output(plant)
+    rows = round(DAYS * 86400)
+    listener.until(
+        lambda: listener.value('fit', 'Samples taken') == str(rows), 'the last sample', 60.0
+    )
+    nothing_lost(listener, rows)
+    the_latched_curve(listener)
+    monitor.send_signal(signal.SIGTERM)
+    assert monitor.wait(10.0) == 0, processes.output(monitor)
+    assert 'Traceback' not in processes.output(monitor)
+
+    (folder,) = (tmp_path / 'recordings').iterdir()
+    assert 'unit-1' in folder.name
+    log = open_log(folder)
+    assert log.warnings == ()
+    recorded_is_sent(log)
+    recorded_is_said(log, listener)
+    the_files_own_words(log)
+    result = verify(folder)
+    assert result.difference == ''
+    assert result.rows == rows
+    assert result.compared['prediction'] == rows
+    assert result.compared['alarms'] == len(listener.alarms)
+    others_read_it(folder)
+    a_changed_recording_is_noticed(log, tmp_path / 'changed')
+
+
+def live_parameter_and_acknowledgement(listener: Listener, monitor: Any) -> None:
+    """Change a live parameter early, then wait for the alarm of the fault and acknowledge it."""
+    listener.until(lambda: listener.value('fit', 'Samples taken') not in ('', '0'), 'samples')
+    wanted = Parameter('alarm_on_delay', value=90).to_parameter_msg()
+    answer = listener.call(
+        SetParameters, 'set_parameters', SetParameters.Request(parameters=[wanted])
+    )
+    assert answer.results[0].successful, answer.results[0].reason
+
+    def raised() -> bool:
+        assert monitor.poll() is None
+        times = [
+            from_time(a.header.stamp) for a in listener.alarms if a.state == Alarm.UNACKNOWLEDGED
+        ]
+        return any(time_ns >= FAULT_NS for time_ns in times)
+
+    listener.until(raised, 'the alarm of the fault')
+    alarm = listener.alarms[-1]
+    assert 'MW less than the valve curve says' in alarm.sentence
+    assert (alarm.name, alarm.unit, alarm.header.frame_id) == ('residual', 'MW', 'unit 1')
+    assert alarm.value < -alarm.limit < 0.0
+    assert from_time(alarm.header.stamp) < FAULT_NS + 3600 * 10**9
+    answer = listener.trigger('acknowledge_alarms')
+    assert answer.success, answer.message
+    listener.until(lambda: listener.alarms[-1].state == Alarm.ACKNOWLEDGED, 'the acknowledgement')
+    again = listener.trigger('acknowledge_alarms')
+    assert (again.success, again.message) == (False, 'There is no alarm to acknowledge.')
+    for name in ('set_reference', 'diagnose'):
+        answer = listener.trigger(name)
+        assert not answer.success
+        assert answer.message.endswith('.')
+
+
+def nothing_lost(listener: Listener, rows: int) -> None:
+    for signal_ in SENT:
+        item = f'input {SIGNALS[signal_].topic}'
+        assert listener.value(item, 'Messages lost on the way') == '0'
+        assert listener.value(item, 'Messages received') == str(rows)
+        assert listener.value(item, 'Readings accepted') == str(rows)
+    assert listener.value('recorder', 'Messages dropped') == '0'
+
+
+def the_latched_curve(listener: Listener) -> None:
+    """The curve that one who comes late gets is the last one, and near the truth."""
+    curve = listener.latched(FlowCharacteristic, 'characteristic')
+    assert curve == listener.curves[-1]
+    assert curve.status == FlowCharacteristic.FRESH
+    assert curve.header.frame_id == 'unit 1'
+    breakpoints = listener.latched(Float64MultiArray, 'breakpoints')
+    slopes = listener.latched(Float64MultiArray, 'slopes')
+    assert list(breakpoints.data) == list(curve.breakpoints)
+    assert list(slopes.data) == list(curve.slopes)
+    clean = [c for c in listener.curves if 0 < from_time(c.window_end) <= FAULT_NS]
+    assert clean
+    truth = UnitDescription().curve
+    u = np.linspace(clean[-1].breakpoints[0], clean[-1].breakpoints[-1], 50)
+    off = np.interp(u, clean[-1].breakpoints, clean[-1].values) - truth(u)
+    # Six hours of one day: the whole range, to a few MW of 300.
+    assert np.sqrt(np.mean(off**2)) < 5.0
+
+
+def sent_table() -> SampleTable:
+    return simulate(DAYS, SEED, effects=effects_of([FAULT])).table
+
+
+def recorded_is_sent(log: LogContents) -> None:
+    """Every value with its time stands in the recording, in the order sent."""
+    table = sent_table()
+    last_log_ns = 0
+    for signal_ in SENT:
+        info = SIGNALS[signal_]
+        messages = list(log.iter_messages([f'/{info.topic}']))
+        assert [m.publish_time_ns for m in messages] == table.time_ns.tolist()
+        expected = [float64_bytes(value) for value in table.column(signal_).tolist()]
+        assert [m.data for m in messages] == expected
+    for message in log.iter_messages():
+        assert message.log_time_ns > last_log_ns
+        last_log_ns = message.log_time_ns
+
+
+def recorded_is_said(log: LogContents, listener: Listener) -> None:
+    """What was heard over DDS is what stands on disk."""
+    def said(kind: Any, name: str) -> list[Any]:
+        return [deserialize_message(m.data, kind) for m in log.iter_messages([f'{MONITOR}/{name}'])]
+
+    assert [repr(m) for m in said(Alarm, 'alarms')] == [repr(m) for m in listener.alarms]
+    recorded = [repr(m) for m in said(FlowCharacteristic, 'characteristic')]
+    assert [repr(m) for m in listener.curves] == recorded[-len(listener.curves) :]
+    kinds = [m.kind for m in said(JournalEntry, 'journal')]
+    for kind in ('FIT_REQUESTED', 'FIT_ADOPTED', 'ACKNOWLEDGE', 'SETTINGS'):
+        assert JournalKind[kind] in kinds
+    predictions = said(Prediction, 'prediction')
+    times = [from_time(m.header.stamp) for m in predictions]
+    assert times == sent_table().time_ns.tolist()
+    power = sent_table().column(Signal.GENERATED_POWER)
+    np.testing.assert_array_equal([m.measured_mw for m in predictions], power)
+
+
+def the_files_own_words(log: LogContents) -> None:
+    settings = Settings(json.loads(log.attachments['parameters.json']))
+    assert settings.text('unit_tag') == 'unit 1'
+    topics = json.loads(log.attachments['topics.json'])
+    assert topics['inputs']['valve_opening'] == '/valve_opening'
+    assert topics['outputs']['prediction'] == f'{MONITOR}/prediction'
+    for info in log.topics.values():
+        assert info.type_hash.startswith('RIHS01_')
+
+
+def others_read_it(folder: Path) -> None:
+    """A reader that is not ours finds the same values."""
+    table = sent_table()
+    with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        by_topic = {connection.topic: connection for connection in reader.connections}
+        for signal_ in SENT:
+            connection = by_topic[f'/{SIGNALS[signal_].topic}']
+            found = [
+                reader.deserialize(raw, connection.msgtype).data
+                for _, _, raw in reader.messages([connection])
+            ]
+            np.testing.assert_array_equal(found, table.column(signal_))
+        connection = by_topic[f'{MONITOR}/characteristic']
+        messages = [
+            reader.deserialize(raw, connection.msgtype)
+            for _, _, raw in reader.messages([connection])
+        ]
+        assert messages[0].status == FlowCharacteristic.UNKNOWN
+        assert len(messages[0].breakpoints) == 0
+        assert messages[-1].header.frame_id == 'unit 1'
+        assert len(messages[-1].breakpoints) == messages[-1].pieces + 1
+        assert by_topic['/diagnostics'].msgcount > 0
+
+
+def a_changed_recording_is_noticed(log: LogContents, folder: Path) -> None:
+    """One bit of one prediction, or one value of one input, and the comparison says where."""
+    names = [f'{MONITOR}/prediction', '/generated_power']
+    for k, name in enumerate(names):
+        place = folder / str(k)
+        with RecordingWriter(place, attachments=log.attachments) as writer:
+            for info in log.topics.values():
+                writer.add_topic(info.name, info.type, definition=info.definition,
+                                 type_hash=info.type_hash)  # fmt: skip
+            count = 0
+            for message in log.iter_messages():
+                data = message.data
+                count += message.topic == name
+                if message.topic == name and count == 9000:
+                    # The low end of the number that stands last in either message.
+                    data = data[:-8] + bytes([data[-8] ^ 1]) + data[-7:]
+                writer.write(message.topic, data, message.log_time_ns, message.publish_time_ns)
+        result = verify(place)
+        assert not result.identical
+        assert 'Prediction number 9000 differs' in result.difference
+        field = 'limit_high_mw' if k == 0 else 'measured_mw'
+        assert field in result.difference
+
+
+def test_ending_during_a_refit_finishes_the_file_at_once(
+    processes: Processes, listener: Listener, tmp_path: Path
+) -> None:
+    monitor = start_monitor(processes, tmp_path / 'recordings', refit_period=0.0)
+    plant = start_plant(processes, days=0.15, stamped=True)
+    listener.until(lambda: plant.poll() is not None, 'the end of the plant')
+    samples = round(0.15 * 86400)
+    listener.until(lambda: listener.value('fit', 'Samples taken') == str(samples), 'the samples')
+    (worker,) = [
+        child for child in psutil.Process(monitor.pid).children()
+        if any('worker_child' in word for word in child.cmdline())
+    ]  # fmt: skip
+    # However fast the machine is, this refit is under way when the monitor has to end.
+    worker.suspend()
+    answer = listener.trigger('refit')
+    assert answer.success, answer.message
+    again = listener.trigger('refit')
+    assert (again.success, again.message) == (False, 'A fit is running already.')
+    begun = time.monotonic()
+    monitor.send_signal(signal.SIGTERM)
+    os.kill(monitor.pid, signal.SIGINT)
+    assert monitor.wait(10.0) == 0, processes.output(monitor)
+    assert time.monotonic() - begun < 2.0
+    assert not worker.is_running() or worker.status() == psutil.STATUS_ZOMBIE
+    (folder,) = (tmp_path / 'recordings').iterdir()
+    assert not list(folder.glob('*.part'))
+    assert (folder / 'metadata.yaml').exists()
+    log = open_log(folder)
+    assert log.warnings == ()
+    assert log.topics['/plant_sample'].count == samples
+    assert verify(folder).difference == ''
