@@ -21,7 +21,7 @@ from valveflow_ros.core.problem import Problem, Samples, free_parameters, move, 
 from valveflow_ros.core.regions import find_regions
 from valveflow_ros.core.sums import gram
 from valveflow_ros.core.uncertainty import covariance_of
-from valveflow_ros.core.whitening import whitened
+from valveflow_ros.core.whitening import fit_ar, whitened
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
@@ -87,18 +87,20 @@ def refine(samples: Samples, start: RegionalModel, most_pieces: int | None = Non
             'Rows that follow each other for longer than the transient',
             int(weight.sum()) * samples.group, LEAST_ROWS,
         )  # fmt: skip
-    model, ar = find_regions(problem, _join(start))
-    if most_pieces is not None:
-        chosen = choose_pieces(problem, model, ar, most_pieces)
-        if chosen.pieces != model.pieces:
-            # A wrong number of pieces is easily taken for another region.
-            model, ar = find_regions(problem, chosen)
-            model = choose_pieces(problem, model, ar, most_pieces)
+    model = _search(Problem(samples.coarser()), _join(start), most_pieces)
+    residual, weight = problem.answer(model)
+    ar = fit_ar(residual, weight)
     free = free_parameters(model.pieces, model.regions, _jumps_supported(problem, model, ar))
     model, cost = move(problem, model, ar, free, 6)
     model, cost = search_levels(problem, model, ar, cost)
     model, cost = move(problem, model, ar, free, 6)
     return _conclude(problem, model, free, ar)
+
+
+def _search(problem: Problem, start: RegionalModel, most_pieces: int | None) -> RegionalModel:
+    """Find regions and, if asked, the number of pieces."""
+    model, ar = find_regions(problem, start)
+    return model if most_pieces is None else choose_pieces(problem, model, ar, most_pieces)
 
 
 def _join(model: RegionalModel) -> RegionalModel:
