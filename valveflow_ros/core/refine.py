@@ -27,6 +27,7 @@ from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
 LEAST_ROWS = 3600
 _JUMP_WALD = 20.0
+_NARROWEST = 0.01  # of the range of u: narrower pieces are not given to the search
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,13 +105,23 @@ def _search(problem: Problem, start: RegionalModel, most_pieces: int | None) -> 
 
 
 def _join(model: RegionalModel) -> RegionalModel:
-    """Close the jumps of a curve: at each inner knot both ends take their mean."""
-    middle = 0.5 * (model.right[:-1] + model.left[1:])
-    return replace(
-        model,
-        left=np.append(model.left[0], middle),
-        right=np.append(middle, model.right[-1]),
+    """Close the jumps of a curve, and take out knots too close to others to be moved.
+
+    At each inner knot both ends take their mean. The exact partition may put a
+    break round a handful of samples.
+    """
+    values = np.concatenate(
+        [model.left[:1], 0.5 * (model.right[:-1] + model.left[1:]), model.right[-1:]]
     )
+    least = _NARROWEST * (model.knots[-1] - model.knots[0])
+    keep = [0]
+    for k in range(1, len(model.knots) - 1):
+        if model.knots[k] - model.knots[keep[-1]] >= least <= model.knots[-1] - model.knots[k]:
+            keep.append(k)
+    keep.append(len(model.knots) - 1)
+    return replace(
+        model, knots=model.knots[keep], left=values[keep][:-1], right=values[keep][1:]
+    )  # fmt: skip
 
 
 def _jumps_supported(problem: Problem, model: RegionalModel, ar: FloatArray) -> BoolArray:

@@ -1,0 +1,237 @@
+"""How fast the exact partition is, beside a plain dynamic programme and beside ruptures.
+
+Run: python benchmarks/partition.py [--kinds valve noise ...] [--sizes 20000 305633 ...]
+                                    [--plain 8000] [--peers 400] [--repeats 3] [--json]
+
+Every kind is partitioned into 1..10 pieces at every size. In the same run the plain
+dynamic programme (every break for every end, in compiled loops) solves the size given by
+--plain, and ruptures' exact and approximate searches that of --peers, where it is
+installed. `cost/optimum` is the cost of what a search found over ours, for the largest
+number of pieces; 1 means that it found the optimum too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable
+
+import numba
+import numpy as np
+
+from valveflow_ros.core.partition import Partition, partition
+from valveflow_ros.core.partition_layers import best_partitions, prepare
+from valveflow_ros.core.partition_levels import make_levels
+
+PIECES = 10
+PEER_PIECES = 4
+
+
+def valve(u: np.ndarray) -> np.ndarray:
+    """Return the curve of the paper's simulation study."""
+    return np.select(
+        [u < 1250.0, u < 1600.0, u < 1900.0],
+        [0.24 * u - 100.0, 0.18 * u - 25.0, 0.09 * u + 119.0],
+        0.01 * u + 271.0,
+    )
+
+
+def random_walk(u: np.ndarray, r: np.random.Generator) -> np.ndarray:
+    walk = np.empty(len(u))
+    walk[np.argsort(u)] = np.cumsum(r.normal(size=len(u)))
+    return walk
+
+
+def share(u: np.ndarray) -> np.ndarray:
+    return (u - 1000.0) / 1336.0
+
+
+KINDS: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {
+    'valve': lambda u, r: valve(u) + r.normal(0, 3, len(u)),
+    'quantised': lambda u, r: valve(u) + r.normal(0, 3, len(u)),  # u in steps of 0.1
+    'noise': lambda u, r: r.normal(size=len(u)),
+    'heavy_tails': lambda u, r: valve(u) + 3.0 * r.standard_t(3, len(u)),
+    'root': lambda u, r: 100.0 * np.sqrt(share(u)) + r.normal(size=len(u)),
+    'square': lambda u, r: 100.0 * share(u) ** 2 + r.normal(size=len(u)),
+    'square_quiet': lambda u, r: 100.0 * share(u) ** 2 + r.normal(0, 0.05, len(u)),
+    'sine': lambda u, r: 50.0 * np.sin(5 * np.pi * share(u)) + r.normal(size=len(u)),
+    'walk': random_walk,
+    'noiseless': lambda u, _: valve(u),
+}
+
+
+def samples(kind: str, n: int) -> tuple[np.ndarray, np.ndarray]:
+    r = np.random.default_rng(2024)
+    u = r.uniform(1000.0, 2336.0, n)
+    if kind == 'quantised':
+        u = np.round(u, 1)
+    return u, KINDS[kind](u, r)
+
+
+@numba.njit(cache=True)
+def plain(x: np.ndarray, y: np.ndarray, pieces: int) -> np.ndarray:
+    """Return the least cost of 1..pieces pieces, trying every break for every end."""
+    n = len(x)
+    best = np.full((pieces + 1, n + 1), np.inf)
+    best[0, 0] = 0.0
+    for r in range(2, n + 1):
+        count = sx = sxx = sy = sxy = syy = 0.0
+        for w in range(r - 1, -1, -1):
+            a = x[r - 1] - x[w]
+            b = y[w] - y[r - 1]
+            count += 1.0
+            sx += a
+            sxx += a * a
+            sy += b
+            sxy += a * b
+            syy += b * b
+            if w > r - 2:
+                continue
+            covariance = sxy - sx * sy / count
+            cost = syy - sy * sy / count - covariance * covariance / (sxx - sx * sx / count)
+            for j in range(1, pieces + 1):
+                best[j, r] = min(best[j, r], best[j - 1, w] + max(cost, 0.0))
+    return best[1:, n]
+
+
+def fitted_cost(u: np.ndarray, y: np.ndarray, ends: list[int]) -> float:
+    """Return the cost of pieces that end before the given samples."""
+    total, begin = 0.0, 0
+    for end in ends:
+        a, b = u[begin:end], y[begin:end]
+        slope, intercept = np.polynomial.polynomial.polyfit(a - a[0], b, 1)[::-1]
+        total += float(((b - intercept - slope * (a - a[0])) ** 2).sum())
+        begin = end
+    return total
+
+
+def timed(action: Callable[[], object], repeats: int = 1) -> tuple[dict[str, float], object]:
+    """Return the least wall and processor time of several runs, and the last result."""
+    wall, cpu, result = [], [], None
+    for _ in range(repeats):
+        begin, begin_cpu = time.perf_counter(), time.process_time()
+        result = action()
+        wall.append(time.perf_counter() - begin)
+        cpu.append(time.process_time() - begin_cpu)
+    return {'wall_s': round(min(wall), 4), 'cpu_s': round(min(cpu), 4)}, result
+
+
+def ours(kind: str, n: int, threads: int | None, repeats: int) -> dict[str, object]:
+    """Time the whole call, and the search alone: without checking, sorting and merging."""
+    u, y = samples(kind, n)
+    whole, found = timed(lambda: partition(u, y, PIECES, threads=threads), repeats)
+    levels = make_levels(u, y)
+    used = threads or (len(os.sched_getaffinity(0)) if len(levels) >= 20_000 else 1)
+
+    def search() -> object:
+        problem = prepare(levels.x, levels.residual, levels.weight, 2, 2e-14 * len(levels.u), used)
+        return best_partitions(problem, PIECES)
+
+    alone, _ = timed(search, repeats)
+    assert isinstance(found, Partition)
+    return {
+        'kind': kind, 'samples': n, 'distinct': found.n_distinct, 'search': alone,
+        'whole': whole, 'certified': found.certified,
+    }  # fmt: skip
+
+
+def against_plain(kind: str, n: int) -> dict[str, object]:
+    u, y = samples(kind, n)
+    order = np.argsort(u)
+    u, y = u[order], y[order]
+    fast, found = timed(lambda: partition(u, y, PIECES, threads=1), 3)
+    slow, cost = timed(lambda: plain(u, y, PIECES))
+    assert isinstance(found, Partition)
+    assert isinstance(cost, np.ndarray)
+    return {
+        'kind': kind, 'samples': n, 'search': 'plain', **slow,
+        'times_slower': round(slow['wall_s'] / fast['wall_s'], 1),
+        'cost/optimum': round(float(cost[-1] / found.cost[-1]), 9),
+    }  # fmt: skip
+
+
+def against_ruptures(kind: str, n: int) -> list[dict[str, object]]:
+    import ruptures
+
+    u, y = samples(kind, n)
+    order = np.argsort(u)
+    u, y = u[order], y[order]
+    fast, found = timed(lambda: partition(u, y, PEER_PIECES, threads=1), 3)
+    assert isinstance(found, Partition)
+    signal = np.column_stack([y, (u - u.mean()) / np.ptp(u), np.ones(n)])
+    searches = {
+        'ruptures Dynp, exact': ruptures.Dynp(model='linear', min_size=2, jump=1),
+        'ruptures Dynp, jump 5': ruptures.Dynp(model='linear', min_size=2, jump=5),
+        'ruptures BottomUp': ruptures.BottomUp(model='linear', min_size=2, jump=5),
+        'ruptures Binseg': ruptures.Binseg(model='linear', min_size=2, jump=5),
+    }
+    rows: list[dict[str, object]] = []
+    for name, search in searches.items():
+        slow, ends = timed(lambda s=search: s.fit(signal).predict(n_bkps=PEER_PIECES - 1))
+        cost = fitted_cost(u, y, list(ends))  # type: ignore[call-overload]
+        rows.append({
+            'kind': kind, 'samples': n, 'search': name, **slow,
+            'times_slower': round(slow['wall_s'] / fast['wall_s'], 1),
+            'cost/optimum': round(cost / float(found.cost[PEER_PIECES - 1]), 6),
+        })  # fmt: skip
+    return rows
+
+
+def measure(options: argparse.Namespace) -> dict[str, list[dict[str, object]]]:
+    partition(*samples('valve', 3000), PIECES)  # compiles
+    plain(np.arange(9.0), np.arange(9.0), 2)
+    result: dict[str, list[dict[str, object]]] = {'ours': [], 'beside': []}
+    for size in options.sizes:
+        for kind in options.kinds:
+            result['ours'].append(ours(kind, size, options.threads, options.repeats))
+    for kind in options.kinds:
+        if options.plain and kind not in ('quantised', 'noiseless'):
+            result['beside'].append(against_plain(kind, options.plain))
+    if options.peers and importlib.util.find_spec('ruptures'):
+        result['beside'] += against_ruptures(options.kinds[0], options.peers)
+    elif options.peers:
+        print('ruptures is not installed, so it is not compared.', file=sys.stderr)
+    return result
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
+    parser.add_argument('--kinds', nargs='+', choices=list(KINDS), default=list(KINDS))
+    parser.add_argument('--sizes', nargs='*', type=int, default=[20_000, 305_633])
+    parser.add_argument('--plain', type=int, default=8000, help='0: not compared')
+    parser.add_argument('--peers', type=int, default=400, help='0: not compared')
+    parser.add_argument('--threads', type=int)
+    parser.add_argument('--repeats', type=int, default=3)
+    parser.add_argument('--json', action='store_true')
+    result = measure(options := parser.parse_args(arguments))
+    if options.json:
+        print(json.dumps(result, indent=2))
+        return 0
+    cores = len(os.sched_getaffinity(0))
+    load = os.getloadavg()[0]
+    print(f'Python {platform.python_version()}, {cores} cores, load {load:.1f}; J = 1..{PIECES}')
+    for row in result['ours']:
+        search, whole = row['search'], row['whole']
+        assert isinstance(search, dict)
+        assert isinstance(whole, dict)
+        print(
+            f'{row["kind"]:13}{row["samples"]:9,} samples {row["distinct"]:9,} distinct   '
+            f'search {search["wall_s"]:8.3f} s (cpu {search["cpu_s"]:.3f} s)   '
+            f'whole {whole["wall_s"]:8.3f} s   certified {row["certified"]}'
+        )
+    for row in result['beside']:
+        print(
+            f'{row["kind"]:13}{row["samples"]:9,} samples   {row["search"]:22} '
+            f'{row["wall_s"]:8.3f} s   {row["times_slower"]} times ours   '
+            f'cost/optimum {row["cost/optimum"]}'
+        )
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
