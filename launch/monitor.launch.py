@@ -21,9 +21,18 @@ def argument(name: str, about: str, default: object = '') -> DeclareLaunchArgume
     return DeclareLaunchArgument(name, default_value=default, description=about)
 
 
+_TRUE = ('true', '1', 'yes', 'on')
+_FALSE = ('false', '0', 'no', 'off', '')
+
+
 def typed(kind: type, text: str) -> object:
     """Turn an argument's text into a parameter's value."""
-    return text.strip().lower() in ('true', '1', 'yes', 'on') if kind is bool else text
+    if kind is not bool:
+        return text
+    word = text.strip().lower()
+    if word not in (*_TRUE, *_FALSE):
+        raise ValueError(f"'{text}' is neither true nor false")
+    return word in _TRUE
 
 
 def monitor(context: LaunchContext) -> list[Node]:

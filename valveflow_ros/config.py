@@ -150,8 +150,8 @@ _TIME_BASE = (
               0.01, 86400.0),
     Parameter('lateness', 2.0, 's',
               'How long a row waits for slower topics before it is closed.', 0.0, 3600.0),
-    Parameter('clock_jump', 60.0, 's',
-              'A stamp further ahead than this needs two more like it before it is believed; '
+    Parameter('clock_jump', 15.0, 's',
+              'A stamp further ahead than this needs two more instants like it to be believed; '
               'stamps further behind than this, twenty in a row, restart the table.',
               1.0, 1e6),
     Parameter('window_days', 10.0, 'd', 'Length of the rolling window.', 0.02, 60.0),
@@ -163,7 +163,7 @@ _MODEL = (
     Parameter('time_constant', 80.0, 's',
               'Largest time constant T expected; with delay it sets the transient 5 T + tau '
               'that does not count after a move begins.', 0.1, 3600.0),
-    Parameter('delay', 10.0, 's', 'Largest delay tau expected.', 0.0, 3600.0),
+    Parameter('delay', 10.0, 's', 'Largest delay tau expected.', 0.0, 600.0),
     Parameter('block', 10.0, 's', 'Length of the means the segmenter works on.', 0.01, 7200.0),
     Parameter('longest_segment', 1800.0, 's',
               'A segment that lasts longer is cut here and goes on without a transient.',
@@ -213,6 +213,8 @@ _ALARM = (
               1.0, 100.0, live=True),
     Parameter('alarm_limit', 0.0, 'MW',
               'Limit of the residual alarm in MW; 0 uses alarm_limit_sd.', 0.0, 1e5, live=True),
+    Parameter('alarm_floor', 1.0, 'MW',
+              'The limit is never less than this, whatever the noise.', 0.0, 1e4, live=True),
     Parameter('alarm_average', 300.0, 's', 'Time the residual is averaged over.', 1.0, 86400.0),
     Parameter('alarm_on_delay', 120.0, 's', 'The limit must be exceeded this long.',
               0.0, 86400.0, live=True),
@@ -234,6 +236,9 @@ _RECORD = (
               1.0, 864000.0),
     Parameter('record_queue', 200_000, '', 'Messages that may wait for the disk.',
               100, 10_000_000),
+    Parameter('record_keep', 0, '',
+              'Finished files kept in a recording, the oldest go first; 0 keeps all.',
+              0, 1_000_000),
     Parameter('diagnostics_period', 1.0, 's', 'Time between messages on /diagnostics.', 0.1, 60.0,
               live=True),
 )  # fmt: skip

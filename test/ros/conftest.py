@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
+from signal import SIGHUP, SIGINT, SIGTERM
 from typing import Any
 
 import pytest
@@ -35,6 +37,15 @@ def processes(ros_environment: dict[str, str], tmp_path: Path) -> Iterator[Proce
     made = Processes(ros_environment, tmp_path)
     yield made
     made.end_all()
+
+
+@pytest.fixture
+def here(ros_environment: dict[str, str]) -> Iterator[None]:
+    """Let a test call the main function of a node in this process; signals are put back."""
+    kept = {number: signal.getsignal(number) for number in (SIGINT, SIGTERM, SIGHUP)}
+    yield
+    for number, handler in kept.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture

@@ -149,9 +149,7 @@ def test_without_a_curve_the_message_says_why_and_gives_no_numbers() -> None:
     assert math.isnan(message.pressure_exponent)
 
 
-@given(
-    times, st.integers(0, 255), texts, texts, st.lists(reals, min_size=5, max_size=5), reals
-)
+@given(times, st.integers(0, 255), texts, texts, st.lists(reals, min_size=5, max_size=5), reals)
 def test_predictions_made_by_hand_are_what_the_encoder_makes(
     time_ns: int, state: int, model: str, tag: str, numbers: list[float], limit: float
 ) -> None:
@@ -165,7 +163,9 @@ def test_predictions_made_by_hand_are_what_the_encoder_makes(
     assert found_ns == time_ns
     assert conversions.from_time(message.header.stamp) == time_ns
     assert (message.header.frame_id, message.model_id, message.state) == (tag, model, state)
-    names = ('integrated_input', 'measured_mw', 'static_mw', 'dynamic_mw', 'residual_mw')
+    names = (
+        'integrated_input', 'measured_mw', 'static_mw', 'dynamic_mw', 'residual_mw', 'average_mw'
+    )  # fmt: skip
     for name, value in zip(names, numbers, strict=True):
         assert bits(getattr(message, name)) == bits(value), name
     assert bits(message.limit_high_mw) == bits(limit)

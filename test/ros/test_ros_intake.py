@@ -19,6 +19,7 @@ from valveflow_ros.ros.tallies import Tally
 from valveflow_ros.ros.wire import clock_bytes, float64_bytes
 
 T0 = 1_700_000_000 * NS_PER_S
+NOW = T0 + NS_PER_S  # later than anything was received
 
 
 class Queue:
@@ -70,7 +71,7 @@ def test_arrivals_come_in_the_order_of_receipt_and_then_of_topics(
     for at, which in sorted(received):
         data = encode(sample(T0)) if which == 2 else float64_bytes(1.0)
         queues[names[which]].put(data, T0 + at)
-    found = intake.collect(0.0, T0)
+    found = intake.collect(0.0, NOW)
     keys = [(arrival.log_ns, arrival.name) for arrival in found]
     assert len(found) == len(received)
     assert [k[0] for k in keys] == sorted({k[0] for k in keys})
@@ -84,14 +85,14 @@ def test_arrivals_come_in_the_order_of_receipt_and_then_of_topics(
         ('source', T0, T0 + 5, T0),
         ('source', 0, T0 + 5, T0 + 5),
         ('receive', T0, T0 + 5, T0 + 5),
-        ('receive', T0, 0, T0 + 99),
-        ('source', 0, 0, T0 + 99),
+        ('receive', T0, 0, NOW),
+        ('source', 0, 0, NOW),
     ],
 )
 def test_the_time_of_a_plain_value(source: str, sent: int, received: int, time_ns: int) -> None:
     queues, intake = intake_of(['valve_opening'], stamp_source=source)
     queues['valve_opening'].put(float64_bytes(50.0), sent, received)
-    (arrival,) = intake.collect(0.0, T0 + 99)
+    (arrival,) = intake.collect(0.0, NOW, last=True)
     assert arrival.time_ns == time_ns
     assert intake.rows([arrival]) == [(time_ns, Signal.VALVE_OPENING, 50.0, Quality.GOOD)]
 
@@ -101,28 +102,95 @@ def test_a_stamped_sample_belongs_to_its_own_time_whatever_the_clock_says() -> N
     queues, intake = intake_of([PLANT_SAMPLE], clock)
     clock.put(clock_bytes(5 * NS_PER_S), T0)
     queues[PLANT_SAMPLE].put(encode(sample(T0 + 7, valve_opening=50.0)), T0 + 1)
-    intake.collect(0.0, T0)
-    (arrival,) = intake.collect(0.0, T0)
+    (arrival,) = intake.collect(0.0, NOW, last=True)
     assert arrival.time_ns == T0 + 7
 
 
 def test_a_value_gets_the_clock_that_was_sent_before_it_however_late_that_is_taken() -> None:
     clock = Queue()
     queues, intake = intake_of(['valve_opening', 'generated_power'], clock)
-    # Three instants are taken at once; the clock message of the last is still on its way.
+    # Three instants are taken at once; two clock messages are still on their way.
     for k in range(3):
         queues['valve_opening'].put(float64_bytes(k), T0 + 10 * k + 1)
         queues['generated_power'].put(float64_bytes(k), T0 + 10 * k + 2)
-        if k < 2:
-            clock.put(clock_bytes((100 + k) * NS_PER_S), T0 + 10 * k)
-    assert intake.collect(0.0, T0) == []
-    clock.put(clock_bytes(102 * NS_PER_S), T0 + 20)
-    found = intake.collect(0.0, T0)
+    clock.put(clock_bytes(100 * NS_PER_S), T0)
+    assert intake.collect(0.0, NOW) == []
+    clock.put(clock_bytes(101 * NS_PER_S), T0 + 10)
+    found = intake.collect(0.1, NOW)
     assert [(a.name, a.time_ns // NS_PER_S) for a in found] == [
         ('valve_opening', 100), ('generated_power', 100),
+    ]  # fmt: skip
+    clock.put(clock_bytes(102 * NS_PER_S), T0 + 20)
+    found = intake.collect(0.11, NOW)
+    # The last instant waits for the clock after it, but not for ever.
+    assert intake.collect(0.19, NOW) == []
+    found += intake.collect(0.21, NOW)
+    assert [(a.name, a.time_ns // NS_PER_S) for a in found] == [
         ('valve_opening', 101), ('generated_power', 101),
         ('valve_opening', 102), ('generated_power', 102),
     ]  # fmt: skip
+
+
+def test_what_came_while_the_topics_were_looked_at_waits_for_the_next_look() -> None:
+    # While the first topic was looked at, the publisher sent three more instants.
+    queues, intake = intake_of(['valve_opening', 'generated_power'])
+    for k in range(3):
+        queues['valve_opening'].put(float64_bytes(k), T0 + 10 * k)
+    for k in range(6):
+        queues['generated_power'].put(float64_bytes(k), T0 + 10 * k + 1)
+    found = intake.collect(0.0, T0 + 25 + 1_000_000)
+    assert [a.time_ns - T0 for a in found] == [0, 1, 10, 11, 20, 21]
+    for k in range(3, 6):
+        queues['valve_opening'].put(float64_bytes(k), T0 + 10 * k)
+    found = intake.collect(0.0, NOW)
+    assert [a.time_ns - T0 for a in found] == [30, 31, 40, 41, 50, 51]
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 3)), max_size=200),
+    st.lists(st.integers(1, 400), max_size=12),
+    st.booleans(),
+)
+def test_however_the_looks_fall_the_order_is_that_of_receipt(
+    sent: list[tuple[int, int]], steps: list[int], with_clock: bool
+) -> None:
+    names = ['valve_command', 'valve_opening', 'generated_power', 'main_steam_pressure']
+    queues, intake = intake_of(names, Queue() if with_clock else None)
+    waiting = sorted((at * 10_000, which) for at, which in sent)
+    now, order = 0, []
+    for step in [*steps, 10**6]:
+        # A look begins at `now`; what is received while it lasts is found by the later topics.
+        now += step * 10_000
+        for k, name in enumerate(names):
+            visible = now + k * 20_000
+            for at, which in [w for w in waiting if w[0] <= visible and w[1] == k]:
+                queues[name].put(float64_bytes(1.0), T0 + at)
+                waiting.remove((at, which))
+        found = intake.collect(0.0, T0 + now + 1_000_000)
+        order += [(a.log_ns, INPUT_ORDER[a.name]) for a in found]
+    order += [(a.log_ns, INPUT_ORDER[a.name]) for a in intake.collect(0.0, NOW, last=True)]
+    assert len(order) == len(sent)
+    expected = sorted((T0 + at * 10_000, INPUT_ORDER[names[which]]) for at, which in sent)
+    assert [topic for _, topic in order] == [topic for _, topic in expected]
+
+
+def test_more_than_a_look_can_take_keeps_the_other_topics_waiting() -> None:
+    queues, intake = intake_of(['valve_opening', 'generated_power'])
+    for k in range(DEPTH + 50):
+        for name in queues:
+            queues[name].put(float64_bytes(k), T0 + 2 * k + INPUT_ORDER[name])
+    del queues['generated_power'].waiting[: DEPTH // 2]
+    found = intake.collect(0.0, NOW) + intake.collect(0.0, NOW)
+    times = [a.time_ns for a in found]
+    assert times == sorted(times)
+    assert len(times) == 2 * DEPTH + 100 - DEPTH // 2
+
+
+def test_a_clock_set_back_holds_nothing_for_long() -> None:
+    queues, intake = intake_of(['valve_opening'])
+    queues['valve_opening'].put(float64_bytes(1.0), T0 + 3600 * NS_PER_S)
+    found = [len(intake.collect(0.02 * k, T0 + k)) for k in range(5)]
+    assert found == [0, 0, 1, 0, 0]
 
 
 def test_the_last_look_holds_nothing_back() -> None:
@@ -130,9 +198,9 @@ def test_the_last_look_holds_nothing_back() -> None:
     queues, intake = intake_of(['valve_opening'], clock)
     clock.put(clock_bytes(NS_PER_S), T0)
     queues['valve_opening'].put(float64_bytes(1.0), T0 + 1)
-    (arrival,) = intake.collect(0.0, T0, last=True)
+    (arrival,) = intake.collect(0.0, NOW, last=True)
     assert arrival.time_ns == NS_PER_S
-    assert intake.collect(0.0, T0, last=True) == []
+    assert intake.collect(0.0, NOW, last=True) == []
 
 
 def test_what_has_no_time_is_logged_counted_and_not_fed() -> None:
@@ -140,7 +208,7 @@ def test_what_has_no_time_is_logged_counted_and_not_fed() -> None:
     queues, intake = intake_of(['valve_opening', PLANT_SAMPLE], clock)
     queues['valve_opening'].put(float64_bytes(1.0), T0)
     queues[PLANT_SAMPLE].put(encode(sample(0)), T0)
-    found = intake.collect(0.0, T0, last=True)
+    found = intake.collect(0.0, NOW, last=True)
     assert [arrival.time_ns for arrival in found] == [0, 0]
     assert intake.rows(found) == []
     assert [intake.tallies[name].without_time for name in queues] == [1, 1]
@@ -183,9 +251,9 @@ def test_units_are_converted_at_the_door() -> None:
 def test_both_byte_orders_are_read() -> None:
     big = b'\x00\x00\x00\x00' + float64_bytes(1.5)[4:][::-1]
     assert Decoder(Settings()).rows('valve_opening', big, T0)[0][2] == 1.5
-    assert header_time_ns(b'\x00\x00\x00\x00' + (7).to_bytes(4, 'big') + (9).to_bytes(4, 'big')) == (
-        7 * NS_PER_S + 9
-    )
+    assert header_time_ns(
+        b'\x00\x00\x00\x00' + (7).to_bytes(4, 'big') + (9).to_bytes(4, 'big')
+    ) == (7 * NS_PER_S + 9)
 
 
 def test_a_sample_gives_a_reading_a_signal_the_optional_one_first() -> None:
@@ -194,7 +262,7 @@ def test_a_sample_gives_a_reading_a_signal_the_optional_one_first() -> None:
     message.main_steam_pressure_quality = Quality.UNCERTAIN.value
     message.main_steam_temperature_quality = 200
     rows = decoder.rows(PLANT_SAMPLE, encode(message), T0)
-    assert [row[1] for row in rows][0] == Signal.VALVE_COMMAND
+    assert rows[0][1] == Signal.VALVE_COMMAND
     by_signal = {Signal(row[1]): row for row in rows}
     assert len(by_signal) == 5
     assert by_signal[Signal.VALVE_COMMAND][2] == 51.0

@@ -26,8 +26,8 @@ def node(context: Any) -> Any:
 
 def publisher_for(node: Node, taker: Taker, reliable: bool = True) -> Any:
     kind = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-    made = node.create_publisher(Float64, taker.topic, QoSProfile(depth=DEPTH, reliability=kind))
-    return made
+    profile = QoSProfile(depth=DEPTH, reliability=kind)
+    return node.create_publisher(Float64, taker.topic, profile)
 
 
 def matched(node: Node, taker: Taker) -> Any:
@@ -40,7 +40,9 @@ def matched(node: Node, taker: Taker) -> Any:
     return publisher
 
 
-def collect(taker: Taker, count: int, executor: SingleThreadedExecutor | None = None) -> list[Taken]:
+def collect(
+    taker: Taker, count: int, executor: SingleThreadedExecutor | None = None
+) -> list[Taken]:
     found: list[Taken] = []
 
     def enough() -> bool:

@@ -78,6 +78,8 @@ def _watch(
             memory[_COUNTING] = 0
         v = abs(value[t])
         if math.isnan(v):
+            # Delays stand still while there is nothing to judge.
+            memory[_SINCE] += step_ns
             continue
         if memory[_ACTIVE] == 0:
             beyond = v > limit

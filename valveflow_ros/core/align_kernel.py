@@ -23,7 +23,7 @@ REASONS = (
 )
 _ACCEPTED, _NOT_FINITE, _BAD, _IMPOSSIBLE, _DUPLICATE, _ORDER, _OUTLIER, _LATE = range(8)
 
-_AHEAD_CONFIRMED = 3  # readings that must agree before a leap forward is believed
+_AHEAD_CONFIRMED = 3  # instants that must agree before a leap forward is believed
 BEHIND_CONFIRMED = 20  # and before the clock is believed to have gone back
 NEVER = np.iinfo(np.int64).min
 _LATEST_NS = 2**62  # the year 2116; later stamps would overflow
@@ -168,7 +168,12 @@ def _wait(state: State, rules: Rules, time_ns: int, s: int, v: float, q: int) ->
     state.wait[n], state.wait_quality[n] = v, q
     clock[_WAITING] = n + 1
     ahead = time_ns > clock[_NEWEST]
-    if n + 1 < (_AHEAD_CONFIRMED if ahead else BEHIND_CONFIRMED):
+    # The values of one instant must not confirm each other: what counts is instants.
+    instants = 1
+    for k in range(1, n + 1):
+        if state.wait_ns[k] != state.wait_ns[k - 1]:
+            instants += 1
+    if n + 1 < BEHIND_CONFIRMED and (not ahead or instants < _AHEAD_CONFIRMED):
         return 0
     return 1 if ahead else -1
 

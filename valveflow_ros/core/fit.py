@@ -27,6 +27,7 @@ from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.records import FloatArray, SegmentKind
 
 _EXPLAINED_LEAST = 0.5  # share of the power's variance a curve must explain to be one
+_LEAST_SPREAD = 10.0  # noise sd that the openings must spread over
 _RICHER = 3  # pieces more than the paper's rule takes, before pruning
 
 
@@ -50,6 +51,7 @@ def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
     part = partition(u, power, settings.whole('max_pieces'), least)
     growth = _inflation(contents, part)
     selection = select(part, rule='paper', correlation_inflation=growth)
+    _moved(task, u)
     chosen = _pieces_of(part, selection.pieces, growth)
     _carries_a_curve(chosen, u, power)
     source = _source(task, rows)
@@ -96,6 +98,17 @@ def _enough(task: FitTask, samples: int) -> None:
             'Samples in steady-state and slope-response segments', samples, need,
             'Longer data, or calmer operation at several loads, would help.',
         )  # fmt: skip
+
+
+def _moved(task: FitTask, u: FloatArray) -> None:
+    """Refuse samples that lie at one opening: their scatter has no slope to tell."""
+    low, high = np.quantile(u, (0.01, 0.99))
+    if high - low < _LEAST_SPREAD * task.input_noise:
+        raise DataError(
+            f'The unit stood at one opening: in the special segments u lies between {low:.4g} and '
+            f'{high:.4g}, hardly more than its noise of {task.input_noise:.2g}. A curve needs '
+            'several loads.'
+        )
 
 
 def _carries_a_curve(pieces: tuple[Piece, ...], u: FloatArray, power: FloatArray) -> None:
@@ -177,6 +190,26 @@ def _static_residuals(
     return residual_statistics(task, rest, weight, task.settings.real('sample_period'))
 
 
+def _only_straight(
+    task: FitTask, static: Characteristic, part: Partition, why: str
+) -> Characteristic:
+    """Return one straight piece where the dynamics could not be estimated.
+
+    Few samples lie in a few clusters, and each cluster's own slope is mostly noise
+    of the valve: pieces of their own would run far off between the clusters.
+    """
+    notes = (f'One straight piece, without dynamics. {why}',)
+    rows = task.contents.special_rows()
+    pieces = _pieces_of(part, 1, _inflation(task.contents, part))
+    return replace(
+        static,
+        pieces=pieces,
+        breakpoint_intervals=(),
+        residuals=_static_residuals(task, pieces, rows),
+        notes=notes,
+    )
+
+
 def _rich(part: Partition, pieces: int) -> tuple[Piece, ...]:
     """Return the exact partition with some pieces more than chosen, to be pruned."""
     return _pieces_of(part, min(len(part.cost), pieces + _RICHER))
@@ -211,6 +244,5 @@ def _refined(
     try:
         result = refine(samples, start, most)
     except (np.linalg.LinAlgError, TooFewSamplesError) as error:
-        why = str(error).rstrip('.')
-        return replace(static, notes=(f'The curve is not refined by dynamics: {why}.',))
+        return _only_straight(task, static, part, str(error))
     return from_refined(task, static, result, samples, u_special)

@@ -159,7 +159,7 @@ class Monitor:
         if fixed > 0.0:
             return fixed
         sd = self._predictor.characteristic.residuals.average_sd_mw
-        return self.settings.real('alarm_limit_sd') * sd
+        return max(self.settings.real('alarm_limit_sd') * sd, self.settings.real('alarm_floor'))
 
     def reconfigure(self, settings: Settings) -> list[Event]:
         """Take settings of which only live ones differ.
@@ -259,7 +259,7 @@ class Monitor:
         events: list[Event] = []
         if pending is not None:
             events += self.refuse(pending, reason)
-        self._segmenter = Segmenter(self.settings)
+        self._segmenter = Segmenter(self.settings, self._segments_seen)
         self._window = RollingWindow(
             86400.0 * self.settings.real('window_days'), self._step_s
         )  # fmt: skip

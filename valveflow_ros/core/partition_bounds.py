@@ -25,8 +25,8 @@ an end in the group from below at the cost of one line fit:
     D(w) + cost([w, r)) >= P + min over the box of slopes (slope . (k - k0))
                              + cost(K) + the same for the tail .
 
-Here ``H1`` is `SHARE` times the Gram matrix of the `WINDOW` that follows the
-node and ``k0`` the best line of that window; without a window (slot 0)
+Here ``H1`` is `SHARE` times the Gram matrix of a window of samples that follows the
+node, and ``k0`` the best line of that window; without a window (slot 0)
 ``f_B = cost(B)``, which needs no line. The farther away the group, the larger
 the window that fits, and the smaller what the inequality gives away: for white
 noise it falls like sqrt(node / window), on smooth curves it falls because the
@@ -51,6 +51,7 @@ from valveflow_ros.core.partition_moments import (
 )
 from valveflow_ros.records import FloatArray
 
+# Windows that a node knows a bound for: none, then its own size times 1, 4, 16, 64, 256.
 SLOTS = 6
 # Two shares of one core, a little less than halves so that rounding cannot make them more.
 SHARE = 0.499999

@@ -19,6 +19,7 @@ from valveflow_ros.core.jit import inlined, kernel
 from valveflow_ros.core.partition_moments import LEAF, Tree
 from valveflow_ros.records import FloatArray, IntArray
 
+# Samples in a cell; a smaller table against fewer breaks that need no look.
 CELL = 8
 CELLS = LEAF // CELL
 

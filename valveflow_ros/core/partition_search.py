@@ -174,7 +174,7 @@ def _descend(tree: Tree, layer: Layer, block: int, group: Group) -> int:
     refer_nowhere(group)
     while end > 0:
         cost = value = slope = 0.0
-        firm = False
+        firm = True
         if end < block:
             cost, value, slope, firm = fit(core)
             if block - end >= _RENEW * renewed and firm:
@@ -190,10 +190,10 @@ def _descend(tree: Tree, layer: Layer, block: int, group: Group) -> int:
             size *= BRANCH
         right = value + slope * (origin - tree.x[LEAF * end - 1])
         rest = cost + layer.slack + tail_part(group, value, slope)
-        usable = wide if firm else 0
         while True:
-            part = _node_part(tree, layer, level, end, size, usable, right, slope)
-            drop = part + rest >= 0.0
+            part = _node_part(tree, layer, level, end, size, wide, right, slope)
+            # Without a line of the core there is nothing to bound about.
+            drop = firm and part + rest >= 0.0
             if drop or level == 0:
                 break
             level -= 1

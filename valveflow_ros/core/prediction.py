@@ -147,6 +147,8 @@ def _predict(
         f.place[_LAST_NS] = time_ns[t]
         if step_ns > f.gap_ns or step_ns <= 0:
             f.place[_AGE] = 0
+            f.memory[_AVERAGE] = np.nan
+            out.average[t] = np.nan
         if kinds[t] == NO_DATA or not (math.isfinite(u[t]) and math.isfinite(y[t])):
             f.place[_AGE] = 0
             out.state[t] = 5

@@ -68,6 +68,8 @@ class Segmenter:
     ----------
     settings : Settings
         Block length, transient, thresholds.
+    numbered : int
+        Number of the last segment before the first found here.
 
     Notes
     -----
@@ -75,7 +77,7 @@ class Segmenter:
     the same kinds, bit for bit.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, numbered: int = 0) -> None:
         period = settings.real('sample_period')
         rows = max(1, round(settings.real('block') / period))
         block_s = rows * period
@@ -109,7 +111,7 @@ class Segmenter:
         self._blocks = np.zeros((3, room))
         self._histograms = np.zeros((2, BINS))
         self._found = np.zeros(kernel.SEG_SIZE)
-        self._number = 0
+        self._number = numbered
 
     @property
     def longest_rows(self) -> int:

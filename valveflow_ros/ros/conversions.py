@@ -129,6 +129,10 @@ def characteristic(
     message.intercept_stderr = [p.intercept_stderr for p in curve.pieces]
     message.breakpoint_low = [low for low, _ in curve.breakpoint_intervals]
     message.breakpoint_high = [high for _, high in curve.breakpoint_intervals]
+    message.region_power_from = [d.power_from for d in curve.dynamics]
+    message.region_power_to = [d.power_to for d in curve.dynamics]
+    message.time_constants = [d.time_constant_s for d in curve.dynamics]
+    message.delays = [d.delay_s for d in curve.dynamics]
     message.cost, message.turning_angle = _selection(curve)
     message.pressure_exponent = curve.pressure_exponent
     message.samples = source.samples

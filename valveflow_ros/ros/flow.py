@@ -13,7 +13,9 @@ from valveflow_ros.ros.inputs import header_time_ns
 from valveflow_ros.ros.taking import Taker
 
 _PREDICTION = 'valveflow_msgs/msg/Prediction'
-_WINDOW = 400
+# Between two processes on one machine the middleware's queue holds 512 messages of all topics.
+_MOST_UNDER_WAY = 240
+_LEAST_STEPS = 8
 _NAP_S = 0.002
 _STUCK_S = 0.5
 _STUCK_MOST = 3
@@ -24,13 +26,15 @@ _LOOK_S = 1.0
 class Flow:
     """Holds a sender back while too much of what it sent is unanswered.
 
-    A topic keeps a thousand messages for who is slow; beyond that the oldest
-    are lost. The monitor answers each row with a prediction that carries the
-    row's stamp, so what is under way is known.
+    What is sent in one go beyond what the middleware's queues hold is lost. The
+    monitor answers each row with a prediction that carries the row's stamp, so
+    what is under way is known.
 
     Parameters
     ----------
     node : Node
+    messages : int
+        How many messages a sample takes.
     stop : callable
         Tells whether to give up waiting.
 
@@ -40,8 +44,11 @@ class Flow:
     rate to what an ordinary subscriber takes.
     """
 
-    def __init__(self, node: Node, stop: Callable[[], bool] = lambda: False) -> None:
+    def __init__(
+        self, node: Node, messages: int, stop: Callable[[], bool] = lambda: False
+    ) -> None:
         self._node = node
+        self._window = max(_LEAST_STEPS, _MOST_UNDER_WAY // messages)
         self._stop = stop
         self._takers: list[Taker] = []
         self._under_way: deque[int] = deque()
@@ -84,14 +91,14 @@ class Flow:
                 self._wait_blindly()
             return
         begun_s = time.monotonic()
-        while len(self._under_way) >= _WINDOW and not self._stop():
+        while len(self._under_way) >= self._window and not self._stop():
             if self._answered():
                 self._stuck = 0
                 begun_s = time.monotonic()
             elif time.monotonic() - begun_s > _STUCK_S:
                 # It may be waiting for what we hold back; and if it has gone, so be it.
                 self._stuck += 1
-                for _ in range(_WINDOW // 4):
+                for _ in range(self._window // 4):
                     self._under_way.popleft()
             else:
                 time.sleep(_NAP_S)

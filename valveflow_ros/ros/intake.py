@@ -15,6 +15,10 @@ from valveflow_ros.ros.tallies import Tally
 __all__ = ['Arrival', 'Clock', 'Intake']
 
 _MOST_CLOCKS = 16 * DEPTH
+_PATIENCE_S = 0.03
+_CLOCK_PATIENCE_S = 0.2
+# A message may get its receipt time a moment before it can be taken.
+_IN_FLIGHT_NS = 1_000_000
 
 
 class Arrival(NamedTuple):
@@ -24,6 +28,16 @@ class Arrival(NamedTuple):
     data: bytes
     log_ns: int
     time_ns: int
+
+
+class _Held(NamedTuple):
+    """A message taken and not given on yet: its place in the order, and when it was taken."""
+
+    received_ns: int
+    order: int
+    taken_s: float
+    name: str
+    taken: Taken
 
 
 class Source(Protocol):
@@ -52,8 +66,12 @@ class Intake:
 
     Notes
     -----
-    With a /clock each message is held back until the next look, so that the
-    clock message sent just before it cannot still be on its way.
+    Topics are looked at one after the other, and while a plant runs faster than
+    real time a later one would be ahead of an earlier one by many samples. So a
+    look gives only what was received before it began, and keeps the rest for
+    the next one. With a /clock a value waits until a clock message is there that
+    was sent after it, so that none sent before it can still be on its way; if
+    none comes, it does not wait for long.
     """
 
     def __init__(
@@ -68,11 +86,12 @@ class Intake:
         self._sources = dict(sources)
         self._decoder = decoder
         self._log_clock = log_clock
-        self._by_receipt = stamp_source == 'receive'
+        # Without a /clock ROS time is the machine's own.
+        self._by_receipt = stamp_source in ('receive', 'ros_time')
         self._clock = clock
         self._watch = watch
         self._track = ClockTrack()
-        self._held: list[tuple[int, int, str, Taken]] = []
+        self._held: list[_Held] = []
         self.tallies = {name: Tally() for name in self._sources}
         self.clock_tally = Tally()
 
@@ -88,22 +107,35 @@ class Intake:
         last : bool
             Hold nothing back.
         """
-        fresh: list[tuple[int, int, str, Taken]] = []
+        until_ns = now_ns - _IN_FLIGHT_NS
         for name, source in self._sources.items():
             found = source.take()
-            tally = self.tallies[name]
-            tally.note_arrival(len(found), now_s)
+            self.tallies[name].note_arrival(len(found), now_s)
             for taken in found:
-                tally.note_number(taken.sequence)
-                fresh.append((taken.received_ns or now_ns, INPUT_ORDER[name], name, taken))
-        fresh.sort(key=lambda entry: entry[:2])
+                self.tallies[name].note_number(taken.sequence)
+                received_ns = taken.received_ns or now_ns
+                self._held.append(_Held(received_ns, INPUT_ORDER[name], now_s, name, taken))
+            if len(found) >= DEPTH:
+                # More is waiting there, received after the last of these.
+                until_ns = min(until_ns, self._held[-1].received_ns)
+        if self._clock is not None:
+            self._follow_clock(self._clock, now_s)
+        # By topic within one receipt time; a topic's own messages stay in their order.
+        self._held.sort(key=lambda held: held[:2])
+        count = len(self._held)
+        if not last:
+            waiting = (k for k, h in enumerate(self._held) if not self._due(h, until_ns, now_s))
+            count = next(waiting, count)
+        ready, self._held = self._held[:count], self._held[count:]
+        return [self._arrival(held) for held in ready]
+
+    def _due(self, held: _Held, until_ns: int, now_s: float) -> bool:
+        waited_s = now_s - held.taken_s
         if self._clock is None:
-            return [self._arrival(*entry) for entry in fresh]
-        self._follow_clock(self._clock, now_s)
-        ready, self._held = self._held, fresh
-        if last:
-            ready, self._held = ready + fresh, []
-        return [self._arrival(*entry) for entry in ready]
+            # Should the machine's clock have been set back, nothing waits for it.
+            return held.received_ns <= until_ns or waited_s > _PATIENCE_S
+        ready = held.received_ns <= until_ns and held.taken.source_ns < self._track.newest_ns
+        return ready or waited_s > _CLOCK_PATIENCE_S
 
     def rows(self, arrivals: list[Arrival]) -> list[Row]:
         """Return the readings in arrivals; what has no time or no meaning is counted."""
@@ -128,7 +160,8 @@ class Intake:
             self.clock_tally.note_number(taken.sequence)
             self._track.note(taken.source_ns, header_time_ns(taken.data))
 
-    def _arrival(self, received_ns: int, _order: int, name: str, taken: Taken) -> Arrival:
+    def _arrival(self, held: _Held) -> Arrival:
+        received_ns, name, taken = held.received_ns, held.name, held.taken
         if self._clock is not None:
             time_ns = self._track.at(taken.source_ns)
         elif self._by_receipt:

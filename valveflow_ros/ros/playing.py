@@ -62,7 +62,7 @@ class Player:
             for name in names
         }
         self._clock = node.create_publisher(Clock, '/clock', qos) if use_clock else None
-        self._flow = Flow(node, stop)
+        self._flow = Flow(node, len(self.publishers) + use_clock, stop)
         self.sent: dict[str, int] = dict.fromkeys(self.publishers, 0)
 
     def wait_for_listeners(self, patience_s: float) -> list[str]:

@@ -26,7 +26,7 @@ def _layout(tag_bytes: int, model_bytes: int) -> struct.Struct:
     before_model = -size % 4
     size += before_model + 4 + model_bytes
     before_numbers = -size % 8
-    return struct.Struct(f'<4siII{tag_bytes}sB{before_model}xI{model_bytes}s{before_numbers}x7d')
+    return struct.Struct(f'<4siII{tag_bytes}sB{before_model}xI{model_bytes}s{before_numbers}x8d')
 
 
 def prediction_bytes(block: PredictionBlock, tag: str) -> Iterator[tuple[int, bytes]]:
@@ -36,7 +36,7 @@ def prediction_bytes(block: PredictionBlock, tag: str) -> Iterator[tuple[int, by
     low, high = -block.limit_mw, block.limit_mw
     columns = (
         block.time_ns, block.state, block.u, block.measured_mw, block.static_mw,
-        block.dynamic_mw, block.residual_mw,
+        block.dynamic_mw, block.residual_mw, block.average_mw,
     )  # fmt: skip
     for row in zip(*(column.tolist() for column in columns), strict=True):
         time_ns, state, *numbers = row

@@ -63,6 +63,7 @@ class Recording:
         self.problem = ''
         self.folder: Path | None = None
         self._recorder: Recorder | None = None
+        self._offered: dict[str, tuple[str, Qos, bool]] = {}
         if not settings.flag('record'):
             self.problem = 'Recording is switched off (parameter record).'
             return
@@ -70,6 +71,7 @@ class Recording:
             queue_limit=settings.whole('record_queue'),
             flush_period_s=settings.real('record_flush'),
             rotate_s=settings.real('record_rotation'),
+            keep_files=settings.whole('record_keep') or None,
         )
         attachments = {
             PARAMETERS: _json(dict(settings)),
@@ -86,25 +88,23 @@ class Recording:
         """Tell whether there is a recorder at work."""
         return self._recorder is not None
 
-    def add_topic(self, topic: str, type_name: str, *, reliable: bool, latched: bool) -> None:
-        """Make a topic known before its first message."""
-        if self._recorder is None:
-            return
+    def offer(self, topic: str, type_name: str, *, reliable: bool, latched: bool) -> None:
+        """Describe a topic; it stands in the file from its first message on."""
         qos = Qos(
             reliability='reliable' if reliable else 'best_effort',
             durability='transient_local' if latched else 'volatile',
             depth=1 if latched else 10,
         )
-        try:
-            self._recorder.add_topic(topic, type_name, qos=qos, latched=latched)
-        except ValveflowError as error:
-            self._give_up(str(error))
+        self._offered[topic] = (type_name, qos, latched)
 
     def write(self, topic: str, data: bytes, log_ns: int, time_ns: int) -> None:
         """Hand in a message; never waits and never raises."""
         if self._recorder is None:
             return
         try:
+            if topic in self._offered:
+                type_name, qos, latched = self._offered.pop(topic)
+                self._recorder.add_topic(topic, type_name, qos=qos, latched=latched)
             self._recorder.record(topic, data, log_ns, time_ns)
         except ValveflowError as error:
             self._give_up(str(error))

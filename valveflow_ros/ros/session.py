@@ -191,14 +191,14 @@ class Session:
         recording = Recording(self._settings, topics, time.time())
         reliable = self._settings.text('input_reliability') == 'reliable'
         for topic in INPUTS:
-            recording.add_topic(
+            recording.offer(
                 self.inputs[topic.name], topic.type_name, reliable=reliable, latched=False
             )
         for name, output in OUTPUTS.items():
-            recording.add_topic(
+            recording.offer(
                 self.outputs[name], output.type_name, reliable=True, latched=output.latched
             )
-        recording.add_topic(
+        recording.offer(
             DIAGNOSTICS, 'diagnostic_msgs/msg/DiagnosticArray', reliable=True, latched=False
         )
         return recording

@@ -34,6 +34,11 @@ class ClockTrack:
         self._sent_ns: list[int] = []
         self._clock_ns: list[int] = []
 
+    @property
+    def newest_ns(self) -> int:
+        """Return when the newest clock message was sent, 0 before the first."""
+        return self._sent_ns[-1] if self._sent_ns else 0
+
     def note(self, sent_ns: int, clock_ns: int) -> None:
         """Take a message of /clock."""
         at = bisect_right(self._sent_ns, sent_ns)

@@ -1,0 +1,168 @@
+"""The engine as the node runs it gives what it gives offline, however the data are cut."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.align import Aligner
+from valveflow_ros.core.events import CurveAdopted, Event, JournalEntry, JournalKind
+from valveflow_ros.core.fit import fit
+from valveflow_ros.core.monitor import Monitor
+from valveflow_ros.core.offline import JournalReplayer
+from valveflow_ros.errors import DataError
+from valveflow_ros.plant.simulator import simulate
+from valveflow_ros.records import Readings, table_to_readings
+from valveflow_ros.ros.inputs import Row
+from valveflow_ros.ros.live import LiveEngine
+from valveflow_ros.ros.outcome import FitOutcome
+from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
+from valveflow_ros.ros.simulator_steps import effects_of
+
+SETTINGS = Settings({'refit_period': 3600.0, 'refit_segments': 0, 'alarm_on_delay': 60.0})
+TABLE = simulate(0.3, 7, effects=effects_of(['gain_step:g=-0.12,t0_days=0.25'])).table
+
+
+class SlowWorker:
+    """Gives outcomes a number of looks after they were asked for."""
+
+    def __init__(self, looks: int) -> None:
+        self._looks = looks
+        self._waiting: list[tuple[int, FitOutcome]] = []
+        self._look = 0
+        self.refuse_next = False
+
+    def submit(self, task: object) -> None:
+        if self.refuse_next:
+            self.refuse_next = False
+            result: object = 'The fit process ended unexpectedly (signal SIGKILL).'
+        else:
+            try:
+                result = fit(task)  # type: ignore[arg-type]
+            except DataError as error:
+                result = str(error)
+        outcome = FitOutcome(task.request_ns, result, 0.5)  # type: ignore[attr-defined,arg-type]
+        self._waiting.append((self._look + self._looks, outcome))
+
+    def poll(self) -> list[FitOutcome]:
+        self._look += 1
+        due = [outcome for look, outcome in self._waiting if look <= self._look]
+        self._waiting = [entry for entry in self._waiting if entry[0] > self._look]
+        return due
+
+
+def rows_of(readings: Readings) -> list[Row]:
+    columns = (readings.time_ns, readings.signal, readings.value, readings.quality)
+    return list(zip(*(column.tolist() for column in columns), strict=True))
+
+
+ROWS = rows_of(table_to_readings(TABLE))
+
+
+def run(cuts: list[int], worker: SlowWorker, engine: LiveEngine) -> list[list[Event]]:
+    """Feed all rows cut at ``cuts``; return the events of each call."""
+    calls: list[list[Event]] = []
+    for start, end in zip([0, *cuts], [*cuts, len(ROWS)], strict=True):
+        calls += [engine.poll(), engine.feed(ROWS[start:end])]
+    return calls
+
+
+def said(calls: list[list[Event]]) -> list[Output]:
+    outputs = Outputs('u')
+    found = list(outputs.first())
+    for events in calls:
+        found += outputs.of(events)
+    return found
+
+
+def evenly(size: int) -> list[int]:
+    return list(range(size, len(ROWS), size))
+
+
+@pytest.fixture(scope='module')
+def live() -> tuple[LiveEngine, list[list[Event]]]:
+    worker = SlowWorker(3)
+    engine = LiveEngine(SETTINGS, worker)
+    return engine, run(evenly(500), worker, engine)
+
+
+def test_it_does_what_it_is_for(live: tuple[LiveEngine, list[list[Event]]]) -> None:
+    engine, calls = live
+    events = [event for call in calls for event in call]
+    assert any(isinstance(event, CurveAdopted) for event in events)
+    assert engine.monitor.rows == len(TABLE)
+    assert engine.last_fit_s == 0.5
+    names = {output.name for output in said(calls)}
+    assert names == set(OUTPUTS)
+
+
+def test_replaying_the_journal_says_the_same_byte_for_byte(
+    live: tuple[LiveEngine, list[list[Event]]],
+) -> None:
+    _, calls = live
+    journal = [e for call in calls for e in call if isinstance(e, JournalEntry)]
+    table = Aligner(SETTINGS).feed(table_to_readings(TABLE)).table
+    for size in (len(table), 1777):
+        replayer = JournalReplayer(Monitor(SETTINGS), journal)
+        again = [
+            replayer.feed(table.part(k, min(k + size, len(table))))
+            for k in range(0, len(table), size)
+        ]
+        assert said(again) == said(calls)
+
+
+def test_the_cutting_of_the_stream_leaves_no_trace() -> None:
+    # With an outcome at the next look, a call per row or many rows differ in the boundary at
+    # which it is adopted; without fits nothing may differ at all.
+    settings = SETTINGS.changed({'refit_period': 0.0})
+    found = []
+    for cuts in (evenly(7), evenly(5000), [], evenly(500)):
+        worker = SlowWorker(0)
+        engine = LiveEngine(settings, worker)
+        found.append(said(run(cuts, worker, engine)))
+    assert all(one == found[0] for one in found[1:])
+    assert len(found[0]) > len(TABLE)
+
+
+def test_a_fit_that_fails_leaves_the_curve_as_stale_with_the_sentence() -> None:
+    worker = SlowWorker(1)
+    engine = LiveEngine(SETTINGS, worker)
+    outputs = Outputs('u')
+    cuts = evenly(5 * 600)
+    for k, (start, end) in enumerate(zip([0, *cuts], [*cuts, len(ROWS)], strict=True)):
+        for events in (engine.poll(), engine.feed(ROWS[start:end])):
+            list(outputs.of(events))
+        if outputs.curve is not None and k % 2 == 0:
+            worker.refuse_next = True
+        if outputs.cause and outputs.curve is not None:
+            break
+    assert 'ended unexpectedly' in outputs.cause
+    assert (outputs.status, outputs.cause) == (engine.monitor.status, engine.monitor.cause)
+    assert outputs.status.name == 'STALE'
+
+
+def test_a_clock_that_goes_back_restarts_the_engine_and_is_journaled() -> None:
+    worker = SlowWorker(0)
+    engine = LiveEngine(SETTINGS, worker)
+    calls = [engine.feed(ROWS[:20_000]), engine.poll(), engine.feed(ROWS[20_000:30_000])]
+    again = [(t - 10**13, *rest) for t, *rest in ROWS[30_000:34_000]]
+    calls += [engine.poll(), engine.feed(again)]  # type: ignore[arg-type]
+    journal = [e for call in calls for e in call if isinstance(e, JournalEntry)]
+    resets = [entry for entry in journal if entry.kind == JournalKind.RESET]
+    assert len(resets) == 1
+    aligned = Aligner(SETTINGS)
+    table = aligned.feed(Readings.of([*ROWS[:30_000], *again])).table  # type: ignore[list-item]
+    replayer = JournalReplayer(Monitor(SETTINGS), journal)
+    assert said([replayer.feed(table)]) == said(calls)
+    assert np.diff(table.time_ns).min() < 0
+
+
+def test_nothing_in_nothing_out() -> None:
+    engine = LiveEngine(SETTINGS, SlowWorker(0))
+    assert engine.feed([]) == []
+    assert engine.poll() == []
+    with pytest.raises(DataError):
+        engine.request_fit()
+    with pytest.raises(DataError):
+        engine.acknowledge()

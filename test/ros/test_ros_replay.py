@@ -1,0 +1,220 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rclpy.node import Node
+from ros_helpers import Processes, wait_until
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Float64
+from valveflow_msgs.msg import PlantSample
+
+from valveflow_ros.logs import open_log, write_samples, write_table
+from valveflow_ros.plant.simulator import simulate
+from valveflow_ros.records import NS_PER_S, SIGNALS, SampleTable, Signal
+from valveflow_ros.ros import replay_main, simulator_main
+from valveflow_ros.ros.inputs import INPUT_BY_NAME, header_time_ns
+from valveflow_ros.ros.replay_steps import steps_of
+from valveflow_ros.ros.simulator_steps import (
+    check_together,
+    effects_of,
+    plain_steps,
+    stamped_steps,
+    start_ns_of,
+)
+from valveflow_ros.ros.stamps import ClockTrack
+from valveflow_ros.ros.taking import Taken, Taker
+from valveflow_ros.ros.wire import float64_bytes
+
+REPLAY = 'valveflow_ros.ros.replay_main'
+TABLE = simulate(0.02, 3).table.part(0, 900)
+
+
+class Ears:
+    """Hears all inputs and the clock."""
+
+    def __init__(self, context: Any, names: list[str]) -> None:
+        self.node = Node('ears', context=context, namespace='plant')
+        kinds: dict[str, Any] = {name: INPUT_BY_NAME[name].message_type for name in names}
+        self._takers = {
+            name: Taker(self.node, kind, name, reliable=True)
+            for name, kind in [*kinds.items(), ('/clock', Clock)]
+        }
+        self.heard: dict[str, list[Taken]] = {name: [] for name in self._takers}
+
+    def take(self) -> None:
+        for name, taker in self._takers.items():
+            self.heard[name] += taker.take()
+
+    def until(self, process: Any) -> None:
+        """Listen until a process has ended and nothing more comes."""
+        quiet = 0
+
+        def over() -> bool:
+            nonlocal quiet
+            before = sum(map(len, self.heard.values()))
+            self.take()
+            still = before == sum(map(len, self.heard.values()))
+            quiet = quiet + 1 if still and process.poll() is not None else 0
+            return quiet > 20
+
+        wait_until(over, 'the end of the replay')
+
+    def close(self) -> None:
+        self.node.destroy_node()
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('kind', ['mcap', 'csv'])
+def test_a_log_is_heard_again_as_it_stands_with_its_times_on_the_clock(
+    context: Any, processes: Processes, tmp_path: Path, kind: str
+) -> None:
+    path = tmp_path / f'log.{kind}'
+    if kind == 'mcap':
+        write_samples(TABLE, path)
+    else:
+        write_table(TABLE, path)
+    names = [info.topic for info in SIGNALS]
+    ears = Ears(context, names)
+    # A thousand times real time: 900 s of plant in less than a second.
+    process = processes.start(
+        REPLAY, str(path), '--rate', '1000', '--ros-args', '-r', '__ns:=/plant'
+    )
+    ears.until(process)
+    assert process.returncode == 0, processes.output(process)
+    clock = ClockTrack()
+    for taken in ears.heard['/clock']:
+        clock.note(taken.source_ns, header_time_ns(taken.data))
+    for info in SIGNALS:
+        heard = ears.heard[info.topic]
+        assert [t.data for t in heard] == [
+            float64_bytes(value) for value in TABLE.column(info.signal).tolist()
+        ]
+        # The time that who listens gives to each value is the recorded one.
+        assert [clock.at(t.source_ns) for t in heard] == TABLE.time_ns.tolist()
+    ears.close()
+
+
+@pytest.mark.ros
+@pytest.mark.usefixtures('here')
+@pytest.mark.parametrize(
+    ('arguments', 'words', 'status'),
+    [
+        (['missing.mcap'], 'missing.mcap: cannot be opened (no such file or directory).', 1),
+        (['missing.mcap', '--verify'], 'missing.mcap: cannot be opened', 1),
+        (['text.mcap'], 'text.mcap: is not an MCAP file.', 1),
+        (['plain.mcap', '--verify'], 'is no recording of the monitor', 1),
+        (['plain.mcap', '--rate', '-1'], 'must be from 0 to 1000000', 2),
+        (['plain.mcap', '--wait', '0.2'], 'Nobody listened within 0.2 s', 1),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_a_sentence(
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    arguments: list[str],
+    words: str,
+    status: int,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'text.mcap').write_text('This is a letter to my grandmother.\n' * 20)
+    write_samples(TABLE, tmp_path / 'plain.mcap')
+    try:
+        found = replay_main.main(arguments)
+    except SystemExit as error:
+        found = error.code  # type: ignore[assignment]
+    assert found == status
+    assert words in capfd.readouterr().err
+
+
+def test_a_recording_and_a_table_of_the_same_samples_give_the_same_steps(tmp_path: Path) -> None:
+    write_samples(TABLE, tmp_path / 'log.mcap')
+    write_table(TABLE, tmp_path / 'log.csv')
+    names, steps = steps_of(open_log(tmp_path / 'log.mcap'))
+    names_of_table, steps_of_table = steps_of(open_log(tmp_path / 'log.csv'))
+    assert set(names) == set(names_of_table) == {info.topic for info in SIGNALS}
+    sorted_steps = [(step.time_ns, sorted(step.messages)) for step in steps]
+    assert sorted_steps == [(step.time_ns, sorted(step.messages)) for step in steps_of_table]
+    assert [time_ns for time_ns, _ in sorted_steps] == TABLE.time_ns.tolist()
+
+
+def with_a_hole(table: SampleTable) -> SampleTable:
+    power = table.column(Signal.GENERATED_POWER).copy()
+    power[10] = math.nan
+    columns = {info.signal: table.column(info.signal) for info in SIGNALS}
+    return SampleTable.from_columns(table.time_ns, columns | {Signal.GENERATED_POWER: power})
+
+
+@pytest.mark.parametrize('command', [False, True])
+def test_the_plant_says_the_same_plainly_and_stamped(command: bool) -> None:
+    from rclpy.serialization import deserialize_message
+
+    table = with_a_hole(TABLE)
+    plain = list(plain_steps([table.part(0, 400), table.part(400, 900)], command))
+    stamped = list(stamped_steps([table], command, 'tag'))
+    assert [s.time_ns for s in plain] == [s.time_ns for s in stamped] == table.time_ns.tolist()
+    for one, other in zip(plain, stamped, strict=True):
+        values = {name: deserialize_message(data, Float64).data for name, data in one.messages}
+        ((name, data),) = other.messages
+        assert name == 'plant_sample'
+        sample = deserialize_message(data, PlantSample)
+        assert header_time_ns(data) == one.time_ns
+        assert sample.header.frame_id == 'tag'
+        assert ('valve_command' in values) == command
+        for info in SIGNALS:
+            value = getattr(sample, info.topic)
+            np.testing.assert_equal(value, values.get(info.topic, math.nan))
+            good = getattr(sample, f'{info.topic}_quality') == PlantSample.QUALITY_GOOD
+            assert good == math.isfinite(value)
+
+
+def test_effects_come_one_by_one_or_together() -> None:
+    texts = ['gain_step:g=0.01,t0_days=1', 'backlash']
+    apart = effects_of(texts)
+    assert [e.name for e in apart] == ['gain_step', 'backlash']
+    assert effects_of(['; '.join(texts)]) == apart
+    assert effects_of(['', ' ; ']) == []
+
+
+@pytest.mark.parametrize(
+    ('text', 'rate', 'expected'),
+    [
+        ('2026-03-01T12:00:00Z', 1.0, 1_772_366_400),
+        ('2026-03-01T12:00:00', 60.0, 1_772_366_400),
+        ('2026-03-01T13:00:00+01:00', 0.0, 1_772_366_400),
+        ('', 60.0, 1_700_006_400),
+        ('', 1.0, 1_800_000_000),
+    ],
+)
+def test_the_first_samples_time(text: str, rate: float, expected: int) -> None:
+    assert start_ns_of(text, rate, 1_800_000_000 * NS_PER_S + 7) == expected * NS_PER_S
+
+
+@pytest.mark.ros
+@pytest.mark.usefixtures('here')
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (['-p', 'days:=-1.0'], "Parameter 'days' must be from"),
+        (['-p', 'effects:=gain_stepp'], "Effect 'gain_stepp' is unknown"),
+        (['-p', 'effects:=[1, 2]'], "Parameter 'effects' must be a list of texts"),
+        (['-p', 'rate:=60.0'], "Parameter 'rate' is 60, and plain values carry no time"),
+        (['-p', 'start:=yesterday'], "Parameter 'start' must be a time such as"),
+    ],
+)
+def test_the_plant_refuses_what_makes_no_sense(
+    capfd: pytest.CaptureFixture[str], arguments: list[str], words: str
+) -> None:
+    assert simulator_main.main(['--ros-args', *arguments]) == 1
+    said = capfd.readouterr().err
+    assert words in said
+    assert said.count('valveflow plant_simulator:') == 1
+
+
+def test_plain_values_need_a_clock_unless_in_real_time() -> None:
+    check_together(1.0, stamped=False, use_clock=False)
+    check_together(60.0, stamped=True, use_clock=False)
+    check_together(0.0, stamped=False, use_clock=True)
