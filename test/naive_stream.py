@@ -69,9 +69,13 @@ class NaiveAligner:
             if self.waiting and abs(time - self.waiting[-1][0]) > self.jump:
                 self.give_up_waiting()
             self.waiting.append((time, signal, value, quality))
-            if time > self.newest and len(self.waiting) == 3:
+            # The values of one instant do not confirm each other.
+            stamps = [r[0] for r in self.waiting]
+            instants = 1 + sum(a != b for a, b in zip(stamps[:-1], stamps[1:], strict=True))
+            enough = len(stamps) == 20
+            if time > self.newest and (instants >= 3 or enough):
                 self.believe()
-            elif time < self.newest and len(self.waiting) == 20:
+            elif time < self.newest and enough:
                 while self.tick is not None and self.tick <= self.newest:
                     self.close()  # what was before the restart is told to its end
                 self.resets.append(len(self.rows))
@@ -421,25 +425,33 @@ class NaiveAlarm:
         self.gap = round(1.5 * settings['sample_period'] * NS)
         self.state = 'NORMAL'
         self.condition = False
-        self.run = []  # times of the rows that speak for a turn, one after the other
+        self.watched = None  # time seen to pass while rows one after the other speak for a turn
         self.last = None
         self.changes = []  # (row, previous, state)
         self.row = 0
 
     def take(self, time, average, limit):
         self.row += 1
-        if self.last is not None and not 0 < time - self.last <= self.gap:
-            self.run = []
+        step = 0 if self.last is None else time - self.last
         self.last = time
+        if not 0 < step <= self.gap:
+            self.watched = None
         if math.isnan(average):
             return
         if self.condition:
             speaks = abs(average) < limit * (1.0 - self.dead_band)
+            delay = self.off
         else:
             speaks = abs(average) > limit
-        self.run = [*self.run, time] if speaks else []
-        if self.run and time - self.run[0] >= (self.off if self.condition else self.on):
-            self.run = []
+            delay = self.on
+        if not speaks:
+            self.watched = None
+        elif self.watched is None:
+            self.watched = 0
+        else:
+            self.watched += step
+        if speaks and self.watched >= delay:
+            self.watched = None
             self.condition = not self.condition
             self.turn()
 

@@ -234,8 +234,11 @@ GOOD = to_json(curve([0.0, 10.0, 20.0], [1.0, 2.0], dynamics=DYNAMICS).with_id()
 
 
 def test_what_this_program_adds_to_the_contract_may_be_missing():
-    raw = {k: v for k, v in GOOD.items()
-           if k not in ('model_id', 'window', 'temperature', 'residuals', 'partition', 'notes')}
+    raw = {
+        k: v
+        for k, v in GOOD.items()
+        if k not in ('model_id', 'window', 'temperature', 'residuals', 'partition', 'notes')
+    }
     raw['dynamics'] = [
         {k: d[k] for k in ('power_from', 'power_to', 'time_constant_s', 'delay_s')}
         for d in raw['dynamics']

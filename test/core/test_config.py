@@ -99,7 +99,12 @@ def test_a_word_that_is_no_choice_is_refused_and_the_choices_named(row):
 
 @pytest.mark.parametrize(
     ('name', 'near'),
-    [('smaple_period', 'sample_period'), ('windowdays', 'window_days'), ('qqqq', None), ('', None)],
+    [
+        ('smaple_period', 'sample_period'),
+        ('windowdays', 'window_days'),
+        ('qqqq', None),
+        ('', None),
+    ],
 )
 def test_an_unknown_name_is_refused_and_the_nearest_one_suggested(name, near):
     sentence = refusal({name: 1.0})

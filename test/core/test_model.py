@@ -22,7 +22,9 @@ def models(draw, most_pieces=4, most_regions=3, kinks=True):
     left[1:] += draw(st.lists(st.floats(-5.0, 5.0), min_size=pieces - 1, max_size=pieces - 1))
     # The answer has a kink in the delay at each whole step.
     whole = st.integers(0, 11)
-    delay = st.floats(0.0, 12.0) if kinks else st.builds(sum, st.tuples(whole, st.floats(0.1, 0.9)))
+    delay = (
+        st.floats(0.0, 12.0) if kinks else st.builds(sum, st.tuples(whole, st.floats(0.1, 0.9)))
+    )
     regions = draw(st.integers(1, most_regions))
     span = right[-1] - 100.0
     levels = 100.0 + span * np.arange(1, regions) / regions
@@ -162,9 +164,7 @@ def test_a_ramp_is_answered_late_by_time_constant_and_delay_at_any_period(step, 
     time_constant = max(4.0, step)
     time_s = step * np.arange(n)
     u = 10.0 + 80.0 * time_s / time_s[-1]
-    got, _ = one_region(time_constant, delay).respond(
-        u, np.ones(n, dtype=np.uint8), step, 0.0
-    )
+    got, _ = one_region(time_constant, delay).respond(u, np.ones(n, dtype=np.uint8), step, 0.0)
     late = 10.0 + 80.0 * (time_s - time_constant - delay) / time_s[-1]
     settled = time_s > 40.0 * time_constant + delay
     assert settled.any()
@@ -230,7 +230,8 @@ def test_the_tangents_of_one_region_are_the_differences(model, seed, group):
         expected, smooth = by_differences(problem, model, column)
         rows = (weight > 0) & smooth
         share.append(rows.sum() / max(1, (weight > 0).sum()))
-        assert jacobian[rows, column] == pytest.approx(expected[rows], rel=2e-3, abs=2e-4)
+        # Rows count as smooth while their two sides differ by less than 1e-3.
+        assert jacobian[rows, column] == pytest.approx(expected[rows], rel=2e-3, abs=1e-3)
     assert np.median(share) > 0.8
 
 

@@ -60,9 +60,7 @@ class LiveRun:
 
     def take(self, events, late):
         self.events += events
-        self.waiting += [
-            (self.done + late, e.task) for e in events if isinstance(e, FitRequested)
-        ]
+        self.waiting += [(self.done + late, e.task) for e in events if isinstance(e, FitRequested)]
 
     def bring_back(self):
         for row, task in list(self.waiting):

@@ -157,6 +157,7 @@ def test_a_jump_is_found_where_there_is_one():
     jumps = result.model.left[1:] - result.model.right[:-1]
     assert jumps[0] == pytest.approx(8.0, abs=2.0)
 
+
 def test_a_constant_error_of_the_power_lifts_the_curve_and_nothing_else():
     samples = measured(TRUE, 1)
     lifted = Samples(samples.u, samples.power_mw + 50.0, samples.usable, 1.0, 110.0, 5)

