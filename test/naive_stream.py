@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from valveflow_ros.records import SIGNALS
+import itertools
 
 NS = 1_000_000_000
 
@@ -71,7 +72,7 @@ class NaiveAligner:
             self.waiting.append((time, signal, value, quality))
             # The values of one instant do not confirm each other.
             stamps = [r[0] for r in self.waiting]
-            instants = 1 + sum(a != b for a, b in zip(stamps[:-1], stamps[1:], strict=True))
+            instants = 1 + sum(a != b for a, b in itertools.pairwise(stamps))
             enough = len(stamps) == 20
             if time > self.newest and (instants >= 3 or enough):
                 self.believe()

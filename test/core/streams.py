@@ -17,6 +17,7 @@ from valveflow_ros.core.units import integrated_input
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.records import NS_PER_S, SampleTable, Signal
+import itertools
 
 START_NS = 1_700_006_400 * NS_PER_S
 INTERPRETED = os.environ.get('NUMBA_DISABLE_JIT', '0') not in ('', '0')
@@ -40,7 +41,7 @@ def cuts(rows, most=6):
 def blocks_of(rows, places):
     """Return the blocks ``(start, end)`` that the places cut ``rows`` into; some are empty."""
     edges = [0, *places, rows]
-    return list(zip(edges[:-1], edges[1:], strict=True))
+    return list(itertools.pairwise(edges))
 
 
 def grid_ns(n, period_s=1.0, start_ns=START_NS):

@@ -304,7 +304,9 @@ HARMS = {
         spans=w.spans[::2],
     ),
     'no temperature': lambda w: changed(w, temperature_degc=np.full(len(w.u), np.nan)),
-    'one spike': lambda w: changed(w, power_mw=np.where(np.arange(len(w.u)) == 77, 1e6, w.power_mw)),
+    'one spike': lambda w: changed(
+        w, power_mw=np.where(np.arange(len(w.u)) == 77, 1e6, w.power_mw)
+    ),
     'falling': lambda w: changed(w, power_mw=500.0 - w.power_mw),
     'huge offset': lambda w: changed(w, u=w.u + 1e6, power_mw=w.power_mw + 1e6),
     'tiny': lambda w: changed(w, u=w.u * 1e-6, power_mw=w.power_mw * 1e-6),
