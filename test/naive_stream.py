@@ -6,12 +6,12 @@ engine but its settings and the words of `records`.
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 
 from valveflow_ros.records import SIGNALS
-import itertools
 
 NS = 1_000_000_000
 

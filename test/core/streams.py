@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import os
 
 import numpy as np
@@ -17,7 +18,6 @@ from valveflow_ros.core.units import integrated_input
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.records import NS_PER_S, SampleTable, Signal
-import itertools
 
 START_NS = 1_700_006_400 * NS_PER_S
 INTERPRETED = os.environ.get('NUMBA_DISABLE_JIT', '0') not in ('', '0')

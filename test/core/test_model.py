@@ -212,7 +212,7 @@ def by_differences(problem, model, column):
         moved, _ = problem.answer(model.unpack(packed))
         here, weight = problem.answer(model)
         sides.append(np.where(weight > 0, sign * (here - moved) / h, np.nan))
-    smooth = np.abs(sides[0] - sides[1]) < 1e-3 * (1.0 + np.abs(sides[0]))
+    smooth = np.abs(sides[0] - sides[1]) < 2e-4 * (1.0 + np.abs(sides[0]))
     return 0.5 * (sides[0] + sides[1]), smooth
 
 

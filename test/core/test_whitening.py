@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from streams import examples
+from streams import examples, needs_jit
 
 from valveflow_ros.core.regional_kernel import lagged_products
 from valveflow_ros.core.whitening import ORDER, fit_ar, inflation, whitened
@@ -70,6 +70,7 @@ def test_whitening_is_linear(seed, factor):
     assert both == pytest.approx(whitened(a, w, ar) + factor * whitened(b, w, ar), abs=1e-9)
 
 
+@needs_jit
 @pytest.mark.parametrize('true', [[0.7], [0.5, 0.3], [0.6, -0.3, 0.2, 0.1], [0.0]])
 def test_the_coefficients_are_found_and_the_rest_is_white(true):
     rng = np.random.default_rng(11)
@@ -93,6 +94,7 @@ def test_the_coefficients_do_not_depend_on_the_scale(seed, factor):
     assert inflation(factor * x, w, 20) == pytest.approx(inflation(x, w, 20), rel=1e-9)
 
 
+@needs_jit
 def test_white_noise_is_not_inflated_and_correlated_noise_as_theory_says():
     rng = np.random.default_rng(3)
     w = np.ones(60_000, dtype=np.uint8)

@@ -149,24 +149,23 @@ def test_without_a_curve_the_message_says_why_and_gives_no_numbers() -> None:
     assert math.isnan(message.pressure_exponent)
 
 
-@given(times, st.integers(0, 255), texts, texts, st.lists(reals, min_size=5, max_size=5), reals)
+@given(times, st.integers(0, 255), texts, texts, st.lists(reals, min_size=6, max_size=6), reals)
 def test_predictions_made_by_hand_are_what_the_encoder_makes(
     time_ns: int, state: int, model: str, tag: str, numbers: list[float], limit: float
 ) -> None:
     columns = [np.array([x]) for x in numbers]
-    block = PredictionBlock(
-        np.array([time_ns]), *columns, np.array([0.25]), np.array([state], dtype=np.uint8), limit,
-        model,
-    )  # fmt: skip
+    kinds = np.array([state], dtype=np.uint8)
+    block = PredictionBlock(np.array([time_ns]), *columns, kinds, limit, model)
     ((found_ns, data),) = prediction_bytes(block, tag)
     message = deserialize_message(data, Prediction)
     assert found_ns == time_ns
     assert conversions.from_time(message.header.stamp) == time_ns
     assert (message.header.frame_id, message.model_id, message.state) == (tag, model, state)
-    names = ('integrated_input', 'measured_mw', 'static_mw', 'dynamic_mw', 'residual_mw')
+    names = (
+        'integrated_input', 'measured_mw', 'static_mw', 'dynamic_mw', 'residual_mw', 'average_mw',
+    )  # fmt: skip
     for name, value in zip(names, numbers, strict=True):
         assert bits(getattr(message, name)) == bits(value), name
-    assert message.average_mw == 0.25
     assert bits(message.limit_high_mw) == bits(limit)
     assert bits(message.limit_low_mw) == bits(-limit)
     assert encode(message) == data

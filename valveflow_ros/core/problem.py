@@ -57,12 +57,12 @@ class Samples:
         def mean(values: FloatArray) -> FloatArray:
             return np.asarray(values[: rows * factor].reshape(rows, factor).mean(axis=1))
 
-        usable = self.usable[: rows * factor].reshape(rows, factor).all(axis=1)
+        usable = np.asarray(self.usable[: rows * factor].reshape(rows, factor).min(axis=1))
         return replace(
             self,
             u=mean(self.u),
             power_mw=mean(self.power_mw),
-            usable=usable.astype(np.uint8),
+            usable=usable,
             step_s=self.step_s * factor,
             group=2,
         )

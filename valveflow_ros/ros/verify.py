@@ -25,7 +25,8 @@ from valveflow_ros.ros.inputs import Decoder, Row
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
 from valveflow_ros.ros.recording import PARAMETERS, TOPICS
 
-_BLOCK = 20_000
+# Small, so that what is said before a decision that cannot be repeated is compared first.
+_BLOCK = 500
 Progress = Callable[[int], None]
 
 
@@ -167,7 +168,7 @@ def _fed(replayer: JournalReplayer, aligner: Aligner, rows: list[Row]) -> list[E
         return replayer.feed(aligner.feed(Readings.of(rows)).table)
     except (KeyError, ValveflowError) as error:
         raise _DifferenceError(
-            f'The journal asks for what the replay cannot do: {error}.'
+            f'The replay cannot follow the journal: {str(error).rstrip(".")}.'
         ) from None
 
 
