@@ -1,5 +1,8 @@
 """Start the monitor; the option --show-args of `ros2 launch` explains the arguments."""
 
+import json
+from tempfile import NamedTemporaryFile
+
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
@@ -35,6 +38,16 @@ def typed(kind: type, text: str) -> object:
     return word in _TRUE
 
 
+def parameter_file(values: dict[str, object]) -> str:
+    """Write a parameter file in which texts stand in quotes.
+
+    launch writes them without, and a tag such as 1E5 would arrive as a number.
+    """
+    with NamedTemporaryFile('w', prefix='valveflow_', suffix='.yaml', delete=False) as file:
+        json.dump({'/**': {'ros__parameters': values}}, file)
+    return file.name
+
+
 def monitor(context: LaunchContext) -> list[Node]:
     """Make the node, with those parameters that were given."""
 
@@ -51,7 +64,7 @@ def monitor(context: LaunchContext) -> list[Node]:
             executable='monitor',
             name='valveflow_monitor',
             namespace=given('namespace'),
-            parameters=[given('params_file'), overrides],
+            parameters=[given('params_file'), parameter_file(overrides)],
             arguments=['--ros-args', '--log-level', given('log_level')],
             respawn=typed(bool, given('use_respawn')),
             respawn_delay=2.0,

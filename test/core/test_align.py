@@ -178,6 +178,17 @@ def test_one_wild_stamp_is_counted_and_changes_no_row():
     assert aligner.counts()['valve_opening']['time_outlier'] == 3
 
 
+@pytest.mark.parametrize('instants', [1, 2])
+def test_the_values_of_one_wrong_instant_do_not_confirm_each_other(instants):
+    rows = steady_stream(40)
+    wrong = [(START_NS + (5000 + k) * NS_PER_S, s, GOOD[s], 0)
+             for k in range(instants) for s in range(4)]  # fmt: skip
+    table, aligner = run(Settings(), rows[:80] + wrong + rows[80:])
+    expected, _ = run(Settings(), rows)
+    assert np.array_equal(table.values, expected.values, equal_nan=True)
+    assert all(aligner.counts()[t]['time_outlier'] == instants for t in TOPICS[:4])
+
+
 def test_a_leap_ahead_ends_the_rows_and_begins_new_ones():
     first, second = steady_stream(30), steady_stream(30)
     leap = 3600 * NS_PER_S

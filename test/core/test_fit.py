@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from streams import (
+    INTERPRETED,
     QUICK_MONITOR,
     examples,
     frozen,
@@ -181,12 +182,12 @@ def test_without_any_temperature_nothing_is_flagged():
 @pytest.mark.parametrize('sd', [0.2, 1.0])
 def test_the_alarms_standard_deviation_is_that_of_the_running_mean(sd):
     """For white noise an exponential mean has sd sqrt((1 - f) / (1 + f)) of it."""
-    c = fit(task(window(3, n=24_000, noise=sd)))
+    c = fit(task(window(3, n=6_000 if INTERPRETED else 24_000, noise=sd)))
     f = math.exp(-1.0 / 10.0)
     total = math.hypot(sd, 0.2 * 0.12)
     assert c.residuals.rmse_mw == pytest.approx(total, rel=0.1)
     assert c.residuals.average_sd_mw == pytest.approx(
-        total * math.sqrt((1.0 - f) / (1.0 + f)), rel=0.15
+        total * math.sqrt((1.0 - f) / (1.0 + f)), rel=0.3 if INTERPRETED else 0.15
     )
     assert (c.residuals.input_noise, c.residuals.power_noise_mw) == (0.7, 0.3)
     assert c.residuals.average_s == 10.0

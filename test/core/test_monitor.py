@@ -167,6 +167,34 @@ def test_shifting_time_shifts_the_stamps_and_nothing_else(seed, harms, seconds):
         assert (a.time_ns + shift, a.state) == (b.time_ns, b.state)
 
 
+@pytest.mark.parametrize('factor', [0.1, 10.0])
+@pytest.mark.parametrize('harms', [[], [('fault', 300, 80), ('nan_u', 420, 9), ('leap', 500, 40)]])
+def test_the_engine_has_no_second_of_its_own(factor, harms):
+    """With every time scaled, the same values give the same story: 0.1 s data, 10 s data."""
+    times = ('block', 'time_constant', 'delay', 'steady_min', 'slope_min', 'longest_segment',
+             'refit_period', 'alarm_average', 'alarm_on_delay', 'alarm_off_delay')  # fmt: skip
+    base = SETTINGS.changed({'longest_segment': 600.0, 'window_days': 0.02})
+    scaled = {name: base.real(name) * factor for name in times}
+    scaled |= {'sample_period': factor, 'window_days': 0.02 * max(1.0, factor)}
+    other = base.changed(scaled)
+    table = plant_table(4, N, harms)
+    since = table.time_ns - START_NS
+    stretched = SampleTable(
+        START_NS + np.round(since * factor).astype(np.int64), table.values, table.quality
+    )
+    here, there = feed_rows(Monitor(base), table), feed_rows(Monitor(other), stretched)
+    assert frozen(column(here, 'state')) == frozen(column(there, 'state'))
+    for name in ('static_mw', 'residual_mw', 'average_mw'):
+        assert column(there, name) == pytest.approx(column(here, name), rel=1e-9, nan_ok=True)
+    kinds = [[e.kind for e in of_type(events, JournalEntry)] for events in (here, there)]
+    states = [[c.state for c in of_type(events, AlarmChange)] for events in (here, there)]
+    assert kinds[0] == kinds[1]
+    assert states[0] == states[1]
+    for a, b in zip(of_type(here, SegmentClosed), of_type(there, SegmentClosed), strict=True):
+        assert a.segment.samples == b.segment.samples
+        assert b.segment.u_rate_per_s * factor == pytest.approx(a.segment.u_rate_per_s, abs=1e-9)
+
+
 # --- fits -----------------------------------------------------------------------------------
 
 
@@ -328,7 +356,12 @@ def test_the_limit_is_the_fixed_one_or_so_many_standard_deviations():
     monitor, _ = with_curve()
     assert monitor.limit_mw() == 3.0
     monitor.reconfigure(SETTINGS.changed({'alarm_limit': 0.0, 'alarm_limit_sd': 5.0}))
-    assert monitor.limit_mw() == 5.0 * monitor.characteristic.residuals.average_sd_mw
+    sd = monitor.characteristic.residuals.average_sd_mw
+    assert monitor.limit_mw() == max(5.0 * sd, 1.0)
+    monitor.reconfigure(monitor.settings.changed({'alarm_floor': 0.0}))
+    assert monitor.limit_mw() == 5.0 * sd
+    monitor.reconfigure(monitor.settings.changed({'alarm_floor': 40.0}))
+    assert monitor.limit_mw() == 40.0
     assert math.isnan(Monitor(SETTINGS).limit_mw())
 
 

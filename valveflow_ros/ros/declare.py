@@ -8,7 +8,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from valveflow_ros.config import PARAMETERS, TABLE, Parameter, Settings, parameter
+from valveflow_ros.config import PARAMETERS, TABLE, Parameter, Settings, Value, parameter
 from valveflow_ros.errors import ParameterError
 
 # What ROS itself puts among the parameters of every node.
@@ -50,9 +50,18 @@ def declare(node: Node, table: Iterable[Parameter] = TABLE) -> dict[str, object]
     for row in table:
         # The table judges first, with its own sentence; then ROS learns the range too.
         loose = ParameterDescriptor(dynamic_typing=True)
-        values[row.name] = row.check(node.declare_parameter(row.name, row.default, loose).value)
+        values[row.name] = _checked(
+            row, node.declare_parameter(row.name, row.default, loose).value
+        )
         node.set_descriptor(row.name, descriptor(row))
     return values
+
+
+def _checked(row: Parameter, value: object) -> Value:
+    if isinstance(row.default, str) and isinstance(value, int | float):
+        hint = 'put it in quotes, and those in quotes once more on a command line'
+        raise ParameterError(row.name, f'must be a text, not {value!r}: {hint}')
+    return row.check(value)
 
 
 def unknown_overrides(node: Node, known: Iterable[str] = PARAMETERS) -> list[str]:

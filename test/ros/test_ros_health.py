@@ -1,0 +1,197 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.align import REASONS
+from valveflow_ros.records import SIGNALS, Signal
+from valveflow_ros.ros.diagnostics import Changes, Item, Level, array
+from valveflow_ros.ros.graph import Publishers
+from valveflow_ros.ros.input_health import InputHealth
+from valveflow_ros.ros.inputs import INPUTS, PLANT_SAMPLE
+from valveflow_ros.ros.tallies import Tally
+
+TOPICS = {topic.name: f'/plant/{topic.name}' for topic in INPUTS}
+NOW = 1000.0
+
+
+class Scene:
+    """An input's circumstances, healthy unless changed."""
+
+    def __init__(self, **settings: object) -> None:
+        self.health = InputHealth(Settings(settings), TOPICS)
+        self.tallies = {name: Tally() for name in TOPICS}
+        self.counts = {info.topic: dict.fromkeys(REASONS, 0) for info in SIGNALS}
+        self.publishers = {info.topic: Publishers(1) for info in SIGNALS}
+        for info in SIGNALS:
+            self.hear(info.topic)
+
+    def hear(self, name: str, at: float = NOW, period: float = 1.0) -> None:
+        tally = self.tallies[name]
+        for k in range(5, -1, -1):
+            tally.note_arrival(1, at - k * period)
+            tally.note_number(tally.received + 1)
+
+    def item(self, topic: str = 'valve_opening', listening: float = 100.0) -> Item:
+        items = self.health.items(self.tallies, self.counts, self.publishers, NOW + 0.5, listening)
+        (found,) = [item for item in items if item.name == f'input {topic}']
+        return found
+
+    def says(self, level: Level, words: str, topic: str = 'valve_opening', **more: Any) -> None:
+        item = self.item(topic, **more)
+        assert words in item.sentence, item.sentence
+        assert item.level == level
+        assert item.sentence.endswith(('.', '?'))
+
+
+def test_a_healthy_input_says_its_rate() -> None:
+    scene = Scene()
+    scene.says(Level.OK, '1 Hz.')
+    values = scene.item().values
+    assert values['Topic'] == '/plant/valve_opening'
+    assert values['Actual frequency (Hz)'] == pytest.approx(1.0)
+    assert values['Age of the newest message (s)'] == pytest.approx(0.5)
+    assert values['Publishers'] == 1
+    assert {f'Readings {reason.replace("_", " ")}' for reason in REASONS} <= set(values)
+
+
+def test_a_wrong_type_is_named_whatever_else_is_true() -> None:
+    scene = Scene()
+    scene.publishers['valve_opening'] = Publishers(1, ('std_msgs/msg/Float32',))
+    scene.says(Level.ERROR, '/plant/valve_opening is published as std_msgs/msg/Float32')
+
+
+def test_silence_from_the_start() -> None:
+    scene = Scene()
+    scene.tallies = {name: Tally() for name in TOPICS}
+    scene.publishers = {}
+    scene.says(Level.OK, 'Waiting for /plant/valve_opening', listening=1.0)
+    scene.says(Level.STALE, 'Nobody publishes /plant/valve_opening')
+    scene.says(Level.OK, 'it is optional', 'valve_command')
+    scene.publishers = {'valve_opening': Publishers(1)}
+    scene.says(Level.STALE, 'has a publisher, but nothing has come')
+    scene.health.mismatched.add('valve_opening')
+    scene.says(Level.ERROR, 'set input_reliability to best_effort')
+
+
+def test_silence_after_speech() -> None:
+    scene = Scene()
+    scene.tallies['valve_opening'] = Tally()
+    scene.hear('valve_opening', NOW - 3.0)
+    scene.says(Level.STALE, '/plant/valve_opening has been silent for 3.5 s')
+
+
+def test_a_stamped_sample_speaks_for_all_its_signals() -> None:
+    scene = Scene()
+    scene.tallies = {name: Tally() for name in TOPICS}
+    scene.hear(PLANT_SAMPLE)
+    scene.publishers = {PLANT_SAMPLE: Publishers(1)}
+    for info in SIGNALS:
+        scene.says(Level.OK, '1 Hz', info.topic)
+        assert scene.item(info.topic).values['Topic'] == '/plant/plant_sample'
+
+
+def test_a_stamped_sample_of_the_wrong_type_is_seen_before_it_is_heard() -> None:
+    scene = Scene()
+    scene.tallies = {name: Tally() for name in TOPICS}
+    scene.publishers = {PLANT_SAMPLE: Publishers(0, ('std_msgs/msg/String',))}
+    scene.says(Level.ERROR, '/plant/plant_sample is published as std_msgs/msg/String')
+
+
+def test_two_publishers_are_named() -> None:
+    scene = Scene()
+    scene.publishers['valve_opening'] = Publishers(2)
+    scene.says(Level.WARN, '/plant/valve_opening has 2 publishers')
+
+
+def test_losses_are_said_once_and_counted_on() -> None:
+    scene = Scene()
+    scene.tallies['valve_opening'].lost = 3
+    scene.says(Level.WARN, '3 messages of /plant/valve_opening were lost')
+    scene.says(Level.OK, 'Hz')
+    assert scene.item().values['Messages lost on the way'] == 3
+
+
+def test_an_impossible_value_is_said_aloud_with_the_unit_it_would_fit() -> None:
+    scene = Scene()
+    scene.health.note('main_steam_pressure', [(1, Signal.MAIN_STEAM_PRESSURE, 162.5, 0)])
+    scene.counts['main_steam_pressure']['impossible'] = 7
+    item = scene.item('main_steam_pressure')
+    assert item.level == Level.WARN
+    assert item.sentence == (
+        '7 new readings were rejected. The last one, 162.5 MPa, is impossible '
+        '(believed: 0.05 to 40 MPa). Is main_steam_pressure_unit bar rather than MPa?'
+    )
+    scene.says(Level.OK, 'Hz', 'main_steam_pressure')
+
+
+def test_the_value_is_named_as_it_was_sent() -> None:
+    scene = Scene(valve_opening_unit='fraction')
+    scene.health.note('valve_opening', [(1, Signal.VALVE_OPENING, 6500.0, 0)])
+    scene.counts['valve_opening']['impossible'] = 1
+    scene.says(Level.WARN, 'The last one, 65 fraction, is impossible')
+    scene.counts['valve_opening']['impossible'] = 2
+    scene.health.note('valve_opening', [(1, Signal.VALVE_OPENING, 6500.0, 0)])
+    scene.says(Level.WARN, 'Is valve_opening_unit % or percent rather than fraction?')
+
+
+def test_a_stamped_value_has_no_other_unit() -> None:
+    scene = Scene(valve_opening_unit='fraction')
+    scene.health.note(PLANT_SAMPLE, [(1, Signal.VALVE_OPENING, 650.0, 0)])
+    scene.counts['valve_opening']['impossible'] = 1
+    scene.says(Level.WARN, 'The last one, 650 %, is impossible (believed: -2 to 105 %).')
+
+
+@pytest.mark.parametrize(
+    ('reason', 'words'),
+    [
+        ('not_finite', 'not finite 4'),
+        ('duplicate', 'duplicate 4'),
+        ('out_of_order', 'out of order 4'),
+    ],
+)
+def test_other_rejections_are_told_by_reason(reason: str, words: str) -> None:
+    scene = Scene()
+    scene.counts['valve_opening'][reason] = 4
+    scene.says(Level.WARN, f'4 new readings were rejected. So far: {words}.')
+
+
+def test_a_topic_without_any_time_points_to_the_clock() -> None:
+    scene = Scene()
+    scene.tallies['valve_opening'].without_time = scene.tallies['valve_opening'].received
+    scene.says(Level.ERROR, 'is /clock published?')
+
+
+def test_the_message_follows_rep_107() -> None:
+    items = [
+        Item('input valve_opening', Level.OK, 'Fine.', {'Rate (Hz)': 1.0, 'Age (s)': None}),
+        Item('recorder', Level.ERROR, 'Broken.', {'On': False}),
+    ]
+    message = array(items, 'HV101', 5 * 10**9)
+    assert message.header.stamp.sec == 5
+    first, second = message.status
+    assert first.name == 'valveflow: HV101 input valve_opening'
+    assert (first.hardware_id, first.message, first.level) == (
+        'HV101',
+        'Fine.',
+        DiagnosticStatus.OK,
+    )
+    assert [(v.key, v.value) for v in first.values] == [('Rate (Hz)', '1'), ('Age (s)', 'unknown')]
+    assert second.level == DiagnosticStatus.ERROR
+    assert second.values[0].value == 'no'
+    for level in Level:
+        assert bytes([level]) == getattr(DiagnosticStatus, level.name)
+
+
+def test_only_changes_get_into_the_log_and_not_too_often() -> None:
+    changes = Changes(quiet_s=30.0)
+    well, ill = Item('a', Level.OK, 'Well.'), Item('a', Level.WARN, 'Ill.')
+    assert changes.pick([well], 0.0) == []
+    assert changes.pick([ill], 1.0) == [ill]
+    assert changes.pick([ill], 2.0) == []
+    assert changes.pick([well], 3.0) == []
+    assert changes.pick([ill], 4.0) == []
+    assert changes.pick([well], 40.0) == [well]

@@ -1,0 +1,57 @@
+"""The launch files: what they declare, and that every argument is explained."""
+
+from __future__ import annotations
+
+import configparser
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+LAUNCH = ROOT / 'launch'
+PYTHON = ['monitor.launch.py', 'replay.launch.py', 'demo.launch.py']
+
+
+def test_the_yaml_twin_explains_its_arguments_and_uses_them_all() -> None:
+    text = (LAUNCH / 'monitor.launch.yaml').read_text()
+    content = yaml.safe_load(text)['launch']
+    arguments = {entry['arg']['name']: entry['arg'] for entry in content if 'arg' in entry}
+    assert {'namespace', 'params_file', 'use_sim_time', 'autostart', 'record'} <= set(arguments)
+    for name, argument in arguments.items():
+        assert argument['description'].endswith('.')
+        assert f'$(var {name})' in text
+    (node,) = [entry['node'] for entry in content if 'node' in entry]
+    assert (node['pkg'], node['exec']) == ('valveflow_ros', 'monitor')
+
+
+@pytest.mark.parametrize('name', PYTHON)
+def test_python_launch_files_explain_their_arguments(name: str) -> None:
+    pytest.importorskip('launch_ros', reason='needs ros2/launch_ros, of which there is no wheel')
+    from launch.launch_description_sources import PythonLaunchDescriptionSource
+
+    from launch import LaunchContext
+
+    description = PythonLaunchDescriptionSource(str(LAUNCH / name)).get_launch_description(
+        LaunchContext()
+    )
+    arguments = description.get_launch_arguments()
+    assert {'namespace', 'log_level'} <= {argument.name for argument in arguments}
+    for argument in arguments:
+        assert argument.description.strip().endswith('.'), argument.name
+
+
+@pytest.mark.parametrize('name', PYTHON)
+def test_python_launch_files_compile(name: str) -> None:
+    code = compile((LAUNCH / name).read_text(), name, 'exec')
+    assert 'generate_launch_description' in code.co_names
+
+
+def test_the_service_ends_the_monitor_in_order() -> None:
+    unit = configparser.ConfigParser(strict=False, interpolation=None)
+    unit.optionxform = str  # type: ignore[assignment, method-assign]
+    unit.read(ROOT / 'config' / 'valveflow.service')
+    service = unit['Service']
+    assert service['KillSignal'] == 'SIGTERM'
+    assert float(service['TimeoutStopSec']) > 2.0
+    assert 'ros2 run valveflow_ros monitor' in service['ExecStart']

@@ -1,0 +1,129 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from ros_helpers import wait_until
+from std_msgs.msg import Float32
+from std_srvs.srv import Trigger
+
+from valveflow_ros.logs import open_log
+from valveflow_ros.ros.monitor_node import MonitorNode
+
+pytestmark = pytest.mark.ros
+DONE = TransitionCallbackReturn.SUCCESS
+
+
+class Stage:
+    """A monitor that does nothing by itself, and somebody who talks to it."""
+
+    def __init__(self, context: Any, folder: Path) -> None:
+        overrides = [
+            Parameter('record_directory', value=str(folder)),
+            Parameter('diagnostics_period', value=0.1),
+            Parameter('unit_tag', value='HV 101/2'),
+        ]
+        self.monitor = MonitorNode(context=context, parameter_overrides=overrides)
+        self.other = Node('other', context=context)
+        self.executor = SingleThreadedExecutor(context=context)
+        for node in (self.monitor, self.other):
+            self.executor.add_node(node)
+        self.health: list[DiagnosticArray] = []
+        self.other.create_subscription(DiagnosticArray, '/diagnostics', self.health.append, 10)
+
+    def turn(self) -> None:
+        self.monitor.step()
+        self.executor.spin_once(timeout_sec=0.01)
+
+    def trigger(self, name: str) -> Trigger.Response:
+        client = self.other.create_client(Trigger, f'/valveflow_monitor/{name}')
+        wait_until(client.service_is_ready, name, 20.0)
+        future = client.call_async(Trigger.Request())
+        wait_until(lambda: self.turn() or future.done(), name, 20.0)
+        return future.result()
+
+    def sentence(self, item: str) -> str:
+        self.health.clear()
+        wait_until(lambda: self.turn() or self.health, 'health', 20.0)
+        found = [s.message for s in self.health[-1].status if s.name.endswith(item)]
+        return found[0] if found else ''
+
+    def close(self) -> None:
+        self.monitor.end_session()
+        self.executor.shutdown()
+        self.monitor.destroy_node()
+        self.other.destroy_node()
+
+
+def test_the_whole_life(context: Any, tmp_path: Path) -> None:
+    stage = Stage(context, tmp_path)
+    monitor = stage.monitor
+    try:
+        assert stage.sentence('fit') == 'The monitor is not configured.'
+        answer = stage.trigger('refit')
+        assert not answer.success
+        assert answer.message == 'The monitor is not active; activate it first.'
+        for _ in range(2):
+            assert monitor.trigger_configure() == DONE
+            assert monitor.session is not None
+            assert not monitor.session.listening
+            assert monitor.trigger_activate() == DONE
+            assert monitor.session.listening
+            assert stage.trigger('refit').message == ('There is no special segment to fit yet.')
+            assert stage.sentence('input valve_opening').startswith('Waiting for /valve_opening')
+            assert monitor.trigger_deactivate() == DONE
+            assert stage.sentence('fit').startswith('No curve yet')
+            assert stage.sentence('input valve_opening') == ''
+            assert monitor.trigger_activate() == DONE
+            assert monitor.trigger_deactivate() == DONE
+            assert monitor.trigger_cleanup() == DONE
+            assert monitor.session is None
+        folders = sorted(tmp_path.iterdir())
+        assert len(folders) == 2
+        for folder in folders:
+            assert folder.name.endswith(('_HV-101-2', '_HV-101-2_2'))
+            assert folder.stat().st_mode & 0o777 == 0o700
+            assert open_log(folder).warnings == (
+                'None of its topics is an input of the monitor; '
+                'name one with --column valve_opening=TOPIC.',
+            )
+        assert monitor.trigger_shutdown() == DONE
+        assert monitor.finalized
+    finally:
+        stage.close()
+
+
+def test_what_is_wrong_with_an_input_is_seen_from_outside(context: Any, tmp_path: Path) -> None:
+    stage = Stage(context, tmp_path)
+    try:
+        stage.monitor.trigger_configure()
+        stage.monitor.trigger_activate()
+        stage.other.create_publisher(Float32, '/valve_opening', 10)
+        wait_until(
+            lambda: 'published as std_msgs/msg/Float32' in stage.sentence('input valve_opening'),
+            'the wrong type', 20.0,
+        )  # fmt: skip
+    finally:
+        stage.close()
+
+
+def test_a_recording_that_cannot_be_made_keeps_nobody_from_monitoring(
+    context: Any, tmp_path: Path
+) -> None:
+    (tmp_path / 'file').write_text('')
+    stage = Stage(context, tmp_path / 'file' / 'below')
+    try:
+        assert stage.monitor.trigger_configure() == DONE
+        assert stage.monitor.trigger_activate() == DONE
+        assert 'cannot be made' in stage.sentence('recorder')
+        session = stage.monitor.session
+        assert session is not None
+        assert not session.recording.on
+    finally:
+        stage.close()
