@@ -123,7 +123,8 @@ def test_an_impossible_value_is_said_aloud_with_the_unit_it_would_fit() -> None:
     assert item.level == Level.WARN
     assert item.sentence == (
         '7 new readings were rejected. The last one, 162.5 MPa, is impossible '
-        '(believed: 0.05 to 40 MPa). Is main_steam_pressure_unit bar rather than MPa?'
+        '(believed: 0.05 to 40 MPa). '
+        'Is main_steam_pressure_unit kPa or bar or psi rather than MPa?'
     )
     scene.says(Level.OK, 'Hz', 'main_steam_pressure')
 

@@ -4,7 +4,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
@@ -101,15 +103,20 @@ def test_the_whole_life(context: Any, tmp_path: Path) -> None:
 
 def test_what_is_wrong_with_an_input_is_seen_from_outside(context: Any, tmp_path: Path) -> None:
     stage = Stage(context, tmp_path)
+    elsewhere = Context()
     try:
         stage.monitor.trigger_configure()
         stage.monitor.trigger_activate()
-        stage.other.create_publisher(Float32, '/valve_opening', 10)
+        # One participant cannot publish one topic as two types: this is another machine's.
+        rclpy.init(context=elsewhere, domain_id=context.get_domain_id())
+        gateway = Node('gateway', context=elsewhere)
+        gateway.create_publisher(Float32, '/valve_opening', 10)
         wait_until(
             lambda: 'published as std_msgs/msg/Float32' in stage.sentence('input valve_opening'),
             'the wrong type', 20.0,
         )  # fmt: skip
     finally:
+        rclpy.try_shutdown(context=elsewhere)
         stage.close()
 
 

@@ -76,6 +76,7 @@ def from_refined(
             float(m.time_constants[i] * error[i]), float(error[m.regions + i]),
         )
         for i in range(m.regions)
+        if edges[i] < edges[i + 1]  # a level beyond the curve's ends leaves a region empty
     )  # fmt: skip
     choice = static.choice
     if task.settings.text('selection_rule') != 'paper':
