@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -61,7 +62,8 @@ def open_input(path: Path, mapping: Mapping, console: Console) -> LogInput:
     contents = open_with(path, mapping)
     for sentence in contents.warnings:
         console.warn(sentence)
-    units = {s: unit_for(s, mapping) for s in contents.signals}
+    told = units_told(contents)
+    units = {s: unit_for(s, mapping, told) for s in contents.signals}
     constants = {_BY_TOPIC[c.name].signal: c.value for c in mapping.constants.values()}
     check_constants(constants)
     readings = _converted(contents.readings, units)
@@ -111,11 +113,35 @@ def _is_known(column: Column) -> bool:
     return not column.unit or column.unit in UNITS[_BY_TOPIC[column.name].signal]
 
 
-def unit_for(signal: Signal, mapping: Mapping) -> str:
-    """Return the unit a signal of the log is taken to have."""
+def unit_for(signal: Signal, mapping: Mapping, told: dict[Signal, str] | None = None) -> str:
+    """Return the unit a signal of the log is taken to have.
+
+    What the person says stands above what the recording says of itself, and
+    that above the unit of the contract.
+    """
     info = SIGNALS[signal]
     column = mapping.columns.get(info.topic)
-    return column.unit if column and column.unit and _is_known(column) else info.unit
+    if column and column.unit and _is_known(column):
+        return column.unit
+    return (told or {}).get(signal, info.unit)
+
+
+def units_told(contents: LogContents) -> dict[Signal, str]:
+    """Return the units a recording of the monitor was made with.
+
+    The monitor records what the gateway sent, as it was sent, and its own
+    parameters beside it. Stamped samples carry the units of the contract.
+    """
+    try:
+        parameters = json.loads(contents.attachments['parameters.json'])
+        named = {s: parameters.get(f'{SIGNALS[s].topic}_unit') for s in contents.signals}
+    except (KeyError, ValueError, AttributeError):
+        return {}
+    return {
+        signal: unit
+        for signal, unit in named.items()
+        if unit in UNITS[signal] and not contents.signals[signal].endswith('plant_sample')
+    }
 
 
 def check_constants(constants: dict[Signal, float]) -> None:

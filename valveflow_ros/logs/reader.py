@@ -109,8 +109,10 @@ def _files_of(folder: Path) -> tuple[list[Path], list[str]]:
 
 
 def _stem(name: str) -> str:
-    """Return the name of a split without number and suffix."""
-    return name.split('.mcap')[0].rstrip('0123456789')
+    """Return the name of a split without its ``_number`` and suffix; other names are their own."""
+    whole = name.split('.mcap')[0]
+    stem, line, number = whole.rpartition('_')
+    return stem + line if line and number.isdecimal() else whole
 
 
 def _listed(folder: Path) -> list[str]:

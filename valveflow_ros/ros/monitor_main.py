@@ -17,7 +17,8 @@ from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.stops import StopFlag
 
 _PERIOD_S = 0.01
-_SPIN_EVERY_S = 0.02
+# Services may wait that long; a look of the executor costs as much as forty messages.
+_SPIN_EVERY_S = 0.1
 
 
 def main(args: Sequence[str] | None = None) -> int:
