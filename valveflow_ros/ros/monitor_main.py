@@ -17,8 +17,7 @@ from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.stops import StopFlag
 
 _PERIOD_S = 0.01
-# Services may wait that long; a look of the executor costs as much as forty messages.
-_SPIN_EVERY_S = 0.1
+_SPIN_EVERY_S = 0.02
 
 
 def main(args: Sequence[str] | None = None) -> int:

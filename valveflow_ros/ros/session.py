@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -64,12 +63,8 @@ class Session:
         try:
             self.warm_up_s = warm_up(settings, self.worker, stop)
             self.engine = LiveEngine(settings, self.worker)
-            # Each event costs the executor time at every look, and nobody listens to these.
-            silent = PublisherEventCallbacks(use_default_callbacks=False)
             self._publishers = {
-                name: node.create_publisher(
-                    topic.message_type, f'~/{name}', _qos(topic.latched), event_callbacks=silent
-                )
+                name: node.create_publisher(topic.message_type, f'~/{name}', _qos(topic.latched))
                 for name, topic in OUTPUTS.items()
             }
             self.recording = self._open_recording()

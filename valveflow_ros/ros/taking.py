@@ -131,9 +131,8 @@ class Taker:
             QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=DEPTH, reliability=reliability),
             raw=True,
             callback_group=group or MutuallyExclusiveCallbackGroup(),
-            # Each event costs the executor time at every look; the rest says nothing of use.
             event_callbacks=SubscriptionEventCallbacks(
-                incompatible_qos=lambda _: on_mismatch(self.topic), use_default_callbacks=False
+                incompatible_qos=lambda _: on_mismatch(self.topic)
             ),
         )
 
