@@ -35,16 +35,20 @@ class InputHealth:
     topics: Mapping[str, str]
     mismatched: set[str] = field(default_factory=set)
     _impossible: dict[str, tuple[str, float]] = field(default_factory=dict)
+    _ranges: list[tuple[float, float]] = field(default_factory=list)
     _rejected: dict[str, int] = field(default_factory=dict)
     _lost: dict[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Look the ranges up once; they are not live."""
+        self._ranges = [plausible_range(info.signal, self.settings) for info in SIGNALS]
 
     def note(self, name: str, rows: Iterable[Row]) -> None:
         """Remember the last impossible value of each signal, to name it."""
         for _, number, value, _ in rows:
-            info = SIGNALS[number]
-            low, high = plausible_range(info.signal, self.settings)
-            if math.isfinite(value) and not low <= value <= high:
-                self._impossible[info.topic] = (name, value)
+            low, high = self._ranges[number]
+            if not low <= value <= high and math.isfinite(value):
+                self._impossible[SIGNALS[number].topic] = (name, value)
 
     def items(
         self,

@@ -18,7 +18,7 @@ _MOST_CLOCKS = 16 * DEPTH
 _PATIENCE_S = 0.03
 _CLOCK_PATIENCE_S = 0.2
 # A message may get its receipt time a moment before it can be taken.
-_IN_FLIGHT_NS = 1_000_000
+_IN_FLIGHT_NS = 200_000
 
 
 class Arrival(NamedTuple):
@@ -110,9 +110,12 @@ class Intake:
         until_ns = now_ns - _IN_FLIGHT_NS
         for name, source in self._sources.items():
             found = source.take()
-            self.tallies[name].note_arrival(len(found), now_s)
+            if not found:
+                continue
+            tally = self.tallies[name]
+            tally.note_arrival(len(found), now_s)
             for taken in found:
-                self.tallies[name].note_number(taken.sequence)
+                tally.note_number(taken.sequence)
                 received_ns = taken.received_ns or now_ns
                 self._held.append(_Held(received_ns, INPUT_ORDER[name], now_s, name, taken))
             if len(found) >= DEPTH:
@@ -120,6 +123,8 @@ class Intake:
                 until_ns = min(until_ns, self._held[-1].received_ns)
         if self._clock is not None:
             self._follow_clock(self._clock, now_s)
+        if not self._held:
+            return []
         # By topic within one receipt time; a topic's own messages stay in their order.
         self._held.sort(key=lambda held: held[:2])
         count = len(self._held)

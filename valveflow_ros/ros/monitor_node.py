@@ -171,14 +171,14 @@ class MonitorNode(LifecycleNode):
 
     # What the loop calls
 
-    def step(self) -> bool:
-        """Do what is due; tell whether there was anything to take."""
-        busy = self.session.step() if self.session is not None else False
+    def step(self) -> int:
+        """Do what is due; return how many messages were taken."""
+        found = self.session.step() if self.session is not None else 0
         now_s = time.monotonic()
         if now_s >= self._next_diagnostics_s:
             self._next_diagnostics_s = now_s + self.settings.real('diagnostics_period')
             self._say_health(now_s)
-        return busy
+        return found
 
     def _say_health(self, now_s: float) -> None:
         session = self.session

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -63,8 +64,12 @@ class Session:
         try:
             self.warm_up_s = warm_up(settings, self.worker, stop)
             self.engine = LiveEngine(settings, self.worker)
+            # Each event costs the executor time at every look, and nobody listens to these.
+            silent = PublisherEventCallbacks(use_default_callbacks=False)
             self._publishers = {
-                name: node.create_publisher(topic.message_type, f'~/{name}', _qos(topic.latched))
+                name: node.create_publisher(
+                    topic.message_type, f'~/{name}', _qos(topic.latched), event_callbacks=silent
+                )
                 for name, topic in OUTPUTS.items()
             }
             self.recording = self._open_recording()
@@ -121,18 +126,18 @@ class Session:
         self._takers.clear()
         self._intake = None
 
-    def step(self, last: bool = False) -> bool:
-        """Take, record and feed what has arrived; tell whether there was anything."""
+    def step(self, last: bool = False) -> int:
+        """Take, record and feed what has arrived; return how many messages that was."""
         self.tell(self.engine.poll())
         if self._intake is None:
-            return False
+            return 0
         arrivals = self._intake.collect(time.monotonic(), time.time_ns(), last)
         for arrival in arrivals:
             self.recording.write(
                 self.inputs[arrival.name], arrival.data, arrival.log_ns, arrival.time_ns
             )
         self.tell(self.engine.feed(self._intake.rows(arrivals)))
-        return bool(arrivals)
+        return len(arrivals)
 
     def tell(self, events: Sequence[Event]) -> None:
         """Publish and record what a call of the engine brought."""
