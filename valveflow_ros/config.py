@@ -192,8 +192,9 @@ _FIT = (
     Parameter('max_pieces', 10, '', 'Largest number of pieces tried, R_max of the paper.', 1, 20),
     Parameter('selection_rule', 'prediction_error', '',
               'How the number of pieces is chosen: a knee must pay for itself in the whitened '
-              "prediction error (needs refine), or the paper's turning angle, eq. (24).",
-              choices=('prediction_error', 'paper')),
+              'prediction error (needs refine), by the evidence of the special samples alone, or '
+              "by the paper's turning angle, eq. (24).",
+              choices=('prediction_error', 'evidence', 'paper')),
     Parameter('min_piece_share', 0.01, '',
               'Smallest share of the special samples in a piece.', 0.0, 0.2),
     Parameter('refine', True, '',
@@ -208,15 +209,18 @@ _FIT = (
 )  # fmt: skip
 
 _ALARM = (
-    Parameter('alarm_limit_sd', 4.0, 'sd',
-              'Limit of the residual alarm in standard deviations of clean residuals.',
-              1.0, 100.0, live=True),
+    Parameter('alarm_run_length', 30.0, 'd',
+              'Mean time between false residual alarms; limits follow from the clean residual.',
+              0.5, 3650.0),
+    Parameter('alarm_block', 60.0, 's', 'Time over which the alarm averages the residual at once.',
+              1.0, 86400.0),
+    Parameter('alarm_floor', 1.0, 'MW', 'Lasting shifts below this need not be found.', 0.0, 1e4),
     Parameter('alarm_limit', 0.0, 'MW',
-              'Limit of the residual alarm in MW; 0 uses alarm_limit_sd.', 0.0, 1e5, live=True),
-    Parameter('alarm_floor', 1.0, 'MW',
-              'The limit is never less than this, whatever the noise.', 0.0, 1e4, live=True),
-    Parameter('alarm_average', 300.0, 's', 'Time the residual is averaged over.', 1.0, 86400.0),
-    Parameter('alarm_on_delay', 120.0, 's', 'The limit must be exceeded this long.',
+              'Fixed limit of the running mean of the residual; 0 leaves it to alarm_run_length.',
+              0.0, 1e5, live=True),
+    Parameter('alarm_average', 300.0, 's', 'Time constant of the running mean of the residual.',
+              1.0, 86400.0),
+    Parameter('alarm_on_delay', 0.0, 's', 'The limit must be exceeded this long.',
               0.0, 86400.0, live=True),
     Parameter('alarm_off_delay', 300.0, 's', 'The return must last this long.', 0.0, 86400.0,
               live=True),
@@ -224,6 +228,17 @@ _ALARM = (
               0.0, 0.9, live=True),
     Parameter('alarm_latch', True, '',
               'An alarm stays until it has returned and was acknowledged.', live=True),
+)  # fmt: skip
+
+_SHIFT = (
+    Parameter('reference_file', '', '',
+              'A characteristic.json that later curves are judged against; empty waits for '
+              '~/set_reference.'),
+    Parameter('shift_confidence', 0.999, '',
+              'How sure a shift of the curve must be before it is called one.',
+              0.9, 0.999999, live=True),
+    Parameter('shift_least', 0.3, 'MW', 'Smaller shifts of the curve do not count.', 0.0, 1e4,
+              live=True),
 )  # fmt: skip
 
 _RECORD = (
@@ -252,6 +267,7 @@ TABLE: tuple[Parameter, ...] = (
     *_MODEL,
     *_FIT,
     *_ALARM,
+    *_SHIFT,
     *_RECORD,
 )
 PARAMETERS: dict[str, Parameter] = {row.name: row for row in TABLE}
@@ -312,6 +328,20 @@ class Settings(Mapping[str, Value]):
         """Return a copy with some values replaced, checked anew."""
         return Settings({**self._values, **values})
 
+    def live_changes(self, wanted: Settings) -> dict[str, Value]:
+        """Return what differs in ``wanted``.
+
+        Raises
+        ------
+        ParameterError
+            One differs that may not be changed while the monitor runs.
+        """
+        changed = {k: v for k, v in wanted.items() if v != self[k]}
+        for name in changed:
+            if not parameter(name).live:
+                raise ParameterError(name, 'cannot be changed while the monitor runs')
+        return changed
+
     @property
     def settle_s(self) -> float:
         """The transient after a move begins, 5 T + tau (Table I of the paper)."""
@@ -338,13 +368,13 @@ def _check_together(values: Mapping[str, Value]) -> None:
                 f'{signal}_low', f'({low:g}) must be below {signal}_high ({high:g})'
             )
     period = float(values['sample_period'])
-    for name in ('hold_limit', 'block', 'alarm_average'):
+    for name in ('hold_limit', 'block', 'alarm_block', 'alarm_average'):
         if float(values[name]) < period:
             raise ParameterError(
                 name, f'({float(values[name]):g} s) must not be below sample_period ({period:g} s)'
             )
     if values['selection_rule'] == 'prediction_error' and not values['refine']:
-        raise ParameterError('selection_rule', 'must be paper when refine is false')
+        raise ParameterError('selection_rule', 'must be evidence or paper when refine is false')
     longest, window_s = float(values['longest_segment']), 86400.0 * float(values['window_days'])
     if longest < 6.0 * float(values['block']):
         raise ParameterError('longest_segment', 'must be at least six times block')

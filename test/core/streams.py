@@ -126,7 +126,7 @@ class Story:
 def story(events):
     """Join the predictions of all blocks; keep everything else in its order."""
     names = ['time_ns', 'u', 'measured_mw', 'static_mw', 'dynamic_mw', 'residual_mw',
-             'average_mw', 'state', 'limit_mw', 'model_id']  # fmt: skip
+             'average_mw', 'evidence', 'shift_mw', 'state', 'width_mw', 'model_id']  # fmt: skip
     columns = {name: [] for name in names}
     others = []
     rows = 0
@@ -182,6 +182,7 @@ QUICK_MONITOR = {
     'alarm_on_delay': 5.0,
     'alarm_off_delay': 8.0,
     'alarm_limit': 3.0,
+    'alarm_run_length': 1.0,
 }
 
 

@@ -130,6 +130,8 @@ def test_a_name_that_is_no_text_is_refused_too(key):
         ({'sample_period': 20.0}, 'hold_limit'),
         ({'sample_period': 20.0, 'hold_limit': 60.0}, 'block'),
         ({'sample_period': 400.0, 'hold_limit': 600.0, 'block': 400.0,
+          'longest_segment': 9000.0}, 'alarm_block'),
+        ({'sample_period': 400.0, 'hold_limit': 600.0, 'block': 400.0, 'alarm_block': 400.0,
           'longest_segment': 9000.0}, 'alarm_average'),
         ({'block': 1000.0}, 'longest_segment'),
         ({'slope_limit': 2.5}, 'slope_limit'),

@@ -23,6 +23,8 @@ from streams import (
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.alarms import AlarmChange, AlarmState
+from valveflow_ros.core.curve_status import CurveStatus
+from valveflow_ros.core.chart import ResidualChart
 from valveflow_ros.core.events import (
     CurveAdopted,
     FitRequested,
@@ -31,7 +33,7 @@ from valveflow_ros.core.events import (
     SegmentClosed,
 )
 from valveflow_ros.core.fit import fit
-from valveflow_ros.core.monitor import CurveStatus, Monitor
+from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.offline import CLOCK_BACK, feed_rows
 from valveflow_ros.core.prediction import PredictionBlock, PredictionState
 from valveflow_ros.core.segmenter import Segmenter
@@ -352,17 +354,20 @@ def test_an_outage_without_rows_raises_no_alarm():
     assert np.nanmax(np.abs(residual)) < 3.0
 
 
-def test_the_limit_is_the_fixed_one_or_so_many_standard_deviations():
+def test_the_evidence_is_the_share_of_the_fixed_limit_or_what_the_chart_of_the_curve_says():
     monitor, _ = with_curve()
-    assert monitor.limit_mw() == 3.0
-    monitor.reconfigure(SETTINGS.changed({'alarm_limit': 0.0, 'alarm_limit_sd': 5.0}))
-    sd = monitor.characteristic.residuals.average_sd_mw
-    assert monitor.limit_mw() == max(5.0 * sd, 1.0)
-    monitor.reconfigure(monitor.settings.changed({'alarm_floor': 0.0}))
-    assert monitor.limit_mw() == 5.0 * sd
-    monitor.reconfigure(monitor.settings.changed({'alarm_floor': 40.0}))
-    assert monitor.limit_mw() == 40.0
-    assert math.isnan(Monitor(SETTINGS).limit_mw())
+    part = plant_table(9, 400, [('fault', 0, 400)])
+    events = feed_rows(monitor, part)
+    average, evidence = column(events, 'average_mw'), column(events, 'evidence')
+    assert evidence == pytest.approx(average / 3.0, nan_ok=True)
+    other, _ = with_curve()
+    other.reconfigure(SETTINGS.changed({'alarm_limit': 0.0}))
+    events = feed_rows(other, part)
+    chart = ResidualChart(other.characteristic.residuals.chart, 1.0)
+    wanted, _ = chart.feed(part.time_ns, column(events, 'residual_mw'))
+    known = np.isfinite(wanted)
+    assert known.sum() > 200
+    assert column(events, 'evidence')[-200:] == pytest.approx(wanted[-200:])
 
 
 # --- restarts and settings ------------------------------------------------------------------
@@ -405,7 +410,7 @@ def test_live_settings_may_change_and_leave_an_entry_others_may_not():
     monitor, _ = with_curve()
     (entry,) = monitor.reconfigure(SETTINGS.changed({'alarm_limit': 7.0}))
     assert (entry.kind, entry.rows) == (JournalKind.SETTINGS, N)
-    assert monitor.limit_mw() == 7.0
+    assert monitor.settings.real('alarm_limit') == 7.0
     assert monitor.reconfigure(monitor.settings) == []
     for name, value in (('sample_period', 2.0), ('time_constant', 3.0), ('refine', True)):
         changes = {name: value}

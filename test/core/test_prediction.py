@@ -119,8 +119,9 @@ def test_every_block_gives_what_the_slow_truth_gives(seed, harms, dynamic, step_
     expected = naive_predictions(c, *rows, step_s)
     p = predictor(c, step_s)
     for start, end in blocks_of(N, data.draw(cuts(N))):
-        block = p.predict(*(a[start:end] for a in rows), 2.5)
-        assert (len(block), block.limit_mw, block.model_id) == (end - start, 2.5, c.model_id)
+        block = p.predict(*(a[start:end] for a in rows))
+        assert (len(block), block.model_id) == (end - start, c.model_id)
+        assert block.width_mw == pytest.approx(c.residuals.width_mw, nan_ok=True)
         for name in ('static', 'dynamic', 'residual', 'average'):
             wanted = [r[name] for r in expected[start:end]]
             got = getattr(block, f'{name}_mw')
@@ -133,9 +134,9 @@ def test_every_block_gives_what_the_slow_truth_gives(seed, harms, dynamic, step_
 @given(st.integers(0, 2**32 - 1), harm, st.booleans(), st.data())
 def test_any_cutting_gives_the_same_bits(seed, harms, dynamic, data):
     rows = rows_of(seed, harms)
-    whole = predictor(paper(dynamic)).predict(*rows, 1.0)
+    whole = predictor(paper(dynamic)).predict(*rows)
     p = predictor(paper(dynamic))
-    parts = [p.predict(*(a[s:e] for a in rows), 1.0)
+    parts = [p.predict(*(a[s:e] for a in rows))
              for s, e in blocks_of(N, data.draw(cuts(N, most=20)))]  # fmt: skip
     for name in ('static_mw', 'dynamic_mw', 'residual_mw', 'average_mw', 'state'):
         joined = np.concatenate([getattr(part, name) for part in parts])
@@ -146,11 +147,11 @@ def test_any_cutting_gives_the_same_bits(seed, harms, dynamic, data):
 @given(st.integers(0, 2**32 - 1), harm)
 def test_bad_rows_poison_nothing_after_the_settling(seed, harms):
     p = predictor(paper())
-    p.predict(*rows_of(seed, harms), 1.0)
+    p.predict(*rows_of(seed, harms))
     _, u, power, kinds = rows_of(seed + 1, [])
     time_ns = grid_ns(N, start_ns=START_NS + 10**15)
-    here = p.predict(time_ns, u, power, kinds, 1.0)
-    fresh = predictor(paper()).predict(time_ns, u, power, kinds, 1.0)
+    here = p.predict(time_ns, u, power, kinds)
+    fresh = predictor(paper()).predict(time_ns, u, power, kinds)
     for name in ('static_mw', 'dynamic_mw', 'residual_mw', 'state'):
         assert frozen(getattr(here, name)) == frozen(getattr(fresh, name)), name
     assert np.isfinite(here.residual_mw).sum() > 0
@@ -166,7 +167,7 @@ def test_rows_missing_without_a_trace_are_a_gap():
     c = paper()
     power = c(u)
     kinds = np.full(n, SETTLED_STEADY, dtype=np.uint8)
-    block = predictor(c).predict(time_ns, u, power, kinds, 1.0)
+    block = predictor(c).predict(time_ns, u, power, kinds)
     assert np.isnan(block.residual_mw[200 : 200 + SETTLE]).all()
     scored = np.isfinite(block.residual_mw)
     assert scored[SETTLE:200].all()
@@ -179,7 +180,7 @@ def test_a_plant_that_is_the_model_has_no_residual():
     rng = np.random.default_rng(0)
     u = 1475.0 + 400.0 * np.sin(np.arange(600) / 40.0) + rng.normal(0.0, 3.0, 600)
     power, _ = c.model.respond(u, np.ones(600, dtype=np.uint8), 1.0, 0.0)
-    block = predictor(c).predict(grid_ns(600), u, power, np.zeros(600, dtype=np.uint8), 1.0)
+    block = predictor(c).predict(grid_ns(600), u, power, np.zeros(600, dtype=np.uint8))
     assert np.nanmax(np.abs(block.residual_mw)) < 1e-9
     assert np.abs(block.average_mw[-1]) < 1e-9
 
@@ -188,8 +189,8 @@ def test_a_plant_that_is_the_model_has_no_residual():
 @given(st.integers(0, 2**32 - 1), st.floats(-20.0, 20.0))
 def test_a_constant_error_of_the_power_is_the_residual(seed, error):
     rows = rows_of(seed, [])
-    here = predictor(paper()).predict(*rows, 1.0)
-    there = predictor(paper()).predict(rows[0], rows[1], rows[2] + error, rows[3], 1.0)
+    here = predictor(paper()).predict(*rows)
+    there = predictor(paper()).predict(rows[0], rows[1], rows[2] + error, rows[3])
     assert there.residual_mw == pytest.approx(here.residual_mw + error, abs=1e-9, nan_ok=True)
     assert np.array_equal(there.dynamic_mw, here.dynamic_mw, equal_nan=True)
 
@@ -199,7 +200,7 @@ def test_the_mean_of_a_constant_residual_rises_to_it_with_its_time_constant():
     n = 200
     u = np.full(n, 1400.0)
     kinds = np.full(n, SETTLED_STEADY, dtype=np.uint8)
-    block = predictor(c).predict(grid_ns(n), u, c(u) + 5.0, kinds, 1.0)
+    block = predictor(c).predict(grid_ns(n), u, c(u) + 5.0, kinds)
     expected = 5.0 * (1.0 - np.exp(-np.arange(1, n + 1) / AVERAGE))
     assert block.average_mw == pytest.approx(expected, rel=1e-9)
 
@@ -207,12 +208,12 @@ def test_the_mean_of_a_constant_residual_rises_to_it_with_its_time_constant():
 def test_warmed_up_it_goes_on_as_if_it_had_always_run():
     c = paper()
     rows = rows_of(5, [])
-    whole = predictor(c).predict(*rows, 1.0)
+    whole = predictor(c).predict(*rows)
     p = predictor(c)
     start = 2 * p.warm_up_rows
     assert p.warm_up_rows > SETTLE
     p.warm_up(*(a[:start] for a in rows[:3]))
-    later = p.predict(*(a[start:] for a in rows), 1.0)
+    later = p.predict(*(a[start:] for a in rows))
     assert np.array_equal(later.dynamic_mw, whole.dynamic_mw[start:], equal_nan=True)
     first = np.flatnonzero(np.isfinite(later.residual_mw))[0]
     forget = math.exp(-1.0 / AVERAGE)
@@ -227,16 +228,16 @@ def test_without_a_curve_rows_are_unknown_or_bad():
     assert block.state.tolist() == [
         PredictionState.UNKNOWN, PredictionState.BAD_DATA, PredictionState.UNKNOWN,
     ]  # fmt: skip
-    for name in ('static_mw', 'dynamic_mw', 'residual_mw', 'average_mw'):
+    for name in ('static_mw', 'dynamic_mw', 'residual_mw', 'average_mw', 'evidence', 'shift_mw'):
         assert np.isnan(getattr(block, name)).all()
-    assert math.isnan(block.limit_mw)
+    assert math.isnan(block.width_mw)
     assert block.model_id == ''
 
 
 @pytest.mark.parametrize('n', [0, 1])
 def test_hardly_any_rows(n):
     block = predictor(paper()).predict(
-        grid_ns(n), np.full(n, 1400.0), np.full(n, 200.0), np.ones(n, dtype=np.uint8), 1.0
+        grid_ns(n), np.full(n, 1400.0), np.full(n, 200.0), np.ones(n, dtype=np.uint8)
     )
     assert len(block) == n
     assert np.isnan(block.residual_mw).all()
@@ -247,9 +248,9 @@ def test_read_only_and_single_precision_columns():
     u32, power32 = u.astype(np.float32), power.astype(np.float32)
     for array in (u32, power32, time_ns, kinds):
         array.setflags(write=False)
-    got = predictor(paper()).predict(time_ns, u32, power32, kinds, 1.0)
+    got = predictor(paper()).predict(time_ns, u32, power32, kinds)
     wanted = predictor(paper()).predict(
-        time_ns, u32.astype(np.float64), power32.astype(np.float64), kinds, 1.0
+        time_ns, u32.astype(np.float64), power32.astype(np.float64), kinds
     )
     assert np.array_equal(got.residual_mw, wanted.residual_mw, equal_nan=True)
 
@@ -259,6 +260,6 @@ def test_the_longest_delay_a_file_may_name_is_remembered():
         type(DYNAMICS[0])(0.0, 100.0, 5.0, 600.0, NAN, NAN),))  # fmt: skip
     n = 1500
     u = np.where(np.arange(n) < 700, 200.0, 800.0)
-    block = predictor(slow).predict(grid_ns(n), u, np.zeros(n), np.ones(n, dtype=np.uint8), 1.0)
+    block = predictor(slow).predict(grid_ns(n), u, np.zeros(n), np.ones(n, dtype=np.uint8))
     assert block.dynamic_mw[700 + 599] == pytest.approx(20.0)
     assert block.dynamic_mw[700 + 660] == pytest.approx(80.0, abs=0.01)

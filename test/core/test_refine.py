@@ -7,8 +7,9 @@ import pytest
 from streams import lagged, needs_jit, steps_and_ramps
 
 from valveflow_ros.core.model import RegionalModel
-from valveflow_ros.core.problem import Samples
+from valveflow_ros.core.problem import Problem, Samples
 from valveflow_ros.core.refine import refine
+from valveflow_ros.core.whitening import whitened
 
 pytestmark = needs_jit
 
@@ -82,7 +83,11 @@ def test_the_standard_errors_are_neither_boast_nor_excuse():
 @pytest.mark.parametrize('seed', [0, 1])
 def test_what_is_left_is_white_and_as_large_as_the_noise(seed):
     result = refined(seed)
-    assert 0 < result.innovation_mw < result.residual_mw[result.weight > 0].std()
+    residual, weight = Problem(measured(TRUE, seed).finer()).answer(result.model)
+    e = whitened(residual, weight, result.ar)[:, 0]
+    assert result.innovation_mw == pytest.approx(e.std(), rel=0.02)
+    assert e.std() < residual[weight > 0].std()
+    assert abs(np.corrcoef(e[1:], e[:-1])[0, 1]) < 0.05
     assert np.isfinite(result.covariance).all()
     eigenvalues = np.linalg.eigvalsh(result.covariance)
     assert eigenvalues.min() > -1e-9 * eigenvalues.max()
@@ -146,16 +151,22 @@ def test_no_jump_is_found_where_there_is_none():
     assert not refined(0).free[2 * 3 : 2 * 3 + 2].any()
 
 
-@pytest.mark.xfail(strict=True, reason='a jump is imitated by a steep piece, never found as one')
-def test_a_jump_is_found_where_there_is_one():
-    left = TRUE.left.copy()
-    left[1] += 8.0
-    right = TRUE.right.copy()
-    right[1] += 8.0
+@pytest.mark.parametrize('seed', [1, 2])
+@pytest.mark.parametrize('jump', [8.0, -6.0])
+def test_a_jump_is_found_where_there_is_one(seed, jump):
+    left, right = TRUE.left.copy(), TRUE.right.copy()
+    left[1:] += jump
+    right[1:] += jump
     jumping = RegionalModel(TRUE.knots, left, right, np.empty(0), np.array([8.0]), np.array([2.0]))
-    result = refine(measured(jumping, 1), START)
-    jumps = result.model.left[1:] - result.model.right[:-1]
-    assert jumps[0] == pytest.approx(8.0, abs=2.0)
+    start = straight(
+        [1000.0, 1150.0, 1290.0, 1310.0, 1600.0, 1800.0, 2000.0],
+        [100.0, 136.0, 170.0, 172.0 + jump, 220.0 + jump, 230.0 + jump, 240.0 + jump],
+    )
+    result = refine(measured(jumping, seed), start, most_pieces=8)
+    assert result.model.pieces == 3
+    assert result.model.left[1:] - result.model.right[:-1] == pytest.approx([jump, 0.0], abs=1.0)
+    assert result.free[2 * 3 : 2 * 3 + 2].tolist() == [True, False]
+    assert result.model.knots[1] == pytest.approx(1300.0, abs=2.0)
 
 
 def test_a_constant_error_of_the_power_lifts_the_curve_and_nothing_else():

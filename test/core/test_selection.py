@@ -1,4 +1,4 @@
-"""The paper's rule (24) and its guard."""
+"""The paper's rule (24) and its guard, and what both rules answer where there is no choice."""
 
 from __future__ import annotations
 
@@ -89,9 +89,10 @@ def test_costs_must_be_numbers(bad):
 def test_the_paper_s_curve_has_four_pieces():
     u, y = samples('noiseless', N)
     found = partition(u, y + np.random.default_rng(6).normal(0, 0.5, N))
-    selection = select(found)
+    selection = select(found, rule='paper')
     assert selection.pieces == 4
-    assert selection.guard_reason == ''
+    assert selection.guard_reason == selection.note == ''
+    assert selection.confidence == {}
     assert selection.rule == 'paper'
     assert list(selection.cost) == list(range(1, 11))
     assert selection.cost[4] == found.cost[3]
@@ -102,7 +103,7 @@ def test_the_paper_s_curve_has_four_pieces():
 @pytest.mark.parametrize('seed', range(5))
 def test_noise_about_a_line_is_one_piece(kind, seed):
     u, y = samples(kind, N, seed)
-    selection = select(partition(u, y))
+    selection = select(partition(u, y), rule='paper')
     assert selection.pieces == 1
     assert selection.guard_reason.startswith('No break lowers the cost by more than chance')
     assert len(selection.turning_angle) == 8  # still reported
@@ -121,36 +122,45 @@ def test_noise_about_a_line_is_one_piece(kind, seed):
 )
 def test_an_exact_line_is_one_piece(y):
     u, _ = samples('straight', N)
-    selection = select(partition(u, y(u)))
-    assert selection.pieces == 1
-    assert selection.guard_reason == 'One line fits exactly.'
+    for rule in ('evidence', 'paper'):
+        selection = select(partition(u, y(u)), rule=rule)
+        assert selection.pieces == 1
+        assert selection.note == 'One line fits exactly.'
+    assert selection.guard_reason == selection.note
 
 
 def test_an_exact_curve_has_its_own_number_of_pieces():
     u, y = samples('noiseless', N)
-    assert select(partition(u, y)).pieces == 4
+    assert select(partition(u, y), rule='paper').pieces == 4
+    selection = select(partition(u, y))
+    assert selection.pieces == 4
+    assert selection.confidence == {4: 1.0}
+    assert selection.note == '4 lines fit exactly.'
 
 
 def test_correlation_makes_chance_larger():
     u = np.linspace(1200.0, 1300.0, N)
     noise = np.random.default_rng(8).normal(0, 1, N)
     found = partition(u, valve(u) + noise, 5)
-    assert select(found).pieces > 1
-    assert select(found, correlation_inflation=1e4).pieces == 1
+    assert select(found, rule='paper').pieces > 1
+    assert select(found, rule='paper', correlation_inflation=1e4).pieces == 1
 
 
 def test_few_distinct_u_leave_few_choices():
     r = np.random.default_rng(4)
     u = np.repeat(np.arange(4.0), 60)
     kinked = np.abs(u - 1.5) + 0.01 * r.normal(size=240)
-    selection = select(partition(u, kinked))
+    selection = select(partition(u, kinked), rule='paper')
     assert selection.pieces == 2
     assert selection.turning_angle == {}
     assert 'only 2 are possible' in selection.guard_reason
-    assert select(partition(u, u + 0.01 * r.normal(size=240))).pieces == 1
-    single = select(partition(u[u < 3.0], kinked[u < 3.0]))
-    assert single.pieces == 1
-    assert '3 distinct u' in single.guard_reason
+    assert select(partition(u, kinked)).pieces == 2
+    straight = partition(u, u + 0.01 * r.normal(size=240))
+    for rule in ('evidence', 'paper'):
+        assert select(straight, rule=rule).pieces == 1
+        single = select(partition(u[u < 3.0], kinked[u < 3.0]), rule=rule)
+        assert single.pieces == 1
+        assert '3 distinct u' in single.note
 
 
 def test_unknown_rules_and_impossible_inflations_are_refused():

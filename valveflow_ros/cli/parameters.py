@@ -66,6 +66,7 @@ def fitting(
         'lateness': max(float(default['lateness']), float(period)),
         'block': block,
         'longest_segment': longest,
+        'alarm_block': max(float(default['alarm_block']), 2.0 * float(period)),
         'alarm_average': max(float(default['alarm_average']), 5.0 * float(period)),
         'window_days': _window_days(span_s, float(period), longest),
     }
@@ -185,7 +186,7 @@ def _words(
     period = settings.real('sample_period')
     told = [
         f'{name} {adapted[name]:g} {PARAMETERS[name].unit}'
-        for name in ('hold_limit', 'lateness', 'block', 'longest_segment', 'alarm_average')
+        for name in ('hold_limit', 'lateness', 'block', 'longest_segment', 'alarm_block', 'alarm_average')
         if name in adapted
     ]
     if 'sample_period' in adapted:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -51,6 +52,15 @@ class AlarmChange:
     model_id: str
 
 
+class Judged(NamedTuple):
+    """A moment, the evidence then, and the shift it speaks of."""
+
+    time_ns: int
+    evidence: float
+    shift_mw: float
+
+
+_LIMIT = 1.0
 # Places in the alarm's memory.
 _ACTIVE, _SINCE, _COUNTING, _LAST_NS = range(4)
 
@@ -101,7 +111,7 @@ def _watch(
 
 
 class ResidualAlarm:
-    """Judge the running mean of the residual against a limit.
+    """Judge the evidence that the plant has left the curve: beyond 1 or -1 it has.
 
     Parameters
     ----------
@@ -137,65 +147,73 @@ class ResidualAlarm:
         return self.state != AlarmState.NORMAL
 
     def feed(
-        self, time_ns: IntArray, average_mw: FloatArray, limit_mw: float, model_id: str
+        self, time_ns: IntArray, evidence: FloatArray, shift_mw: FloatArray, model_id: str
     ) -> list[tuple[int, AlarmChange]]:
-        """Judge rows; return changes, each with the number of rows up to it."""
+        """Judge rows; return changes, each with the number of rows up to it.
+
+        Parameters
+        ----------
+        time_ns : int64 (n,)
+        evidence : float64 (n,)
+            NaN where there is nothing to judge.
+        shift_mw : float64 (n,)
+            The shift it speaks of, for the sentence.
+        model_id : str
+        """
         changes: list[tuple[int, AlarmChange]] = []
         done = 0
         while done < len(time_ns):
             turned = _watch(
-                time_ns[done:], average_mw[done:], limit_mw, self._dead_band,
+                time_ns[done:], evidence[done:], _LIMIT, self._dead_band,
                 self._on_ns, self._off_ns, self._gap_ns, self._memory,
             )  # fmt: skip
             if not turned:
                 break
             done += turned
-            at_ns, value = int(time_ns[done - 1]), float(average_mw[done - 1])
-            changes.append((done, self._turn(at_ns, value, limit_mw, model_id)))
+            judged = Judged(
+                int(time_ns[done - 1]), float(evidence[done - 1]), float(shift_mw[done - 1])
+            )
+            changes.append((done, self._turn(judged, model_id)))
         return changes
 
-    def acknowledge(
-        self, time_ns: int, value: float, limit: float, model_id: str
-    ) -> AlarmChange | None:
+    def acknowledge(self, judged: Judged, model_id: str) -> AlarmChange | None:
         """Acknowledge; None when there is nothing to acknowledge."""
         if self.state == AlarmState.UNACKNOWLEDGED:
-            return self._enter(AlarmState.ACKNOWLEDGED, time_ns, value, limit, model_id)
+            return self._enter(AlarmState.ACKNOWLEDGED, judged, model_id)
         if self.state == AlarmState.RETURNED_UNACKNOWLEDGED:
-            return self._enter(AlarmState.NORMAL, time_ns, value, limit, model_id)
+            return self._enter(AlarmState.NORMAL, judged, model_id)
         return None
 
-    def _turn(self, time_ns: int, value: float, limit: float, model_id: str) -> AlarmChange:
+    def _turn(self, judged: Judged, model_id: str) -> AlarmChange:
         """Change state because the condition has begun or ended."""
         if self.active:
             self._occurrence += 1
-            self._raised_ns = time_ns
-            return self._enter(AlarmState.UNACKNOWLEDGED, time_ns, value, limit, model_id)
+            self._raised_ns = judged.time_ns
+            return self._enter(AlarmState.UNACKNOWLEDGED, judged, model_id)
         latched = self._latch and self.state == AlarmState.UNACKNOWLEDGED
         after = AlarmState.RETURNED_UNACKNOWLEDGED if latched else AlarmState.NORMAL
-        return self._enter(after, time_ns, value, limit, model_id)
+        return self._enter(after, judged, model_id)
 
-    def _enter(
-        self, state: AlarmState, time_ns: int, value: float, limit: float, model_id: str
-    ) -> AlarmChange:
+    def _enter(self, state: AlarmState, judged: Judged, model_id: str) -> AlarmChange:
         previous, self.state = self.state, state
         return AlarmChange(
-            time_ns, self.NAME, state, previous, Priority.MEDIUM, value, limit, 'MW',
-            _sentence(state, value, limit), self._occurrence, self._raised_ns, model_id,
+            judged.time_ns, self.NAME, state, previous, Priority.MEDIUM, judged.evidence, _LIMIT,
+            '', _sentence(state, judged.shift_mw), self._occurrence, self._raised_ns, model_id,
         )  # fmt: skip
 
 
-def _sentence(state: AlarmState, value: float, limit: float) -> str:
+def _sentence(state: AlarmState, shift_mw: float) -> str:
     """Say what happened in words an operator can act on."""
-    side = 'more' if value > 0.0 else 'less'
+    side = 'more' if shift_mw > 0.0 else 'less'
     if state == AlarmState.UNACKNOWLEDGED:
         return (
-            f'The unit gives {abs(value):.1f} MW {side} than the valve curve says '
-            f'(limit {limit:.1f} MW): check what changed, or re-identify.'
+            f'The unit gives {abs(shift_mw):.1f} MW {side} than the valve curve says, and it '
+            'lasts: check what changed, or re-identify.'
         )
-    if state == AlarmState.ACKNOWLEDGED and math.isnan(value):
-        return 'Acknowledged; with the new curve there is no residual to tell yet.'
+    if state == AlarmState.ACKNOWLEDGED and not abs(shift_mw) > 0.0:
+        return 'Acknowledged; there is no residual to tell yet.'
     if state == AlarmState.ACKNOWLEDGED:
-        return f'Acknowledged; the unit still gives {abs(value):.1f} MW {side} than expected.'
+        return f'Acknowledged; the unit still gives {abs(shift_mw):.1f} MW {side} than expected.'
     if state == AlarmState.RETURNED_UNACKNOWLEDGED:
         return 'The unit follows the valve curve again; acknowledge to clear the alarm.'
     return 'The unit follows the valve curve.'

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from valveflow_ros.core.chart import ChartDesign
 from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import FloatArray
@@ -40,12 +42,31 @@ class RegionDynamics:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """How J was chosen: the rule, Omega(J) of eq. (19) and Lambda(J) of eq. (24)."""
+    """How J was chosen: the rule, Omega(J) of eq. (19) and Lambda(J) of eq. (24).
+
+    ``confidence`` is the probability of each J; empty where the rule has none.
+    """
 
     rule: str
     cost: dict[int, float]
     turning_angle: dict[int, float]
     note: str = ''
+    confidence: dict[int, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Support:
+    """What a piece rests on: special segments and samples inside it.
+
+    ``levels`` are the distinct steady levels in u. ``identifiable`` says whether the
+    condition after Proposition 2 of the paper holds.
+    """
+
+    steady: int
+    slope_response: int
+    samples: int
+    levels: tuple[float, ...]
+    identifiable: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,13 +85,19 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class ResidualStatistics:
-    """What residuals of this curve look like on the data it was fitted to (MW)."""
+    """What residuals of this curve look like on the data it was fitted to (MW).
+
+    95 % of single measurements lie within +- ``width_mw`` of the prediction. ``chart`` watches
+    for a lasting shift; without one there is no alarm.
+    """
 
     rmse_mw: float
     average_sd_mw: float
     average_s: float
     input_noise: float
     power_noise_mw: float
+    width_mw: float = math.nan
+    chart: ChartDesign | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +113,7 @@ class Characteristic:
     dynamics: tuple[RegionDynamics, ...] = ()
     partition_pieces: tuple[Piece, ...] = ()
     notes: tuple[str, ...] = ()
+    support: tuple[Support, ...] = ()
     model_id: str = field(default='')
 
     @property

@@ -12,13 +12,14 @@ from valveflow_ros.core.characteristic import (
     RegionDynamics,
     ResidualStatistics,
     Source,
+    Support,
 )
+from valveflow_ros.core.chart import ChartDesign
+from valveflow_ros.core.json_field import Field
 from valveflow_ros.errors import DataError
 
 FORMAT = 'valveflow/characteristic'
 VERSION = 1
-
-_LARGEST = 1e30  # no number of a plant is larger; products of two still are finite
 
 
 def _number(value: float) -> float | None:
@@ -38,6 +39,37 @@ def _piece_json(piece: Piece) -> dict[str, Any]:
     }
 
 
+def _supported_json(c: Characteristic) -> list[dict[str, Any]]:
+    """Return the pieces, each with what it rests on where that is known."""
+    pieces = [_piece_json(p) for p in c.pieces]
+    for piece, support in zip(pieces, c.support, strict=False):
+        piece['identifiable'] = support.identifiable
+        piece['support'] = {
+            'steady': support.steady,
+            'slope_response': support.slope_response,
+            'samples': support.samples,
+            'levels': list(support.levels),
+        }
+    return pieces
+
+
+def _chart_json(chart: ChartDesign | None) -> dict[str, Any]:
+    """Return the chart under its key; a curve without one has no such key."""
+    if chart is None:
+        return {}
+    small, large = ({'slack': k, 'limit': h} for k, h in zip(chart.slack, chart.limit, strict=True))
+    return {
+        'chart': {
+            'block_s': chart.block_s,
+            'correlation': chart.correlation,
+            'innovation_mw': chart.innovation_mw,
+            'small': small,
+            'large': large,
+            'run_length_days': chart.run_length_days,
+        }
+    }
+
+
 def to_json(c: Characteristic) -> dict[str, Any]:
     """Return the content of ``characteristic.json``."""
     return {
@@ -45,13 +77,14 @@ def to_json(c: Characteristic) -> dict[str, Any]:
         'version': VERSION,
         'model_id': c.model_id,
         'pressure_exponent': c.pressure_exponent,
-        'pieces': [_piece_json(p) for p in c.pieces],
+        'pieces': _supported_json(c),
         'breakpoint_intervals': [[_number(lo), _number(hi)] for lo, hi in c.breakpoint_intervals],
         'selection': {
             'rule': c.choice.rule,
             'cost': {str(j): _number(v) for j, v in c.choice.cost.items()},
             'turning_angle': {str(j): _number(v) for j, v in c.choice.turning_angle.items()},
             'note': c.choice.note,
+            'confidence': {str(j): _number(v) for j, v in c.choice.confidence.items()},
         },
         'segments': {
             'steady': c.source.steady,
@@ -81,6 +114,8 @@ def to_json(c: Characteristic) -> dict[str, Any]:
             'average_s': c.residuals.average_s,
             'input_noise': c.residuals.input_noise,
             'power_noise_mw': c.residuals.power_noise_mw,
+            'width_mw': _number(c.residuals.width_mw),
+            **_chart_json(c.residuals.chart),
         }
         if math.isfinite(c.residuals.rmse_mw)
         else {},
@@ -88,71 +123,6 @@ def to_json(c: Characteristic) -> dict[str, Any]:
         'notes': list(c.notes),
         'optimal': True,
     }
-
-
-class _Field:
-    """A place in the JSON that knows its path, so that an error can name it."""
-
-    def __init__(self, value: object, path: str) -> None:
-        self._value = value
-        self._path = path
-
-    def fail(self, problem: str) -> DataError:
-        return DataError(f"The characteristic cannot be used: '{self._path}' {problem}.")
-
-    def key(self, name: str) -> _Field:
-        path = f'{self._path}.{name}' if self._path else name
-        if not isinstance(self._value, dict):
-            raise self.fail('is not an object')
-        if name not in self._value:
-            raise _Field(None, path).fail('is missing')
-        return _Field(self._value[name], path)
-
-    def may_have(self, name: str) -> _Field | None:
-        present = isinstance(self._value, dict) and name in self._value
-        return self.key(name) if present else None
-
-    def items(self) -> list[_Field]:
-        if not isinstance(self._value, list):
-            raise self.fail('is not a list')
-        return [_Field(v, f'{self._path}[{k}]') for k, v in enumerate(self._value)]
-
-    def real(self, low: float = -math.inf, high: float = math.inf) -> float:
-        value = self._value
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.fail('is not a number')
-        if not low <= value <= high or abs(value) > _LARGEST:
-            raise self.fail('is out of range')
-        return float(value)
-
-    def real_or_nan(self, low: float = -math.inf) -> float:
-        return math.nan if self._value is None else self.real(low)
-
-    def whole(self) -> int:
-        value = self._value
-        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-            raise self.fail('is not a count')
-        return value
-
-    def flag(self) -> bool:
-        if not isinstance(self._value, bool):
-            raise self.fail('is neither true nor false')
-        return self._value
-
-    def text(self) -> str:
-        if not isinstance(self._value, str):
-            raise self.fail('is not a text')
-        return self._value
-
-    def by_pieces(self) -> dict[int, float]:
-        if not isinstance(self._value, dict):
-            raise self.fail('is not an object')
-        table = {}
-        for name in self._value:
-            if not (isinstance(name, str) and name.isdecimal()):
-                raise self.fail('has a key that is no number of pieces')
-            table[int(name)] = self.key(name).real_or_nan()
-        return table
 
 
 def from_json(raw: object) -> Characteristic:
@@ -172,14 +142,14 @@ def from_json(raw: object) -> Characteristic:
         raise DataError(
             f'The characteristic has version {raw.get("version")}, this program reads {VERSION}.'
         )
-    top = _Field(raw, '')
+    top = Field(raw, '')
     pieces = _pieces(top.key('pieces'))
     intervals = tuple(_interval(f) for f in top.key('breakpoint_intervals').items())
     if len(intervals) != len(pieces) - 1:
         raise top.key('breakpoint_intervals').fail(f'must have {len(pieces) - 1} entries')
     selection = top.key('selection')
     notes, partition, name = (top.may_have(n) for n in ('notes', 'partition', 'model_id'))
-    note = selection.may_have('note')
+    note, confidence = (selection.may_have(n) for n in ('note', 'confidence'))
     return Characteristic(
         pressure_exponent=top.key('pressure_exponent').real(0.5, 2.0),
         pieces=pieces,
@@ -189,17 +159,19 @@ def from_json(raw: object) -> Characteristic:
             selection.key('cost').by_pieces(),
             selection.key('turning_angle').by_pieces(),
             note.text() if note else '',
+            confidence.by_pieces() if confidence else {},
         ),
         source=_source(top),
         residuals=_residuals(top.may_have('residuals')),
         dynamics=_dynamics(top.key('dynamics')),
         partition_pieces=_pieces(partition.key('pieces'), touching=False) if partition else (),
         notes=tuple(n.text() for n in notes.items()) if notes else (),
+        support=_support(top.key('pieces')),
         model_id=name.text() if name else '',
     )
 
 
-def _pieces(field: _Field, touching: bool = True) -> tuple[Piece, ...]:
+def _pieces(field: Field, touching: bool = True) -> tuple[Piece, ...]:
     pieces: list[Piece] = []
     for f in field.items():
         if pieces and touching and f.key('u_from').real() != pieces[-1].u_to:
@@ -221,14 +193,33 @@ def _pieces(field: _Field, touching: bool = True) -> tuple[Piece, ...]:
     return tuple(pieces)
 
 
-def _interval(field: _Field) -> tuple[float, float]:
+def _support(field: Field) -> tuple[Support, ...]:
+    """Return what the pieces rest on; empty unless every piece says so."""
+    found: list[Support] = []
+    for piece in field.items():
+        judged, support = piece.may_have('identifiable'), piece.may_have('support')
+        if judged is None or support is None:
+            return ()
+        found.append(
+            Support(
+                support.key('steady').whole(),
+                support.key('slope_response').whole(),
+                support.key('samples').whole(),
+                tuple(level.real() for level in support.key('levels').items()),
+                judged.flag(),
+            )
+        )
+    return tuple(found)
+
+
+def _interval(field: Field) -> tuple[float, float]:
     ends = field.items()
     if len(ends) != 2:
         raise field.fail('must be a lower and an upper end')
     return ends[0].real_or_nan(), ends[1].real_or_nan()
 
 
-def _source(top: _Field) -> Source:
+def _source(top: Field) -> Source:
     segments, window, temperature = (
         top.key('segments'),
         top.may_have('window'),
@@ -250,14 +241,31 @@ def _source(top: _Field) -> Source:
     )
 
 
-def _residuals(field: _Field | None) -> ResidualStatistics:
+def _residuals(field: Field | None) -> ResidualStatistics:
     names = ('rmse_mw', 'average_sd_mw', 'average_s', 'input_noise', 'power_noise_mw')
     if field is None or not field.may_have('rmse_mw'):
         return ResidualStatistics(*(math.nan for _ in names))
-    return ResidualStatistics(*(field.key(name).real(0.0) for name in names))
+    width, chart = field.may_have('width_mw'), field.may_have('chart')
+    return ResidualStatistics(
+        *(field.key(name).real(0.0) for name in names),
+        width_mw=width.real_or_nan(0.0) if width else math.nan,
+        chart=_chart(chart) if chart else None,
+    )
 
 
-def _dynamics(field: _Field) -> tuple[RegionDynamics, ...]:
+def _chart(field: Field) -> ChartDesign:
+    sums = field.key('small'), field.key('large')
+    return ChartDesign(
+        block_s=field.key('block_s').real(1e-3),
+        correlation=field.key('correlation').real(0.0, 0.999),
+        innovation_mw=field.key('innovation_mw').real(1e-12),
+        slack=(sums[0].key('slack').real(0.0), sums[1].key('slack').real(0.0)),
+        limit=(sums[0].key('limit').real(1e-6), sums[1].key('limit').real(1e-6)),
+        run_length_days=field.key('run_length_days').real(0.0),
+    )
+
+
+def _dynamics(field: Field) -> tuple[RegionDynamics, ...]:
     regions: list[RegionDynamics] = []
     for f in field.items():
         t_error, d_error = f.may_have('time_constant_stderr_s'), f.may_have('delay_stderr_s')

@@ -9,6 +9,7 @@ from valveflow_ros.core.alarms import AlarmChange
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.prediction import PredictionBlock
+from valveflow_ros.core.shift import Shift
 from valveflow_ros.records import SpecialSegment
 
 
@@ -53,9 +54,28 @@ class FitRequested:
 
 @dataclass(frozen=True, slots=True)
 class CurveAdopted:
-    """A new curve predicts from the next row on."""
+    """A new curve predicts from the next row on.
+
+    ``shift`` is the judgement against the reference, None without one.
+    """
+
+    characteristic: Characteristic
+    shift: Shift | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceSet:
+    """Later curves are judged against this one."""
 
     characteristic: Characteristic
 
 
-Event = PredictionBlock | SegmentClosed | FitRequested | CurveAdopted | AlarmChange | JournalEntry
+Event = (
+    PredictionBlock
+    | SegmentClosed
+    | FitRequested
+    | CurveAdopted
+    | ReferenceSet
+    | AlarmChange
+    | JournalEntry
+)

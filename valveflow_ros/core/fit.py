@@ -17,14 +17,16 @@ from valveflow_ros.core.characteristic import (
 )
 from valveflow_ros.core.fit_result import from_refined, residual_statistics
 from valveflow_ros.core.fit_task import FitTask
+from valveflow_ros.core.identifiability import with_support
 from valveflow_ros.core.partition import Partition, partition
 from valveflow_ros.core.problem import Samples
 from valveflow_ros.core.refine import refine
-from valveflow_ros.core.selection import Selection, select
+from valveflow_ros.core.selection import select
+from valveflow_ros.core.selection_series import Series
 from valveflow_ros.core.whitening import inflation
 from valveflow_ros.core.window import WindowContents
 from valveflow_ros.errors import DataError, TooFewSamplesError
-from valveflow_ros.records import FloatArray, SegmentKind
+from valveflow_ros.records import FloatArray, IntArray, SegmentKind
 
 _EXPLAINED_LEAST = 0.5  # share of the power's variance a curve must explain to be one
 _LEAST_SPREAD = 10.0  # noise sd that the openings must spread over
@@ -50,14 +52,21 @@ def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
     least = max(2, math.ceil(settings.real('min_piece_share') * len(np.unique(u))))
     part = partition(u, power, settings.whole('max_pieces'), least)
     growth = _inflation(contents, part)
-    selection = select(part, rule='paper', correlation_inflation=growth)
+    selection = select(
+        part,
+        rule='evidence' if settings.text('selection_rule') == 'evidence' else 'paper',
+        correlation_inflation=growth,
+        series=Series.of_spans(contents.u, contents.power_mw, contents.spans),
+    )
     _moved(task, u)
+    _valve_moved(task, rows)
     chosen = _pieces_of(part, selection.pieces, growth)
     _carries_a_curve(chosen, u, power)
     source = _source(task, rows)
     choice = Choice(
-        selection.rule, dict(selection.cost), dict(selection.turning_angle), _note(selection)
-    )
+        selection.rule, dict(selection.cost), dict(selection.turning_angle), selection.note,
+        dict(selection.confidence),
+    )  # fmt: skip
     static = Characteristic(
         pressure_exponent=settings.real('pressure_exponent'),
         pieces=chosen,
@@ -68,8 +77,9 @@ def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
         partition_pieces=chosen,
     )
     if not settings.flag('refine'):
-        return static.with_id()
-    return _refined(task, static, part, u, progress).with_id()
+        return with_support(static, contents, task.input_noise).with_id()
+    refined = _refined(task, static, part, u, progress)
+    return with_support(refined, contents, task.input_noise).with_id()
 
 
 def _pieces_of(part: Partition, pieces: int, inflation: float = 1.0) -> tuple[Piece, ...]:
@@ -108,6 +118,28 @@ def _moved(task: FitTask, u: FloatArray) -> None:
             f'The unit stood at one opening: in the special segments u lies between {low:.4g} and '
             f'{high:.4g}, hardly more than its noise of {task.input_noise:.2g}. A curve needs '
             'several loads.'
+        )
+
+
+def _valve_moved(task: FitTask, rows: IntArray) -> None:
+    """Refuse samples whose u was moved by the pressure alone.
+
+    They may follow a curve well, since power follows the pressure; but it is no
+    characteristic of the valve, and a dead transmitter gives the same.
+    """
+    if not len(task.contents.opening_percent):
+        return
+    opening, u = task.contents.opening_percent[rows], task.contents.u[rows]
+    known = np.isfinite(opening)
+    if not known.any() or not np.median(opening[known]) > 0.0:
+        return
+    low, high = np.quantile(opening[known], (0.01, 0.99))
+    moved_u = (high - low) * float(np.median(u[known]) / np.median(opening[known]))
+    if moved_u < _LEAST_SPREAD * task.input_noise:
+        raise DataError(
+            f'The valve did not move: in the special segments its opening lies between {low:.4g} '
+            f'and {high:.4g} %, and u follows the pressure alone. Hours at several openings are '
+            'needed; if the valve did move, the transmitter of its opening is dead.'
         )
 
 
@@ -151,10 +183,6 @@ def _inflation(contents: WindowContents, part: Partition) -> float:
     return inflation(residual, weight, longest)
 
 
-def _note(selection: Selection) -> str:
-    return str(selection.guard_reason)
-
-
 def _no_intervals(pieces: tuple[Piece, ...]) -> tuple[tuple[float, float], ...]:
     return tuple((math.nan, math.nan) for _ in pieces[1:])
 
@@ -187,7 +215,11 @@ def _static_residuals(
     c = task.contents
     rest = c.power_mw[rows] - _evaluate(pieces, c.u[rows])
     weight = np.ones(len(rest), dtype=np.uint8)
-    return residual_statistics(task, rest, weight, task.settings.real('sample_period'))
+    # A static curve has no error of its own that is known here: that of its mean is the least.
+    sd = float(np.std(rest))
+    return residual_statistics(
+        task, rest, weight, task.settings.real('sample_period'), sd, sd / math.sqrt(len(rest))
+    )
 
 
 def _only_straight(
@@ -238,7 +270,7 @@ def _refined(
         group=max(1, round(settings.real('block') / step)),
     )
     most, start = None, static.model
-    if settings.text('selection_rule') != 'paper':
+    if settings.text('selection_rule') == 'prediction_error':
         most = settings.whole('max_pieces')
         start = replace(static, pieces=_rich(part, len(static.pieces))).model
     try:

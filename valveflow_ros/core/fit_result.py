@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from scipy.signal import lfilter
 
 from valveflow_ros.core.characteristic import (
     Characteristic,
@@ -17,6 +18,7 @@ from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.problem import Samples
 from valveflow_ros.core.refine import Refined
+from valveflow_ros.core.run_length import design_chart
 from valveflow_ros.records import ByteArray, FloatArray
 
 _Z95 = 1.959963984540054
@@ -24,17 +26,29 @@ _MAD_TO_SD = 1.4826022185056018
 
 
 def residual_statistics(
-    task: FitTask, residual: FloatArray, weight: ByteArray, step_s: float
+    task: FitTask,
+    residual: FloatArray,
+    weight: ByteArray,
+    step_s: float,
+    row_sd_mw: float,
+    curve_error_mw: float,
 ) -> ResidualStatistics:
-    """Return rmse, and the sd that the running mean of the alarm has on these residuals."""
-    average_s = task.settings.real('alarm_average')
-    keep = weight > 0
-    rest = residual[keep]
+    """Return what clean residuals look like, and the chart that watches for others.
+
+    Parameters
+    ----------
+    residual, weight : (m,)
+        Of rows, or of means over some, ``step_s`` apart.
+    row_sd_mw : float
+        sd of single rows.
+    curve_error_mw : float
+        Standard error of the prediction.
+    """
+    settings = task.settings
+    average_s = settings.real('alarm_average')
+    rest = residual[weight > 0]
     forget = math.exp(-step_s / average_s)
-    run, mean = np.empty(len(rest)), 0.0
-    for k, value in enumerate(rest):
-        mean = forget * mean + (1.0 - forget) * value
-        run[k] = mean
+    run = lfilter([1.0 - forget], [1.0, -forget], rest)
     settled = run[min(len(run) // 4, int(3.0 * average_s / step_s)) :]
     sd = _MAD_TO_SD * float(np.median(np.abs(settled - np.median(settled))))
     return ResidualStatistics(
@@ -43,7 +57,15 @@ def residual_statistics(
         average_s=average_s,
         input_noise=task.input_noise,
         power_noise_mw=task.power_noise_mw,
-    )
+        width_mw=_Z95 * math.hypot(row_sd_mw, curve_error_mw),
+        chart=design_chart(
+            residual, weight, step_s,
+            block_s=settings.real('alarm_block'),
+            run_length_days=settings.real('alarm_run_length'),
+            floor_mw=settings.real('alarm_floor'),
+            curve_error_mw=curve_error_mw,
+        ),
+    )  # fmt: skip
 
 
 def from_refined(
@@ -79,9 +101,12 @@ def from_refined(
         if edges[i] < edges[i + 1]  # a level beyond the curve's ends leaves a region empty
     )  # fmt: skip
     choice = static.choice
-    if task.settings.text('selection_rule') != 'paper':
+    if task.settings.text('selection_rule') == 'prediction_error':
         note = f"The paper's rule (24) takes J = {len(static.pieces)}."
-        choice = replace(choice, rule='prediction_error', note=f'{note} {choice.note}'.strip())
+        choice = replace(
+            choice, rule='prediction_error', note=f'{note} {choice.note}'.strip(),
+            confidence=dict(result.confidence),
+        )  # fmt: skip
     return replace(
         static,
         choice=choice,
@@ -89,7 +114,8 @@ def from_refined(
         breakpoint_intervals=intervals,
         dynamics=dynamics,
         residuals=residual_statistics(
-            task, result.residual_mw, result.weight, samples.step_s * samples.group
+            task, result.residual_mw, result.weight, samples.step_s * samples.group,
+            result.row_sd_mw, result.prediction_mw,
         ),
     )
 

@@ -11,7 +11,8 @@ while the weakest loses too little.
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,8 +26,27 @@ from valveflow_ros.records import FloatArray
 # Log-likelihood a knee must gain. A knee is two parameters found by a search along u;
 # by chance the best of such a search gains 3 or 4, once in a thousand about 9.
 KNEE_GAIN = 12.0
+_SURE = 1e3  # worth beyond which nothing changes
+_TEMPER = 0.5
 _CANDIDATES = 30
 _BLOCKS = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Grown:
+    """A model with its number of pieces chosen.
+
+    Attributes
+    ----------
+    model : RegionalModel
+    worth : dict
+        For each J on the way, from 2 on, the log-likelihood that its J-th piece is worth,
+        with the robust variance; J reaches one beyond the model's pieces where that could
+        be tried.
+    """
+
+    model: RegionalModel
+    worth: dict[int, float]
 
 
 def _insert(model: RegionalModel, knot: float) -> RegionalModel:
@@ -108,9 +128,7 @@ def _gain(problem: Problem, small: RegionalModel, large: RegionalModel, ar: Floa
     )
 
 
-def choose_pieces(
-    problem: Problem, model: RegionalModel, ar: FloatArray, most: int
-) -> RegionalModel:
+def choose_pieces(problem: Problem, model: RegionalModel, ar: FloatArray, most: int) -> Grown:
     """Add and remove knees until each is worth its place.
 
     Parameters
@@ -122,21 +140,70 @@ def choose_pieces(
     most : int
         Largest number of pieces.
     """
+    worth: dict[int, float] = {}
     while model.pieces < most:
         place, gain = _best_knee(problem, model, ar)
+        worth[model.pieces + 1] = gain
         if gain < KNEE_GAIN:
             break
         trial = _insert(model, place)
         trial, _ = move(problem, trial, ar, free_parameters(trial.pieces, trial.regions), 8)
-        if _gain(problem, model, trial, ar) < KNEE_GAIN:
+        worth[model.pieces + 1] = gain = min(gain, _gain(problem, model, trial, ar))
+        if gain < KNEE_GAIN:
             break
         model = trial
     while model.pieces > 1:
-        worth = bend_certainty(problem, model, ar)
-        weakest = int(np.argmin(worth))
+        certainty = bend_certainty(problem, model, ar)
+        weakest = int(np.argmin(certainty))
         trial = _remove(model, weakest)
         trial, _ = move(problem, trial, ar, free_parameters(trial.pieces, trial.regions), 8)
-        if min(worth[weakest], _gain(problem, trial, model, ar)) >= KNEE_GAIN:
+        least = min(float(certainty[weakest]), _gain(problem, trial, model, ar))
+        # With J pieces each bend was worth at least this: taking more away costs more.
+        others = np.sort(np.delete(certainty, weakest))
+        for j, value in enumerate([least, *others.tolist()]):
+            worth[model.pieces - j] = float(value)
+        if least >= KNEE_GAIN:
             break
         model = trial
-    return model
+    return Grown(model, worth)
+
+
+def confidence(worth: dict[int, float], most: int) -> dict[int, float]:
+    """Return how probable each number of pieces is, from what each piece is worth.
+
+    Parameters
+    ----------
+    worth : dict
+        As in `Grown`.
+    most : int
+        Largest number of pieces asked for.
+
+    Returns
+    -------
+    dict
+        Probabilities of J = 1 .. ``most``, summing to 1.
+
+    Notes
+    -----
+    A piece worth `KNEE_GAIN` makes J and J - 1 equally probable; each unit of
+    log-likelihood beyond it changes the odds by ``exp(_TEMPER)``. Beyond the last piece
+    that was tried a further one is taken for worth as much as that one.
+    """
+    last = max(worth, default=1)
+    odds = [0.0]
+    for j in range(2, most + 1):
+        value = worth.get(j, worth.get(last, 0.0) if j > last else math.inf)
+        odds.append(odds[-1] + _TEMPER * (min(value, _SURE) - KNEE_GAIN))
+    weight = np.exp(np.array(odds) - max(odds))
+    return {j: float(w) for j, w in enumerate(weight / weight.sum(), start=1)}
+
+
+def shifted(likely: dict[int, float], by: int) -> dict[int, float]:
+    """Return probabilities moved to ``by`` more pieces, from 1 on.
+
+    Where two knees turn out to be the ends of one jump, or a piece is split
+    later, all numbers mean one piece more or less than when they were weighed.
+    """
+    moved = {j + by: share for j, share in likely.items() if j + by >= 1}
+    total = sum(moved.values())
+    return {j: share / total for j, share in moved.items()} if total > 0.0 else {}

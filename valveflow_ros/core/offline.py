@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 
 from valveflow_ros.core.align import Aligned, Aligner
+from valveflow_ros.core.characteristic_json import from_json
 from valveflow_ros.core.events import Event, FitRequested, JournalEntry, JournalKind
 from valveflow_ros.core.fit import fit
 from valveflow_ros.core.fit_task import FitTask
@@ -125,7 +126,10 @@ class JournalReplayer:
         if entry.kind == JournalKind.RESET:
             return monitor.restart(entry.text)
         if entry.kind == JournalKind.SETTINGS:
-            return monitor.reconfigure(monitor.settings.changed(_settings(entry)))
+            return monitor.reconfigure(monitor.settings.changed(_held(entry, 'parameters')))
+        if entry.kind == JournalKind.SET_REFERENCE:
+            given = from_json(_held(entry, 'reference')) if entry.text else None
+            return monitor.set_reference(given)
         return []
 
     def _adopt(self, entry: JournalEntry) -> list[Event]:
@@ -145,12 +149,12 @@ class JournalReplayer:
         return self._monitor.adopt(entry.request_ns, found)
 
 
-def _settings(entry: JournalEntry) -> dict[str, object]:
-    """Return the parameters a journal entry changes."""
+def _held(entry: JournalEntry, what: str) -> dict[str, object]:
+    """Return the JSON object a journal entry holds."""
     try:
-        changed = json.loads(entry.text)
+        held = json.loads(entry.text)
     except ValueError:
-        changed = None
-    if not isinstance(changed, dict):
-        raise DataError(f"The journal's change of parameters cannot be read: '{entry.text}'.")
-    return changed
+        held = None
+    if not isinstance(held, dict):
+        raise DataError(f"The journal's change of {what} cannot be read: '{entry.text[:200]}'.")
+    return held

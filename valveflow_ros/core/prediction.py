@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.chart import ResidualChart
 from valveflow_ros.core.jit import jit
 from valveflow_ros.core.regional_kernel import (
     TAP_0,
@@ -52,11 +53,15 @@ class PredictionBlock:
         NaN where unknown. The residual is measured minus dynamic prediction, or
         minus static prediction in settled rows when no dynamics are known.
     average_mw : float64
-        The running mean of the residual that the alarm judges; NaN before the first.
+        The running mean of the residual; NaN before the first.
+    evidence : float64
+        What the alarm judges: beyond 1 or -1 the plant has left the curve; NaN before the first.
+    shift_mw : float64
+        By how much, as the evidence sees it.
     state : uint8
         A `PredictionState`.
-    limit_mw : float
-        The alarm's limit on ``average_mw``, +- this; NaN without a curve.
+    width_mw : float
+        95 % of single measurements lie within +- this of the prediction; NaN without a curve.
     model_id : str
     """
 
@@ -67,8 +72,10 @@ class PredictionBlock:
     dynamic_mw: FloatArray
     residual_mw: FloatArray
     average_mw: FloatArray
+    evidence: FloatArray
+    shift_mw: FloatArray
     state: ByteArray
-    limit_mw: float
+    width_mw: float
     model_id: str
 
     def __len__(self) -> int:
@@ -184,12 +191,23 @@ class Predictor:
         After a gap the dynamic prediction is not trusted for this long.
     average_s : float
         Time constant of the residual's running mean.
+    limit_mw : float
+        Where above zero, the evidence is the running mean's share of this limit; otherwise it is
+        that of the chart that came with the curve.
     """
 
     def __init__(
-        self, characteristic: Characteristic, step_s: float, settle_s: float, average_s: float
+        self,
+        characteristic: Characteristic,
+        step_s: float,
+        settle_s: float,
+        average_s: float,
+        limit_mw: float = 0.0,
     ) -> None:
         self.characteristic = characteristic
+        self.limit_mw = limit_mw
+        design = characteristic.residuals.chart
+        self._chart = None if design is None else ResidualChart(design, step_s)
         m = characteristic.model
         self._filter = _Filter(
             m.knots, m.left, m.right, m.levels, m.taps(step_s),
@@ -209,27 +227,34 @@ class Predictor:
     def warm_up(self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray) -> None:
         """Run over rows of the past; the residual's mean starts afresh afterwards."""
         kinds = np.full(len(u), SETTLED_STEADY, dtype=np.uint8)
-        self.predict(time_ns, u, power_mw, kinds, math.nan)
+        self._rows(time_ns, u, power_mw, kinds)
         self._filter.memory[_AVERAGE] = math.nan
 
     def predict(
-        self,
-        time_ns: IntArray,
-        u: FloatArray,
-        power_mw: FloatArray,
-        kinds: ByteArray,
-        limit_mw: float,
+        self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray, kinds: ByteArray
     ) -> PredictionBlock:
         """Predict rows of shape (n,); ``kinds`` are the segmenter's."""
+        out = self._rows(time_ns, u, power_mw, kinds)
+        evidence = shift = np.full(len(u), math.nan)
+        if self._chart is not None:
+            evidence, shift = self._chart.feed(time_ns, out.residual)
+        if self.limit_mw > 0.0:
+            evidence, shift = out.average / self.limit_mw, out.average
+        return PredictionBlock(
+            time_ns, u, power_mw, out.static, out.dynamic, out.residual, out.average, evidence,
+            shift, out.state, self.characteristic.residuals.width_mw,
+            self.characteristic.model_id,
+        )  # fmt: skip
+
+    def _rows(
+        self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray, kinds: ByteArray
+    ) -> _Columns:
         n = len(u)
         out = _Columns(
             np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n, dtype=np.uint8)
         )
         _predict(time_ns, u, power_mw, kinds, self._filter, out)
-        return PredictionBlock(
-            time_ns, u, power_mw, *out, limit_mw,
-            self.characteristic.model_id,
-        )  # fmt: skip
+        return out
 
 
 def no_prediction(
@@ -241,5 +266,5 @@ def no_prediction(
         kinds == NO_DATA, int(PredictionState.BAD_DATA), int(PredictionState.UNKNOWN)
     ).astype(np.uint8)
     return PredictionBlock(
-        time_ns, u, power_mw, nan, nan, nan, nan, state, math.nan, ''
+        time_ns, u, power_mw, nan, nan, nan, nan, nan, nan, state, math.nan, ''
     )  # fmt: skip

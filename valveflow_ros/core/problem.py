@@ -8,10 +8,13 @@ import numpy as np
 
 from valveflow_ros.core import regional_kernel as kernel
 from valveflow_ros.core.model import RegionalModel
-from valveflow_ros.core.sums import gram
-from valveflow_ros.core.whitening import whitened
+from valveflow_ros.core.normal_kernel import square_sum
+from valveflow_ros.core.whitening import normal_equations
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
+# What reacts to the power within the rows averaged, as a load controller does, would be
+# taken for dynamics of the valve: so in the end few rows are averaged.
+_FINE_S = 2.0
 _LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4, 0.2, 0.1, 0.05)
 
 
@@ -42,6 +45,10 @@ class Samples:
     def means(self) -> int:
         """Return the number of scored means."""
         return len(self.u) // self.group
+
+    def finer(self) -> Samples:
+        """Return the same rows with hardly any averaging, for the last word on all parameters."""
+        return replace(self, group=max(1, min(self.group, round(_FINE_S / self.step_s))))
 
     def coarser(self) -> Samples:
         """Return means over some rows, for searches: two rows to a scored mean.
@@ -111,8 +118,7 @@ class Problem:
     def cost(self, model: RegionalModel, ar: FloatArray) -> float:
         """Return the sum of squared innovations."""
         residual, weight = self.answer(model)
-        e = whitened(residual, weight, ar)
-        return float((e * e).sum())
+        return float(square_sum(residual, weight, ar))
 
 
 def free_parameters(pieces: int, regions: int, jumps: BoolArray | None = None) -> BoolArray:
@@ -144,9 +150,8 @@ def move(
     cost = problem.cost(model, ar)
     for _ in range(steps):
         residual, jacobian, weight = problem.tangents(model)
-        both = whitened(np.column_stack([jacobian[:, free], residual]), weight, ar)
-        sums = gram(both)
-        normal, slope = sums[:-1, :-1], sums[:-1, -1]
+        sums, _, _ = normal_equations(jacobian, residual, weight, ar)
+        normal, slope = sums[:-1, :-1][np.ix_(free, free)], sums[:-1, -1][free]
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-12 * np.diag(normal).max()))
         normal = normal / np.outer(scale, scale)
         better = None

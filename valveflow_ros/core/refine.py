@@ -11,22 +11,24 @@ not smooth in it; everything else moves by Levenberg-Marquardt.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from valveflow_ros.core.grow import choose_pieces
+from valveflow_ros.core.grow import choose_pieces, confidence, shifted
+from valveflow_ros.core.input_errors import corrected
+from valveflow_ros.core.jumps import find_jumps, supported_jumps
 from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.problem import Problem, Samples, free_parameters, move, search_levels
 from valveflow_ros.core.regions import find_regions
-from valveflow_ros.core.sums import gram
 from valveflow_ros.core.uncertainty import covariance_of
-from valveflow_ros.core.whitening import fit_ar, whitened
+from valveflow_ros.core.whitening import ORDER, fit_ar
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
 LEAST_ROWS = 3600
-_JUMP_WALD = 20.0
+# What an autoregressive model must remember: white noise on top of slow noise has a long tail.
+_MEMORY_S = 40.0
 _NARROWEST = 0.01  # of the range of u: narrower pieces are not given to the search
 
 
@@ -39,22 +41,35 @@ class Refined:
     model : RegionalModel
     covariance : float64 (P, P)
         Of the packed parameters, robust against what the AR model leaves (block scores).
+    level_stderr : float64 (I - 1,)
+        Of the levels between regions, MW.
     free : bool (P,)
         Which packed parameters were free; jumps not supported by the data are not.
-    ar : float64 (4,)
+    ar : float64 (k,)
+        Of the residual of the last fit, whose rows are means over 2 s (or single rows).
     innovation_mw : float
-        sd of the whitened residual of the means.
+        sd of that residual when whitened.
+    prediction_mw : float
+        How wrong the prediction is because parameters are, root mean square.
     residual_mw : float64 (m,), weight : uint8 (m,)
         Residual of the means and whether it was scored.
+    row_sd_mw : float
+        sd of the residual of single rows.
+    confidence : dict
+        Probability of each number of pieces; empty when it was given.
     """
 
     model: RegionalModel
     covariance: FloatArray
+    level_stderr: FloatArray
     free: BoolArray
     ar: FloatArray
     innovation_mw: float
+    prediction_mw: float
     residual_mw: FloatArray
     weight: ByteArray
+    row_sd_mw: float
+    confidence: dict[int, float] = field(default_factory=dict)
 
 
 def refine(samples: Samples, start: RegionalModel, most_pieces: int | None = None) -> Refined:
@@ -88,20 +103,38 @@ def refine(samples: Samples, start: RegionalModel, most_pieces: int | None = Non
             'Rows that follow each other for longer than the transient',
             int(weight.sum()) * samples.group, LEAST_ROWS,
         )  # fmt: skip
-    model = _search(Problem(samples.coarser()), _join(start), most_pieces)
-    residual, weight = problem.answer(model)
-    ar = fit_ar(residual, weight)
-    free = free_parameters(model.pieces, model.regions, _jumps_supported(problem, model, ar))
-    model, cost = move(problem, model, ar, free, 6)
-    model, cost = search_levels(problem, model, ar, cost)
-    model, cost = move(problem, model, ar, free, 6)
-    return _conclude(problem, model, free, ar)
+    model, likely = _search(Problem(samples.coarser()), _join(start), most_pieces)
+    searched = model.pieces
+    fine = Problem(samples.finer())
+    order = int(np.clip(round(_MEMORY_S / (fine.samples.step_s * fine.samples.group)), ORDER, 20))
+    free = free_parameters(model.pieces, model.regions)
+    for steps in (3, 6):
+        residual, weight = fine.answer(model)
+        ar = fit_ar(residual, weight, order)
+        model, cost = move(fine, model, ar, free, steps)
+        model, cost = search_levels(fine, model, ar, cost)
+    model, cost = move(fine, model, ar, free, 6)
+    if most_pieces is None:
+        jumps = supported_jumps(fine, model, ar)
+    else:
+        model, jumps, cost = find_jumps(fine, model, ar, cost)
+    free = free_parameters(model.pieces, model.regions, jumps)
+    if jumps.any():
+        model, cost = move(fine, model, ar, free, 6)
+    model = corrected(samples, fine, model, ar, free)
+    found = _conclude(problem, fine, model, free, ar)
+    return replace(found, confidence=shifted(likely, model.pieces - searched))
 
 
-def _search(problem: Problem, start: RegionalModel, most_pieces: int | None) -> RegionalModel:
-    """Find regions and, if asked, the number of pieces."""
+def _search(
+    problem: Problem, start: RegionalModel, most_pieces: int | None
+) -> tuple[RegionalModel, dict[int, float]]:
+    """Find regions and, if asked, the number of pieces; and how probable each number is."""
     model, ar = find_regions(problem, start)
-    return model if most_pieces is None else choose_pieces(problem, model, ar, most_pieces)
+    if most_pieces is None:
+        return model, {}
+    grown = choose_pieces(problem, model, ar, most_pieces)
+    return grown.model, confidence(grown.worth, most_pieces)
 
 
 def _join(model: RegionalModel) -> RegionalModel:
@@ -124,23 +157,19 @@ def _join(model: RegionalModel) -> RegionalModel:
     )  # fmt: skip
 
 
-def _jumps_supported(problem: Problem, model: RegionalModel, ar: FloatArray) -> BoolArray:
-    """Test each inner knot for a jump by its Wald statistic in the joint regression."""
-    residual, jacobian, weight = problem.tangents(model)
-    both = whitened(np.column_stack([jacobian, residual]), weight, ar)
-    sums = gram(both)
-    used = np.append(np.diag(sums)[:-1] > 0.0, False)
-    inverse = np.linalg.pinv(sums[np.ix_(used, used)])
-    step = np.zeros(len(used) - 1)
-    variance = np.full(len(used) - 1, np.inf)
-    step[used[:-1]] = inverse @ sums[used, -1]
-    variance[used[:-1]] = np.diag(inverse) * sums[-1, -1] / max(len(both), 1)
-    places = slice(2 * model.pieces, 3 * model.pieces - 1)
-    return np.asarray(step[places] ** 2 / variance[places] > _JUMP_WALD)
-
-
-def _conclude(problem: Problem, model: RegionalModel, free: BoolArray, ar: FloatArray) -> Refined:
+def _conclude(
+    problem: Problem, fine: Problem, model: RegionalModel, free: BoolArray, ar: FloatArray
+) -> Refined:
     """Add what is left over, and how sure the parameters are."""
-    covariance, innovation = covariance_of(problem, model, free, ar)
+    certainty = covariance_of(fine, model, free, ar)
     residual, weight = problem.answer(model)
-    return Refined(model, covariance, free, ar, innovation, residual, weight)
+    return Refined(
+        model, certainty.covariance, certainty.level_stderr, free, ar, certainty.innovation_mw,
+        certainty.prediction_mw, residual, weight, _row_sd(fine, model),
+    )  # fmt: skip
+
+
+def _row_sd(problem: Problem, model: RegionalModel) -> float:
+    """Return the sd of single rows about the model, MW."""
+    residual, weight = Problem(replace(problem.samples, group=1)).answer(model)
+    return float(np.std(residual[weight > 0]))

@@ -1,15 +1,17 @@
-"""The number of pieces by the paper's rule (24), guarded where that rule cannot be right."""
+"""The number of pieces: by evidence, or by the paper's rule (24) with a guard."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from valveflow_ros.core.evidence import Evidence, weigh
 from valveflow_ros.core.partition import Partition
+from valveflow_ros.core.selection_series import Series
 from valveflow_ros.errors import DataError, InputError, ParameterError
 from valveflow_ros.records import FloatArray
 
@@ -38,6 +40,10 @@ class Selection:
         Omega(J) of eq. (19) in MW^2, J = 1 .. J_max.
     guard_reason : str
         Why the rule was overruled, as a sentence; empty when it was not.
+    confidence : dict
+        Probability of each J; empty under the paper's rule, which has none.
+    note : str
+        On what J was chosen, as a sentence.
     """
 
     rule: str
@@ -45,6 +51,8 @@ class Selection:
     turning_angle: dict[int, float]
     cost: dict[int, float]
     guard_reason: str
+    confidence: dict[int, float] = field(default_factory=dict)
+    note: str = ''
 
 
 def paper_rule(
@@ -108,7 +116,11 @@ def _turn(into: float, out: float) -> float:
 
 
 def select(
-    partition: Partition, *, rule: str = 'paper', correlation_inflation: float = 1.0
+    partition: Partition,
+    *,
+    rule: str = 'evidence',
+    correlation_inflation: float = 1.0,
+    series: Series | None = None,
 ) -> Selection:
     """Choose J.
 
@@ -116,10 +128,14 @@ def select(
     ----------
     partition : Partition
     rule : str
-        'paper' is eq. (24), the only rule known here.
+        'evidence' weighs every J by how probable it makes the samples; 'paper' is eq. (24).
+        Lambda(J) and Omega(J) are reported under both.
     correlation_inflation : float
-        How many times the variance of a long mean of the residual exceeds that
-        of independent samples, at least 1.
+        Paper's rule: how many times the variance of a long mean of the residual
+        exceeds that of independent samples, at least 1.
+    series : Series, optional
+        Evidence: the partition's samples in order of time, from which the noise's memory is
+        learnt. Without it the samples are taken in ascending order of u.
 
     Raises
     ------
@@ -130,40 +146,120 @@ def select(
 
     Notes
     -----
-    The rule is free of scale: it finds a largest turn in any costs, also in those
-    of pure noise about one line, and cannot answer 1. So it is asked only if some
+    The paper's rule is free of scale: it finds a largest turn in any costs, also in
+    those of pure noise about one line, and cannot answer 1. So it is asked only if some
     partition lowers the cost by more, per break, than chance would.
     """
-    if rule != 'paper':
-        raise InputError(f"The rule '{rule}' is unknown; 'paper' is eq. (24).")
+    if rule not in ('evidence', 'paper'):
+        raise InputError(
+            f"The rule '{rule}' is unknown; there are 'evidence', and 'paper', eq. (24)."
+        )
     if not 1.0 <= correlation_inflation < math.inf:
         raise ParameterError('correlation_inflation', f'is {correlation_inflation:g}, not >= 1')
-    cost = partition.cost
-    costs = {j: float(value) for j, value in enumerate(cost, start=1)}
-    angles: dict[int, float] = {}
-    pieces = len(cost)
-    if len(cost) >= 3:
-        angles, pieces = paper_rule(cost, max(partition.floor, _EXACT * float(cost[0])))
+    if rule == 'evidence':
+        return _by_evidence(partition, series)
+    angles, pieces = _turning(partition)
     reason = _straight(partition, correlation_inflation)
     if reason:
         pieces = 1
     elif not angles:
+        most = len(partition.cost)
         reason = (
-            f'The rule (24) compares three numbers of pieces and only {len(cost)} are '
-            f'possible; {len(cost)} pieces lower the cost by more than chance would.'
+            f'The rule (24) compares three numbers of pieces and only {most} are '
+            f'possible; {most} pieces lower the cost by more than chance would.'
         )
-    return Selection(rule, pieces, angles, costs, reason)
+    return Selection(rule, pieces, angles, _costs(partition), reason, note=reason)
+
+
+def _costs(partition: Partition) -> dict[int, float]:
+    return {j: float(value) for j, value in enumerate(partition.cost, start=1)}
+
+
+def _turning(partition: Partition) -> tuple[dict[int, float], int]:
+    """Return Lambda(J) and where it is largest; none, and the most pieces, for fewer than 3."""
+    cost = partition.cost
+    if len(cost) < 3:
+        return {}, len(cost)
+    return paper_rule(cost, max(partition.floor, _EXACT * float(cost[0])))
+
+
+def _by_evidence(partition: Partition, series: Series | None) -> Selection:
+    """Weigh every J, unless one line or some exact fit leaves nothing to weigh."""
+    angles, turn = _turning(partition)
+    note = _exactly_straight(partition)
+    confidence = {1: 1.0}
+    if not note:
+        exact = max(partition.floor, _EXACT * float(partition.cost[0]))
+        fits = np.flatnonzero(partition.cost <= exact)
+        # Where pieces have two or three samples each, lines fit anything.
+        if len(fits) and partition.n_distinct > 4 * (int(fits[0]) + 1):
+            confidence = {int(fits[0]) + 1: 1.0}
+            note = f'{int(fits[0]) + 1} lines fit exactly.'
+        else:
+            found = _weighed(partition, series)
+            confidence, note = found.probability, _sentence(found, partition, turn)
+    pieces = max(confidence, key=lambda j: (confidence[j], -j))
+    return Selection('evidence', pieces, angles, _costs(partition), '', confidence, note)
+
+
+def _weighed(partition: Partition, series: Series | None) -> Evidence:
+    most = len(partition.cost)
+    starts = {j: partition.u[partition.breaks(j)[1:-1]] for j in range(2, most + 1)}
+    if series is None:
+        # Equal u come in ascending order of y, which would look like memory.
+        mixed = np.random.default_rng(0).permutation(partition.n_samples)
+        order = mixed[np.argsort(partition.u[mixed], kind='stable')]
+        fresh = np.zeros(partition.n_samples, dtype=bool)
+        fresh[0] = True
+        series = Series(partition.u[order], partition.y[order], fresh)
+    return weigh(series, most, starts)
+
+
+def _sentence(found: Evidence, partition: Partition, turn: int) -> str:
+    """Say on what evidence J was chosen."""
+    share = found.probability
+    others = sorted((j for j in share if j != found.pieces), key=lambda j: -share[j])
+    words = (
+        f'J = {found.pieces} has {_percent(share[found.pieces])} of the evidence of '
+        f'{partition.n_samples} samples'
+    )
+    if others:
+        words += f', J = {others[0]} has {_percent(share[others[0]])}'
+    noise = [] if found.memory < 1.5 else [
+        f'a memory (one independent sample in {found.memory:.3g})'
+    ]  # fmt: skip
+    if found.dof < 10.0:
+        noise.append(f"heavy tails (Student's t, {found.dof:g} degrees of freedom)")
+    if noise:
+        words += f'; the noise has {" and ".join(noise)}'
+    if len(partition.cost) >= 3 and turn != found.pieces:
+        words += f"; the paper's rule (24) takes J = {turn}"
+    return f'{words}.'
+
+
+def _percent(share: float) -> str:
+    if share > 0.9995:
+        return 'more than 99.9 %'
+    return 'less than 0.1 %' if share < 0.001 else f'{100.0 * share:.3g} %'
+
+
+def _exactly_straight(partition: Partition) -> str:
+    """Say why there is nothing to choose, or return an empty text."""
+    if len(partition.cost) == 1:
+        return f'One piece is all that {partition.n_distinct} distinct u allow.'
+    about_mean = partition.y - partition.y.mean()
+    total = float((about_mean * about_mean).sum())
+    if partition.cost[0] <= max(partition.floor, _EXACT * total):
+        return 'One line fits exactly.'
+    return ''
 
 
 def _straight(partition: Partition, inflation: float) -> str:
     """Say why one piece is enough, or return an empty text."""
+    exactly = _exactly_straight(partition)
+    if exactly:
+        return exactly
     cost = partition.cost
-    if len(cost) == 1:
-        return f'One piece is all that {partition.n_distinct} distinct u allow.'
-    about_mean = partition.y - partition.y.mean()
-    total = float((about_mean * about_mean).sum())
-    if cost[0] <= max(partition.floor, _EXACT * total):
-        return 'One line fits exactly.'
     n = partition.n_samples
     variance = float(cost[-1]) / max(n - 2 * len(cost), 1)
     gain = float(np.max((cost[0] - cost[1:]) / np.arange(1, len(cost))))

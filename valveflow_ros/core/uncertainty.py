@@ -1,40 +1,71 @@
-"""How sure the parameters of a refined model are."""
+"""How sure the parameters are, with noise that is correlated and depends on what happens."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.problem import Problem
 from valveflow_ros.core.sums import gram
-from valveflow_ros.core.whitening import whitened
+from valveflow_ros.core.whitening import normal_equations
 from valveflow_ros.records import BoolArray, FloatArray
 
 _MOST_BLOCKS = 60
-_LEAST_IN_BLOCK = 50
+_LEAST_IN_BLOCK_S = 500.0
+# The answer is not smooth in a level: half this many MW to both sides average over what lies near.
+_LEVEL_STEP_MW = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Certainty:
+    """Covariance of what was estimated.
+
+    Attributes
+    ----------
+    covariance : float64 (P, P)
+        Of the packed parameters. What was not free has 0; what was free and is not moved by
+        the data has NaN.
+    level_stderr : float64 (I - 1,)
+        Standard errors of the levels between regions, MW.
+    innovation_mw : float
+        sd of the whitened residual.
+    prediction_mw : float
+        How wrong the prediction is because parameters are: root mean square over all rows.
+    """
+
+    covariance: FloatArray
+    level_stderr: FloatArray
+    innovation_mw: float
+    prediction_mw: float
 
 
 def covariance_of(
-    problem: Problem, model: RegionalModel, free: BoolArray, ar: FloatArray
-) -> tuple[FloatArray, float]:
-    """Return the covariance of the packed parameters and the sd of the innovations in MW.
+    problem: Problem,
+    model: RegionalModel,
+    free: BoolArray,
+    ar: FloatArray,
+    with_levels: bool = True,
+) -> Certainty:
+    """Return how sure the packed parameters are, and the levels unless they are held.
 
     The inverse normal matrix, widened where sums of scores over blocks vary
-    more than independent innovations would let them. Levels are held, so the
-    errors of T and tau are somewhat too small. Parameters that are not free have
-    covariance 0; a free one that the data do not move has NaN.
+    more than independent innovations would let them. The levels count as
+    parameters, by differences: time constants and delays lean on them.
     """
     residual, jacobian, weight = problem.tangents(model)
+    packed = len(free)
+    if with_levels:
+        jacobian = np.column_stack([jacobian, _level_tangents(problem, model)])
+        free = np.append(free, np.ones(len(model.levels), dtype=bool))
     moved = free & (np.abs(jacobian).max(axis=0) > 0.0)
-    both = whitened(np.column_stack([jacobian[:, moved], residual]), weight, ar)
-    j, e = both[:, :-1], both[:, -1]
-    sums = gram(both)
+    blocks = _blocks(problem)
+    sums, scores, rows = normal_equations(jacobian[:, moved], residual, weight, ar, blocks)
     scale = np.sqrt(np.maximum(np.diag(sums)[:-1], 1e-300))
     inverse = np.linalg.pinv(sums[:-1, :-1] / np.outer(scale, scale), hermitian=True)
     inverse = inverse / np.outer(scale, scale)
-    variance = float(sums[-1, -1]) / max(len(e) - j.shape[1], 1)
-    blocks = max(1, min(_MOST_BLOCKS, len(e) // _LEAST_IN_BLOCK))
-    scores = np.array([s.sum(axis=0) for s in np.array_split(j * e[:, None], blocks)])
+    variance = float(sums[-1, -1]) / max(rows - len(inverse), 1)
     robust = inverse @ gram(scores) @ inverse
     plain = inverse * variance
     # Few blocks make the robust form noisy; it may widen, never narrow.
@@ -44,7 +75,36 @@ def covariance_of(
     covariance[np.ix_(moved, moved)] = plain * np.outer(widen, widen)
     dead = np.flatnonzero(free & ~moved)
     covariance[dead, dead] = np.nan
-    return covariance, float(np.sqrt(max(variance, 0.0)))
+    return Certainty(
+        covariance[:packed, :packed],
+        np.sqrt(np.diag(covariance)[packed:]),
+        float(np.sqrt(max(variance, 0.0))),
+        _prediction_error(jacobian[weight > 0][:, moved], covariance[np.ix_(moved, moved)]),
+    )
+
+
+def _prediction_error(jacobian: FloatArray, covariance: FloatArray) -> float:
+    """Return the root mean square of what errors of the parameters do to the answer."""
+    square = np.sum(gram(np.ascontiguousarray(jacobian)) * covariance) / max(len(jacobian), 1)
+    return float(np.sqrt(max(square, 0.0)))
+
+
+def _blocks(problem: Problem) -> int:
+    """Return into how many blocks of time the window is cut."""
+    rows = max(1, round(_LEAST_IN_BLOCK_S / (problem.samples.step_s * problem.samples.group)))
+    return max(1, min(_MOST_BLOCKS, problem.samples.means // rows))
+
+
+def _level_tangents(problem: Problem, model: RegionalModel) -> FloatArray:
+    """Return the answer's change per MW of each level, shape (m, I - 1)."""
+    columns = np.empty((problem.samples.means, len(model.levels)))
+    for k in range(len(model.levels)):
+        half = np.zeros(len(model.levels))
+        half[k] = 0.5 * _LEVEL_STEP_MW
+        low, _ = problem.answer(model.with_levels(model.levels - half))
+        high, _ = problem.answer(model.with_levels(model.levels + half))
+        columns[:, k] = (low - high) / _LEVEL_STEP_MW
+    return columns
 
 
 def bend_certainty(problem: Problem, model: RegionalModel, ar: FloatArray) -> FloatArray:
@@ -55,7 +115,8 @@ def bend_certainty(problem: Problem, model: RegionalModel, ar: FloatArray) -> Fl
     j = model.pieces
     free = np.zeros(len(model.pack()), dtype=bool)
     free[: j + 1] = True
-    covariance = np.nan_to_num(covariance_of(problem, model, free, ar)[0][: j + 1, : j + 1])
+    covariance = np.nan_to_num(covariance_of(problem, model, free, ar, with_levels=False).covariance)
+    covariance = covariance[: j + 1, : j + 1]
     width = np.diff(model.knots)
     change = np.zeros((j - 1, j + 1))
     for k in range(j - 1):

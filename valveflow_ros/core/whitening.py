@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import solve_toeplitz
 
+from valveflow_ros.core.normal_kernel import normal_sums
 from valveflow_ros.core.regional_kernel import lagged_products, whiten
 from valveflow_ros.records import ByteArray, FloatArray
 
@@ -28,6 +29,33 @@ def fit_ar(residual: FloatArray, weight: ByteArray, order: int = ORDER) -> Float
     # root at one would make levels, and with them the misfit, invisible.
     total = float(ar.sum())
     return ar * (_LARGEST_SUM / total) if total > _LARGEST_SUM else ar
+
+
+def normal_equations(
+    jacobian: FloatArray, residual: FloatArray, weight: ByteArray, ar: FloatArray, blocks: int = 1
+) -> tuple[FloatArray, FloatArray, int]:
+    """Return products of whitened tangents and residual, block scores, and the rows counted.
+
+    Parameters
+    ----------
+    jacobian : float64 (m, P)
+    residual, weight : (m,)
+    ar : float64 (k,)
+    blocks : int
+        Even stretches of time for which scores are added up.
+
+    Returns
+    -------
+    sums : float64 (P + 1, P + 1)
+        The residual is the last column.
+    scores : float64 (blocks, P)
+    rows : int
+    """
+    columns = jacobian.shape[1]
+    sums = np.empty((columns + 1, columns + 1))
+    scores = np.empty((blocks, columns))
+    rows = normal_sums(np.ascontiguousarray(jacobian), residual, weight, ar, sums, scores)
+    return sums, scores, int(rows)
 
 
 def whitened(columns: FloatArray, weight: ByteArray, ar: FloatArray) -> FloatArray:

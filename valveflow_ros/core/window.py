@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,6 +24,8 @@ class WindowContents:
         NaN in ``u`` or ``power_mw`` where a row has no usable data.
     spans : int64 (k, 3)
         Special segments as (first row, end row, kind), rows counted within these arrays.
+    opening_percent : float64 (n,) or (0,)
+        The opening that u was made from, NaN where it was not given; empty where unknown.
     """
 
     time_ns: IntArray
@@ -31,6 +33,7 @@ class WindowContents:
     power_mw: FloatArray
     temperature_degc: FloatArray
     spans: IntArray
+    opening_percent: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def special_rows(self) -> IntArray:
         """Return the rows that lie in special segments, in order of time."""
@@ -57,7 +60,7 @@ class RollingWindow:
         self._rows = max(16, int(np.ceil(window_s / period_s)) + 1)
         self._room = min(_FIRST_ROOM, self._rows * 5 // 4 + 16)
         self._time_ns = np.empty(self._room, dtype=np.int64)
-        self._data = np.empty((3, self._room))
+        self._data = np.empty((4, self._room))
         self._end = 0
         self._base = 0
         self._segments: deque[FoundSegment] = deque()
@@ -82,7 +85,12 @@ class RollingWindow:
         return sum(s.segment.samples for s in self._segments)
 
     def append(
-        self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray, temperature_degc: FloatArray
+        self,
+        time_ns: IntArray,
+        u: FloatArray,
+        power_mw: FloatArray,
+        temperature_degc: FloatArray,
+        opening_percent: FloatArray | None = None,
     ) -> None:
         """Append rows; rows that have left the window are forgotten."""
         done = 0
@@ -95,6 +103,7 @@ class RollingWindow:
             self._data[0, place] = u[part]
             self._data[1, place] = power_mw[part]
             self._data[2, place] = temperature_degc[part]
+            self._data[3, place] = np.nan if opening_percent is None else opening_percent[part]
             self._end += take
             done += take
         self._forget()
@@ -128,6 +137,7 @@ class RollingWindow:
             self._data[1, first : self._end].copy(),
             self._data[2, first : self._end].copy(),
             np.array(spans, dtype=np.int64).reshape(-1, 3),
+            self._data[3, first : self._end].copy(),
         )
 
     def _make_room(self) -> None:
@@ -136,7 +146,7 @@ class RollingWindow:
         if self._room < limit:
             self._room = min(limit, 2 * self._room)
             time_ns = np.empty(self._room, dtype=np.int64)
-            data = np.empty((3, self._room))
+            data = np.empty((4, self._room))
             time_ns[: self._end] = self._time_ns[: self._end]
             data[:, : self._end] = self._data[:, : self._end]
             self._time_ns, self._data = time_ns, data

@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 from valveflow_ros.core.alarms import AlarmChange, AlarmState
-from valveflow_ros.core.events import CurveAdopted, Event, JournalEntry, JournalKind
+from valveflow_ros.core.events import (
+    CurveAdopted,
+    Event,
+    JournalEntry,
+    JournalKind,
+    ReferenceSet,
+)
 from valveflow_ros.ros.diagnostics import Level
 
 _STANDING = (AlarmState.UNACKNOWLEDGED, AlarmState.RETURNED_UNACKNOWLEDGED)
@@ -22,6 +28,8 @@ def line_of(event: Event) -> tuple[Level, str] | None:
             f'new curve {curve.model_id}: {len(curve.pieces)} pieces, knees at u = {knees}, '
             f'{curve.source.samples} special samples'
         )
+    if isinstance(event, ReferenceSet):
+        return Level.OK, f'the reference is now curve {event.characteristic.model_id}'
     if isinstance(event, JournalEntry) and event.kind == JournalKind.FIT_REFUSED:
         return Level.WARN, f'no new curve: {event.text}'
     if isinstance(event, JournalEntry) and event.kind == JournalKind.RESET:

@@ -13,8 +13,9 @@ from valveflow_msgs.msg import SpecialSegment as SegmentMessage
 
 from valveflow_ros.core.alarms import AlarmChange
 from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.curve_status import CurveStatus
 from valveflow_ros.core.events import JournalEntry, JournalKind
-from valveflow_ros.core.monitor import CurveStatus
+from valveflow_ros.core.shift import Shift
 from valveflow_ros.records import NS_PER_S, FloatArray, SpecialSegment
 
 # The latest time whose seconds a stamp can hold.
@@ -100,7 +101,12 @@ def journal_entry(message: JournalMessage) -> JournalEntry:
 
 
 def characteristic(
-    curve: Characteristic | None, status: CurveStatus, cause: str, tag: str
+    curve: Characteristic | None,
+    status: CurveStatus,
+    cause: str,
+    tag: str,
+    reference_id: str = '',
+    shift: Shift | None = None,
 ) -> FlowCharacteristic:
     """Return the running curve and what it is worth; without a curve, say why there is none."""
     nan = math.nan
@@ -112,6 +118,7 @@ def characteristic(
         rmse_mw=nan,
         temperature_mean_degc=nan,
         temperature_spread_degc=nan,
+        reference_model_id=reference_id,
     )
     if curve is None:
         return message
@@ -142,7 +149,26 @@ def characteristic(
     message.temperature_mean_degc = source.temperature_mean_degc
     message.temperature_spread_degc = source.temperature_spread_k
     message.temperature_flag = source.temperature_flag
+    _put_shift(message, shift)
     return message
+
+
+def _put_shift(message: FlowCharacteristic, shift: Shift | None) -> None:
+    """Put the judgement against the reference into a message that has its curve."""
+    if not message.reference_model_id:
+        return
+    if shift is None:
+        # The reference itself has not moved; any other curve has not been judged.
+        same = message.model_id == message.reference_model_id
+        message.shift_mw = [0.0 if same else math.nan] * message.pieces
+        message.shift_confidence = list(message.shift_mw)
+        return
+    message.shift_sentence = shift.sentence
+    message.shift_mw = [p.shift_mw for p in shift.pieces]
+    message.shift_confidence = [p.confidence for p in shift.pieces]
+    message.shift_since = to_time(shift.since_ns)
+    message.shift_since_low = to_time(shift.since_low_ns)
+    message.shift_since_high = to_time(shift.since_high_ns)
 
 
 def _selection(curve: Characteristic) -> tuple[list[float], list[float]]:

@@ -70,8 +70,12 @@ class LiveEngine:
         return self._pass_on(self.monitor.request_fit())
 
     def acknowledge(self) -> list[Event]:
-        """Acknowledge the alarm; raises `DataError` if there is none."""
+        """Acknowledge the alarms; raises `DataError` if there is none."""
         return self.monitor.acknowledge()
+
+    def set_reference(self, given: Characteristic | None = None) -> list[Event]:
+        """Judge later curves against the running one, or one given; raises `DataError`."""
+        return self.monitor.set_reference(given)
 
     def reconfigure(self, settings: Settings) -> list[Event]:
         """Take settings of which only live ones differ."""

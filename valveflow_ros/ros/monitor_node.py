@@ -236,9 +236,10 @@ class MonitorNode(LifecycleNode):
         return 'The alarm is acknowledged.'
 
     def _set_reference(self, session: Session) -> str:
-        raise ValveflowError(
-            'This version judges no shift against a reference yet; nothing was changed.'
-        )
+        session.tell(session.engine.set_reference())
+        curve = session.engine.monitor.reference.curve
+        assert curve is not None
+        return f'Curve {curve.model_id} is the reference that later ones are judged against.'
 
     def _diagnose(self, session: Session) -> str:
         raise ValveflowError(

@@ -53,8 +53,11 @@ def objection(task: FitTask, result: object) -> str:
         return 'The fit gave breakpoints that do not increase.'
     if any(d.time_constant_s <= 0.0 or d.delay_s < 0.0 for d in result.dynamics):
         return 'The fit gave a time constant or delay that cannot be.'
-    if result.residuals.average_sd_mw <= 0.0:
+    chart = result.residuals.chart
+    if result.residuals.average_sd_mw <= 0.0 or chart is None or not chart.innovation_mw > 0.0:
         return 'The fit gave residuals without spread.'
+    if not (min(chart.limit) > 0.0 and all(map(math.isfinite, chart.limit + chart.slack))):
+        return 'The fit gave no limits for the alarm.'
     if result.source.window_end_ns != int(task.contents.time_ns[-1]):
         return 'The fit answered for other data.'
     if replace(result, model_id='').with_id().model_id != result.model_id:

@@ -16,9 +16,10 @@ from valveflow_msgs.msg import Alarm, FlowCharacteristic, JournalEntry, Predicti
 from valveflow_ros.core import events as engine
 from valveflow_ros.core.alarms import AlarmChange
 from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.curve_status import CurveStatus
 from valveflow_ros.core.events import JournalKind
-from valveflow_ros.core.monitor import CurveStatus
 from valveflow_ros.core.prediction import PredictionBlock
+from valveflow_ros.core.shift import Shift
 from valveflow_ros.ros import conversions
 from valveflow_ros.ros.encoding import encode
 from valveflow_ros.ros.prediction_bytes import prediction_bytes
@@ -75,6 +76,8 @@ class Outputs:
         self.curve: Characteristic | None = None
         self.status = CurveStatus.UNKNOWN
         self.cause = NO_CURVE_YET
+        self.reference_id = ''
+        self.shift: Shift | None = None
 
     def first(self) -> Iterator[Output]:
         """Yield what stands there before anything has happened."""
@@ -117,6 +120,10 @@ class Outputs:
             yield _output('alarms', conversions.alarm(event, tag), event.time_ns)
         elif isinstance(event, engine.CurveAdopted):
             self.curve, self.status, self.cause = event.characteristic, CurveStatus.FRESH, ''
+            self.shift = event.shift
+            yield from self._curve_messages()
+        elif isinstance(event, engine.ReferenceSet):
+            self.reference_id, self.shift = event.characteristic.model_id, None
             yield from self._curve_messages()
         elif isinstance(event, engine.JournalEntry):
             yield _output('journal', conversions.journal(event, tag), event.time_ns)
@@ -137,7 +144,9 @@ class Outputs:
     def _curve_messages(self) -> Iterator[Output]:
         curve = self.curve
         time_ns = 0 if curve is None else curve.source.window_end_ns
-        message = conversions.characteristic(curve, self.status, self.cause, self._tag)
+        message = conversions.characteristic(
+            curve, self.status, self.cause, self._tag, self.reference_id, self.shift
+        )
         yield _output('characteristic', message, time_ns)
         knots = [] if curve is None else curve.breakpoints
         slopes = [] if curve is None else [p.slope for p in curve.pieces]

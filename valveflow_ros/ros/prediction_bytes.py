@@ -26,17 +26,18 @@ def _layout(tag_bytes: int, model_bytes: int) -> struct.Struct:
     before_model = -size % 4
     size += before_model + 4 + model_bytes
     before_numbers = -size % 8
-    return struct.Struct(f'<4siII{tag_bytes}sB{before_model}xI{model_bytes}s{before_numbers}x8d')
+    return struct.Struct(f'<4siII{tag_bytes}sB{before_model}xI{model_bytes}s{before_numbers}x10d')
 
 
 def prediction_bytes(block: PredictionBlock, tag: str) -> Iterator[tuple[int, bytes]]:
     """Yield the message of each row with the row's time in ns."""
     frame, model = tag.encode() + b'\x00', block.model_id.encode() + b'\x00'
     pack = _layout(len(frame), len(model)).pack
-    low, high = -block.limit_mw, block.limit_mw
+    expected = block.measured_mw - block.residual_mw
     columns = (
         block.time_ns, block.state, block.u, block.measured_mw, block.static_mw,
-        block.dynamic_mw, block.residual_mw, block.average_mw,
+        block.dynamic_mw, block.residual_mw, block.average_mw, expected - block.width_mw,
+        expected + block.width_mw, block.evidence, block.shift_mw,
     )  # fmt: skip
     for row in zip(*(column.tolist() for column in columns), strict=True):
         time_ns, state, *numbers = row
@@ -53,7 +54,5 @@ def prediction_bytes(block: PredictionBlock, tag: str) -> Iterator[tuple[int, by
                 len(model),
                 model,
                 *numbers,
-                low,
-                high,
             ),
         )

@@ -23,6 +23,7 @@ from valveflow_ros.ros.intake import Clock, Intake
 from valveflow_ros.ros.live import LiveEngine
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
 from valveflow_ros.ros.recording import Recording
+from valveflow_ros.ros.reference_file import reference_of
 from valveflow_ros.ros.stamps import LogClock
 from valveflow_ros.ros.taking import Taker
 from valveflow_ros.ros.warmup import warm_up
@@ -57,6 +58,7 @@ class Session:
         self._log = log
         self._settings = settings
         self._log_clock = LogClock()
+        self._reference = reference_of(settings)
         self.inputs = {topic.name: node.resolve_topic_name(topic.name) for topic in INPUTS}
         self.outputs = {name: node.resolve_topic_name(f'~/{name}') for name in OUTPUTS}
         self.worker = FitWorker(settings.real('refit_timeout'))
@@ -115,6 +117,8 @@ class Session:
         if not self._begun:
             self._begun = True
             self._say(self._outputs.first())
+            if self._reference is not None:
+                self.tell(self.engine.set_reference(self._reference))
 
     def hush(self) -> None:
         """Unsubscribe, after taking what is there."""
@@ -169,6 +173,7 @@ class Session:
             )  # fmt: skip
         items.append(work_health.fit_item(monitor, self.worker, self.engine.last_fit_s))
         items.append(work_health.alarm_item(monitor))
+        items.append(work_health.reference_item(monitor))
         items.append(work_health.recorder_item(self.recording))
         return items
 

@@ -10,6 +10,7 @@ import numpy as np
 from valveflow_ros.config import Settings
 from valveflow_ros.core.alarms import ResidualAlarm
 from valveflow_ros.core.align import Aligner
+from valveflow_ros.core.chart import ChartDesign
 from valveflow_ros.core.characteristic import (
     Characteristic,
     Choice,
@@ -62,7 +63,10 @@ def made_up_curve(settings: Settings) -> Characteristic:
         breakpoint_intervals=((1190.0, 1210.0),),
         choice=Choice('', {}, {}),
         source=Source(0, 0, 0, 0, 0, 540.0, 0.0, False),
-        residuals=ResidualStatistics(1.0, 1.0, settings.real('alarm_average'), 0.5, 1.0),
+        residuals=ResidualStatistics(
+            1.0, 1.0, settings.real('alarm_average'), 0.5, 1.0, 2.0,
+            ChartDesign(settings.real('alarm_block'), 0.5, 1.0, (0.25, 1.0), (17.0, 5.0), 30.0),
+        ),  # fmt: skip
         dynamics=(RegionDynamics(180.0, 285.0, 30.0, 5.0, 1.0, 1.0),),
     )
 
@@ -103,5 +107,5 @@ def _predict(settings: Settings, curve: Characteristic, c: WindowContents) -> No
     )
     few = slice(0, _FEW)
     kinds = np.ones(_FEW, dtype=np.uint8)
-    block = predictor.predict(c.time_ns[few], c.u[few], c.power_mw[few], kinds, 1.0)
-    ResidualAlarm(settings).feed(block.time_ns, block.average_mw, block.limit_mw, curve.model_id)
+    block = predictor.predict(c.time_ns[few], c.u[few], c.power_mw[few], kinds)
+    ResidualAlarm(settings).feed(block.time_ns, block.evidence, block.shift_mw, curve.model_id)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from valveflow_ros.core.monitor import CurveStatus, Monitor
+from valveflow_ros.core.curve_status import CurveStatus
+from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.logs import RecorderState
 from valveflow_ros.ros.diagnostics import Item, Level
 from valveflow_ros.ros.recording import Recording
@@ -58,12 +59,38 @@ def alarm_item(monitor: Monitor) -> Item:
     """Return how the residual alarm stands."""
     alarm = monitor.alarm
     words = alarm.state.name.lower().replace('_', ' ')
-    values: dict[str, object] = {'State': words, 'Limit (MW)': monitor.limit_mw()}
+    values: dict[str, object] = {
+        'State': words,
+        'Evidence (1 is an alarm)': monitor.judged.evidence,
+        'Shift (MW)': monitor.judged.shift_mw,
+    }
     if alarm.active:
         return Item('alarm', Level.ERROR, f'The unit does not follow its curve ({words}).', values)
     if alarm.standing:
         return Item('alarm', Level.WARN, f'The alarm waits to be cleared ({words}).', values)
     return Item('alarm', Level.OK, 'No alarm.', values)
+
+
+def reference_item(monitor: Monitor) -> Item:
+    """Return how the curve stands to its reference."""
+    keeper = monitor.reference
+    if keeper.curve is None:
+        return Item('reference', Level.OK, 'No reference was set (~/set_reference).')
+    shift = keeper.shift
+    words = keeper.alarm.state.name.lower().replace('_', ' ')
+    values: dict[str, object] = {'Reference': keeper.curve.model_id, 'Alarm': words}
+    if shift is not None:
+        sizes = [p.shift_mw for p in shift.pieces]
+        values['Shift by piece (MW)'] = ', '.join(f'{size:+.2f}' for size in sizes)
+        values['Shift since (s since 1970)'] = shift.since_ns // 10**9 or None
+    if keeper.problem:
+        return Item('reference', Level.WARN, keeper.problem, values)
+    if shift is None:
+        return Item('reference', Level.OK, 'The next curve is judged against it.', values)
+    level = Level.ERROR if keeper.alarm.active else Level.OK
+    if keeper.alarm.standing and not keeper.alarm.active:
+        level = Level.WARN
+    return Item('reference', level, shift.sentence, values)
 
 
 def recorder_item(recording: Recording) -> Item:

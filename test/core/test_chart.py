@@ -1,0 +1,193 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from streams import START_NS, blocks_of, cuts, examples
+
+from valveflow_ros.core.chart import ChartDesign, ResidualChart
+from valveflow_ros.core.run_length import (
+    alarms,
+    block_means,
+    design_chart,
+    limit_for,
+    normal_limit,
+)
+from valveflow_ros.records import NS_PER_S
+
+DESIGN = ChartDesign(60.0, 0.5, 1.5, (0.25, 1.0), (15.0, 5.0), 30.0)
+
+
+class NaiveChart:
+    """What the chart is meant to be, block by block, with lists."""
+
+    def __init__(self, design):
+        self.design = design
+        self.block, self.rows, self.last = None, [], math.nan
+        self.sums = [[], [], [], []]  # of (value, mean) since the sum left zero
+        self.answer = (math.nan, math.nan)
+
+    def take(self, time_ns, residual):
+        block = time_ns // round(self.design.block_s * NS_PER_S)
+        if block != self.block:
+            self._close()
+            if self.block is None or block != self.block + 1:
+                self.last = math.nan
+            self.block, self.rows = block, []
+        if math.isfinite(residual):
+            self.rows.append(residual)
+        return self.answer
+
+    def _close(self):
+        if len(self.rows) < 30:
+            self.last = math.nan
+            return
+        d = self.design
+        mean = sum(self.rows) / len(self.rows)
+        if math.isnan(self.last):
+            e = mean * math.sqrt(1 - d.correlation**2) / d.innovation_mw
+        else:
+            e = (mean - d.correlation * self.last) / d.innovation_mw
+        e = max(-4.0, min(4.0, e))
+        best = (0.0, 0.0)
+        for k, history in enumerate(self.sums):
+            sign, which = (1, -1)[k % 2], k // 2
+            value = (history[-1][0] if history else 0.0) + sign * e - d.slack[which]
+            if value <= 0.0:
+                history.clear()
+                continue
+            history.append((min(value, 1.25 * d.limit[which]), mean))
+            share = history[-1][0] / d.limit[which]
+            if share > abs(best[0]):
+                best = (sign * share, sum(m for _, m in history) / len(history))
+        self.answer, self.last = best, mean
+
+
+def rows(seed, gaps):
+    """Return times and residuals of half an hour or so, with holes and a shift."""
+    rng = np.random.default_rng(seed)
+    n = 2400
+    time_s = np.arange(n) + np.cumsum(np.where(rng.random(n) < gaps, rng.integers(1, 200, n), 0))
+    residual = rng.normal(0.0, 3.0, n) + np.where(np.arange(n) > n // 2, rng.normal(0.0, 4.0), 0.0)
+    residual[rng.random(n) < 10 * gaps] = math.nan
+    start = START_NS + int(rng.integers(0, 10**12))
+    return start + time_s * NS_PER_S, residual
+
+
+@examples(40)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.002, 0.03]), st.data())
+def test_any_cutting_gives_what_the_slow_truth_gives(seed, gaps, data):
+    time_ns, residual = rows(seed, gaps)
+    slow, fast = NaiveChart(DESIGN), ResidualChart(DESIGN, 1.0)
+    wanted = np.array([slow.take(t, r) for t, r in zip(time_ns.tolist(), residual, strict=True)])
+    parts = [
+        fast.feed(time_ns[a:b], residual[a:b])
+        for a, b in blocks_of(len(time_ns), data.draw(cuts(len(time_ns))))
+    ]
+    assert np.concatenate([e for e, _ in parts]) == pytest.approx(wanted[:, 0], nan_ok=True)
+    assert np.concatenate([s for _, s in parts]) == pytest.approx(wanted[:, 1], nan_ok=True)
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_a_lasting_shift_is_found_with_its_size_and_side(sign):
+    rng = np.random.default_rng(1)
+    time_ns = START_NS + np.arange(7200) * NS_PER_S
+    shift = np.where(np.arange(7200) > 1800, 4.0 * sign, 0.0)
+    evidence, found = ResidualChart(DESIGN, 1.0).feed(time_ns, shift + rng.normal(0.0, 1.0, 7200))
+    raised = int(np.argmax(sign * evidence > 1.0))
+    assert 1800 < raised < 1800 + 15 * 60
+    assert found[raised] == pytest.approx(4.0 * sign, rel=0.3)
+    assert abs(evidence[1700]) < 0.5
+
+
+def test_one_wild_minute_alone_raises_nothing():
+    time_ns = START_NS + np.arange(7200) * NS_PER_S
+    residual = np.zeros(7200)
+    residual[3600:3660] = 1e6
+    evidence, _ = ResidualChart(DESIGN, 1.0).feed(time_ns, residual)
+    assert 0.5 < np.nanmax(np.abs(evidence)) < 1.0
+
+
+def test_no_residual_no_evidence():
+    time_ns = START_NS + np.arange(600) * NS_PER_S
+    evidence, shift = ResidualChart(DESIGN, 1.0).feed(time_ns, np.full(600, math.nan))
+    assert np.isnan(evidence).all()
+    assert np.isnan(shift).all()
+
+
+# --- limits ---------------------------------------------------------------------------------
+
+
+def naive_alarms(e, slack, limit):
+    count, sums = 0, [0.0, 0.0]
+    for value in e:
+        sums = [max(0.0, sums[0] + value - slack), max(0.0, sums[1] - value - slack)]
+        if max(sums) > limit:
+            count, sums = count + 1, [0.0, 0.0]
+    return count
+
+
+@examples(40)
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 2.0), st.floats(0.1, 9.0))
+def test_alarms_are_counted_as_by_hand(seed, slack, limit):
+    e = np.random.default_rng(seed).normal(0.0, 1.5, 300)
+    assert alarms(e, slack, limit) == naive_alarms(e, slack, limit)
+
+
+@pytest.mark.parametrize('slack', [0.25, 0.5, 1.0])
+@pytest.mark.parametrize('run_length', [500.0, 5000.0])
+def test_limits_keep_their_word_on_other_draws(slack, run_length):
+    drawn, others = np.random.default_rng(7).normal(0.0, 1.0, (2, 600_000))
+    limit = limit_for(drawn, slack, run_length)
+    assert len(others) / alarms(others, slack, limit) == pytest.approx(run_length, rel=0.3)
+    assert limit == pytest.approx(normal_limit(slack, run_length), rel=0.06)
+
+
+def correlated(rng, n, correlation):
+    w, out = rng.normal(0.0, 1.0, n), np.empty(n)
+    value = w[0]
+    for k in range(n):
+        value = correlation * value + math.sqrt(1.0 - correlation**2) * w[k]
+        out[k] = value
+    return out
+
+
+@pytest.mark.parametrize('correlation', [0.0, 0.5, 0.9])
+def test_the_design_learns_correlation_and_noise(correlation):
+    r = 2.0 * correlated(np.random.default_rng(3), 20_000, correlation)
+    d = design_chart(r, np.ones(len(r), np.uint8), 60.0, block_s=60.0, run_length_days=1.0,
+                     floor_mw=0.0, curve_error_mw=0.0)  # fmt: skip
+    assert d.correlation == pytest.approx(correlation, abs=0.03)
+    assert d.innovation_mw == pytest.approx(2.0 * math.sqrt(1.0 - correlation**2), rel=0.05)
+    assert d.limit[0] >= normal_limit(0.25, 2.0 * 1440.0) - 1e-9
+
+
+def test_a_wandering_residual_gets_wider_limits_and_a_doubtful_curve_more_slack():
+    rng = np.random.default_rng(4)
+    clean = correlated(rng, 15_000, 0.5)
+    wander = clean + 0.6 * correlated(rng, 15_000, 0.995)
+    weight = np.ones(15_000, np.uint8)
+    common = {'block_s': 60.0, 'run_length_days': 5.0, 'floor_mw': 0.0}
+    a = design_chart(clean, weight, 60.0, curve_error_mw=0.0, **common)
+    b = design_chart(wander, weight, 60.0, curve_error_mw=0.0, **common)
+    assert b.limit[0] > 1.5 * a.limit[0]
+    c = design_chart(clean, weight, 60.0, curve_error_mw=0.5, **common)
+    assert c.slack[0] > a.slack[0] + 0.1
+
+
+def test_hardly_any_clean_rows_still_give_limits():
+    for n in (0, 1, 2, 5):
+        d = design_chart(np.ones(n), np.ones(n, np.uint8), 60.0, block_s=60.0,
+                         run_length_days=30.0, floor_mw=1.0, curve_error_mw=0.0)  # fmt: skip
+        assert min(d.limit) > 3.0
+        assert d.innovation_mw > 0.0
+
+
+def test_block_means_leave_thin_blocks_out():
+    residual = np.arange(12.0)
+    weight = np.array([1, 1, 1, 1, 0, 0, 1, 1, 0, 0, 0, 1], dtype=np.uint8)
+    assert block_means(residual, weight, 4) == pytest.approx([1.5, 6.5, math.nan], nan_ok=True)
+    assert block_means(residual[:3], weight[:3], 4).shape == (0,)

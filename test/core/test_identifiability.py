@@ -1,0 +1,154 @@
+"""Which pieces rest on data of their own."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from streams import examples, grid_ns
+from test_characteristic import curve
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.characteristic import Piece
+from valveflow_ros.core.characteristic_json import from_json, to_json
+from valveflow_ros.core.fit import fit
+from valveflow_ros.core.fit_task import FitTask
+from valveflow_ros.core.identifiability import support_of, with_support
+from valveflow_ros.core.window import WindowContents
+from valveflow_ros.errors import DataError
+from valveflow_ros.records import SegmentKind
+
+NOISE = 0.5
+STEADY, SLOPE = int(SegmentKind.STEADY), int(SegmentKind.SLOPE)
+
+
+def contents(*segments, rows=200):
+    """Return a window of segments (u at the start, u at the end, kind), a gap between them."""
+    u, spans = [], []
+    for begin, end, kind in segments:
+        spans.append((len(u), len(u) + rows, kind))
+        u += [*np.linspace(begin, end, rows), np.nan]
+    nothing = np.zeros(len(u))
+    return WindowContents(
+        grid_ns(len(u)), np.array(u), nothing, nothing,
+        np.array(spans, dtype=np.int64).reshape(-1, 3),
+    )  # fmt: skip
+
+
+def piece(low=1000.0, high=1400.0):
+    return Piece(low, high, 0.2, 50.0, 0.001, 1.0, 0)
+
+
+def judged(*segments, at=None):
+    return support_of(at or piece(), contents(*segments), NOISE)
+
+
+@pytest.mark.parametrize(
+    ('segments', 'identifiable'),
+    [
+        ([], False),
+        ([(1200.0, 1200.0, STEADY)], False),
+        ([(1200.0, 1200.0, STEADY), (1203.0, 1203.0, STEADY)], False),  # within the noise
+        ([(1200.0, 1200.0, STEADY), (1250.0, 1250.0, STEADY)], True),
+        ([(1100.0, 1300.0, SLOPE)], True),
+        ([(1398.0, 2000.0, SLOPE)], False),  # all but its beginning lies elsewhere
+        ([(1500.0, 1500.0, STEADY), (1600.0, 1600.0, STEADY)], False),
+        ([(1200.0, 1200.0, STEADY), (1100.0, 1300.0, SLOPE)], True),
+    ],
+)
+def test_two_levels_or_one_ramp_determine_a_line(segments, identifiable):
+    assert judged(*segments).identifiable is identifiable
+
+
+def test_segments_levels_and_samples_are_counted():
+    found = judged(
+        (1200.0, 1200.0, STEADY), (1201.0, 1201.0, STEADY), (1300.0, 1300.0, STEADY),
+        (1350.0, 1450.0, SLOPE), (1600.0, 1600.0, STEADY),
+    )  # fmt: skip
+    assert (found.steady, found.slope_response) == (3, 1)
+    assert found.levels == (1200.0, 1300.0)
+    assert found.samples == 3 * 200 + 100
+
+
+@examples(30)
+@given(
+    st.lists(
+        st.tuples(st.floats(900.0, 1900.0), st.floats(-150.0, 150.0), st.booleans()), max_size=8
+    ),
+    st.floats(1001.0, 1799.0),
+)
+def test_pieces_share_all_samples_and_more_data_never_hurt(segments, knot):
+    rows = [(u, u + (move if ramp else 0.0), SLOPE if ramp else STEADY)
+            for u, move, ramp in segments]  # fmt: skip
+    window = contents(*rows)
+    left = support_of(piece(700.0, knot), window, NOISE, last=False)
+    right = support_of(piece(knot, 2100.0), window, NOISE)
+    assert left.samples + right.samples == 200 * len(rows)
+    for found, p in ((left, piece(700.0, knot)), (right, piece(knot, 2100.0))):
+        assert found.steady + found.slope_response <= len(rows)
+        assert found.steady >= len(found.levels)
+        if not found.samples:
+            assert not found.identifiable
+        more = contents(*rows, (p.u_from + 1.0, p.u_to - 1.0, SLOPE))
+        assert support_of(p, more, NOISE).identifiable
+
+
+def test_a_piece_without_data_of_its_own_is_marked_and_says_what_would_help():
+    found = curve([1000.0, 1400.0, 1800.0, 2200.0], [0.2, 0.1, 0.05])
+    window = contents((1100.0, 1300.0, SLOPE), (1500.0, 1500.0, STEADY))
+    told = with_support(found, window, NOISE)
+    assert [s.identifiable for s in told.support] == [True, False, False]
+    assert told.support[2].samples == 0
+    second, third = told.notes[-2:]
+    assert second.startswith('Piece 2 (u 1400 to 1800) rests on one steady level, u 1500: ')
+    assert 'an hour at u 1720 (' in second
+    assert third.startswith('Piece 3 (u 1800 to 2200) rests on no special sample: ')
+    assert 'an hour each at u 1880 (' in third
+    everywhere = contents(*[(u, u + 90.0, SLOPE) for u in range(1000, 2200, 100)])
+    assert with_support(found, everywhere, NOISE).notes == found.notes
+
+
+def test_what_pieces_rest_on_and_the_confidence_survive_json():
+    found = curve([1000.0, 1400.0, 1800.0], [0.2, 0.1])
+    choice = dataclasses.replace(found.choice, confidence={1: 0.0125, 2: 0.9875})
+    window = contents((1100.0, 1300.0, SLOPE), (1500.0, 1500.0, STEADY))
+    told = with_support(dataclasses.replace(found, choice=choice), window, NOISE)
+    raw = json.loads(json.dumps(to_json(told)))
+    assert raw['selection']['confidence'] == {'1': 0.0125, '2': 0.9875}
+    assert [p['identifiable'] for p in raw['pieces']] == [True, False]
+    assert from_json(raw) == told
+    for piece in raw['pieces']:  # as another program, or an older version, wrote it
+        del piece['identifiable'], piece['support']
+    del raw['selection']['confidence']
+    plain = from_json(raw)
+    assert plain.support == ()
+    assert plain.choice.confidence == {}
+
+
+@pytest.mark.parametrize('jitter', [0.0, 0.005])
+def test_a_valve_that_stands_still_has_no_characteristic(jitter):
+    """The pressure moves u, and the power with it, but that is no property of the valve."""
+    r = np.random.default_rng(3)
+    n, hold = 3000, 60
+    pressure = np.repeat(r.uniform(10.0, 16.0, n // hold), hold)
+    opening = 80.0 + jitter * r.normal(size=n)
+    u = opening * pressure**1.125
+    power = 0.15 * u + 20.0 + 0.3 * r.normal(size=n)
+    spans = np.array([[k + 15, k + hold, STEADY] for k in range(0, n, hold)])
+    window = WindowContents(grid_ns(n), u, power, np.full(n, 540.0), spans, opening)
+    settings = Settings({'refine': False, 'selection_rule': 'evidence', 'min_fit_samples': 100})
+    with pytest.raises(DataError, match=r'The valve did not move: .* transmitter'):
+        fit(FitTask(0, window, settings, NOISE, 0.3))
+    moving = 80.0 + 10.0 * np.repeat(r.uniform(-1.0, 1.0, n // hold), hold)
+    u = moving * pressure**1.125
+    power = 0.15 * u + 20.0 + 0.3 * r.normal(size=n)
+    window = dataclasses.replace(window, u=u, power_mw=power, opening_percent=moving)
+    found = fit(FitTask(0, window, settings, NOISE, 0.3))
+    assert len(found.pieces) == 1
+    assert found.choice.rule == 'evidence'
+    assert found.choice.confidence[1] > 0.9
+    assert found.support[0].identifiable

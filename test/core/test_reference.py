@@ -1,0 +1,265 @@
+"""The reference of a running monitor: decision, journal, judgement and alarm."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from streams import (
+    QUICK_MONITOR,
+    START_NS,
+    first_difference,
+    grid_ns,
+    lagged,
+    plant_table,
+    steps_and_ramps,
+    story,
+    table_of,
+)
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.alarms import AlarmChange, AlarmState
+from valveflow_ros.core.characteristic_json import from_json, to_json
+from valveflow_ros.core.events import CurveAdopted, JournalEntry, JournalKind, ReferenceSet
+from valveflow_ros.core.monitor import Monitor
+from valveflow_ros.core.offline import CLOCK_BACK, JournalReplayer, feed_rows
+from valveflow_ros.core.reference import ReferenceKeeper
+from valveflow_ros.core.shift import PieceShift, Shift
+from valveflow_ros.core.shift_alarm import ShiftAlarm
+from valveflow_ros.errors import DataError
+from valveflow_ros.records import NS_PER_S, SegmentKind, SpecialSegment
+
+# The residual alarm is out of the way: it would stop refits before the curve can move.
+SETTINGS = Settings({**QUICK_MONITOR, 'alarm_limit': 1000.0, 'shift_confidence': 0.99})
+N = 700
+
+
+def plant(seed, n, lost_mw=0.0, start_ns=START_NS):
+    """Return rows of a small plant that gives so many MW less than it should."""
+    rng = np.random.default_rng(seed)
+    u = steps_and_ramps(rng, n, hold=(30, 90))
+    power = lagged(20.0 + 0.1 * u, 2.0, 1.0) - lost_mw + 0.15 * rng.normal(0.0, 1.0, n)
+    return table_of(grid_ns(n, start_ns=start_ns), u + 0.5 * rng.normal(0.0, 1.0, n), power)
+
+
+def of_type(events, kind):
+    return [e for e in events if isinstance(e, kind)]
+
+
+def following(monitor, seed, n, lost_mw=0.0):
+    return plant(seed, n, lost_mw, monitor.last_ns + NS_PER_S)
+
+
+def with_curve():
+    monitor = Monitor(SETTINGS)
+    feed_rows(monitor, plant(1, N))
+    assert monitor.characteristic is not None
+    return monitor
+
+
+def changes_of(events):
+    return [e for e in of_type(events, AlarmChange) if e.name == ShiftAlarm.NAME]
+
+
+# --- the decision -----------------------------------------------------------------------------
+
+
+def test_without_a_curve_there_is_nothing_to_set():
+    monitor = Monitor(SETTINGS)
+    with pytest.raises(DataError, match=r'could become the reference\. No curve yet'):
+        monitor.set_reference()
+    assert monitor.reference.curve is None
+
+
+def test_setting_it_is_told_and_journalled():
+    monitor = with_curve()
+    told, entry = monitor.set_reference()
+    curve = monitor.characteristic
+    assert told == ReferenceSet(curve)
+    assert entry == JournalEntry(
+        monitor.last_ns, JournalKind.SET_REFERENCE, 0, monitor.rows, curve.model_id, ''
+    )
+    assert monitor.reference.curve is curve
+
+
+def test_one_that_is_given_stands_in_the_journal_whole():
+    curve = with_curve().characteristic
+    fresh = Monitor(SETTINGS)
+    _, entry = fresh.set_reference(curve)
+    again = from_json(json.loads(entry.text))
+    assert to_json(again) == to_json(curve)
+    assert entry.rows == 0
+    other = replace(curve, pressure_exponent=1.0)
+    with pytest.raises(DataError, match=r'pressure exponent 1, the monitor 1\.125'):
+        fresh.set_reference(other)
+    assert fresh.reference.curve.model_id == curve.model_id
+
+
+def test_every_later_curve_is_judged_and_none_before():
+    monitor = with_curve()
+    before = feed_rows(monitor, following(monitor, 2, N))
+    assert of_type(before, CurveAdopted)
+    assert all(e.shift is None for e in of_type(before, CurveAdopted))
+    monitor.set_reference()
+    after = of_type(feed_rows(monitor, following(monitor, 3, N)), CurveAdopted)
+    assert after
+    for event in after:
+        assert event.shift.model_id == event.characteristic.model_id
+        assert event.shift.reference_id == monitor.reference.curve.model_id
+        assert len(event.shift.pieces) == len(event.characteristic.pieces)
+
+
+def test_a_clock_that_goes_back_takes_neither_reference_nor_alarm():
+    monitor = with_curve()
+    monitor.set_reference()
+    feed_rows(monitor, following(monitor, 4, 4 * N, 4.0))
+    assert monitor.reference.alarm.active
+    monitor.restart(CLOCK_BACK)
+    assert monitor.reference.curve is not None
+    assert monitor.reference.alarm.state == AlarmState.UNACKNOWLEDGED
+    events = feed_rows(monitor, plant(5, N, 4.0))
+    assert any(e.shift is not None for e in of_type(events, CurveAdopted))
+
+
+# --- the alarm --------------------------------------------------------------------------------
+
+
+def test_a_plant_that_moved_raises_the_alarm_once_and_it_can_be_acknowledged():
+    monitor = with_curve()
+    monitor.set_reference()
+    events = feed_rows(monitor, following(monitor, 4, 4 * N, 4.0))
+    (change,) = changes_of(events)
+    assert (change.state, change.previous) == (AlarmState.UNACKNOWLEDGED, AlarmState.NORMAL)
+    assert change.value < -SETTINGS.real('shift_least')
+    assert change.unit == 'MW'
+    assert 'less than the reference of 2023-11-15' in change.sentence
+    acknowledged, entry = monitor.acknowledge()
+    assert acknowledged.state == AlarmState.ACKNOWLEDGED
+    assert acknowledged.name == 'curve_shift'
+    assert entry.kind == JournalKind.ACKNOWLEDGE
+    with pytest.raises(DataError, match='no alarm to acknowledge'):
+        monitor.acknowledge()
+    # The moved plant is accepted: its curve is the reference now.
+    ended = changes_of(monitor.set_reference())
+    assert [c.state for c in ended] == [AlarmState.NORMAL]
+    assert not monitor.reference.alarm.standing
+
+
+def test_a_plant_that_stays_raises_none():
+    monitor = with_curve()
+    feed_rows(monitor, following(monitor, 2, N))
+    monitor.set_reference()
+    assert not changes_of(feed_rows(monitor, following(monitor, 6, 4 * N)))
+
+
+def judged(by_mw, p_value=1e-6):
+    """Return a judgement of one piece."""
+    moved = p_value < 1e-3 and abs(by_mw) >= 0.3
+    piece = PieceShift(
+        1000.0, 1200.0, by_mw, by_mw, by_mw, 0.1, np.nan, np.nan, 200.0, p_value, moved, 0.4
+    )
+    return Shift('then', 'now', START_NS, START_NS, (piece,), 0, 0, 0, f'By {by_mw} MW.')
+
+
+STRICT = Settings({'shift_confidence': 0.999, 'shift_least': 0.3, 'alarm_dead_band': 0.3})
+
+
+def told(alarm, *judgements, settings=STRICT):
+    return [
+        change.state for k, shift in enumerate(judgements)
+        for change in alarm.judge(shift, START_NS + k, settings)
+    ]  # fmt: skip
+
+
+def test_its_states_are_those_of_the_standard():
+    alarm = ShiftAlarm()
+    assert told(alarm, judged(0.0, 1.0), judged(2.0), judged(2.1)) == [AlarmState.UNACKNOWLEDGED]
+    assert told(alarm, judged(0.0, 1.0)) == [AlarmState.RETURNED_UNACKNOWLEDGED]
+    assert [c.state for c in alarm.acknowledge(START_NS, 'now')] == [AlarmState.NORMAL]
+    assert alarm.acknowledge(START_NS, 'now') == []
+    assert told(alarm, judged(-2.0)) == [AlarmState.UNACKNOWLEDGED]
+    (change,) = alarm.acknowledge(START_NS, 'now')
+    assert change.sentence == 'Acknowledged. By -2.0 MW.'
+    assert (change.occurrence, change.value, change.limit) == (2, -2.0, 0.4)
+    assert told(alarm, judged(0.1)) == [AlarmState.NORMAL]
+
+
+def test_without_a_latch_it_goes_by_itself():
+    loose = STRICT.changed({'alarm_latch': False})
+    states = told(ShiftAlarm(), judged(2.0), judged(0.0, 1.0), settings=loose)
+    assert states == [AlarmState.UNACKNOWLEDGED, AlarmState.NORMAL]
+
+
+def test_near_the_limit_it_does_not_come_and_go():
+    alarm = ShiftAlarm()
+    doubtful, smaller = judged(2.0, 5e-3), judged(0.25)
+    assert told(alarm, doubtful, smaller) == []
+    assert told(alarm, judged(2.0), doubtful, smaller) == [AlarmState.UNACKNOWLEDGED]
+    assert told(alarm, judged(2.0, 2e-2)) == [AlarmState.RETURNED_UNACKNOWLEDGED]
+
+
+def test_the_keeper_forgets_segments_with_the_window():
+    keeper = ReferenceKeeper(Settings({'window_days': 1.0}))
+    for hour in range(60):
+        at = START_NS + hour * 3600 * NS_PER_S
+        keeper.add(
+            SpecialSegment(hour, SegmentKind.STEADY, at, at + 600 * NS_PER_S, 600, 1.0, 1.0, 0.0,
+                           0.0, 1.0, 1.0, 0.0, 540.0)
+        )  # fmt: skip
+    assert len(keeper.segments) == 24
+    assert keeper.segments[0].number == 36
+    keeper.restart()
+    assert keeper.segments == ()
+
+
+def test_a_curve_that_cannot_be_compared_says_why():
+    monitor = with_curve()
+    far = replace(
+        monitor.characteristic,
+        pieces=tuple(
+            replace(p, u_from=p.u_from + 9e3, u_to=p.u_to + 9e3)
+            for p in monitor.characteristic.pieces
+        ),
+    )
+    monitor.set_reference(far)
+    events = feed_rows(monitor, following(monitor, 3, N))
+    assert all(e.shift is None for e in of_type(events, CurveAdopted))
+    assert 'nothing can be compared' in monitor.reference.problem
+
+
+# --- replay -----------------------------------------------------------------------------------
+
+
+def test_rows_and_journal_repeat_it_bit_for_bit():
+    given = with_curve().characteristic
+    monitor = Monitor(SETTINGS)
+    events = monitor.set_reference(given)
+    tables = [plant_table(11, 500)]
+    events += feed_rows(monitor, tables[-1])
+    events += monitor.set_reference()
+    tables.append(following(monitor, 12, 2000, 4.0))
+    events += feed_rows(monitor, tables[-1])
+    events += monitor.acknowledge()
+    events += monitor.reconfigure(SETTINGS.changed({'shift_least': 0.5}))
+    events += monitor.restart(CLOCK_BACK)
+    tables.append(plant(13, 900, 4.0))
+    events += feed_rows(monitor, tables[-1])
+    events += monitor.set_reference()
+    assert len(changes_of(events)) >= 3
+    journal = of_type(events, JournalEntry)
+    again = Monitor(SETTINGS)
+    replayer = JournalReplayer(again, journal)
+    repeated = []
+    for table in tables:
+        for start in range(0, len(table), 37):
+            repeated += replayer.feed(table.part(start, min(start + 37, len(table))))
+    assert not first_difference(story(events), story(repeated))
+    assert story(repeated) == story(events)
+
+
+def test_a_reference_that_cannot_be_read_stops_a_replay_with_a_sentence():
+    entry = JournalEntry(0, JournalKind.SET_REFERENCE, 0, 0, 'x', '{"format": 1')
+    with pytest.raises(DataError, match='change of reference cannot be read'):
+        JournalReplayer(Monitor(SETTINGS), [entry]).feed(plant(1, 5))

@@ -1,0 +1,274 @@
+"""The judgement of a shift: relations between judgements, and plants made by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from streams import START_NS, examples
+
+from valveflow_ros.core.characteristic import (
+    Characteristic,
+    Choice,
+    Piece,
+    RegionDynamics,
+    ResidualStatistics,
+    Source,
+)
+from valveflow_ros.core.line_error import curve_error, piece_error
+from valveflow_ros.core.segment_residual import segment_residuals
+from valveflow_ros.core.shift import ShiftLimits, judge_shift
+from valveflow_ros.core.shift_json import shift_json
+from valveflow_ros.errors import DataError
+from valveflow_ros.records import NS_PER_S, SegmentKind, SpecialSegment
+
+KNOTS = np.array([1060.0, 1250.0, 1600.0, 1900.0, 2280.0])
+SLOPES = np.array([0.24, 0.18, 0.09, 0.01])
+VALUES = 155.0 + np.concatenate([[0.0], np.cumsum(SLOPES * np.diff(KNOTS))])
+DAY_NS = 86400 * NS_PER_S
+STDERR = 5e-4
+
+
+def curve_of(values=VALUES, knots=KNOTS, end_ns=START_NS, name='now', stderr=STDERR):
+    slopes = np.diff(values) / np.diff(knots)
+    pieces = tuple(
+        Piece(float(knots[k]), float(knots[k + 1]), float(slopes[k]),
+              float(values[k] - slopes[k] * knots[k]), stderr, 1.0, 1000)
+        for k in range(len(slopes))
+    )  # fmt: skip
+    return Characteristic(
+        1.125, pieces, tuple((math.nan, math.nan) for _ in pieces[1:]),
+        Choice('prediction_error', {}, {}),
+        Source(end_ns - 10 * DAY_NS, end_ns, 1, 1, 1000, 540.0, 1.0, False),
+        ResidualStatistics(2.0, 0.5, 300.0, 1.0, 1.0),
+        dynamics=(RegionDynamics(100.0, 300.0, 60.0, 5.0, 1.0, 1.0),), model_id=name,
+    )  # fmt: skip
+
+
+REFERENCE = curve_of(name='then')
+
+
+def segment(number, start_ns, u, power, kind=SegmentKind.STEADY, rate=0.0, samples=400):
+    reach = 0.5 * rate * samples
+    slope = SLOPES[np.clip(np.searchsorted(KNOTS, u) - 1, 0, 3)]
+    return SpecialSegment(
+        number, kind, start_ns, start_ns + samples * NS_PER_S, samples, u - reach, u + reach,
+        rate, 1.0, power - slope * reach, power + slope * reach, 1.0, 540.0,
+    )  # fmt: skip
+
+
+def history(seed, days=10.0, change=lambda day, u: 0.0, count=400, noise=1.0, start_ns=START_NS):
+    """Return the segments of a plant on the reference curve, plus a change by day and u."""
+    rng = np.random.default_rng(seed)
+    at = np.sort(rng.uniform(0.0, days, count))
+    u = rng.uniform(KNOTS[0] + 20.0, KNOTS[-1] - 20.0, count)
+    power = np.interp(u, KNOTS, VALUES) + noise * rng.normal(0.0, 1.0, count)
+    return [
+        segment(k + 1, start_ns + round(at[k] * DAY_NS), u[k], power[k] + change(at[k], u[k]))
+        for k in range(count)
+    ]
+
+
+shifts = st.lists(st.floats(-3.0, 3.0), min_size=5, max_size=5).map(np.array)
+
+
+@examples(60)
+@given(shifts)
+def test_changing_places_turns_the_sign_and_nothing_else(by):
+    one = judge_shift(REFERENCE, curve_of(VALUES + by))
+    other = judge_shift(curve_of(VALUES + by), REFERENCE)
+    for a, b in zip(one.pieces, other.pieces, strict=True):
+        assert b.middle_mw == pytest.approx(-a.middle_mw, abs=1e-9)
+        assert (b.low_mw, b.high_mw) == pytest.approx((-a.high_mw, -a.low_mw), abs=1e-9)
+        assert b.p_value == pytest.approx(a.p_value, rel=1e-6, abs=1e-300)
+        assert b.moved == a.moved
+
+
+@examples(60)
+@given(shifts)
+def test_what_lies_between_the_knots_is_what_is_said(by):
+    """The difference of two curves on the same knots is straight on each piece."""
+    shift = judge_shift(REFERENCE, curve_of(VALUES + by))
+    for k, piece in enumerate(shift.pieces):
+        assert piece.middle_mw == pytest.approx(0.5 * (by[k] + by[k + 1]), abs=1e-9)
+        assert piece.low_mw >= min(by[k], by[k + 1]) - 1e-9
+        assert piece.high_mw <= max(by[k], by[k + 1]) + 1e-9
+        assert piece.high_mw - piece.low_mw == pytest.approx(0.98 * abs(by[k + 1] - by[k]))
+
+
+@examples(40)
+@given(shifts, st.floats(1.0, 10.0))
+def test_doubt_never_makes_a_shift(by, wider):
+    sure = judge_shift(REFERENCE, curve_of(VALUES + by))
+    unsure = judge_shift(REFERENCE, curve_of(VALUES + by, stderr=wider * STDERR))
+    for a, b in zip(sure.pieces, unsure.pieces, strict=True):
+        assert b.p_value >= a.p_value - 1e-15
+        assert a.moved or not b.moved
+
+
+@examples(40)
+@given(st.integers(0, 2**32 - 1), st.integers(-400, 400))
+def test_the_days_on_which_all_happened_do_not_matter(seed, days):
+    moved = history(seed, change=lambda day, u: 2.0 * (day > 6.0))
+    one = judge_shift(REFERENCE, curve_of(end_ns=START_NS + 10 * DAY_NS), moved)
+    by = days * DAY_NS
+    later = [replace(s, start_ns=s.start_ns + by, end_ns=s.end_ns + by) for s in moved]
+    two = judge_shift(curve_of(end_ns=START_NS + by, name='then'), curve_of(), later)
+    assert [p.now_mw for p in two.pieces] == pytest.approx(
+        [p.now_mw for p in one.pieces], nan_ok=True
+    )
+    assert two.since_ns - by == pytest.approx(one.since_ns, abs=1e4)
+
+
+def test_the_same_curve_has_not_moved():
+    shift = judge_shift(REFERENCE, curve_of())
+    assert not shift.moved
+    assert shift.largest is None
+    assert [p.confidence for p in shift.pieces] == [0.0] * 4
+    smallest = min(p.smallest_mw for p in shift.pieces)
+    assert f'a shift of {smallest:.1f} to' in shift.sentence
+    assert 'would have been seen' in shift.sentence
+
+
+@pytest.mark.parametrize('share', [0.9, 1.1])
+def test_the_smallest_shift_that_is_said_to_be_seen_is(share):
+    smallest = judge_shift(REFERENCE, curve_of()).pieces[1].smallest_mw
+    by = np.array([0.0, 1.0, 1.0, 0.0, 0.0]) * share * smallest
+    assert judge_shift(REFERENCE, curve_of(VALUES + by)).pieces[1].moved == (share > 1.0)
+
+
+def test_a_piece_that_moved_is_named_dated_and_measured():
+    change = lambda day, u: -2.1 * (day > 6.0) * (1250.0 <= u < 1600.0)  # noqa: E731
+    by = 0.4 * np.array([0.0, -2.1, -2.1, 0.0, 0.0])
+    shift = judge_shift(REFERENCE, curve_of(VALUES + by), history(1, change=change))
+    assert shift.pieces[1].moved
+    assert shift.largest is shift.pieces[1]
+    assert not shift.pieces[3].moved
+    assert shift.pieces[1].shift_mw == pytest.approx(-2.1, abs=0.4)
+    assert shift.pieces[1].percent == pytest.approx(-2.1 / 2.32, abs=0.2)
+    day = (shift.since_ns - START_NS) / DAY_NS
+    assert day == pytest.approx(6.0, abs=0.4)
+    assert shift.since_low_ns <= shift.since_ns <= shift.since_high_ns
+    assert shift.sentence.startswith('Piece 2 (u 1250 to 1600) gives')
+    assert 'less than the reference of 2023-11-15' in shift.sentence
+    assert 'since about 2023-11-2' in shift.sentence
+
+
+def test_segments_alone_show_a_change_the_curves_do_not_show_yet():
+    """A change half a day ago hardly moves a fit to ten days."""
+    shift = judge_shift(REFERENCE, curve_of(), history(2, change=lambda day, u: 3.0 * (day > 9.0)))
+    assert shift.moved
+    assert shift.largest.now_mw == pytest.approx(3.0, abs=0.7)
+
+
+def test_a_shift_from_before_the_data_has_no_date():
+    shift = judge_shift(REFERENCE, curve_of(VALUES + 2.0), history(3, change=lambda day, u: 2.0))
+    assert all(p.moved for p in shift.pieces)
+    assert shift.since_ns == 0
+    assert 'so from before that' in shift.sentence
+    without = judge_shift(REFERENCE, curve_of(VALUES + 2.0))
+    assert 'since when is not known' in without.sentence
+
+
+def test_a_change_the_reference_was_made_of_is_no_shift():
+    """Its data end on day 6; the change was on day 3."""
+    reference = curve_of(end_ns=START_NS + 6 * DAY_NS, name='then')
+    before = history(4, change=lambda day, u: 2.0 * (day < 3.0))
+    assert not judge_shift(reference, curve_of(), before).moved
+    later = history(4, change=lambda day, u: 2.0 * (day < 3.0) - 3.0 * (day > 8.0))
+    shift = judge_shift(reference, curve_of(), later)
+    assert shift.moved
+    assert (shift.since_ns - START_NS) / DAY_NS == pytest.approx(8.0, abs=0.3)
+
+
+def test_calm_plants_are_hardly_ever_blamed():
+    """The curves agree; the segments scatter, and neighbours are correlated."""
+    blamed = 0
+    for seed in range(150):
+        segments = history(seed, count=200)
+        wander = np.random.default_rng(seed).normal(0.0, 0.5, 50).repeat(4)
+        segments = [
+            replace(s, power_start_mw=s.power_start_mw + w, power_end_mw=s.power_end_mw + w)
+            for s, w in zip(segments, wander, strict=True)
+        ]
+        blamed += judge_shift(REFERENCE, curve_of(), segments).moved
+    assert blamed <= 3
+
+
+def test_small_shifts_do_not_count_however_sure():
+    sharp = curve_of(VALUES + 0.2, stderr=1e-6)
+    reference = curve_of(stderr=1e-6)
+    assert not judge_shift(reference, sharp).moved
+    assert judge_shift(reference, sharp, limits=ShiftLimits(0.999, 0.1)).moved
+
+
+def test_ramps_are_taken_with_their_lag():
+    rate, u = 0.3, 1425.0
+    flow = np.interp(u, KNOTS, VALUES)
+    late = segment(1, START_NS, u, flow - 0.18 * rate * 65.0, SegmentKind.SLOPE, rate)
+    found = segment_residuals(REFERENCE, [late])
+    assert found.residual_mw == pytest.approx([0.0], abs=1e-9)
+    unknown = replace(REFERENCE, dynamics=())
+    assert len(segment_residuals(unknown, [late])) == 0
+    still = segment(2, START_NS, u, flow + 1.0)
+    assert segment_residuals(unknown, [late, still]).residual_mw == pytest.approx([1.0])
+
+
+def test_a_ramp_over_a_knee_is_judged_by_the_mean_of_the_curve():
+    ramp = segment(1, START_NS, 1600.0, 0.0, SegmentKind.SLOPE, 0.5, 400)
+    u = np.linspace(ramp.u_start, ramp.u_end, 100_001)
+    power = float(np.interp(u, KNOTS, VALUES).mean()) - 0.09 * 0.5 * 65.0
+    ramp = replace(ramp, power_start_mw=power, power_end_mw=power)
+    assert segment_residuals(REFERENCE, [ramp]).residual_mw == pytest.approx([0.0], abs=0.02)
+
+
+def test_segments_the_reference_does_not_reach_do_not_count():
+    outside = segment(1, START_NS, 2400.0, 300.0)
+    assert len(segment_residuals(REFERENCE, [outside])) == 0
+
+
+def test_a_piece_the_reference_does_not_know_is_not_judged():
+    knots = np.append(KNOTS, 2600.0)
+    current = curve_of(np.append(VALUES, VALUES[-1] + 3.2), knots)
+    shift = judge_shift(REFERENCE, current)
+    assert math.isnan(shift.pieces[4].middle_mw)
+    assert not shift.pieces[4].moved
+    assert math.isnan(shift.pieces[4].confidence)
+    content = json.loads(json.dumps(shift_json(shift), allow_nan=False))
+    assert content['pieces'][4]['shift_mw'] is None
+    assert content['pieces'][0]['shift_mw'] == pytest.approx(0.0)
+
+
+def test_curves_of_different_inputs_are_not_compared():
+    with pytest.raises(DataError, match='not the same thing'):
+        judge_shift(replace(REFERENCE, pressure_exponent=1.0), curve_of())
+    with pytest.raises(DataError, match='nothing can be compared'):
+        judge_shift(REFERENCE, curve_of(knots=KNOTS + 2000.0))
+
+
+def test_errors_that_are_not_known_judge_by_segments_only():
+    unknown = curve_of(VALUES + 2.0, stderr=math.nan)
+    shift = judge_shift(curve_of(stderr=math.nan), unknown)
+    assert not shift.moved
+    assert 'no error of the curves is known' in shift.sentence
+
+
+def test_the_error_of_a_line_is_the_one_of_least_squares():
+    """Even samples on a piece: the textbook's error of the fitted value."""
+    u, sigma = np.linspace(1250.0, 1600.0, 400), 1.3
+    design = np.column_stack([np.ones(400), u])
+    covariance = sigma**2 * np.linalg.inv(design.T @ design)
+    at = np.array([1250.0, 1300.0, 1425.0, 1600.0])
+    rows = np.column_stack([np.ones(4), at])
+    truth = np.sqrt(np.einsum('ij,jk,ik->i', rows, covariance, rows))
+    piece = Piece(1250.0, 1600.0, 0.18, 0.0, float(np.sqrt(covariance[1, 1])),
+                  float(np.sqrt(covariance[0, 0])), 400)  # fmt: skip
+    assert piece_error(piece, at) == pytest.approx(truth, rel=0.01)
+    both = curve_error(REFERENCE, np.array([1300.0, 2000.0]))
+    assert both[0] == piece_error(REFERENCE.pieces[1], np.array([1300.0]))[0]
+    assert both[1] == piece_error(REFERENCE.pieces[3], np.array([2000.0]))[0]

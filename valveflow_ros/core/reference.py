@@ -1,0 +1,79 @@
+"""The reference of the running monitor: kept, and what later curves are judged against."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.alarms import AlarmChange
+from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.shift import Shift, ShiftLimits, judge_shift
+from valveflow_ros.core.shift_alarm import ShiftAlarm
+from valveflow_ros.errors import DataError
+from valveflow_ros.records import NS_PER_S, SpecialSegment
+
+
+class ReferenceKeeper:
+    """Keep the reference, the window's segments and the alarm on a shift.
+
+    Parameters
+    ----------
+    settings : Settings
+        ``window_days`` bounds how far back segments are kept.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._window_ns = round(86400.0 * settings.real('window_days') * NS_PER_S)
+        self._segments: deque[SpecialSegment] = deque()
+        self.curve: Characteristic | None = None
+        self.shift: Shift | None = None
+        self.problem = ''
+        self.alarm = ShiftAlarm()
+
+    @property
+    def segments(self) -> tuple[SpecialSegment, ...]:
+        """Return the segments of the window, in order of time."""
+        return tuple(self._segments)
+
+    def add(self, segment: SpecialSegment) -> None:
+        """Remember a segment that has closed; forget those that have left the window."""
+        self._segments.append(segment)
+        while self._segments[0].start_ns <= segment.end_ns - self._window_ns:
+            self._segments.popleft()
+
+    def restart(self) -> None:
+        """Forget the segments after the clock went back; reference and alarm stay."""
+        self._segments.clear()
+
+    def set(self, curve: Characteristic, time_ns: int, settings: Settings) -> list[AlarmChange]:
+        """Judge against ``curve`` from the next adoption on.
+
+        Raises
+        ------
+        DataError
+            The curve's input u is not the one of this monitor.
+        """
+        exponent = settings.real('pressure_exponent')
+        if curve.pressure_exponent != exponent:
+            raise DataError(
+                f'The reference has the pressure exponent {curve.pressure_exponent:g}, the '
+                f'monitor {exponent:g}: their inputs u are not the same thing.'
+            )
+        self.curve = curve
+        self.shift, self.problem = None, ''
+        return self.alarm.end('There is a new reference.', time_ns, curve.model_id, settings)
+
+    def judge(
+        self, current: Characteristic, time_ns: int, settings: Settings
+    ) -> tuple[Shift | None, list[AlarmChange]]:
+        """Judge a curve that was adopted; None without a reference it can be compared with."""
+        self.shift, self.problem = None, ''
+        if self.curve is None:
+            return None, []
+        limits = ShiftLimits(settings.real('shift_confidence'), settings.real('shift_least'))
+        try:
+            self.shift = judge_shift(self.curve, current, self.segments, limits)
+        except DataError as error:
+            self.problem = str(error)
+            return None, []
+        return self.shift, self.alarm.judge(self.shift, time_ns, settings)

@@ -1,0 +1,73 @@
+"""When a fit is to be asked for, and which outcome is awaited."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from valveflow_ros.config import Settings
+from valveflow_ros.records import NS_PER_S, IntArray
+
+
+class Refits:
+    """Counts segments and time towards the next request, and names requests.
+
+    A request's name is the time of the row after which it was made.
+    """
+
+    def __init__(self) -> None:
+        self.pending_ns: int | None = None
+        self._last_ns: int | None = None
+        self._last_name_ns = 0
+        self._segments_at_request = 0
+        self.segments_seen = 0
+
+    def rows_until_due(self, time_ns: IntArray, settings: Settings) -> tuple[int, bool]:
+        """Return how many rows to take before the period is over, and whether it is among them."""
+        if self._last_ns is None:
+            self._last_ns = int(time_ns[0])
+        period_ns = round(settings.real('refit_period') * NS_PER_S)
+        if period_ns == 0:
+            return len(time_ns), False
+        due = int(np.searchsorted(time_ns, self._last_ns + period_ns, side='left'))
+        return (due + 1, True) if due < len(time_ns) else (len(time_ns), False)
+
+    def due(self, last_ns: int, closed: bool, by_time: bool, settings: Settings) -> bool:
+        """Tell whether the time or the segments since the last request ask for one.
+
+        Parameters
+        ----------
+        last_ns : int
+            Time of the newest row.
+        closed : bool
+            A segment closed at it.
+        by_time : bool
+            The period ended at it.
+        """
+        if by_time:
+            self._last_ns = last_ns
+        if self.pending_ns is not None or settings.real('refit_period') <= 0.0:
+            return False
+        new = self.segments_seen - self._segments_at_request
+        wanted = settings.whole('refit_segments')
+        return (by_time and new > 0) or (closed and wanted > 0 and new >= wanted)
+
+    def ask(self, last_ns: int) -> int:
+        """Note a request made now; return its name."""
+        # After the clock went back names must not come again.
+        self.pending_ns = max(last_ns, self._last_name_ns + 1)
+        self._last_name_ns = self.pending_ns
+        self._last_ns = last_ns
+        self._segments_at_request = self.segments_seen
+        return self.pending_ns
+
+    def settle(self, request_ns: int) -> bool:
+        """Take an outcome; tell whether it was awaited."""
+        if request_ns != self.pending_ns:
+            return False
+        self.pending_ns = None
+        return True
+
+    def restart(self) -> None:
+        """Begin to count anew; names go on."""
+        self._last_ns = None
+        self._segments_at_request = self.segments_seen
