@@ -3,6 +3,8 @@
 # make test    set-up, then every test              (PYTEST_ARGS='-k partition' for some)
 # make lint    set-up, then ruff and mypy           (make format rewrites the layout)
 # make bench   set-up, then what is fast, measured
+# make study   how good curve, choice, segments, shifts, alarm and baselines are (hours)
+# make certify-partition   the exact partition of 305,633 samples against every break (minutes)
 # make lock    requirements.in -> requirements.lock (UPGRADE=1 takes newer versions)
 # make clean   remove everything the set-up made
 #
@@ -10,7 +12,7 @@
 
 SHELL := bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint format bench lock clean
+.PHONY: help setup demo test lint format bench study certify-partition lock clean
 
 export PYTHON
 ENV := source ./env.sh &&
@@ -19,7 +21,9 @@ PYTEST_ARGS ?=
 # Checked as strictly as mypy can; ros/ is not, because rclpy carries no annotations.
 STRICT := $(wildcard $(addprefix valveflow_ros/,errors.py records.py config.py \
   core plant logs report cli compare diagnosis) tools)
-BENCHMARKS := $(filter-out __init__,$(basename $(notdir $(wildcard benchmarks/*.py))))
+BENCHMARKS := node_load partition reading ten_days
+STUDIES := paper_study coverage_study selection_study segment_study shift_study alarm_study \
+  compare_study study_figures
 
 help:
 	@sed -n 's/^# //p;/^$$/q' Makefile
@@ -44,6 +48,12 @@ format: setup
 
 bench: setup
 	@$(ENV) for name in $(BENCHMARKS); do python -m benchmarks.$$name || exit 1; done
+
+study: setup
+	@$(ENV) for name in $(STUDIES); do python -m benchmarks.$$name || exit 1; done
+
+certify-partition: setup
+	@$(ENV) python -m benchmarks.partition --certify --kinds valve --sizes 305633
 
 lock: setup
 	@$(ENV) uv pip compile --quiet --universal --python-version 3.10 --generate-hashes \

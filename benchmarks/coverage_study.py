@@ -33,9 +33,7 @@ def identify(unit: UnitDescription, seed: int, days: float) -> Characteristic:
     """Simulate a unit and identify it with the defaults."""
     log = simulate(days, seed, unit)
     monitor = Monitor(
-        Settings(
-            {'refit_period': 0.0, 'window_days': days, 'sample_period': unit.sample_period_s}
-        )
+        Settings({'refit_period': 0.0, 'window_days': days, 'sample_period': unit.sample_period_s})
     )
     monitor.feed(log.table)
     (task,) = (e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
@@ -99,7 +97,9 @@ def summary(rows: list[dict[str, object]]) -> dict[str, object]:
             'count': len(z),
             'not_known': len(z) - len(known),
             'covered_95': round(float(np.mean(np.abs(known) < _Z95)), 4) if len(known) else None,
-            'robust_sd': round(float(1.4826 * np.median(np.abs(known))), 3) if len(known) else None,
+            'robust_sd': round(float(1.4826 * np.median(np.abs(known))), 3)
+            if len(known)
+            else None,
             'bias': round(float(np.mean(np.clip(known, -5, 5))), 3) if len(known) else None,
         }
     return out

@@ -65,7 +65,7 @@ def test_turned_round_in_time_it_is_the_same_change(seed, n):
 
 def test_without_a_change_one_is_seen_no_more_often_than_said():
     limit = 0.01
-    chances = [scan(*series(seed, 60)).p_value for seed in range(1500)]
+    chances = [scan(*series(seed, 60)).p_value for seed in range(1000)]
     # The correction for correlated neighbours makes it see rather less.
     assert np.mean(np.array(chances) < limit) <= 2.0 * limit
 

@@ -165,6 +165,9 @@ def test_what_is_left_out_needs_no_inverse():
     made = compensate(curve, u_to=1500.0)
     assert made.u[-1] == 1500.0
     assert made.identity_mw < 1e-9
+    assert made.first_piece == 1
+    assert compensate(PAPER, u_from=1700.0).first_piece == 3
+    assert any('Piece 4' in note for note in compensate(PAPER, u_from=1300.0).notes)
     with pytest.raises(InputError, match='nothing of it lies between'):
         compensate(curve, u_from=1900.0)
     with pytest.raises(InputError, match='2 points or more'):

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -23,8 +21,8 @@ from streams import (
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.alarms import AlarmChange, AlarmState
-from valveflow_ros.core.curve_status import CurveStatus
 from valveflow_ros.core.chart import ResidualChart
+from valveflow_ros.core.curve_status import CurveStatus
 from valveflow_ros.core.events import (
     CurveAdopted,
     FitRequested,

@@ -88,7 +88,8 @@ class LiveRun:
             elif button == 'restart':
                 self.events += monitor.restart(CLOCK_BACK)
             elif button == 'limit':
-                changes = {'alarm_limit': 4.0 if monitor.settings.real('alarm_limit') == 3.0 else 3.0}
+                before = monitor.settings.real('alarm_limit')
+                changes = {'alarm_limit': 4.0 if before == 3.0 else 3.0}
                 self.events += monitor.reconfigure(monitor.settings.changed(changes))
             elif button == 'period':
                 changes = {'refit_period': 90.0, 'refit_segments': 2}

@@ -111,7 +111,7 @@ def test_doubt_never_makes_a_shift(by, wider):
         assert a.moved or not b.moved
 
 
-@examples(40)
+@examples(12)
 @given(st.integers(0, 2**32 - 1), st.integers(-400, 400))
 def test_the_days_on_which_all_happened_do_not_matter(seed, days):
     moved = history(seed, change=lambda day, u: 2.0 * (day > 6.0))
@@ -189,7 +189,7 @@ def test_a_change_the_reference_was_made_of_is_no_shift():
 def test_calm_plants_are_hardly_ever_blamed():
     """The curves agree; the segments scatter, and neighbours are correlated."""
     blamed = 0
-    for seed in range(150):
+    for seed in range(80):
         segments = history(seed, count=200)
         wander = np.random.default_rng(seed).normal(0.0, 0.5, 50).repeat(4)
         segments = [
@@ -197,7 +197,7 @@ def test_calm_plants_are_hardly_ever_blamed():
             for s, w in zip(segments, wander, strict=True)
         ]
         blamed += judge_shift(REFERENCE, curve_of(), segments).moved
-    assert blamed <= 3
+    assert blamed <= 2
 
 
 def test_small_shifts_do_not_count_however_sure():

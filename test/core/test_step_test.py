@@ -137,10 +137,10 @@ def test_exact_levels_give_back_the_broken_line(knees):
 def test_noise_alone_hardly_ever_gives_a_knee():
     u = np.linspace(1000.0, 2000.0, 20)
     pieces = []
-    for seed in range(1000, 1060):
+    for seed in range(1000, 1040):
         power = 0.1 * u + np.random.default_rng(seed).normal(0.0, 0.5, 20)
         pieces.append(len(broken_line(Points(u, power, np.full(20, 0.5)), 8).knots) - 1)
-    assert pieces.count(1) >= 54
+    assert pieces.count(1) >= 36
 
 
 def test_the_errors_of_the_line_are_those_of_many_tests():
@@ -151,10 +151,10 @@ def test_the_errors_of_the_line_are_those_of_many_tests():
             Points(u, np.interp(u, knots, values)
                    + np.random.default_rng(seed).normal(0.0, 0.5, 20), np.full(20, 0.5)), 4
         )
-        for seed in range(2000, 2150)
+        for seed in range(2000, 2080)
     ]  # fmt: skip
     two = [line for line in found if len(line.knots) == 3]
-    assert len(two) >= 140
+    assert len(two) >= 74
     # The ends do not hang on where the knot falls; the knot's own error is given beside it.
     for k in (0, 2):
         scatter = np.std([line.values[k] for line in two])

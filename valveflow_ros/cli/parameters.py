@@ -186,7 +186,14 @@ def _words(
     period = settings.real('sample_period')
     told = [
         f'{name} {adapted[name]:g} {PARAMETERS[name].unit}'
-        for name in ('hold_limit', 'lateness', 'block', 'longest_segment', 'alarm_block', 'alarm_average')
+        for name in (
+            'hold_limit',
+            'lateness',
+            'block',
+            'longest_segment',
+            'alarm_block',
+            'alarm_average',
+        )
         if name in adapted
     ]
     if 'sample_period' in adapted:

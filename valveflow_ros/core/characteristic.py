@@ -30,7 +30,10 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class RegionDynamics:
-    """First-order dynamics with delay, eq. (3), between two power levels."""
+    """First-order dynamics with delay, eq. (3), between two power levels.
+
+    ``power_to_stderr_mw`` is the standard error of the upper level; the last region has none.
+    """
 
     power_from: float
     power_to: float
@@ -38,6 +41,7 @@ class RegionDynamics:
     delay_s: float
     time_constant_stderr_s: float
     delay_stderr_s: float
+    power_to_stderr_mw: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)

@@ -57,7 +57,9 @@ def _chart_json(chart: ChartDesign | None) -> dict[str, Any]:
     """Return the chart under its key; a curve without one has no such key."""
     if chart is None:
         return {}
-    small, large = ({'slack': k, 'limit': h} for k, h in zip(chart.slack, chart.limit, strict=True))
+    small, large = (
+        {'slack': k, 'limit': h} for k, h in zip(chart.slack, chart.limit, strict=True)
+    )
     return {
         'chart': {
             'block_s': chart.block_s,
@@ -105,6 +107,7 @@ def to_json(c: Characteristic) -> dict[str, Any]:
                 'delay_s': d.delay_s,
                 'time_constant_stderr_s': _number(d.time_constant_stderr_s),
                 'delay_stderr_s': _number(d.delay_stderr_s),
+                'power_to_stderr_mw': _number(d.power_to_stderr_mw),
             }
             for d in c.dynamics
         ],
@@ -244,12 +247,17 @@ def _source(top: Field) -> Source:
 def _residuals(field: Field | None) -> ResidualStatistics:
     names = ('rmse_mw', 'average_sd_mw', 'average_s', 'input_noise', 'power_noise_mw')
     if field is None or not field.may_have('rmse_mw'):
-        return ResidualStatistics(*(math.nan for _ in names))
+        return ResidualStatistics(math.nan, math.nan, math.nan, math.nan, math.nan)
     width, chart = field.may_have('width_mw'), field.may_have('chart')
+    rmse, average_sd, average, noise, power_noise = (field.key(n).real(0.0) for n in names)
     return ResidualStatistics(
-        *(field.key(name).real(0.0) for name in names),
-        width_mw=width.real_or_nan(0.0) if width else math.nan,
-        chart=_chart(chart) if chart else None,
+        rmse,
+        average_sd,
+        average,
+        noise,
+        power_noise,
+        width.real_or_nan(0.0) if width else math.nan,
+        _chart(chart) if chart else None,
     )
 
 
@@ -269,6 +277,7 @@ def _dynamics(field: Field) -> tuple[RegionDynamics, ...]:
     regions: list[RegionDynamics] = []
     for f in field.items():
         t_error, d_error = f.may_have('time_constant_stderr_s'), f.may_have('delay_stderr_s')
+        level = f.may_have('power_to_stderr_mw')
         region = RegionDynamics(
             f.key('power_from').real(),
             f.key('power_to').real(),
@@ -276,6 +285,7 @@ def _dynamics(field: Field) -> tuple[RegionDynamics, ...]:
             f.key('delay_s').real(0.0, 600.0),
             t_error.real_or_nan(0.0) if t_error else math.nan,
             d_error.real_or_nan(0.0) if d_error else math.nan,
+            level.real_or_nan(0.0) if level else math.nan,
         )
         if regions and not region.power_to > regions[-1].power_to:
             raise f.key('power_to').fail('does not lie above the region before')

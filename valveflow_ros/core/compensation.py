@@ -46,6 +46,8 @@ class Compensation:
         Largest error that interpolating in the table as written has, in MW and in u.
     jumps : tuple of (float, float, float)
         Where the curve jumps up: u, and the powers below and above.
+    first_piece : int
+        Number that the first of these pieces has in the whole curve, from 1.
     notes : tuple of str
     """
 
@@ -63,6 +65,7 @@ class Compensation:
     table_mw: float
     table_u: float
     jumps: tuple[tuple[float, float, float], ...]
+    first_piece: int
     notes: tuple[str, ...]
 
 
@@ -100,8 +103,8 @@ def compensate(
     """
     if points < 2:
         raise InputError(f'A table needs 2 points or more, not {points}.')
-    cut = _cut(curve, u_from, u_to)
-    _rises(cut)
+    cut, first = _cut(curve, u_from, u_to)
+    _rises(cut, first)
     x, u = _corners(cut)
     exact = len(x)
     x, u = spread(x, u, points) if points >= exact else thin(x, u, points)
@@ -117,13 +120,13 @@ def compensate(
         within=gain <= limit * (1.0 + 1e-9), curve=cut, gains=gains, gain_limit=limit,
         largest_step=_largest_step(gains), useful_mw=_useful(cut, gains, limit),
         identity_mw=_identity(cut), table_mw=table_mw, table_u=table_u, jumps=_jumps(cut),
-        notes=(),
+        first_piece=first, notes=(),
     )  # fmt: skip
     return replace(made, notes=_notes(made, points, exact))
 
 
-def _cut(curve: Characteristic, u_from: float, u_to: float) -> Characteristic:
-    """Return the curve between two u."""
+def _cut(curve: Characteristic, u_from: float, u_to: float) -> tuple[Characteristic, int]:
+    """Return the curve between two u, and the number of its first piece."""
     knots = curve.breakpoints
     low, high = max(u_from, float(knots[0])), min(u_to, float(knots[-1]))
     if not low < high:
@@ -137,33 +140,34 @@ def _cut(curve: Characteristic, u_from: float, u_to: float) -> Characteristic:
         if p.u_from < high and p.u_to > low
     ]
     inner = tuple(curve.breakpoint_intervals[k] for k, _ in kept[:-1])
-    return replace(curve, pieces=tuple(p for _, p in kept), breakpoint_intervals=inner)
+    part = replace(curve, pieces=tuple(p for _, p in kept), breakpoint_intervals=inner)
+    return part, kept[0][0] + 1
 
 
 def _end(piece: Piece, u: float) -> float:
     return piece.slope * u + piece.intercept
 
 
-def _rises(curve: Characteristic) -> None:
+def _rises(curve: Characteristic, first: int) -> None:
     """Refuse a curve that has no inverse."""
     what = (
         'Identify from data in which the unit moves more there, or leave that part out with '
         '--u-from and --u-to.'
     )
-    for k, piece in enumerate(curve.pieces):
+    for number, piece in enumerate(curve.pieces, first):
         if piece.slope <= 0.0:
             does = 'falls' if piece.slope < 0.0 else 'is level'
             raise DataError(
-                f'The curve has no inverse: piece {k + 1} (u {piece.u_from:.1f} to '
+                f'The curve has no inverse: piece {number} (u {piece.u_from:.1f} to '
                 f'{piece.u_to:.1f}) {does} ({piece.slope:.4g} MW per unit of u), so one power '
                 f'belongs to several openings. {what}'
             )
-    for k, (a, b) in enumerate(itertools.pairwise(curve.pieces)):
+    for number, (a, b) in enumerate(itertools.pairwise(curve.pieces), first):
         drop = _end(a, a.u_to) - _end(b, b.u_from)
         if drop > _JOINED_MW:
             raise DataError(
-                f'The curve has no inverse: at u = {a.u_to:.1f}, between pieces {k + 1} and '
-                f'{k + 2}, it falls by {drop:.3g} MW. {what}'
+                f'The curve has no inverse: at u = {a.u_to:.1f}, between pieces {number} and '
+                f'{number + 1}, it falls by {drop:.3g} MW. {what}'
             )
 
 
@@ -263,10 +267,11 @@ def _notes(made: Compensation, points: int, exact: int) -> tuple[str, ...]:
         f'Below {made.power_mw[0]:.2f} MW and above {made.power_mw[-1]:.2f} MW nothing is known '
         'of the valve: the controller must hold u at the end of the table there.'
     ]
-    for k, (piece, gain) in enumerate(zip(made.curve.pieces, made.gains, strict=True)):
+    pairs = zip(made.curve.pieces, made.gains, strict=True)
+    for number, (piece, gain) in enumerate(pairs, made.first_piece):
         if gain > made.gain_limit:
             notes.append(
-                f'Piece {k + 1} (u {piece.u_from:.0f} to {piece.u_to:.0f}, '
+                f'Piece {number} (u {piece.u_from:.0f} to {piece.u_to:.0f}, '
                 f'{_end(piece, piece.u_from):.1f} to {_end(piece, piece.u_to):.1f} MW) hardly '
                 f'answers: 1 MW takes {gain:.3g} units of u (limit {made.gain_limit:.3g}), so '
                 'noise of the demand would drive the valve to and fro; do not use the table there.'

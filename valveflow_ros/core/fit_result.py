@@ -15,6 +15,7 @@ from valveflow_ros.core.characteristic import (
     ResidualStatistics,
 )
 from valveflow_ros.core.fit_task import FitTask
+from valveflow_ros.core.grow import evidence_words
 from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.problem import Samples
 from valveflow_ros.core.refine import Refined
@@ -92,17 +93,20 @@ def from_refined(
     ends = np.concatenate([m.left, m.right, m.levels])
     edges = [float(ends.min()), *m.levels.tolist(), float(ends.max())]
     error = error[3 * j - 1 :]
+    level_errors = np.append(result.level_stderr, math.nan)
     dynamics = tuple(
         RegionDynamics(
             edges[i], edges[i + 1], float(m.time_constants[i]), float(m.delays[i]),
             float(m.time_constants[i] * error[i]), float(error[m.regions + i]),
+            float(level_errors[i]),
         )
         for i in range(m.regions)
         if edges[i] < edges[i + 1]  # a level beyond the curve's ends leaves a region empty
     )  # fmt: skip
     choice = static.choice
     if task.settings.text('selection_rule') == 'prediction_error':
-        note = f"The paper's rule (24) takes J = {len(static.pieces)}."
+        note = evidence_words(result.model.pieces, result.confidence)
+        note += f" The paper's rule (24) takes J = {len(static.pieces)}."
         choice = replace(
             choice, rule='prediction_error', note=f'{note} {choice.note}'.strip(),
             confidence=dict(result.confidence),
@@ -114,8 +118,12 @@ def from_refined(
         breakpoint_intervals=intervals,
         dynamics=dynamics,
         residuals=residual_statistics(
-            task, result.residual_mw, result.weight, samples.step_s * samples.group,
-            result.row_sd_mw, result.prediction_mw,
+            task,
+            result.residual_mw,
+            result.weight,
+            samples.step_s * samples.group,
+            result.row_sd_mw,
+            result.prediction_mw,
         ),
     )
 

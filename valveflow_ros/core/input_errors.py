@@ -58,7 +58,7 @@ def corrected(
         return model
     drawn = np.random.default_rng(_SEED).standard_normal(len(samples.u))
     noisier = Problem(replace(problem.samples, u=samples.u * (1.0 + share * drawn)))
-    moved, _ = move(noisier, model, ar, free, 4)
+    moved, _ = move(noisier, model, ar, free, 2)
     packed = 2.0 * model.pack() - moved.pack()
     packed[-model.regions :] = np.maximum(packed[-model.regions :], 0.0)
     trial = model.unpack(packed)

@@ -242,9 +242,7 @@ class Monitor:
         block = self._predict(rows, segmented)
         self._rows += n
         self._last_ns = int(rows.time_ns[-1])
-        self.judged = Judged(
-            self._last_ns, float(block.evidence[-1]), float(block.shift_mw[-1])
-        )
+        self.judged = Judged(self._last_ns, float(block.evidence[-1]), float(block.shift_mw[-1]))
         self._say(block, segmented, events)
         return n, bool(segmented.found)
 

@@ -108,19 +108,19 @@ def refine(samples: Samples, start: RegionalModel, most_pieces: int | None = Non
     fine = Problem(samples.finer())
     order = int(np.clip(round(_MEMORY_S / (fine.samples.step_s * fine.samples.group)), ORDER, 20))
     free = free_parameters(model.pieces, model.regions)
-    for steps in (3, 6):
+    for steps in (2, 3):
         residual, weight = fine.answer(model)
         ar = fit_ar(residual, weight, order)
         model, cost = move(fine, model, ar, free, steps)
         model, cost = search_levels(fine, model, ar, cost)
-    model, cost = move(fine, model, ar, free, 6)
+    model, cost = move(fine, model, ar, free, 3)
     if most_pieces is None:
         jumps = supported_jumps(fine, model, ar)
     else:
         model, jumps, cost = find_jumps(fine, model, ar, cost)
     free = free_parameters(model.pieces, model.regions, jumps)
     if jumps.any():
-        model, cost = move(fine, model, ar, free, 6)
+        model, cost = move(fine, model, ar, free, 4)
     model = corrected(samples, fine, model, ar, free)
     found = _conclude(problem, fine, model, free, ar)
     return replace(found, confidence=shifted(likely, model.pieces - searched))

@@ -74,7 +74,7 @@ def design_chart(
 
 
 def block_means(residual: FloatArray, weight: ByteArray, rows: int) -> FloatArray:
-    """Return means over ``rows`` rows, NaN where less than half of them count, shape (n // rows,)."""
+    """Return means over ``rows`` rows, shape (n // rows,); NaN where less than half count."""
     count = len(residual) // rows
     w = weight[: count * rows].reshape(count, rows) > 0
     values = np.where(w, residual[: count * rows].reshape(count, rows), 0.0)

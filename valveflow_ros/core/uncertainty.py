@@ -115,7 +115,9 @@ def bend_certainty(problem: Problem, model: RegionalModel, ar: FloatArray) -> Fl
     j = model.pieces
     free = np.zeros(len(model.pack()), dtype=bool)
     free[: j + 1] = True
-    covariance = np.nan_to_num(covariance_of(problem, model, free, ar, with_levels=False).covariance)
+    covariance = np.nan_to_num(
+        covariance_of(problem, model, free, ar, with_levels=False).covariance
+    )
     covariance = covariance[: j + 1, : j + 1]
     width = np.diff(model.knots)
     change = np.zeros((j - 1, j + 1))

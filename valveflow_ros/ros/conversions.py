@@ -140,7 +140,11 @@ def characteristic(
     message.region_power_to = [d.power_to for d in curve.dynamics]
     message.time_constants = [d.time_constant_s for d in curve.dynamics]
     message.delays = [d.delay_s for d in curve.dynamics]
+    message.time_constant_stderr = [d.time_constant_stderr_s for d in curve.dynamics]
+    message.delay_stderr = [d.delay_stderr_s for d in curve.dynamics]
+    message.power_to_stderr = [d.power_to_stderr_mw for d in curve.dynamics]
     message.cost, message.turning_angle = _selection(curve)
+    message.confidence = [likely for _, likely in sorted(curve.choice.confidence.items())]
     message.pressure_exponent = curve.pressure_exponent
     message.samples = source.samples
     message.steady_segments = source.steady

@@ -10,7 +10,6 @@ import numpy as np
 from valveflow_ros.config import Settings
 from valveflow_ros.core.alarms import ResidualAlarm
 from valveflow_ros.core.align import Aligner
-from valveflow_ros.core.chart import ChartDesign
 from valveflow_ros.core.characteristic import (
     Characteristic,
     Choice,
@@ -19,6 +18,7 @@ from valveflow_ros.core.characteristic import (
     ResidualStatistics,
     Source,
 )
+from valveflow_ros.core.chart import ChartDesign
 from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.prediction import Predictor
@@ -64,9 +64,14 @@ def made_up_curve(settings: Settings) -> Characteristic:
         choice=Choice('', {}, {}),
         source=Source(0, 0, 0, 0, 0, 540.0, 0.0, False),
         residuals=ResidualStatistics(
-            1.0, 1.0, settings.real('alarm_average'), 0.5, 1.0, 2.0,
+            1.0,
+            1.0,
+            settings.real('alarm_average'),
+            0.5,
+            1.0,
+            2.0,
             ChartDesign(settings.real('alarm_block'), 0.5, 1.0, (0.25, 1.0), (17.0, 5.0), 30.0),
-        ),  # fmt: skip
+        ),
         dynamics=(RegionDynamics(180.0, 285.0, 30.0, 5.0, 1.0, 1.0),),
     )
 
