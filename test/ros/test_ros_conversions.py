@@ -26,8 +26,8 @@ from valveflow_msgs.msg import JournalEntry as JournalMessage
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.alarms import AlarmChange, AlarmState, Priority
+from valveflow_ros.core.curve_status import CurveStatus
 from valveflow_ros.core.events import JournalEntry, JournalKind
-from valveflow_ros.core.monitor import CurveStatus
 from valveflow_ros.core.prediction import PredictionBlock, PredictionState
 from valveflow_ros.records import NS_PER_S, Quality, SegmentKind
 from valveflow_ros.records import SpecialSegment as SegmentRecord
@@ -149,13 +149,13 @@ def test_without_a_curve_the_message_says_why_and_gives_no_numbers() -> None:
     assert math.isnan(message.pressure_exponent)
 
 
-@given(times, st.integers(0, 255), texts, texts, st.lists(reals, min_size=6, max_size=6), reals)
+@given(times, st.integers(0, 255), texts, texts, st.lists(reals, min_size=8, max_size=8), reals)
 def test_predictions_made_by_hand_are_what_the_encoder_makes(
-    time_ns: int, state: int, model: str, tag: str, numbers: list[float], limit: float
+    time_ns: int, state: int, model: str, tag: str, numbers: list[float], width: float
 ) -> None:
     columns = [np.array([x]) for x in numbers]
     kinds = np.array([state], dtype=np.uint8)
-    block = PredictionBlock(np.array([time_ns]), *columns, kinds, limit, model)
+    block = PredictionBlock(np.array([time_ns]), *columns, kinds, width, model)
     ((found_ns, data),) = prediction_bytes(block, tag)
     message = deserialize_message(data, Prediction)
     assert found_ns == time_ns
@@ -163,11 +163,14 @@ def test_predictions_made_by_hand_are_what_the_encoder_makes(
     assert (message.header.frame_id, message.model_id, message.state) == (tag, model, state)
     names = (
         'integrated_input', 'measured_mw', 'static_mw', 'dynamic_mw', 'residual_mw', 'average_mw',
+        'alarm_evidence', 'shift_mw',
     )  # fmt: skip
     for name, value in zip(names, numbers, strict=True):
         assert bits(getattr(message, name)) == bits(value), name
-    assert bits(message.limit_high_mw) == bits(limit)
-    assert bits(message.limit_low_mw) == bits(-limit)
+    with np.errstate(all='ignore'):
+        expected = columns[1] - columns[4]
+        assert bits(message.limit_high_mw) == bits(float((expected + width)[0]))
+        assert bits(message.limit_low_mw) == bits(float((expected - width)[0]))
     assert encode(message) == data
 
 

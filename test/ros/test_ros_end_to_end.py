@@ -306,7 +306,7 @@ def a_changed_recording_is_noticed(log: LogContents, folder: Path) -> None:
         result = verify(place)
         assert not result.identical
         assert 'Prediction number 9000 differs' in result.difference
-        field = 'limit_high_mw' if k == 0 else 'measured_mw'
+        field = 'shift_mw' if k == 0 else 'measured_mw'
         assert field in result.difference
 
 

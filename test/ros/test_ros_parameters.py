@@ -168,25 +168,25 @@ def test_from_afar_bad_values_come_back_with_the_sentence(context: Any, node: Mo
     client = asking.create_client(SetParameters, '/valveflow_monitor/set_parameters')
     wait_until(client.service_is_ready, 'the service', 20.0)
     wanted = [
-        ros('alarm_limit_sd', math.nan), ros('alarm_limit_sd', 'high'), ros('unit_tag', 'x'),
-        ros('alarm_limit_sd', None), ros('no_such_thing', 1), ros('alarm_limit_sd', 6),
+        ros('alarm_off_delay', math.nan), ros('alarm_off_delay', 'high'), ros('unit_tag', 'x'),
+        ros('alarm_off_delay', None), ros('no_such_thing', 1), ros('alarm_off_delay', 6),
     ]  # fmt: skip
     request = SetParameters.Request(parameters=[p.to_parameter_msg() for p in wanted])
     future = client.call_async(request)
     wait_until(lambda: executor.spin_once(timeout_sec=0.05) or future.done(), 'the answer', 20.0)
     results = future.result().results
     assert [result.successful for result in results] == [False] * 5 + [True]
-    assert results[0].reason == "Parameter 'alarm_limit_sd' must be from 1 to 100 sd, not nan."
-    assert results[1].reason == "Parameter 'alarm_limit_sd' must be a number, not 'high'."
+    assert results[0].reason == "Parameter 'alarm_off_delay' must be from 0 to 86400 s, not nan."
+    assert results[1].reason == "Parameter 'alarm_off_delay' must be a number, not 'high'."
     assert 'cannot be changed while the monitor runs' in results[2].reason
-    assert 'alarm_limit_sd' in results[3].reason
+    assert 'alarm_off_delay' in results[3].reason
     assert 'no_such_thing' in results[4].reason
-    assert node.settings.real('alarm_limit_sd') == 6.0
+    assert node.settings.real('alarm_off_delay') == 6.0
     describe = asking.create_client(DescribeParameters, '/valveflow_monitor/describe_parameters')
     wait_until(describe.service_is_ready, 'the service', 20.0)
-    future = describe.call_async(DescribeParameters.Request(names=['alarm_limit_sd']))
+    future = describe.call_async(DescribeParameters.Request(names=['alarm_off_delay']))
     wait_until(lambda: executor.spin_once(timeout_sec=0.05) or future.done(), 'the answer', 20.0)
-    assert future.result().descriptors[0].floating_point_range[0].to_value == 100.0
+    assert future.result().descriptors[0].floating_point_range[0].to_value == 86400.0
     executor.shutdown()
     asking.destroy_node()
 

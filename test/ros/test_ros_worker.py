@@ -47,7 +47,8 @@ def test_gives_what_a_fit_in_place_gives_bit_for_bit() -> None:
     with worker(FIT_JOB) as made:
         result = outcome_of(made).result
     assert isinstance(result, Characteristic)
-    assert result == fit(TASK)
+    # NaN is equal to itself here, and to the last bit.
+    assert repr(result) == repr(fit(TASK))
 
 
 @pytest.fixture(scope='module')

@@ -71,7 +71,7 @@ def watch(readings: Readings, settings: Settings, progress: Progress = quiet) ->
             elif isinstance(event, JournalEntry) and event.kind == JournalKind.RESET:
                 segments.clear()
     table, counts = SampleTable.concatenate(tables), aligner.counts()
-    _check_signals(table, counts)
+    check_signals(table, counts)
     if not monitor.segments:
         raise DataError(_no_segment(table, settings, monitor.noise().learnt))
     task = next(e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
@@ -87,7 +87,7 @@ def identify(watched: Watched, progress: Progress = quiet) -> Characteristic:
     return fit(watched.task, lambda what: progress(0.6, what))
 
 
-def _check_signals(table: SampleTable, counts: dict[str, dict[str, int]]) -> None:
+def check_signals(table: SampleTable, counts: dict[str, dict[str, int]]) -> None:
     """Refuse a log in which a needed signal has no usable value, and say which and why."""
     for info in _NEEDED:
         if len(table) and np.isfinite(table.column(info.signal)).any():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,14 @@ from valveflow_ros.cli import engine
 from valveflow_ros.cli.console import Console, Outcome
 from valveflow_ros.cli.first_run import SENTENCE, is_first_run
 from valveflow_ros.cli.log_input import LogInput, steps_of
+from valveflow_ros.cli.manual_test import advice_for, found_in_step_test, refusal
 from valveflow_ros.cli.parameters import settings_for
 from valveflow_ros.cli.report_words import columns, rejected_words
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.characteristic_json import to_json
+from valveflow_ros.core.shift import ShiftLimits, judge_shift
+from valveflow_ros.core.shift_json import shift_json
+from valveflow_ros.errors import DataError
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.answer import explained, opening_gain, temperature_words
 from valveflow_ros.report.identification import identification_report
@@ -34,9 +39,13 @@ from valveflow_ros.report.quality import rejected
 
 
 def found_in(
-    log: LogInput, given: Mapping[str, Any], source: Path, console: Console
+    log: LogInput,
+    given: Mapping[str, Any],
+    source: Path,
+    console: Console,
+    step_test: bool = False,
 ) -> Identified:
-    """Run the engine and the fit.
+    """Run the engine and the fit, or identify a manual step test.
 
     Raises
     ------
@@ -45,18 +54,26 @@ def found_in(
     """
     times = log.readings.time_ns
     span_s = float(times.max() - times.min()) / 1e9 if len(times) else 0.0
+    if step_test:
+        return found_in_step_test(log, given, source, console, span_s)
     settings, notes = settings_for(steps_of(log.readings), span_s, given)
     notes += _constant_notes(log)
     for sentence in notes:
         console.say(sentence)
     if is_first_run():
         console.say(SENTENCE)
-    watched = engine.watch(log.readings, settings, console.progress)
+    try:
+        watched = engine.watch(log.readings, settings, console.progress)
+        characteristic = engine.identify(watched, console.progress)
+    except DataError as error:
+        raise refusal(error, log.readings, settings) from None
     if watched.clock_resets:
         told = 'The clock went back within the log; only what follows the last time counts.'
         console.warn(told)
         notes.append(told)
-    characteristic = engine.identify(watched, console.progress)
+    if told := advice_for(watched.table, settings):
+        console.warn(told)
+        notes.append(told)
     return Identified(
         source=source.name, characteristic=characteristic, table=watched.table,
         segments=watched.segments, counts=watched.counts, settings=settings,
@@ -71,13 +88,31 @@ def _constant_notes(log: LogInput) -> list[str]:
     ]
 
 
+def judged(found: Identified, reference: Characteristic) -> Identified:
+    """Judge the curve against a reference.
+
+    Raises
+    ------
+    DataError
+        The two cannot be compared.
+    """
+    settings = found.settings
+    limits = ShiftLimits(settings.real('shift_confidence'), settings.real('shift_least'))
+    shift = judge_shift(reference, found.characteristic, found.segments, limits)
+    return replace(found, shift=shift, reference=reference)
+
+
 def texts(found: Identified) -> dict[str, str]:
     """Return the files of the result by name."""
     content = json.dumps(to_json(found.characteristic), indent=2, allow_nan=False)
-    return {
+    files = {
         'characteristic.json': content + '\n',
         'report.html': identification_report(found),
     }
+    if found.shift is not None:
+        told = json.dumps(shift_json(found.shift), indent=2, allow_nan=False)
+        files['shift.json'] = told + '\n'
+    return files
 
 
 def outcome(found: Identified, written: Mapping[str, Path], log: LogInput) -> Outcome:
@@ -90,6 +125,7 @@ def outcome(found: Identified, written: Mapping[str, Path], log: LogInput) -> Ou
         'inputs': {SIGNALS[s].topic: name for s, name in log.contents.signals.items()},
         'constants': {SIGNALS[s].topic: value for s, value in log.constants.items()},
         'reading_notes': list(found.notes),
+        **({} if found.shift is None else {'shift': shift_json(found.shift)}),
         'files': {name: str(path) for name, path in written.items()},
     }
     return Outcome(_text(found, written), data)
@@ -110,6 +146,7 @@ def _text(found: Identified, written: Mapping[str, Path]) -> str:
         f'{plain(c.residuals.rmse_mw, 2)} MW.',
         temperature_words(c),
         *c.notes,
+        '' if found.shift is None else f'Against the reference: {found.shift.sentence}',
         rejected_words(found.counts) if rejected(found.counts) else '',
         f'Wrote {written["report.html"]} and {written["characteristic.json"].name}.',
     ]

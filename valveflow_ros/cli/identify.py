@@ -44,6 +44,14 @@ def arguments(parser: ArgumentParser) -> None:
         '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs',
         help='one parameter, such as time_constant=120; stands above the file',
     )  # fmt: skip
+    parser.add_argument(
+        '--reference', metavar='FILE', type=Path,
+        help='a characteristic.json to judge the curve against: DIR gets shift.json',
+    )  # fmt: skip
+    parser.add_argument(
+        '--step-test', action='store_true',
+        help='the log is a manual test: pressure constant, the opening in steps, each held',
+    )  # fmt: skip
     add_mapping(parser)
 
 
@@ -52,15 +60,19 @@ def run(options: Namespace, console: Console) -> Outcome:
     mapping = read_mapping(options.column, options.constant)
     console.progress(0.0, 'starting')
     from valveflow_ros.cli.files import check_folder, write_texts
-    from valveflow_ros.cli.identification import found_in, outcome, texts
+    from valveflow_ros.cli.identification import found_in, judged, outcome, texts
     from valveflow_ros.cli.log_input import open_input
+    from valveflow_ros.cli.model_file import read_model
     from valveflow_ros.cli.parameters import read_parameters
 
     given = read_parameters(options.params, options.pairs)
     check_folder(options.output)
+    reference = read_model(options.reference) if options.reference else None
     console.progress(0.02, 'reading')
     log = open_input(options.log, mapping, console)
-    found: Identified = found_in(log, given, options.log, console)
+    found: Identified = found_in(log, given, options.log, console, options.step_test)
+    if reference is not None:
+        found = judged(found, reference)
     console.progress(0.9, 'writing the report')
     written = write_texts(options.output, texts(found))
     return outcome(found, written, log)

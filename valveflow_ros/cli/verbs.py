@@ -16,6 +16,10 @@ VERBS: tuple[tuple[str, str, str], ...] = (
     ('import', 'import_table', 'a historian table becomes a log'),
     ('info', 'info', 'what is in a log, and is it any good'),
     ('identify', 'identify', 'find the flow characteristic'),
+    ('diagnose', 'diagnose', 'what the simulation gets wrong, and why'),
+    ('validate', 'validate', 'hold a characteristic against other days'),
+    ('compare', 'compare', 'the proposed method beside two of the literature'),
+    ('compensate', 'compensate', 'the inverse curve as a table for the turbine controller'),
     ('export', 'export', 'a log becomes a table'),
     ('recover', 'recover', 'repair a broken recording'),
 )

@@ -132,14 +132,27 @@ def pieces_table(data: Identified) -> str:
                 with_error(piece.intercept, piece.intercept_stderr),
                 plain(gain, 3) + at,
                 count(piece.samples),
+                *_rests(c, k),
             ]
         )
     head = [
         'piece', f'u ({input_unit(c.pressure_exponent)})', 'power (MW)',
         'slope ± standard error (MW per unit of u)', 'intercept ± standard error (MW)',
-        'MW per 1 % of opening', 'samples',
+        'MW per 1 % of opening', 'samples', *(['rests on'] if c.support else []),
     ]  # fmt: skip
     return table(head, rows)
+
+
+def _rests(c: Characteristic, k: int) -> list[str]:
+    """Return what a piece rests on, as a cell of the table; none where it is not known."""
+    if not c.support:
+        return []
+    found = c.support[k]
+    said = (
+        f'{counted(found.steady, "steady state")} at {counted(len(found.levels), "level")}, '
+        f'{counted(found.slope_response, "slope response")}'
+    )
+    return [said if found.identifiable else f'<b>not identifiable by itself</b>: {said}']
 
 
 def _ends(piece: Piece) -> FloatArray:

@@ -11,7 +11,15 @@ from valveflow_ros.core.characteristic import Choice
 from valveflow_ros.records import FloatArray
 from valveflow_ros.report.figure import Figure, Spec, rounded, token
 from valveflow_ros.report.numbers import plain
+from valveflow_ros.report.page import paragraph, table
 
+_KEPT = {
+    'prediction_error': 'the number kept is the one that predicts all samples best once the '
+    'dynamics are known',
+    'evidence': 'the number kept is the one that makes the special samples most probable, their '
+    'noise considered',
+}
+_LEAST_SHOWN = 0.005  # probability of a number of pieces worth a row
 # Mantissas of the ticks, the coarsest first.
 _STEPS = (
     [1.0, 2.0, 5.0],
@@ -59,6 +67,26 @@ def choice_figure(choice: Choice, chosen: int) -> Figure:
     return Figure('choice', _caption(choice, chosen), _description(choice, chosen), traces, layout)
 
 
+def confidence_table(choice: Choice) -> str:
+    """Return how probable each number of pieces is; empty where the rule has no confidence."""
+    likely = {j: p for j, p in sorted(choice.confidence.items()) if p >= _LEAST_SHOWN}
+    if not likely:
+        return ''
+    rows = [[str(j), _percent(p)] for j, p in likely.items()]
+    rest = sum(p for p in choice.confidence.values() if p < _LEAST_SHOWN)
+    words = paragraph(
+        'How probable each number of pieces is, given these data and their noise; all others '
+        f'together {_percent(rest)}.'
+    )
+    return words + table(['number of pieces J', 'probability'], rows)
+
+
+def _percent(share: float) -> str:
+    if share > 0.9995:
+        return 'more than 99.9 %'
+    return 'less than 0.1 %' if share < 0.0005 else f'{100.0 * share:.1f} %'
+
+
 def _ticks(costs: FloatArray) -> Spec:
     """Return round ticks for a logarithmic axis, at least three where there is room."""
     costs = costs[costs > 0.0]
@@ -95,10 +123,8 @@ def _caption(choice: Choice, chosen: int) -> str:
     )
     sharpest = max(choice.turning_angle, key=lambda j: choice.turning_angle[j], default=chosen)
     if choice.rule != 'paper' and sharpest != chosen:
-        words += (
-            f'It turns most sharply at J = {sharpest}; the number kept is the one that predicts '
-            'all samples best once the dynamics are known. '
-        )
+        kept = _KEPT.get(choice.rule, 'another number was kept')
+        words += f'It turns most sharply at J = {sharpest}; {kept}. '
     words += f'<b>Chosen: J = {chosen}.</b>'
     if choice.note:
         words += f' {escape(choice.note)}'

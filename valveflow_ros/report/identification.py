@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from valveflow_ros import __version__
 from valveflow_ros.config import PARAMETERS
+from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.step_test import RULE
 from valveflow_ros.report.answer import (
     answer_words,
     breakpoints_table,
@@ -11,13 +13,14 @@ from valveflow_ros.report.answer import (
     temperature_words,
     window_words,
 )
-from valveflow_ros.report.choice import choice_figure
+from valveflow_ros.report.choice import choice_figure, confidence_table
 from valveflow_ros.report.curve import curve_figure
 from valveflow_ros.report.dynamics import dynamics_figure, dynamics_table
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.numbers import moment, plain
 from valveflow_ros.report.page import Section, page, paragraph, table, text
 from valveflow_ros.report.quality import quality_table, quality_words
+from valveflow_ros.report.shift import shift_section
 from valveflow_ros.report.signals import signals_figure
 
 
@@ -33,8 +36,9 @@ def identification_report(data: Identified) -> str:
     )
     sections = [
         _answer(data),
+        *([shift] if (shift := shift_section(data)) else []),
         Section('The moments that carry it', [signals_figure(data)]),
-        Section('Why this number of pieces', [choice_figure(c.choice, max(1, len(c.pieces)))]),
+        _choice(c),
         _dynamics(data),
         Section('The data', [quality_words(data), quality_table(data), _read(data)]),
         Section('How it was made', [_settings(data)]),
@@ -51,6 +55,16 @@ def _answer(data: Identified) -> Section:
     return Section(
         'The answer',
         [answer_words(data), pieces_table(data), curve_figure(data), breakpoints_table(c)],
+    )
+
+
+def _choice(c: Characteristic) -> Section:
+    """Return why there are so many pieces; without a turning angle there is nothing to draw."""
+    number = max(1, len(c.pieces))
+    if not c.choice.turning_angle and c.choice.rule == RULE:
+        return Section('Why this number of pieces', [paragraph(text(c.choice.note))])
+    return Section(
+        'Why this number of pieces', [choice_figure(c.choice, number), confidence_table(c.choice)]
     )
 
 

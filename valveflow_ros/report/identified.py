@@ -9,6 +9,7 @@ import numpy as np
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.shift import Shift
 from valveflow_ros.core.units import integrated_input
 from valveflow_ros.records import (
     FloatArray,
@@ -39,6 +40,9 @@ class Identified:
     settings : Settings
     notes : tuple of str
         Sentences about how the data were read, for a person.
+    shift : Shift, optional
+        The judgement against ``reference``, where there was one.
+    reference : Characteristic, optional
     u : float64 (n,)
         Integrated input of each row, made from the table.
     rows : int64 (k, 2)
@@ -54,6 +58,8 @@ class Identified:
     counts: Mapping[str, Mapping[str, int]]
     settings: Settings
     notes: tuple[str, ...] = ()
+    shift: Shift | None = None
+    reference: Characteristic | None = None
     u: FloatArray = field(init=False)
     rows: IntArray = field(init=False)
     special: IntArray = field(init=False)

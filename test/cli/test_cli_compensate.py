@@ -1,0 +1,160 @@
+"""``valveflow compensate``: the table, its checks, and what is refused."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+KNOTS = [1060.0, 1250.0, 1600.0, 1900.0, 2280.0]
+SLOPES = [0.24, 0.18, 0.09, 0.01]
+
+
+def content(slopes=SLOPES, **changes):
+    """Return a characteristic.json as another program would write it."""
+    pieces, value = [], 150.0
+    for k, slope in enumerate(slopes):
+        pieces.append(
+            {'u_from': KNOTS[k], 'u_to': KNOTS[k + 1], 'slope': slope,
+             'intercept': value - slope * KNOTS[k], 'slope_stderr': 5e-4,
+             'intercept_stderr': 0.8, 'samples': 1000}
+        )  # fmt: skip
+        value += slope * (KNOTS[k + 1] - KNOTS[k])
+    return {
+        'format': 'valveflow/characteristic', 'version': 1, 'pressure_exponent': 1.125,
+        'pieces': pieces, 'breakpoint_intervals': [[None, None]] * (len(slopes) - 1),
+        'selection': {'rule': 'paper', 'cost': {}, 'turning_angle': {}},
+        'segments': {'steady': 1, 'slope_response': 1, 'samples': 4000}, 'dynamics': [],
+        'optimal': True, **changes,
+    }  # fmt: skip
+
+
+@pytest.fixture
+def model(tmp_path):
+    def write(*args, **changes):
+        path = tmp_path / 'characteristic.json'
+        path.write_text(json.dumps(content(*args, **changes)), encoding='utf-8')
+        return path
+
+    return write
+
+
+def rows_of(path):
+    with path.open(newline='') as file:
+        return [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
+
+
+def test_the_table_brings_back_the_power(run, model, tmp_path):
+    table = tmp_path / 'table.csv'
+    ran = run('compensate', '--model', model(), '-o', table, '--pressure', '16.7')
+    assert ran.status == 0, ran.err
+    rows = rows_of(table)
+    assert len(rows) == 16
+    power, u = (np.array([row[name] for row in rows]) for name in ('power_mw', 'u'))
+    knots_mw = 150.0 + np.concatenate([[0.0], np.cumsum(np.diff(KNOTS) * SLOPES)])
+    asked = np.linspace(knots_mw[0], knots_mw[-1], 500)
+    got = np.interp(np.interp(asked, power, u), KNOTS, knots_mw)
+    assert got == pytest.approx(asked, abs=2e-3)
+    opening = np.array([row['opening_percent_at_16.7_mpa'] for row in rows])
+    assert opening == pytest.approx(u / 16.7**1.125, abs=1e-5)
+    assert [row['within_gain_limit'] for row in rows] == (u < 1900.0).astype(float).tolist()
+    assert all(row['u_stderr'] > 0.0 for row in rows)
+    assert 'Piece 4' in ran.err
+    assert 'Checked: F(F^-1(x)) differs from x by at most' in ran.out
+    assert 'Below 150.00 MW and above' in ran.out
+
+
+def test_programs_get_the_same_numbers(run, model, tmp_path):
+    table = tmp_path / 'table.parquet'
+    ran = run('compensate', '--model', model(), '-o', table, '--points', '7', '--json',
+              '--pressure', '12', '--pressure', '16.7')  # fmt: skip
+    columns = pq.read_table(table).to_pydict()
+    assert ran.json['columns'] == columns
+    assert list(columns) == [
+        'power_mw',
+        'u',
+        'u_stderr',
+        'gain_u_per_mw',
+        'within_gain_limit',
+        'opening_percent_at_12_mpa',
+        'opening_percent_at_16.7_mpa',
+    ]
+    assert ran.json['checks']['passed'] is True
+    assert ran.json['useful_mw'] == pytest.approx([150.0, 285.6])
+    # 2280 at 12 MPa would be 139 %: the valve is fully open before the table ends.
+    assert ran.json['full_opening_mw']['12'] == pytest.approx(
+        np.interp(100.0 * 12.0**1.125, KNOTS, [150.0, 195.6, 258.6, 285.6, 289.4])
+    )
+    assert ran.json['full_opening_mw']['16.7'] is None
+    assert ran.json['power_limits_mw'] == pytest.approx([150.0, 289.4])
+
+
+def test_a_short_table_says_what_it_costs(run, model, tmp_path):
+    ran = run('compensate', '--model', model(), '-o', tmp_path / 't.csv', '--points', '3')
+    assert ran.status == 0
+    assert '5 points would make the table exact' in ran.err
+    assert 'Not within tolerance' in ran.out
+    wide = run('compensate', '--model', model(), '-o', tmp_path / 't.csv', '--points', '3',
+               '--tolerance', '50', '--overwrite', '--json')  # fmt: skip
+    assert wide.json['checks']['passed'] is True
+    assert wide.json['checks']['table_mw'] > 1.0
+
+
+def test_a_falling_piece_is_refused_and_can_be_left_out(run, model, tmp_path):
+    path, table = model([0.24, 0.18, 0.09, -0.01]), tmp_path / 't.csv'
+    said = run('compensate', '--model', path, '-o', table).refused()
+    assert 'piece 4 (u 1900.0 to 2280.0) falls' in said
+    assert not table.exists()
+    ran = run('compensate', '--model', path, '-o', table, '--u-to', '1900')
+    assert ran.status == 0, ran.err
+    assert rows_of(table)[-1]['u'] == 1900.0
+
+
+def test_a_gain_limit_of_ones_own(run, model, tmp_path):
+    ran = run('compensate', '--model', model(), '-o', tmp_path / 't.csv', '--max-gain', '6',
+              '--json')  # fmt: skip
+    assert ran.json['useful_mw'] == pytest.approx([150.0, 258.6])
+    none = run('compensate', '--model', model(), '-o', tmp_path / 't2.csv', '--max-gain', '1')
+    assert 'Nowhere is the gain within its limit' in none.out
+
+
+@pytest.mark.parametrize(
+    ('words', 'said'),
+    [
+        (['--points', '1'], 'from 2 to 10000'),
+        (['--pressure', '0'], 'from 0.05 to 40 MPa'),
+        (['--max-gain', '-1'], 'above 0'),
+        (['--u-from', 'nan'], 'must be a number'),
+        (['--points', 'many'], 'many'),
+    ],
+)
+def test_wrong_options_are_wrong_usage(run, model, tmp_path, words, said):
+    ran = run('compensate', '--model', model(), '-o', tmp_path / 't.csv', *words)
+    assert said in ran.refused(2)
+
+
+def test_what_is_no_curve_is_refused(run, model, tmp_path):
+    table = tmp_path / 't.csv'
+    bad = tmp_path / 'bad.json'
+    for text, said in (
+        ('no json', 'holds no JSON'),
+        ('{"format": "other"}', "'format' must be"),
+        (json.dumps({**content(), 'pieces': []}), "'pieces' is empty"),
+        ('[' * 100_000, 'holds no JSON'),
+    ):
+        bad.write_text(text, encoding='utf-8')
+        assert said in run('compensate', '--model', bad, '-o', table).refused()
+    gone = run('compensate', '--model', tmp_path / 'gone.json', '-o', table)
+    assert 'gone.json: cannot be read' in gone.refused()
+    assert 'must end in .csv' in run('compensate', '--model', model(), '-o', 'a.txt').refused()
+    outside = run('compensate', '--model', model(), '-o', table, '--u-from', '3000')
+    assert 'nothing of it lies between' in outside.refused()
+    table.write_text('mine', encoding='utf-8')
+    assert 'exists already' in run('compensate', '--model', model(), '-o', table).refused()
+    assert table.read_text(encoding='utf-8') == 'mine'
+    # The folder of a result stands for the curve in it.
+    ran = run('compensate', '--model', model().parent, '-o', table, '--overwrite')
+    assert ran.status == 0

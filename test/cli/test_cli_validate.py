@@ -1,0 +1,161 @@
+"""``valveflow validate``: a characteristic held against a log."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+
+import pytest
+
+pytestmark = pytest.mark.skipif(
+    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
+)
+SEGMENTS = {'steady': 40, 'slope_response': 10, 'samples': 20000}
+
+
+def characteristic(shift_mw=0.0, knots=(1000.0, 1250.0, 1600.0, 1900.0, 2600.0), exponent=1.125):
+    """Return the paper's true curve as a characteristic, lifted by ``shift_mw``."""
+    slopes, intercepts = (0.24, 0.18, 0.09, 0.01), (-100.0, -25.0, 119.0, 271.0)
+    regions = [(100.0, 240.0, 10.0, 3.0), (240.0, 320.0, 80.0, 10.0)]
+    return {
+        'format': 'valveflow/characteristic', 'version': 1, 'model_id': f'shift{shift_mw:g}',
+        'pressure_exponent': exponent,
+        'pieces': [
+            {
+                'u_from': knots[k], 'u_to': knots[k + 1], 'slope': slopes[k],
+                'intercept': intercepts[k] + shift_mw, 'slope_stderr': 0.001,
+                'intercept_stderr': 1.0, 'samples': 5000,
+            }
+            for k in range(4)
+        ],
+        'breakpoint_intervals': [[None, None]] * 3,
+        'selection': {'rule': 'paper', 'cost': {}, 'turning_angle': {}},
+        'segments': SEGMENTS,
+        'dynamics': [
+            {'power_from': a, 'power_to': b, 'time_constant_s': t, 'delay_s': d}
+            for a, b, t, d in regions
+        ],
+    }  # fmt: skip
+
+
+@pytest.fixture
+def model(tmp_path):
+    def write(name='model.json', **changes):
+        path = tmp_path / name
+        path.write_text(json.dumps(characteristic(**changes)))
+        return path
+
+    return write
+
+
+def test_the_true_curve_holds_on_its_plant(run, logs, model, tmp_path):
+    ran = run(
+        'validate', logs / 'plant.mcap', '--model', model(), '-o', tmp_path / 'out',
+        '--tolerance', '3',
+    )  # fmt: skip
+    assert ran.status == 0, ran.err
+    content = json.loads((tmp_path / 'out' / 'validation.json').read_text())
+    assert (content['format'], content['version']) == ('valveflow/validation', 1)
+    # Ten hours hold few segments a piece, so that some may stay open; none may be off.
+    assert content['verdict'] in ('holds', 'open')
+    assert content['judged_by'] == 'simulated'
+    low, high = content['overall']['interval_mw']
+    assert low < 0.7
+    assert high > -0.7
+    # 2 MW slow and 2.2 MW white noise are 8.8 MW^2.
+    assert 5.0 < content['totals']['simulated']['mse_mw2'] < 14.0
+    assert sorted(p.name for p in (tmp_path / 'out').iterdir()) == [
+        'report.html', 'segments.csv', 'validation.json',
+    ]  # fmt: skip
+    with (tmp_path / 'out' / 'segments.csv').open(newline='') as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == content['judged']['segments']
+    page = (tmp_path / 'out' / 'report.html').read_text()
+    for sentence in content['words']:
+        assert sentence in ran.out
+        assert sentence.split('.')[0].replace("'", '&#x27;') in page
+    assert re.search(r'\bnan\b', ran.out) is None
+    assert '\r' not in ran.err
+
+
+def test_a_wrong_curve_is_off_and_the_right_one_better(run, logs, model, tmp_path):
+    ran = run(
+        'validate', logs / 'plant.csv', '--model', model(shift_mw=6.0), '-o', tmp_path / 'out',
+        '--against', model('true.json'), '--json',
+    )  # fmt: skip
+    content = ran.json
+    assert content['verdict'] == 'off'
+    assert content['overall']['mean_difference_mw']['mean'] == pytest.approx(-6.0, abs=1.0)
+    assert content['gain_over_against_mw2']['mean'] == pytest.approx(-36.0, abs=12.0)
+    assert 'true.json is better' in ' '.join(content['words'])
+    assert (content['model_id'], content['against_model_id']) == ('shift6', 'shift0')
+    assert 'segments' not in content
+
+
+def test_a_curve_that_is_too_short_is_flagged(run, logs, model, tmp_path):
+    knots = (1000.0, 1100.0, 1200.0, 1300.0, 1500.0)
+    ran = run('validate', logs / 'plant.csv', '--model', model(knots=knots), '-o', tmp_path / 'o')
+    assert ran.status == 0, ran.err
+    content = json.loads((tmp_path / 'o' / 'validation.json').read_text())
+    assert 0.05 < content['outside_share'] < 1.0
+    assert 'Warning: ' in ran.err
+    assert 'beyond the ends' in ran.err
+    assert 'class="notice"' in (tmp_path / 'o' / 'report.html').read_text()
+
+
+def test_a_curve_for_other_inputs_is_refused_with_both_ranges(run, logs, model, tmp_path):
+    knots = (5000.0, 5100.0, 5200.0, 5300.0, 5500.0)
+    said = run(
+        'validate', logs / 'plant.csv', '--model', model(knots=knots), '-o', tmp_path / 'o'
+    ).refused()
+    assert 'beyond what the curve is known for' in said
+    assert not (tmp_path / 'o').exists()
+
+
+def test_the_exponent_is_the_models(run, logs, model, tmp_path):
+    path = model(exponent=1.0)
+    said = run(
+        'validate', logs / 'plant.csv', '--model', path, '-o', tmp_path / 'o',
+        '--set', 'pressure_exponent=1.125',
+    ).refused(status=2)  # fmt: skip
+    assert 'V p^1,' in said
+    assert 'the model decides' in said
+    said = run(
+        'validate', logs / 'plant.csv', '--model', path, '-o', tmp_path / 'o',
+        '--against', model('other.json', knots=(100.0, 120.0, 140.0, 160.0, 3000.0)),
+    ).refused()  # fmt: skip
+    assert 'different inputs' in said or 'beyond what the curve' in said
+
+
+@pytest.mark.parametrize(
+    ('content', 'part'),
+    [(None, 'cannot be read'), ('{', 'holds no JSON'), ('{"format": "x"}', 'no flow char')],
+)
+def test_an_unreadable_model_is_refused(run, logs, tmp_path, content, part):
+    path = tmp_path / 'model.json'
+    if content is not None:
+        path.write_text(content)
+    said = run('validate', logs / 'plant.csv', '--model', path, '-o', tmp_path / 'o').refused()
+    assert part in said
+    assert 'model.json' in said
+
+
+def test_a_log_without_segments_is_refused_with_what_would_help(run, model, tmp_path):
+    assert run('simulate', '-o', tmp_path / 'a.csv', '--days', '0.02').status == 0
+    said = run('validate', tmp_path / 'a.csv', '--model', model(), '-o', tmp_path / 'o').refused()
+    assert said.startswith('valveflow: a.csv: ')
+    assert 'No steady-state or slope-response segment' in said
+
+
+@pytest.mark.parametrize('words', [['--tolerance', '0'], ['--tolerance', 'x'], []])
+def test_wrong_usage(run, logs, model, tmp_path, words):
+    options = ['--model', model(), *words] if words else []
+    run('validate', logs / 'plant.csv', '-o', tmp_path / 'o', *options).refused(status=2)
+
+
+def test_help_has_an_example(run):
+    ran = run('validate', '--help')
+    assert ran.status == 0
+    assert 'valveflow validate other.mcap --model result/characteristic.json' in ran.out

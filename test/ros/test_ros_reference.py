@@ -1,0 +1,289 @@
+"""The reference in the node: its file, its service, its messages, its recording."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from ros_helpers import PATIENCE_S, Processes, wait_until
+from std_srvs.srv import Trigger
+from valveflow_msgs.msg import Alarm, FlowCharacteristic
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.alarms import AlarmState
+from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.characteristic_json import to_json
+from valveflow_ros.core.curve_status import CurveStatus
+from valveflow_ros.core.events import CurveAdopted, Event, JournalEntry, JournalKind, ReferenceSet
+from valveflow_ros.core.monitor import Monitor
+from valveflow_ros.core.offline import JournalReplayer, feed_rows
+from valveflow_ros.core.shift import judge_shift
+from valveflow_ros.errors import DataError, ParameterError
+from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
+from valveflow_ros.ros import conversions
+from valveflow_ros.ros.demo_processes import ros_arguments
+from valveflow_ros.ros.outputs import Outputs
+from valveflow_ros.ros.reference_file import reference_of
+from valveflow_ros.ros.verify import verify
+from valveflow_ros.ros.work_health import reference_item
+
+MONITOR = '/valveflow_monitor'
+LATCHED = QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+SETTINGS = Settings({'refit_period': 3600.0, 'refit_segments': 0, 'alarm_limit': 500.0})
+TABLE = simulate(0.3, 7).table
+
+
+@pytest.fixture(scope='module')
+def curve() -> Characteristic:
+    monitor = Monitor(SETTINGS)
+    feed_rows(monitor, TABLE)
+    assert monitor.characteristic is not None
+    return monitor.characteristic
+
+
+def lifted(curve: Characteristic, by_mw: float) -> Characteristic:
+    pieces = tuple(replace(p, intercept=p.intercept + by_mw) for p in curve.pieces)
+    return replace(curve, pieces=pieces, model_id='lifted')
+
+
+# --- messages ---------------------------------------------------------------------------------
+
+
+def test_without_a_reference_nothing_is_said_of_a_shift(curve: Characteristic) -> None:
+    message = conversions.characteristic(curve, CurveStatus.FRESH, '', 'u')
+    assert message.reference_model_id == message.shift_sentence == ''
+    assert list(message.shift_mw) == list(message.shift_confidence) == []
+    assert conversions.from_time(message.shift_since) == 0
+
+
+def test_the_reference_itself_has_not_moved(curve: Characteristic) -> None:
+    message = conversions.characteristic(curve, CurveStatus.FRESH, '', 'u', curve.model_id)
+    assert list(message.shift_mw) == list(message.shift_confidence) == [0.0] * len(curve.pieces)
+    other = conversions.characteristic(curve, CurveStatus.FRESH, '', 'u', 'another')
+    assert all(math.isnan(v) for v in [*other.shift_mw, *other.shift_confidence])
+    assert len(other.shift_mw) == len(curve.pieces)
+    none = conversions.characteristic(None, CurveStatus.UNKNOWN, 'why', 'u', 'another')
+    assert (none.reference_model_id, list(none.shift_mw)) == ('another', [])
+
+
+def test_a_judgement_stands_in_the_message(curve: Characteristic) -> None:
+    shift = replace(
+        judge_shift(lifted(curve, 5.0), curve),
+        since_ns=DEFAULT_START_NS, since_low_ns=DEFAULT_START_NS - 1,
+        since_high_ns=DEFAULT_START_NS + 1,
+    )  # fmt: skip
+    message = conversions.characteristic(curve, CurveStatus.FRESH, '', 'u', 'lifted', shift)
+    assert list(message.shift_mw) == pytest.approx([-5.0] * len(curve.pieces))
+    assert list(message.shift_confidence) == [p.confidence for p in shift.pieces]
+    assert message.shift_sentence == shift.sentence
+    assert conversions.from_time(message.shift_since) == DEFAULT_START_NS
+    assert conversions.from_time(message.shift_since_low) == DEFAULT_START_NS - 1
+    assert conversions.from_time(message.shift_since_high) == DEFAULT_START_NS + 1
+
+
+def test_outputs_follow_the_events(curve: Characteristic) -> None:
+    outputs = Outputs('u')
+    said = list(outputs.of([ReferenceSet(lifted(curve, 5.0))]))
+    assert [o.name for o in said] == ['characteristic', 'breakpoints', 'slopes']
+    shift = judge_shift(lifted(curve, 5.0), curve)
+    list(outputs.of([CurveAdopted(curve, shift)]))
+    assert (outputs.reference_id, outputs.shift) == ('lifted', shift)
+    list(outputs.of([CurveAdopted(curve)]))
+    assert outputs.shift is None
+
+
+def test_a_run_with_references_is_repeated_byte_for_byte(curve: Characteristic) -> None:
+    """As `verify` does it: rows and journal again, every message compared."""
+    monitor = Monitor(SETTINGS)
+    calls: list[list[Event]] = [monitor.set_reference(lifted(curve, 5.0))]
+    third = len(TABLE) // 3
+    for k in range(3):
+        calls.append(feed_rows(monitor, TABLE.part(k * third, (k + 1) * third)))
+        if k == 1:
+            calls.append(monitor.acknowledge())
+            calls.append(monitor.set_reference())
+    events = [event for call in calls for event in call]
+    kinds = [e.kind for e in events if isinstance(e, JournalEntry)]
+    assert kinds.count(JournalKind.SET_REFERENCE) == 2
+    assert JournalKind.ACKNOWLEDGE in kinds
+    first, second = Outputs('u'), Outputs('u')
+    live = [o for call in calls for o in first.of(call)]
+    # Through messages and back, as a recording keeps the journal.
+    journal = [
+        conversions.journal_entry(conversions.journal(e, 'u'))
+        for e in events
+        if isinstance(e, JournalEntry)
+    ]
+    replayer = JournalReplayer(Monitor(SETTINGS), journal)
+    again = [
+        o
+        for start in range(0, 3 * third, 777)
+        for o in second.of(replayer.feed(TABLE.part(start, min(start + 777, 3 * third))))
+    ]
+    again += second.of(replayer.feed(TABLE.part(0, 0)))
+    assert [(o.name, o.time_ns) for o in again] == [(o.name, o.time_ns) for o in live]
+    assert [o.data for o in again] == [o.data for o in live]
+    assert any(o.name == 'alarms' for o in live)
+
+
+# --- health and file --------------------------------------------------------------------------
+
+
+def test_health_says_how_the_curve_stands_to_its_reference(curve: Characteristic) -> None:
+    monitor = Monitor(SETTINGS)
+    assert 'No reference was set' in reference_item(monitor).sentence
+    monitor.set_reference(lifted(curve, 5.0))
+    assert 'The next curve is judged' in reference_item(monitor).sentence
+    feed_rows(monitor, TABLE)
+    item = reference_item(monitor)
+    assert item.values['Alarm'] == 'unacknowledged'
+    assert 'less than the reference' in item.sentence
+    monitor.acknowledge()
+    monitor.set_reference()
+    assert monitor.reference.alarm.state == AlarmState.NORMAL
+
+
+def test_a_reference_is_read_from_its_file(curve: Characteristic, tmp_path: Path) -> None:
+    assert reference_of(Settings()) is None
+    path = tmp_path / 'characteristic.json'
+    path.write_text(json.dumps(to_json(curve)), encoding='utf-8')
+    read = reference_of(Settings({'reference_file': str(path)}))
+    assert read is not None
+    assert to_json(read) == to_json(curve)
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('{', 'cannot be used'),
+        ('{"format": "x"}', "'format' must be"),
+        (None, 'no such file'),
+        ('\udcff', 'cannot be used'),
+    ],
+)
+def test_a_bad_file_is_refused_with_a_sentence(
+    tmp_path: Path, text: str | None, said: str
+) -> None:
+    path = tmp_path / 'characteristic.json'
+    if text is not None:
+        path.write_text(text, encoding='utf-8', errors='surrogateescape')
+    with pytest.raises(ParameterError) as caught:
+        reference_of(Settings({'reference_file': str(path)}))
+    assert said in str(caught.value)
+    assert str(caught.value).startswith("Parameter 'reference_file' names")
+
+
+def test_a_file_for_another_exponent_is_refused(curve: Characteristic, tmp_path: Path) -> None:
+    path = tmp_path / 'characteristic.json'
+    path.write_text(json.dumps(to_json(curve)), encoding='utf-8')
+    settings = Settings({'reference_file': str(path), 'pressure_exponent': 1.0})
+    with pytest.raises(ParameterError, match=r'the pressure exponent 1\.125'):
+        reference_of(settings)
+
+
+# --- the node ---------------------------------------------------------------------------------
+
+
+class Listener:
+    """Hears curves and alarms, and calls services."""
+
+    def __init__(self, context: Any) -> None:
+        self.node = Node('reference_listener', context=context)
+        self.executor = SingleThreadedExecutor(context=context)
+        self.executor.add_node(self.node)
+        self.curves: list[FlowCharacteristic] = []
+        self.alarms: list[Alarm] = []
+        subscribe = self.node.create_subscription
+        subscribe(FlowCharacteristic, f'{MONITOR}/characteristic', self.curves.append, LATCHED)
+        subscribe(Alarm, f'{MONITOR}/alarms', self.alarms.append, LATCHED)
+
+    def until(self, condition: Any, what: str) -> Any:
+        return wait_until(
+            lambda: self.executor.spin_once(timeout_sec=0.02) or condition(), what, PATIENCE_S
+        )
+
+    def trigger(self, name: str) -> Any:
+        client = self.node.create_client(Trigger, f'{MONITOR}/{name}')
+        self.until(client.service_is_ready, name)
+        future = client.call_async(Trigger.Request())
+        return self.until(lambda: future.done() and future.result(), name)
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+def test_the_node_judges_curves_and_its_recording_repeats(
+    processes: Processes, context: Any, curve: Characteristic, tmp_path: Path
+) -> None:
+    given = tmp_path / 'reference.json'
+    given.write_text(json.dumps(to_json(lifted(curve, 12.0))), encoding='utf-8')
+    parameters = {
+        'record_directory': f'"{tmp_path / "recordings"}"', 'unit_tag': '"unit"',
+        'input_reliability': 'reliable', 'refit_period': 3600.0, 'refit_segments': 0,
+        'reference_file': f'"{given}"', 'alarm_limit': 500.0, 'use_sim_time': True,
+    }  # fmt: skip
+    monitor = processes.start('valveflow_ros.ros.monitor_main', *ros_arguments(parameters))
+    listener = Listener(context)
+    listener.until(
+        lambda: listener.curves and listener.curves[-1].reference_model_id == 'lifted',
+        'the reference that was given',
+    )
+    refused = listener.trigger('set_reference')
+    assert not refused.success
+    assert 'no curve that could become the reference' in refused.message
+    plant = processes.start(
+        'valveflow_ros.ros.simulator_main',
+        *ros_arguments({'seed': 7, 'rate': 0.0, 'wait': PATIENCE_S, 'days': 0.1,
+                        'use_clock': True}),
+    )  # fmt: skip
+    listener.until(lambda: plant.poll() is not None, 'the end of the plant')
+    raised = listener.until(
+        lambda: [a for a in listener.alarms if a.name == 'curve_shift'], 'the alarm on the shift'
+    )
+    assert raised[0].state == Alarm.UNACKNOWLEDGED
+    assert 'less than the reference' in raised[0].sentence
+    moved = listener.until(lambda: [m for m in listener.curves if m.shift_sentence], 'the shift')
+    assert len(moved[-1].shift_mw) == moved[-1].pieces
+    assert min(moved[-1].shift_mw) < -5.0
+    assert listener.trigger('acknowledge_alarms').success
+    answer = listener.trigger('set_reference')
+    assert answer.success
+    model_id = listener.curves[-1].model_id
+    assert model_id in answer.message
+    listener.until(lambda: listener.curves[-1].reference_model_id == model_id, 'its message')
+    assert set(listener.curves[-1].shift_mw) == {0.0}
+    listener.until(lambda: listener.alarms[-1].state == Alarm.NORMAL, 'the end of the alarm')
+    monitor.terminate()
+    assert monitor.wait(10.0) == 0, processes.output(monitor)
+    assert 'Traceback' not in processes.output(monitor)
+    (folder,) = (tmp_path / 'recordings').iterdir()
+    result = verify(folder)
+    assert result.identical, result.difference
+    assert result.compared['journal'] >= 5
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+def test_a_bad_reference_keeps_the_node_from_starting(
+    processes: Processes, tmp_path: Path
+) -> None:
+    gone = tmp_path / 'gone.json'
+    monitor = processes.start(
+        'valveflow_ros.ros.monitor_main',
+        *ros_arguments({'reference_file': f'"{gone}"', 'record': False}),
+    )
+    said = "names '" + str(gone)
+    wait_until(lambda: said in processes.output(monitor), 'the sentence')
+    assert 'Traceback' not in processes.output(monitor)
+
+
+def test_what_cannot_be_replayed_is_said() -> None:
+    entry = JournalEntry(0, JournalKind.SET_REFERENCE, 0, 0, 'x', '')
+    with pytest.raises(DataError, match='no curve that could become the reference'):
+        JournalReplayer(Monitor(SETTINGS), [entry]).feed(TABLE.part(0, 3))

@@ -1,0 +1,77 @@
+"""``valveflow validate``: does a characteristic hold on other days."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from pathlib import Path
+
+from valveflow_ros.cli.console import Console, Outcome
+from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
+
+_DESCRIPTION = """\
+Hold a characteristic against a log it was not made from: in each steady-state and
+slope-response segment of the log, how far is the measured power from the predicted one?
+Says whether the curve holds, is off (and on which piece), or cannot be told. DIR gets
+report.html for people, validation.json and segments.csv for programs.
+
+example:
+  valveflow validate other.mcap --model result/characteristic.json -o checked"""
+
+
+def _positive(words: str) -> float:
+    value = float(words)
+    if not 0.0 < value <= 1e4:
+        raise ArgumentTypeError(f'must be above 0 and at most 10000 MW, not {words}')
+    return value
+
+
+def arguments(parser: ArgumentParser) -> None:
+    """Add description, example and options."""
+    parser.description = _DESCRIPTION
+    parser.usage = 'valveflow validate LOG --model FILE -o DIR [options]'
+    parser.epilog = MAPPING_HELP
+    parser.add_argument('log', metavar='LOG', type=Path, help='the log to judge by')
+    parser.add_argument(
+        '--model', metavar='FILE', type=Path, required=True,
+        help='a characteristic.json, as identify writes it',
+    )  # fmt: skip
+    parser.add_argument(
+        '-o', '--output', metavar='DIR', type=Path, required=True,
+        help='folder for the results, made if absent',
+    )  # fmt: skip
+    parser.add_argument(
+        '--against', metavar='FILE', type=Path,
+        help='a second characteristic.json, to see which of the two is better',
+    )  # fmt: skip
+    parser.add_argument(
+        '--tolerance', metavar='MW', type=_positive,
+        help='a mean difference that does not matter (default: the parameter alarm_floor, 1 MW)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--params', metavar='FILE', type=Path, help='parameters, a YAML file as the node takes it'
+    )
+    parser.add_argument(
+        '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs',
+        help='one parameter, such as time_constant=120; stands above the file',
+    )  # fmt: skip
+    add_mapping(parser)
+
+
+def run(options: Namespace, console: Console) -> Outcome:
+    """Read, find segments, judge, write."""
+    mapping = read_mapping(options.column, options.constant)
+    console.progress(0.0, 'starting')
+    from valveflow_ros.cli.files import check_folder, write_texts
+    from valveflow_ros.cli.model_file import read_model
+    from valveflow_ros.cli.parameters import read_parameters
+    from valveflow_ros.cli.validating import check_exponent, outcome, texts, validated
+
+    given = read_parameters(options.params, options.pairs)
+    check_folder(options.output)
+    model = read_model(options.model)
+    against = None if options.against is None else read_model(options.against)
+    check_exponent(model, options.model, given)
+    data = validated(options, model, against, mapping, given, console)
+    console.progress(0.9, 'writing the report')
+    content, files = texts(data)
+    return outcome(data, content, write_texts(options.output, files))

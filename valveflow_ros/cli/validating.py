@@ -1,0 +1,144 @@
+"""From a log and a characteristic to the files and the words of a validation."""
+
+from __future__ import annotations
+
+import json
+from argparse import Namespace
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from valveflow_ros.cli.console import Console, Outcome
+from valveflow_ros.cli.mapping import Mapping as Columns
+from valveflow_ros.cli.report_words import columns
+from valveflow_ros.cli.usage import UsageError
+from valveflow_ros.cli.watching import read, see
+from valveflow_ros.compare.data import other_data
+from valveflow_ros.compare.validation import validate
+from valveflow_ros.compare.validation_json import to_json
+from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.records import SegmentKind
+from valveflow_ros.report.comparison_csv import segments_csv
+from valveflow_ros.report.comparison_validation import (
+    LABELS,
+    OUTSIDE_FLAG,
+    Validated,
+    validation_report,
+    verdict_words,
+)
+from valveflow_ros.report.numbers import decimals, interval, percent, plain
+
+
+def check_exponent(model: Characteristic, path: Path, given: Mapping[str, Any]) -> None:
+    """Refuse a pressure exponent that is not the model's.
+
+    Raises
+    ------
+    UsageError
+    """
+    wanted = given.get('pressure_exponent')
+    if wanted is not None and abs(float(wanted) - model.pressure_exponent) > 1e-9:
+        raise UsageError(
+            f'{path} is a curve over V p^{model.pressure_exponent:g}, but the parameter '
+            f'pressure_exponent is set to {float(wanted):g}: leave it out, the model decides.'
+        )
+
+
+def validated(
+    options: Namespace,
+    model: Characteristic,
+    against: Characteristic | None,
+    mapping: Columns,
+    given: Mapping[str, Any],
+    console: Console,
+) -> Validated:
+    """Read the log, find its special segments, judge.
+
+    Raises
+    ------
+    RecordingError, InputError, DataError
+        The log cannot be read or holds nothing to judge by.
+    """
+    console.progress(0.02, 'reading')
+    log = read(options.log, mapping, console)
+    settings = {**given, 'pressure_exponent': model.pressure_exponent}
+    seen = see(log, options.log.name, settings, console, console.progress)
+    console.progress(0.7, 'judging')
+    tolerance = options.tolerance or seen.settings.real('alarm_floor')
+    other = other_data(seen.contents, seen.settings)
+    result = validate(model, other, tolerance, against)
+    if result.outside_share > OUTSIDE_FLAG:
+        console.warn(
+            f'{percent(result.outside_share, 2)} of the special samples lie beyond the ends of '
+            'the curve and were not judged.'
+        )
+    second = '' if options.against is None else _name(options.against, options.model)
+    return Validated(
+        options.log.name, _name(options.model, options.against), second, result, seen.contents,
+        seen.notes,
+    )  # fmt: skip
+
+
+def _name(path: Path, other: Path | None) -> str:
+    """Return a file's name, with its folder where two would read alike."""
+    return str(path) if other is not None and other.name == path.name else path.name
+
+
+def texts(data: Validated) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the content of the JSON, and the files of the result by name."""
+    content = {
+        **to_json(data.result),
+        'log': data.source,
+        'model': data.model,
+        'against': data.other or None,
+        'words': verdict_words(data),
+    }
+    return content, {
+        'validation.json': json.dumps(content, indent=1, allow_nan=False) + '\n',
+        'segments.csv': segments_csv(data.result.judgement, tuple(data.result.predictions)),
+        'report.html': validation_report(data),
+    }
+
+
+def outcome(data: Validated, content: Mapping[str, Any], written: Mapping[str, Path]) -> Outcome:
+    """Return what is printed at the end; the segments stand in the file only."""
+    brief = {k: v for k, v in content.items() if k != 'segments'}
+    files = {name: str(path) for name, path in written.items()}
+    return Outcome(_text(data, written), {**brief, 'files': files})
+
+
+def _text(data: Validated, written: Mapping[str, Path]) -> str:
+    parts = [
+        f'{data.model}, held against {data.source}:',
+        *verdict_words(data),
+        _pieces(data),
+        _errors(data),
+        f'Wrote {written["report.html"]}, {written["validation.json"].name} and segments.csv.',
+    ]
+    return '\n'.join(part for part in parts if part)
+
+
+def _pieces(data: Validated) -> str:
+    v = data.result
+    rows = [
+        [
+            'all' if k == 0 else str(k),
+            f'{decimals(c.u_from, 1)} to {decimals(c.u_to, 1)}',
+            str(c.segments),
+            decimals(c.test.mean, 2),
+            interval(c.low_mw, c.high_mw),
+        ]
+        for k, c in enumerate((v.overall, *v.pieces))
+    ]
+    head = ['piece', 'u (% MPa^m)', 'segments', 'measured - predicted (MW)', '95 % (MW)']
+    return columns(rows, head)
+
+
+def _errors(data: Validated) -> str:
+    j = data.result.judgement
+    kinds = (None, SegmentKind.STEADY, SegmentKind.SLOPE)
+    rows = [
+        [LABELS[name], *(plain(j.mse(name, k)) if j.kinds(k) else '-' for k in kinds)]
+        for name in data.result.predictions
+    ]
+    return columns(rows, ['mean squared error (MW^2)', 'segments', 'steady', 'slope'])

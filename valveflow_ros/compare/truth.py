@@ -1,0 +1,129 @@
+"""What is true of a simulated plant, and how far a curve is from it (Table IV of the paper)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from valveflow_ros.errors import DataError
+from valveflow_ros.records import FloatArray
+
+_PLACES = 2000
+_LARGEST = 1e9
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """The true curve.
+
+    Attributes
+    ----------
+    knots : float64 (J + 1,)
+    slopes, intercepts : float64 (J,)
+    pressure_exponent : float
+    """
+
+    knots: FloatArray
+    slopes: FloatArray
+    intercepts: FloatArray
+    pressure_exponent: float
+
+    def __call__(self, u: FloatArray) -> FloatArray:
+        """Evaluate F; the outer pieces go on."""
+        k = np.searchsorted(self.knots[1:-1], u, side='right')
+        return np.asarray(self.slopes[k] * u + self.intercepts[k])
+
+
+@dataclass(frozen=True, slots=True)
+class CurveError:
+    """How far a curve is from the true one, between two inputs.
+
+    Attributes
+    ----------
+    rmse_mw, largest_mw : float
+    known : float
+        Share of the range in which the curve says anything; errors are of that share.
+    slope, knee, intercept : float
+        Largest errors of the parameters, NaN unless the number of pieces is right.
+    """
+
+    rmse_mw: float
+    largest_mw: float
+    known: float
+    slope: float = math.nan
+    knee: float = math.nan
+    intercept: float = math.nan
+
+
+def read_truth(raw: object) -> Truth:
+    """Read a truth: what ``valveflow simulate --truth`` writes, or a characteristic.
+
+    Raises
+    ------
+    DataError
+        It is neither; the sentence names the place.
+    """
+    if not isinstance(raw, dict) or not isinstance(raw.get('pieces'), list) or not raw['pieces']:
+        raise DataError("This is no truth of a plant: it must hold a list 'pieces'.")
+    pieces = [_piece(piece, k) for k, piece in enumerate(raw['pieces'])]
+    for k in range(1, len(pieces)):
+        if not math.isclose(pieces[k][0], pieces[k - 1][1], rel_tol=1e-9):
+            raise DataError(
+                f"The truth cannot be used: 'pieces[{k}].u_from' is not where the piece before "
+                'it ends.'
+            )
+    table = np.array(pieces)
+    exponent = _number(raw.get('pressure_exponent', 1.125), 'pressure_exponent')
+    return Truth(np.append(table[:, 0], table[-1, 1]), table[:, 2], table[:, 3], exponent)
+
+
+def _piece(raw: object, number: int) -> tuple[float, float, float, float]:
+    where = f'pieces[{number}]'
+    if not isinstance(raw, dict):
+        raise DataError(f"The truth cannot be used: '{where}' is not an object.")
+    low, high, slope, intercept = (
+        _number(raw.get(name), f'{where}.{name}')
+        for name in ('u_from', 'u_to', 'slope', 'intercept')
+    )
+    if not low < high:
+        raise DataError(f"The truth cannot be used: '{where}.u_to' is not above u_from.")
+    return low, high, slope, intercept
+
+
+def _number(value: object, where: str) -> float:
+    good = isinstance(value, int | float) and not isinstance(value, bool)
+    if not (good and abs(value) < _LARGEST):  # type: ignore[arg-type]
+        raise DataError(f"The truth cannot be used: '{where}' is missing or no number.")
+    return float(value)  # type: ignore[arg-type]
+
+
+def curve_error(
+    curve: Callable[[FloatArray], FloatArray], truth: Truth, u_from: float, u_to: float
+) -> CurveError:
+    """Return how far ``curve`` is from the truth at evenly spaced inputs."""
+    u = np.linspace(u_from, u_to, _PLACES)
+    found = curve(u)
+    known = np.isfinite(found)
+    if not known.any():
+        return CurveError(math.nan, math.nan, 0.0)
+    off = found[known] - truth(u[known])
+    return CurveError(
+        float(np.sqrt(np.mean(off**2))), float(np.abs(off).max()), float(known.mean())
+    )
+
+
+def pieces_error(
+    knots: FloatArray, slopes: FloatArray, intercepts: FloatArray, truth: Truth
+) -> tuple[float, float, float]:
+    """Return the largest errors of slopes, inner knots and intercepts; NaN if J is not right."""
+    if len(slopes) != len(truth.slopes):
+        return math.nan, math.nan, math.nan
+    knees = np.abs(np.asarray(knots)[1:-1] - truth.knots[1:-1])
+    return (
+        float(np.abs(slopes - truth.slopes).max()),
+        float(knees.max()) if len(knees) else 0.0,
+        float(np.abs(intercepts - truth.intercepts).max()),
+    )
