@@ -1,35 +1,41 @@
-"""How fast the exact partition is, beside a plain dynamic programme and beside ruptures.
+"""How fast the exact partition is, beside a plain dynamic programme and beside other packages.
 
-Run: python benchmarks/partition.py [--kinds valve noise ...] [--sizes 20000 305633 ...]
-                                    [--plain 8000] [--peers 400] [--repeats 3] [--json]
+Run: python -m benchmarks.partition [--kinds valve noise ...] [--sizes 20000 305633 ...]
+                                    [--large 3000000] [--plain 8000] [--no-peers] [--repeats 3]
+     python -m benchmarks.partition --certify    the judge of the exact partition, minutes
 
 Every kind is partitioned into 1..10 pieces at every size. In the same run the plain
 dynamic programme (every break for every end, in compiled loops) solves the size given by
---plain, and ruptures' exact and approximate searches that of --peers, where it is
-installed. `cost/optimum` is the cost of what a search found over ours, for the largest
-number of pieces; 1 means that it found the optimum too.
+--plain, and ruptures, pwlf and piecewise-regression the sizes they can do, where they are
+installed. `cost/optimum` is the cost of what a search found over ours; 1 means that it
+found the optimum too. Of several runs the least time counts; processor seconds are those
+of all threads together, and do not suffer from other people's work as wall seconds do.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import os
 import platform
+import resource
+import subprocess
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numba
 import numpy as np
 
+from benchmarks.partition_certify import certify
+from benchmarks.partition_peers import against_peers
 from valveflow_ros.core.partition import Partition, partition
 from valveflow_ros.core.partition_layers import best_partitions, prepare
 from valveflow_ros.core.partition_levels import make_levels
 
 PIECES = 10
-PEER_PIECES = 4
+RESULTS = Path(__file__).parent / 'results'
 
 
 def valve(u: np.ndarray) -> np.ndarray:
@@ -99,17 +105,6 @@ def plain(x: np.ndarray, y: np.ndarray, pieces: int) -> np.ndarray:
     return best[1:, n]
 
 
-def fitted_cost(u: np.ndarray, y: np.ndarray, ends: list[int]) -> float:
-    """Return the cost of pieces that end before the given samples."""
-    total, begin = 0.0, 0
-    for end in ends:
-        a, b = u[begin:end], y[begin:end]
-        slope, intercept = np.polynomial.polynomial.polyfit(a - a[0], b, 1)[::-1]
-        total += float(((b - intercept - slope * (a - a[0])) ** 2).sum())
-        begin = end
-    return total
-
-
 def timed(action: Callable[[], object], repeats: int = 1) -> tuple[dict[str, float], object]:
     """Return the least wall and processor time of several runs, and the last result."""
     wall, cpu, result = [], [], None
@@ -136,7 +131,8 @@ def ours(kind: str, n: int, threads: int | None, repeats: int) -> dict[str, obje
     assert isinstance(found, Partition)
     return {
         'kind': kind, 'samples': n, 'distinct': found.n_distinct, 'search': alone,
-        'whole': whole, 'certified': found.certified,
+        'whole': whole, 'certified': found.certified, 'load': round(os.getloadavg()[0], 1),
+        'peak_mb': round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0),
     }  # fmt: skip
 
 
@@ -150,71 +146,56 @@ def against_plain(kind: str, n: int) -> dict[str, object]:
     assert isinstance(cost, np.ndarray)
     return {
         'kind': kind, 'samples': n, 'search': 'plain', **slow,
-        'times_slower': round(slow['wall_s'] / fast['wall_s'], 1),
+        'times_slower': round(slow['cpu_s'] / fast['cpu_s'], 1),
         'cost/optimum': round(float(cost[-1] / found.cost[-1]), 9),
     }  # fmt: skip
 
 
-def against_ruptures(kind: str, n: int) -> list[dict[str, object]]:
-    import ruptures
-
-    u, y = samples(kind, n)
-    order = np.argsort(u)
-    u, y = u[order], y[order]
-    fast, found = timed(lambda: partition(u, y, PEER_PIECES, threads=1), 3)
-    assert isinstance(found, Partition)
-    signal = np.column_stack([y, (u - u.mean()) / np.ptp(u), np.ones(n)])
-    searches = {
-        'ruptures Dynp, exact': ruptures.Dynp(model='linear', min_size=2, jump=1),
-        'ruptures Dynp, jump 5': ruptures.Dynp(model='linear', min_size=2, jump=5),
-        'ruptures BottomUp': ruptures.BottomUp(model='linear', min_size=2, jump=5),
-        'ruptures Binseg': ruptures.Binseg(model='linear', min_size=2, jump=5),
-    }
-    rows: list[dict[str, object]] = []
-    for name, search in searches.items():
-        slow, ends = timed(lambda s=search: s.fit(signal).predict(n_bkps=PEER_PIECES - 1))
-        cost = fitted_cost(u, y, list(ends))  # type: ignore[call-overload]
-        rows.append({
-            'kind': kind, 'samples': n, 'search': name, **slow,
-            'times_slower': round(slow['wall_s'] / fast['wall_s'], 1),
-            'cost/optimum': round(cost / float(found.cost[PEER_PIECES - 1]), 6),
-        })  # fmt: skip
-    return rows
+def large(kind: str, n: int, threads: int | None) -> dict[str, object]:
+    """Time one large partition in a process of its own, and what memory it took at most."""
+    command = [sys.executable, '-m', 'benchmarks.partition', '--kinds', kind, '--sizes', str(n)]
+    command += ['--plain', '0', '--large', '0', '--no-peers', '--repeats', '1', '--json']
+    command += ['--threads', str(threads)] if threads else []
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    return dict(json.loads(done.stdout)['ours'][0])
 
 
 def measure(options: argparse.Namespace) -> dict[str, list[dict[str, object]]]:
     partition(*samples('valve', 3000), PIECES)  # compiles
-    plain(np.arange(9.0), np.arange(9.0), 2)
     result: dict[str, list[dict[str, object]]] = {'ours': [], 'beside': []}
     for size in options.sizes:
         for kind in options.kinds:
             result['ours'].append(ours(kind, size, options.threads, options.repeats))
-    for kind in options.kinds:
-        if options.plain and kind not in ('quantised', 'noiseless'):
-            result['beside'].append(against_plain(kind, options.plain))
-    if options.peers and importlib.util.find_spec('ruptures'):
-        result['beside'] += against_ruptures(options.kinds[0], options.peers)
-    elif options.peers:
-        print('ruptures is not installed, so it is not compared.', file=sys.stderr)
+    if options.large:
+        for kind in ('valve', 'quantised'):
+            result['ours'].append(large(kind, options.large, options.threads))
+    if options.plain:
+        plain(np.arange(9.0), np.arange(9.0), 2)  # compiles
+        for kind in options.kinds:
+            if kind not in ('quantised', 'noiseless'):
+                result['beside'].append(against_plain(kind, options.plain))
+    if options.peers:
+        rows = against_peers(lambda n: samples('valve', n))
+        result['beside'] += [{'kind': 'valve', **row} for row in rows]
     return result
 
 
-def main(arguments: list[str] | None = None) -> int:
+def arguments_of(given: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
     parser.add_argument('--kinds', nargs='+', choices=list(KINDS), default=list(KINDS))
     parser.add_argument('--sizes', nargs='*', type=int, default=[20_000, 305_633])
+    parser.add_argument('--large', type=int, default=3_000_000, help='0: left out')
     parser.add_argument('--plain', type=int, default=8000, help='0: not compared')
-    parser.add_argument('--peers', type=int, default=400, help='0: not compared')
+    parser.add_argument('--no-peers', dest='peers', action='store_false')
     parser.add_argument('--threads', type=int)
     parser.add_argument('--repeats', type=int, default=3)
-    parser.add_argument('--json', action='store_true')
-    result = measure(options := parser.parse_args(arguments))
-    if options.json:
-        print(json.dumps(result, indent=2))
-        return 0
-    cores = len(os.sched_getaffinity(0))
-    load = os.getloadavg()[0]
-    print(f'Python {platform.python_version()}, {cores} cores, load {load:.1f}; J = 1..{PIECES}')
+    parser.add_argument('--certify', action='store_true', help='every layer, every end; minutes')
+    parser.add_argument('--layers', type=int, default=4, help='to certify')
+    parser.add_argument('--json', action='store_true', help='print only, as JSON')
+    return parser.parse_args(given)
+
+
+def show(result: dict[str, list[dict[str, object]]]) -> None:
     for row in result['ours']:
         search, whole = row['search'], row['whole']
         assert isinstance(search, dict)
@@ -222,14 +203,46 @@ def main(arguments: list[str] | None = None) -> int:
         print(
             f'{row["kind"]:13}{row["samples"]:9,} samples {row["distinct"]:9,} distinct   '
             f'search {search["wall_s"]:8.3f} s (cpu {search["cpu_s"]:.3f} s)   '
-            f'whole {whole["wall_s"]:8.3f} s   certified {row["certified"]}'
+            f'whole {whole["wall_s"]:8.3f} s (cpu {whole["cpu_s"]:.3f} s)   '
+            f'load {row["load"]}   peak {row["peak_mb"]} MB   certified {row["certified"]}'
         )
     for row in result['beside']:
         print(
             f'{row["kind"]:13}{row["samples"]:9,} samples   {row["search"]:22} '
-            f'{row["wall_s"]:8.3f} s   {row["times_slower"]} times ours   '
+            f'cpu {row["cpu_s"]:8.3f} s   {row["times_slower"]} times ours   '
             f'cost/optimum {row["cost/optimum"]}'
         )
+
+
+def keep(name: str, result: object, arguments: list[str] | None) -> None:
+    """Write a result beside the others, with the command that brought it."""
+    given = sys.argv[1:] if arguments is None else arguments
+    content = {
+        'command': ' '.join(['python -m benchmarks.partition', *given]),
+        'python': platform.python_version(), 'cores': len(os.sched_getaffinity(0)),
+        'load_at_end': round(os.getloadavg()[0], 1), 'pieces': PIECES, 'result': result,
+    }  # fmt: skip
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / name).write_text(json.dumps(content, indent=1) + '\n', encoding='utf-8')
+
+
+def main(arguments: list[str] | None = None) -> int:
+    options = arguments_of(arguments)
+    if options.certify:
+        found = [
+            {'kind': k, **certify(*samples(k, n), options.layers)}
+            for n in options.sizes for k in options.kinds
+        ]  # fmt: skip
+        print(json.dumps(found, indent=1))
+        keep('partition_certified.json', found, arguments)
+        return 0 if all(row['agree'] for row in found) else 1
+    result = measure(options)
+    if options.json:
+        print(json.dumps(result, indent=2))
+        return 0
+    print(f'Python {platform.python_version()}, {len(os.sched_getaffinity(0))} cores; J = 1..10')
+    show(result)
+    keep('partition.json', result, arguments)
     return 0
 
 

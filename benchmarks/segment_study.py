@@ -1,0 +1,169 @@
+"""How well special segments are found: precision and recall against the simulator's truth.
+
+Run: ``python -m benchmarks.segment_study --seeds 4 --first 3000``. What is special in truth
+says `segment_truth`. A found segment is right when at least nine tenths of its rows are
+special in truth and of its kind; a true stretch is found when half of its rows lie in found
+segments of its kind. Rows are counted as well, also against a truth in which a ramp that
+crosses a knee of the curve stays one ramp: a bend that small cannot be seen in u. The same
+runs are also judged with thresholds that stand on the noise of the ordinary plant instead of
+what they learn.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.segment_truth import Stretch, by_row, true_stretches
+from valveflow_ros.config import Settings
+from valveflow_ros.core.feeding import Rows
+from valveflow_ros.core.segmenter import Segmenter
+from valveflow_ros.plant.recorder import SimulatedLog
+from valveflow_ros.plant.simulator import simulate
+from valveflow_ros.plant.unit import UnitDescription
+from valveflow_ros.records import SegmentKind
+
+RESULTS = Path(__file__).parent / 'results'
+RIGHT, FOUND = 0.9, 0.5
+KINDS = {'steady': SegmentKind.STEADY, 'slope': SegmentKind.SLOPE}
+PLANTS = {
+    'as in the paper': (1.0, 1.0),
+    'noise x 0.5': (0.5, 1.0),
+    'noise x 2': (2.0, 1.0),
+    '2 s sampling': (1.0, 2.0),
+}
+
+
+def plant(noise: float, period_s: float) -> UnitDescription:
+    """Return the paper's unit with other noise: of power, sensors and the valve's own jitter."""
+    unit = UnitDescription(sample_period_s=period_s)
+    n, p = unit.noise, unit.programme
+    return replace(
+        unit,
+        noise=replace(
+            n, slow_mw=noise * n.slow_mw, white_mw=noise * n.white_mw,
+            opening_percent=noise * n.opening_percent, pressure_mpa=noise * n.pressure_mpa,
+        ),
+        programme=replace(p, jitter_percent=noise * p.jitter_percent),
+    )  # fmt: skip
+
+
+def found_segments(
+    log: SimulatedLog, settings: Settings
+) -> tuple[list[Stretch], dict[str, float]]:
+    """Return the segments found and the noise they stand on."""
+    segmenter = Segmenter(settings)
+    rows = Rows.of(log.table, settings.real('pressure_exponent'))
+    out = segmenter.feed(rows.time_ns, rows.u, rows.power_mw, rows.temperature_degc)
+    noise = segmenter.noise()
+    stretches = [Stretch(f.first_row, f.end_row, int(f.segment.kind)) for _, f in out.found]
+    return stretches, {'input': round(noise.input, 3), 'power_mw': round(noise.power_mw, 3)}
+
+
+def compare(
+    true: list[Stretch], without_knees: list[Stretch], found: list[Stretch], n: int, kind: int
+) -> dict[str, int]:
+    """Count segments and rows of one kind."""
+    truth, seen = by_row(true, n), by_row(found, n)
+    driven = by_row(without_knees, n)
+    right = [float(np.mean(truth[a:b] == kind)) >= RIGHT for a, b, k in found if k == kind]
+    hit = [float(np.mean(seen[a:b] == kind)) >= FOUND for a, b, k in true if k == kind]
+    return {
+        'found': len(right), 'right': sum(right), 'true': len(hit), 'hit': sum(hit),
+        'rows_found': int(np.sum(seen == kind)), 'rows_true': int(np.sum(truth == kind)),
+        'rows_both': int(np.sum((seen == kind) & (truth == kind))),
+        'rows_driven_so': int(np.sum((seen == kind) & (driven == kind))),
+    }  # fmt: skip
+
+
+def shares(counts: dict[str, int]) -> dict[str, float | None]:
+    """Return precision and recall, of segments and of rows."""
+
+    def share(part: str, whole: str) -> float | None:
+        return round(counts[part] / counts[whole], 3) if counts[whole] else None
+
+    return {
+        'precision': share('right', 'found'), 'recall': share('hit', 'true'),
+        'row_precision': share('rows_both', 'rows_found'),
+        'row_recall': share('rows_both', 'rows_true'),
+        'row_precision_but_for_knees': share('rows_driven_so', 'rows_found'),
+    }  # fmt: skip
+
+
+def study(name: str, seeds: range, days: float, fixed: dict[str, float]) -> dict[str, object]:
+    """Judge one kind of plant over some seeds, with learnt and with fixed thresholds."""
+    noise, period_s = PLANTS[name]
+    given = {'sample_period': period_s}
+    learnt = Settings(given)
+    rigid = Settings({**given, 'input_noise': fixed['input'], 'power_noise': fixed['power_mw']})
+    totals: dict[str, dict[str, dict[str, int]]] = {'learnt': {}, 'fixed': {}}
+    levels = []
+    for seed in seeds:
+        log = simulate(days, seed, plant(noise, period_s))
+        true = true_stretches(log, seed, learnt)
+        without_knees = true_stretches(log, seed, learnt, knees=False)
+        for how, settings in (('learnt', learnt), ('fixed', rigid)):
+            found, level = found_segments(log, settings)
+            if how == 'learnt':
+                levels.append(level)
+            for kind, number in KINDS.items():
+                counts = compare(true, without_knees, found, len(log.load_mw), number)
+                sums = totals[how].setdefault(kind, dict.fromkeys(counts, 0))
+                for key, value in counts.items():
+                    sums[key] += value
+    return {
+        'plant': name, 'noise_learnt': levels,
+        **{
+            how: {kind: {**shares(c), 'counts': c} for kind, c in kinds.items()}
+            for how, kinds in totals.items()
+        },
+    }  # fmt: skip
+
+
+def ordinary_noise(seeds: range, days: float) -> dict[str, float]:
+    """Return the noise learnt on the ordinary plant, the mean over the seeds."""
+    found = [found_segments(simulate(days, s, plant(1.0, 1.0)), Settings({}))[1] for s in seeds]
+    return {key: float(np.mean([f[key] for f in found])) for key in found[0]}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
+    parser.add_argument('--seeds', type=int, default=4)
+    parser.add_argument('--first', type=int, default=3000)
+    parser.add_argument('--days', type=float, default=5.0)
+    parser.add_argument('--figure', action='store_true', help='draw the result (needs matplotlib)')
+    options = parser.parse_args(arguments)
+    place = RESULTS / 'segment_study.json'
+    if options.figure:
+        from benchmarks.segment_figure import draw
+
+        draw(json.loads(place.read_text(encoding='utf-8')), RESULTS / 'segment_study.png')
+        return 0
+    seeds = range(options.first, options.first + options.seeds)
+    fixed = ordinary_noise(seeds, min(options.days, 2.0))
+    rows = []
+    for name in PLANTS:
+        rows.append(study(name, seeds, options.days, fixed))
+        for how in ('learnt', 'fixed'):
+            said = rows[-1][how]
+            assert isinstance(said, dict)
+            for kind, found in said.items():
+                numbers = ', '.join(f'{k} {v}' for k, v in found.items() if k != 'counts')
+                print(f'{name:16} {how:7} {kind:7} {numbers}', flush=True)
+    content = {
+        'command': f'python -m benchmarks.segment_study --seeds {options.seeds} '
+        f'--first {options.first} --days {options.days:g}',
+        'first_seed': options.first, 'fixed_noise': fixed, 'plants': rows,
+    }  # fmt: skip
+    RESULTS.mkdir(exist_ok=True)
+    place.write_text(json.dumps(content, indent=1) + '\n', encoding='utf-8')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
