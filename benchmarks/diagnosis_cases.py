@@ -1,0 +1,241 @@
+"""Plants to be diagnosed: what is hidden in them is drawn, and so is the plant itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from valveflow_ros.plant.effect import Effect, Values
+from valveflow_ros.plant.hooks import Forcing, Hooks
+from valveflow_ros.plant.random_unit import random_unit
+from valveflow_ros.plant.spec import EffectSpec
+from valveflow_ros.plant.unit import UnitDescription
+
+PAPER_NOISE_MW, PAPER_RATED_MW = 3.0, 300.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """A plant, what is hidden in it, and whether an earlier model of it is at hand."""
+
+    kind: str
+    label: str
+    seed: int
+    unit: UnitDescription
+    effects: tuple[EffectSpec, ...]
+    names: tuple[str, ...]
+    given: bool = False
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What an amplitude depends on."""
+
+    rng: np.random.Generator
+    unit: UnitDescription
+    days: float
+    low: float = 2.0
+    high: float = 4.0
+
+    @property
+    def noise(self) -> float:
+        """Return the noise of this unit, relative to the paper's."""
+        n = self.unit.noise
+        rated = self.unit.programme.load_high_mw
+        return float(np.hypot(n.slow_mw, n.white_mw)) / PAPER_NOISE_MW * PAPER_RATED_MW / rated
+
+    @property
+    def size(self) -> float:
+        """Draw a multiple of the smallest detectable amplitude in ten days of the paper's unit."""
+        times = np.exp(self.rng.uniform(np.log(self.low), np.log(self.high)))
+        return float(times * self.noise * np.sqrt(10.0 / self.days))
+
+    @property
+    def sign(self) -> float:
+        """Draw a sign."""
+        return 1.0 if self.rng.random() < 0.5 else -1.0
+
+    @property
+    def onset(self) -> float:
+        """Draw an onset in days, away from both ends."""
+        return float(self.rng.uniform(0.25, 0.75) * self.days)
+
+    @property
+    def mw(self) -> float:
+        """Return the size of the unit relative to the paper's."""
+        return self.unit.programme.load_high_mw / PAPER_RATED_MW
+
+    def u(self, share: float) -> float:
+        """Return a place on the curve between its outermost inner ends."""
+        low, high = self.unit.curve.knots[0], self.unit.curve.knots[-1]
+        margin = 0.08 * (high - low)
+        return float(low + margin + share * (high - low - 2.0 * margin))
+
+
+def _text(name: str, **values: float) -> str:
+    return f'{name}:' + ','.join(f'{k}={v:.6g}' for k, v in values.items())
+
+
+def _choked(s: Setting) -> str:
+    plan = s.unit.programme
+    pressure = float(plan.sliding_pressure_mpa(np.array([plan.load_high_mw]))[0])
+    ratio = s.rng.uniform(0.64, 0.72)
+    return _text('choked', kappa=ratio * pressure / plan.load_high_mw)
+
+
+def _curve_step(s: Setting) -> str:
+    first = s.rng.uniform(0.1, 0.5)
+    return _text(
+        'curve_step', s_mw=s.sign * 0.65 * s.size * s.mw, u_from=s.u(first),
+        u_to=s.u(first + s.rng.uniform(0.15, 0.3)), t0_days=s.onset,
+    )  # fmt: skip
+
+
+def _curve_shape(s: Setting) -> str:
+    # In the middle of the longest piece: on a knee, the knee would take part of it.
+    knots = s.unit.curve.knots
+    k = int(np.argmax(np.diff(knots[: max(3, len(knots) - 1)])))
+    width = s.rng.uniform(0.3, 0.5) * (knots[k + 1] - knots[k])
+    return _text(
+        'curve_shape', h_mw=s.sign * 0.6 * s.size * s.mw, u0=0.5 * (knots[k] + knots[k + 1]),
+        width_u=width,
+    )  # fmt: skip
+
+
+def _stiction(s: Setting) -> str:
+    band = 1.0 * s.rng.uniform(1.0, 1.8)
+    return _text('stiction', s_percent=band, j_percent=0.7 * band)
+
+
+def _clock(s: Setting) -> str:
+    least = min(r.delay_s for r in s.unit.regions)
+    return _text('clock', d_s=least + 10.0 + 5.0 * (s.size - 2.0 * s.noise))
+
+
+def _region_lag(s: Setting) -> str:
+    plan = s.unit.programme
+    level = s.rng.uniform(0.35, 0.65) * (plan.load_high_mw - plan.load_low_mw) + plan.load_low_mw
+    region = next(r for r in s.unit.regions if level < r.power_to_mw)
+    factor = s.rng.uniform(2.0, 3.0) if s.rng.random() < 0.5 else s.rng.uniform(0.3, 0.5)
+    return _text(
+        'region_lag', time_s=region.time_constant_s * factor, delay_s=region.delay_s,
+        level_mw=level,
+    )  # fmt: skip
+
+
+def _intervals(s: Setting) -> str:
+    return (
+        _text('intervals', g=s.sign * 0.0018 * s.size, off_low_h=12.0, off_high_h=30.0)
+        + f',pattern={int(s.rng.integers(1, 10_000))}'
+    )
+
+
+EFFECTS: dict[str, Callable[[Setting], str]] = {
+    'temperature': lambda s: _text('temperature', k=-0.00033 * s.size),
+    'exponent': lambda s: _text('exponent', dm=s.sign * 0.02 * s.size),
+    'choked': _choked,
+    'gain_drift': lambda s: _text('gain_drift', g=s.sign * 0.0021 * s.size * 10.0 / s.days),
+    'input_drift': lambda s: _text('input_drift', g=s.sign * 0.0018 * s.size * 10.0 / s.days),
+    'output_offset_drift': lambda s: _text(
+        'output_offset_drift', b_mw=s.sign * 0.5 * s.size * s.mw * 10.0 / s.days
+    ),
+    'gain_step': lambda s: _text('gain_step', g=s.sign * 0.0014 * s.size, t0_days=s.onset),
+    'input_step': lambda s: _text('input_step', g=s.sign * 0.0014 * s.size, t0_days=s.onset),
+    'curve_step': _curve_step,
+    'intervals': _intervals,
+    'diurnal': lambda s: _text('diurnal', a=0.0009 * s.size, peak_h=s.rng.uniform(0.0, 24.0)),
+    'backlash': lambda s: _text('backlash', w_percent=0.09 * s.size),
+    'stiction': _stiction,
+    'rate_limit': lambda s: _text('rate_limit', r_percent_per_s=0.3 / s.size),
+    'saturation': lambda s: _text('saturation', max_percent=s.rng.uniform(80.0, 85.0)),
+    'region_lag': _region_lag,
+    'reheater': lambda s: _text(
+        'reheater', alpha=s.rng.uniform(0.25, 0.4), time_s=s.rng.uniform(20.0, 40.0)
+    ),
+    'clock': _clock,
+    'curve_shape': _curve_shape,
+}
+
+PAIRS = (
+    ('backlash', 'gain_drift'), ('temperature', 'gain_step'), ('diurnal', 'backlash'),
+    ('exponent', 'input_step'), ('curve_shape', 'gain_drift'), ('rate_limit', 'temperature'),
+)  # fmt: skip
+
+
+def _unit(rng: np.random.Generator) -> UnitDescription:
+    """Draw a unit; every third is the paper's."""
+    return UnitDescription() if rng.random() < 1.0 / 3.0 else random_unit(rng)
+
+
+def hidden(names: tuple[str, ...], seed: int, days: float, times: tuple[float, float]) -> Case:
+    """Return a plant with effects hidden in it."""
+    rng = np.random.default_rng([seed, *(ord(c) for c in '+'.join(names))])
+    setting = Setting(rng, _unit(rng), days, *times)
+    effects = tuple(EffectSpec.parse(EFFECTS[name](setting)) for name in names)
+    return Case(
+        'hidden' if len(names) == 1 else 'pair', '+'.join(names), seed, setting.unit, effects,
+        names, given='region_lag' in names,
+    )  # fmt: skip
+
+
+def _install(change: Callable[[Forcing, float], None], size: float) -> Callable[..., None]:
+    def install(values: Values, hooks: Hooks) -> None:
+        hooks.forcing.append(lambda rows: change(rows, size))
+
+    return install
+
+
+def _period(rows: Forcing, mw: float) -> None:
+    rows.offset_mw[:] += mw * np.sqrt(2.0) * np.sin(2.0 * np.pi * rows.time_s / 5400.0)
+
+
+def _signs(rows: Forcing, mw: float) -> None:
+    t, p = rows.temperature_degc, rows.pressure_mpa
+    rows.offset_mw[:] += mw * np.sign(t - 539.0) * np.sign(p - 13.5)
+
+
+def _daily_temperature(rows: Forcing, mw: float) -> None:
+    angle = 2.0 * np.pi * rows.clock_s / 86_400.0
+    rows.offset_mw[:] += mw * np.sign(np.cos(angle)) * np.tanh(rows.temperature_degc - 539.0)
+
+
+def _ripple(rows: Forcing, mw: float) -> None:
+    rows.offset_mw[:] += mw * np.sqrt(2.0) * np.sin(8.0 * rows.pressure_mpa)
+
+
+OUTSIDE: dict[str, Callable[[Forcing, float], None]] = {
+    'period of 90 min': _period, 'sign(T) sign(p)': _signs,
+    'T by night and day': _daily_temperature,
+    'ripple in p': _ripple,
+}  # fmt: skip
+OUTSIDE_SHARE = 0.4  # of the sd of the noise of ten-second means: 16 % of its variance
+
+
+def outside(label: str, seed: int) -> Case:
+    """Return a plant with something no cause of the catalogue explains."""
+    unit = UnitDescription()
+    size = OUTSIDE_SHARE * 2.07
+    effect = Effect(label.replace(' ', '_'), label, (), _install(OUTSIDE[label], size))
+    return Case('outside', label, seed, unit, (EffectSpec.of(effect),), ())
+
+
+def null(seed: int) -> Case:
+    """Return a plant with nothing hidden, but tempting."""
+    rng = np.random.default_rng([seed, 0])
+    unit = _unit(rng)
+    kind = ('clean', 'no feedback', 'load noise', 'ar 600 s', 'slow 2 h', 'T follows p')[seed % 6]
+    noise, plan = unit.noise, unit.programme
+    scale = plan.load_high_mw / PAPER_RATED_MW
+    if kind == 'no feedback':
+        plan = replace(plan, feedback=False)
+    elif kind == 'load noise':
+        noise = replace(noise, load_dependence=float(rng.uniform(-0.4, 0.6)))
+    elif kind == 'ar 600 s':
+        noise = replace(noise, slow_time_s=600.0)
+    elif kind == 'slow 2 h':
+        noise = replace(noise, wander_mw=float(rng.uniform(0.6, 1.2)) * scale)
+    elif kind == 'T follows p':
+        plan = replace(plan, temperature_pressure_correlation=0.8)
+    return Case('null', kind, seed, replace(unit, noise=noise, programme=plan), (), ())

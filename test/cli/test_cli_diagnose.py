@@ -1,0 +1,65 @@
+"""``valveflow diagnose``: from a log to verdict, extended model and report."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import pytest
+
+from valveflow_ros.cli.main import main
+from valveflow_ros.diagnosis.diagnosis_json import model_from_json
+
+pytestmark = pytest.mark.skipif(
+    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
+)
+
+
+@pytest.fixture(scope='module')
+def diagnosed(tmp_path_factory):
+    """Diagnose a day with a spiky power record; return folder and words."""
+    folder = tmp_path_factory.mktemp('diagnosed')
+    log = str(folder / 'plant.parquet')
+    words = ['simulate', '-o', log, '--days', '1.3', '--seed', '2', '--quiet']
+    assert main([*words, '--effect', 'spikes:height=60,per_day=60']) == 0
+    assert main(['diagnose', log, '-o', str(folder / 'out'), '--quiet']) == 0
+    return folder
+
+
+def test_the_json_is_the_contract(diagnosed):
+    content = json.loads((diagnosed / 'out' / 'diagnosis.json').read_text())
+    assert content['format'] == 'valveflow/diagnosis'
+    assert content['version'] == 1
+    assert content['verdict'] == 'named'
+    assert [c['name'] for c in content['causes']] == ['spikes']
+    for cause in content['causes']:
+        assert set(cause) >= {'name', 'sentence', 'parameters', 'gain'}
+        assert set(cause['gain']) == {'rmse_before', 'rmse_after', 'reduction', 'p_value'}
+        for value in cause['parameters'].values():
+            assert set(value) == {'value', 'low', 'high', 'unit'}
+    assert content['disturbance'] is None
+    assert {'name', 'reason'} <= set(content['rejected'][0])
+    assert content['rmse_noise_floor'] <= content['rmse_extended'] <= content['rmse_simulation']
+
+
+def test_the_extended_model_can_be_read(diagnosed):
+    raw = json.loads((diagnosed / 'out' / 'extended_model.json').read_text())
+    model, exponent, _, _ = model_from_json(raw)
+    assert model.base.pieces >= 2
+    assert exponent == 1.125
+
+
+def test_the_page_tells_four_steps(diagnosed):
+    page = (diagnosed / 'out' / 'report.html').read_text()
+    for step in ('1. What is wrong', '2. Why', '3. The extended model', '4. The proof'):
+        assert step in page
+    assert 'single wild values' in page
+
+
+def test_a_model_that_is_none_is_refused(run, logs, tmp_path):
+    wrong = tmp_path / 'model.json'
+    wrong.write_text('{"format": "other"}')
+    told = run('diagnose', logs / 'plant.csv', '-o', tmp_path / 'o', '--model', wrong).refused()
+    assert 'flow characteristic' in told
+    told = run('diagnose', logs / 'plant.csv', '-o', tmp_path / 'o', '--model', tmp_path / 'no')
+    assert 'cannot be read' in told.refused()

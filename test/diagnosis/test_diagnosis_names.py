@@ -1,0 +1,168 @@
+"""An effect is hidden and must be found; where nothing is hidden, nothing may be."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from diagnosis_records import (
+    diagnosed,
+    masked,
+    names,
+    record,
+    rough_model,
+    shifted_column,
+    table,
+    unit,
+)
+
+from valveflow_ros.diagnosis.diagnose import diagnose
+from valveflow_ros.errors import DataError
+from valveflow_ros.plant.unit import Noise, Programme
+from valveflow_ros.records import SampleTable, Signal
+
+pytestmark = pytest.mark.skipif(
+    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='days of data need the compiled loops'
+)
+HALF_DAY_ROWS = 21_600
+
+
+@pytest.mark.parametrize(
+    ('effect', 'key', 'truth'),
+    [
+        ('temperature:k=-0.0016', 'k', -0.0016),
+        ('gain_step:g=0.008,t0_days=1.7', 'g', 0.008),
+        ('output_offset_drift:b_mw=6', 'b_mw', 6.0),
+        ('backlash:w_percent=0.6', 'w_percent', 0.6),
+    ],
+)
+def test_a_hidden_effect_is_named_sized_and_worth_its_gain(effect, key, truth):
+    found = diagnosed(effect)
+    name = effect.partition(':')[0]
+    assert found.verdict == 'named'
+    assert names(found) == {name}
+    (cause,) = found.causes
+    estimate = cause.parameters[key]
+    assert estimate.low <= estimate.value <= estimate.high
+    assert estimate.value == pytest.approx(truth, rel=0.25)
+    assert found.rmse_extended < found.rmse_simulation
+    assert cause.gain.p_value < 0.05
+    assert found.rmse_noise_floor <= found.rmse_extended
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    'effect',
+    [
+        'exponent:dm=0.1',
+        'choked',
+        'gain_drift:g=0.02',
+        'input_drift:g=-0.02',
+        'input_step:g=0.008,t0_days=2.1',
+        'curve_step:s_mw=-4,t0_days=1.6',
+        'diurnal:a=0.004',
+        'rate_limit:r_percent_per_s=0.1',
+        'saturation:max_percent=82',
+        'curve_shape:h_mw=3',
+    ],
+)
+def test_every_family_is_told_from_the_others(effect):
+    if os.environ.get('VALVEFLOW_SLOW') != '1':
+        pytest.skip('VALVEFLOW_SLOW=1 runs it; benchmarks/diagnosis_study.py does more')
+    found = diagnosed(effect)
+    assert names(found) == {effect.partition(':')[0]}
+
+
+@pytest.mark.parametrize(
+    'tempting',
+    [
+        unit(Noise(load_dependence=0.6)),
+        unit(programme=Programme(temperature_pressure_correlation=0.8)),
+        unit(Noise(wander_mw=1.0)),
+    ],
+    ids=['noise grows with load', 'temperature follows pressure', 'slow wander'],
+)
+def test_tempting_noise_is_no_cause(tempting):
+    found = diagnosed(seed=3, of=tempting)
+    assert found.verdict == 'nothing'
+    assert found.causes == ()
+    assert found.unexplained_by == ()
+    assert (found.disturbance is not None) == (tempting.noise.wander_mw > 0.0)
+
+
+def test_what_an_earlier_model_says_of_the_dynamics_is_held_against_the_record():
+    found = diagnosed(
+        'region_lag:time_s=30,delay_s=10', model=rough_model_of_the_unit(), given=True
+    )
+    assert 'region_lag' in names(found)
+    lag = next(c for c in found.causes if c.name == 'region_lag')
+    assert lag.parameters['time_s'].value == pytest.approx(30.0, rel=0.3)
+
+
+def rough_model_of_the_unit():
+    """The paper's dynamics to the digit, its curve roughly."""
+    return replace(
+        rough_model(), levels=np.array([240.0]), time_constants=np.array([10.0, 80.0]),
+        delays=np.array([3.0, 10.0]),
+    )  # fmt: skip
+
+
+def test_faults_of_the_record_are_named_and_masked():
+    found = diagnosed('spikes:height=40,per_day=30', 'flatline:t0_days=1.2', days=2.0)
+    assert names(found) == {'spikes', 'flatline'}
+    assert all(np.isnan(c.gain.p_value) for c in found.causes)
+    assert found.causes[0].gain.rmse_after < found.causes[0].gain.rmse_before
+
+
+def test_a_fault_before_the_sensor_is_found_from_the_command():
+    found = diagnosed('rate_limit:before_sensor=1,r_percent_per_s=0.1', days=2.0)
+    (cause,) = [c for c in found.causes if c.name == 'rate_limit']
+    assert 'commanded' in cause.sentence
+    assert cause.parameters['r_percent_per_s'].value == pytest.approx(0.1, rel=0.1)
+
+
+def test_a_short_record_says_what_it_cannot_judge():
+    samples = table(0.6, 5, (), unit())
+    found = diagnose(record(samples), rough_model())
+    reasons = dict(found.rejected)
+    for name in ('gain_drift', 'gain_step', 'diurnal', 'intervals'):
+        assert 'cannot be judged' in reasons[name]
+    assert 'backlash' not in reasons or 'cannot' not in reasons['backlash']
+
+
+def test_constant_temperature_and_missing_command_are_said():
+    samples = table(1.2, 5, (), unit())
+    values = samples.values.copy()
+    values[:, Signal.MAIN_STEAM_TEMPERATURE] = 540.0
+    values[:, Signal.VALVE_COMMAND] = np.nan
+    found = diagnose(
+        record(type(samples)(samples.time_ns, values, samples.quality)), rough_model()
+    )
+    assert 'temperature hardly changes' in dict(found.rejected)['temperature']
+    assert any('command' in note for note in found.notes)
+
+
+@pytest.mark.slow
+def test_missing_rows_and_another_time_change_no_name():
+    effects = ('temperature:k=-0.0016',)
+    samples = table(4.0, 1, effects, unit())
+    assert names(diagnose(record(masked(samples, 0.01, 1)), rough_model())) == {'temperature'}
+
+
+@pytest.mark.slow
+def test_the_name_goes_when_its_variable_is_shuffled():
+    samples = table(4.0, 1, ('temperature:k=-0.0016',), unit())
+    moved = shifted_column(samples, Signal.MAIN_STEAM_TEMPERATURE, 2 * HALF_DAY_ROWS)
+    assert 'temperature' not in names(diagnose(record(moved), rough_model()))
+
+
+def test_a_record_in_which_nothing_moves_is_refused():
+    samples = table(0.6, 5, (), unit())
+    values = samples.values.copy()
+    values[:, Signal.VALVE_OPENING] = 70.0
+    values[:, Signal.MAIN_STEAM_PRESSURE] = 12.0
+    still = SampleTable(samples.time_ns, values, samples.quality)
+    with pytest.raises(DataError, match='hardly moves'):
+        diagnose(record(still), rough_model())

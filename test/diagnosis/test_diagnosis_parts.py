@@ -1,0 +1,234 @@
+"""The parts of the diagnosis, each against an obvious truth."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from diagnosis_records import record, rough_model, table, unit
+from hypothesis import given
+from hypothesis import strategies as st
+
+from valveflow_ros.diagnosis import kernels, quality
+from valveflow_ros.diagnosis.catalogue import catalogue
+from valveflow_ros.diagnosis.cause import Active, Stage
+from valveflow_ros.diagnosis.diagnosis_json import model_from_json, model_json
+from valveflow_ros.diagnosis.extended import Extended, answer
+from valveflow_ros.diagnosis.fitting import Task, base_mask, base_tangents, cause_tangents
+from valveflow_ros.diagnosis.gain import sign_flip
+from valveflow_ros.diagnosis.grid import make_scene
+from valveflow_ros.diagnosis.scene import ORDER, SEALED_FOLD
+from valveflow_ros.diagnosis.simplify import simplified
+from valveflow_ros.errors import DataError, TooFewSamplesError
+from valveflow_ros.records import SampleTable, Signal
+
+pytestmark = pytest.mark.skipif(
+    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled loops'
+)
+NAMES = {
+    'temperature', 'exponent', 'choked', 'gain_drift', 'input_drift', 'output_offset_drift',
+    'gain_step', 'input_step', 'curve_step', 'intervals', 'diurnal', 'backlash', 'stiction',
+    'rate_limit', 'saturation', 'region_lag', 'reheater', 'clock', 'curve_shape',
+}  # fmt: skip
+TYPICAL = {
+    'temperature': (-6e-4,), 'exponent': (0.05,), 'choked': (0.038,), 'gain_drift': (0.01,),
+    'input_drift': (0.01,), 'output_offset_drift': (2.0,), 'gain_step': (0.006, 0.2),
+    'input_step': (0.006, 0.2), 'curve_step': (-2.5, 1450.0, 1750.0, 0.2), 'intervals': (0.01,),
+    'diurnal': (0.005, 5.0), 'backlash': (0.6,), 'stiction': (1.0, 0.7), 'rate_limit': (0.1,),
+    'saturation': (84.0,), 'region_lag': (30.0, 5.0, 250.0), 'reheater': (0.3, 20.0),
+    'clock': (5.0,), 'curve_shape': (1.5, 1425.0, 150.0),
+}  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def scene():
+    samples = table(0.4, 2, (), unit())
+    bad = np.zeros(samples.values.shape, dtype=bool)
+    return make_scene(*record(samples).about, bad)
+
+
+def test_the_catalogue_holds_what_it_promises():
+    assert set(catalogue()) == NAMES == set(TYPICAL)
+    for name, cause in catalogue().items():
+        assert cause.name == name
+        assert set(cause.confusers) <= NAMES - {name}
+        assert cause.experiment.endswith('.')
+        keys = [u.name for u in cause.unknowns]
+        said = cause.sentence(dict(zip(keys, TYPICAL[name], strict=True)))
+        assert said.endswith('.')
+        assert said[0].isupper()
+
+
+@pytest.mark.parametrize('name', sorted(NAMES))
+def test_every_cause_changes_the_answer_and_nothing_is_nothing(scene, name):
+    plain = Extended(rough_model())
+    cause = catalogue()[name]
+    extra = (3600.0, 9000.0) if name == 'intervals' else ()
+    changed = answer(scene, plain.with_cause(Active(cause, TYPICAL[name], extra)))
+    assert np.isfinite(changed).all()
+    assert np.abs(changed - answer(scene, plain))[scene.scored].max() > 1e-3
+
+
+@pytest.mark.parametrize('name', sorted(NAMES))
+def test_tangents_of_causes_predict_small_changes(scene, name):
+    cause = catalogue()[name]
+    if cause.stage in (Stage.OPENING, Stage.DYNAMICS):
+        pytest.skip('not smooth, or it changes regions')
+    extra = (3600.0, 9000.0) if name == 'intervals' else ()
+    # One region: nothing can flip.
+    model = replace(
+        rough_model(), levels=np.empty(0), time_constants=np.array([20.0]), delays=np.array([4.0])
+    )
+    here = Extended(model, (Active(cause, TYPICAL[name], extra),))
+    task = Task(scene, scene.whole, np.zeros(ORDER))
+    tangent = cause_tangents(task, here)[:, 0]
+    values = list(TYPICAL[name])
+    by = 0.3 * cause.unknowns[0].step
+    values[0] += by
+    moved = answer(scene, Extended(model, (Active(cause, tuple(values), extra),)))
+    change = moved - answer(scene, here)
+    assert np.abs(change - by * tangent).max() <= 0.1 * np.abs(change).max() + 1e-9
+
+
+def test_tangents_of_the_curve_predict_small_changes(scene):
+    model = Extended(replace(
+        rough_model(), levels=np.empty(0), time_constants=np.array([20.0]), delays=np.array([4.0])
+    ))  # fmt: skip
+    task = Task(scene, scene.whole, np.zeros(ORDER))
+    free = np.flatnonzero(base_mask(task, model))
+    columns = base_tangents(task, model)
+    packed = model.base.pack()
+    rng = np.random.default_rng(3)
+    step = rng.normal(size=len(free)) * np.where(free < 5, 0.1, 0.01)
+    packed[free] += step
+    change = answer(scene, replace(model, base=model.base.unpack(packed))) - answer(scene, model)
+    rows = scene.scored
+    assert np.abs(change - columns @ step)[rows].max() < 0.05 * np.abs(change)[rows].max() + 1e-3
+
+
+def naive_play(v, half):
+    out, plug = [], v[0]
+    for here in v:
+        if here - plug > half:
+            plug = here - half
+        elif plug - here > half:
+            plug = here + half
+        out.append(plug)
+    return np.array(out)
+
+
+@given(st.lists(st.floats(0.0, 100.0), min_size=1, max_size=60), st.floats(0.0, 5.0))
+def test_play_is_what_one_would_write_down(values, half):
+    v = np.array(values)
+    out = np.empty(len(v))
+    kernels.play(v, half, out)
+    np.testing.assert_allclose(out, naive_play(v, half), atol=1e-12)
+    assert np.all(np.abs(out - v) <= half + 1e-12)
+
+
+@given(st.lists(st.floats(0.0, 100.0), min_size=1, max_size=60), st.floats(0.01, 5.0))
+def test_sticking_without_a_jump_is_play(values, band):
+    v = np.array(values)
+    stuck, loose = np.empty(len(v)), np.empty(len(v))
+    kernels.stick_slip(v, band, 0.0, stuck)
+    kernels.play(v, 0.5 * band, loose)
+    np.testing.assert_allclose(stuck, loose, atol=1e-9)
+
+
+@given(st.lists(st.floats(-3.0, 3.0), min_size=1, max_size=9), st.floats(0.1, 2.0))
+def test_the_hidden_path_is_the_cheapest(costs, penalty):
+    cost = np.array(costs)
+    path = np.empty(len(cost), dtype=np.uint8)
+    kernels.viterbi(cost, penalty, path)
+
+    def price(states):
+        switches = int(states[0]) + sum(a != b for a, b in itertools.pairwise(states))
+        return float(np.dot(states, cost)) + penalty * switches
+
+    best = min(price(states) for states in itertools.product((0, 1), repeat=len(cost)))
+    assert price(path) == pytest.approx(best, abs=1e-9)
+
+
+def test_one_pass_and_two_passes_of_the_filter_agree(scene):
+    x = rough_model().static(scene.u)
+    path = np.zeros(len(x), dtype=np.uint8)
+    taps = rough_model().taps(scene.step_s)
+    usable = scene.usable.copy()
+    usable[1000:1010] = 0
+    rows, means = np.empty(len(x)), np.empty(len(scene.power))
+    kernels.respond(x, usable, path, taps, rows)
+    kernels.respond_means(x, usable, path, taps, scene.group, means)
+    np.testing.assert_allclose(means, scene.means(rows), rtol=1e-12)
+
+
+def test_every_fifth_block_is_sealed_and_in_no_fit(scene):
+    assert not np.any(scene.open_rows & scene.sealed_rows)
+    assert np.array_equal(scene.open_rows | scene.sealed_rows, scene.whole)
+    assert set(scene.fold_of_sub[scene.sub[scene.sealed_rows]]) == {SEALED_FOLD}
+
+
+def test_scores_of_noise_have_even_chances():
+    rng = np.random.default_rng(4)
+    chances = [sign_flip(rng.normal(size=30)) for _ in range(40)]
+    assert 0.3 < np.mean(chances) < 0.7
+    assert sign_flip(np.full(30, 1.0)) < 1e-4
+    assert sign_flip(-np.full(30, 1.0)) == 1.0
+
+
+def test_a_clean_record_has_no_faults():
+    samples = table(0.4, 2, (), unit())
+    bad, found = quality.faults(samples, 2.0)
+    assert found == ()
+    assert not bad.any()
+
+
+def test_faults_are_masked_where_they_are():
+    samples = table(0.4, 2, (), unit())
+    values = samples.values.copy()
+    places = np.array([3000, 5001, 9000, 12000, 15000])
+    values[places, Signal.GENERATED_POWER] += 60.0
+    values[7000:8000, Signal.MAIN_STEAM_PRESSURE] = values[7000, Signal.MAIN_STEAM_PRESSURE]
+    bad, found = quality.faults(SampleTable(samples.time_ns, values, samples.quality), 2.0)
+    assert {(f.name, f.signal.signal) for f in found} == {
+        ('spikes', Signal.GENERATED_POWER), ('flatline', Signal.MAIN_STEAM_PRESSURE),
+    }  # fmt: skip
+    assert set(np.flatnonzero(bad[:, Signal.GENERATED_POWER])) == set(places)
+    assert bad[7001:8000, Signal.MAIN_STEAM_PRESSURE].all()
+
+
+def test_shallow_knees_are_taken_out_and_steep_ones_stay():
+    model = rough_model()
+    split = replace(
+        model, knots=np.insert(model.knots, 2, 1400.0),
+        left=np.insert(model.left, 2, 225.5), right=np.insert(model.right, 1, 225.5),
+    )  # fmt: skip
+    assert simplified(split).pieces == model.pieces
+    assert simplified(model).pieces == model.pieces
+
+
+def test_the_extended_model_comes_back_from_its_file(scene):
+    model = Extended(
+        rough_model(),
+        (Active(catalogue()['gain_step'], (0.006, 0.2)),
+         Active(catalogue()['intervals'], (0.01,), (3600.0, 9000.0))),
+    )  # fmt: skip
+    raw = json.loads(json.dumps(model_json(model, 1.125, 5, scene.reference)))
+    back, exponent, start_ns, reference = model_from_json(raw)
+    assert (exponent, start_ns, reference) == (1.125, 5, scene.reference)
+    np.testing.assert_array_equal(answer(scene, back), answer(scene, model))
+
+
+@pytest.mark.parametrize('raw', [None, {}, {'format': 'valveflow/extended_model', 'version': 9}])
+def test_what_is_no_extended_model_is_refused(raw):
+    with pytest.raises(DataError):
+        model_from_json(raw)
+
+
+def test_a_record_of_minutes_is_refused():
+    samples = table(0.4, 2, (), unit()).part(0, 600)
+    with pytest.raises(TooFewSamplesError, match='longer record'):
+        make_scene(*record(samples).about, np.zeros(samples.values.shape, dtype=bool))

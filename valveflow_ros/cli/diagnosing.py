@@ -1,0 +1,197 @@
+"""From a log that was read to the files and the words of a diagnosis."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from valveflow_ros.cli import engine
+from valveflow_ros.cli.console import Console, Outcome
+from valveflow_ros.cli.first_run import SENTENCE, is_first_run
+from valveflow_ros.cli.log_input import LogInput, steps_of
+from valveflow_ros.cli.parameters import settings_for
+from valveflow_ros.cli.report_words import columns
+from valveflow_ros.config import Settings
+from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.characteristic_json import from_json
+from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.diagnosis.diagnose import Record, diagnose
+from valveflow_ros.diagnosis.diagnosis_json import model_json, to_json
+from valveflow_ros.diagnosis.first_model import first_model
+from valveflow_ros.errors import DataError, RecordingError
+from valveflow_ros.records import SIGNALS, IntArray, SampleTable
+from valveflow_ros.report.diagnosis import Diagnosed, diagnosis_report
+from valveflow_ros.report.numbers import decimals, interval, plain
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """A diagnosis, what it was made from, and the exponent of its u."""
+
+    page: Diagnosed
+    exponent: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """Aligned rows, special segments, and the curve where one was found."""
+
+    table: SampleTable
+    spans_ns: IntArray
+    curve: Characteristic | None
+    why: str = ''
+
+
+def read_model(path: Path) -> Characteristic:
+    """Read ``characteristic.json``.
+
+    Raises
+    ------
+    RecordingError, DataError
+    """
+    try:
+        raw = json.loads(path.read_text(encoding='utf-8'))
+    except OSError as error:
+        raise RecordingError(path, f'cannot be read ({(error.strerror or "").lower()})') from None
+    except ValueError:
+        raise RecordingError(path, 'is no JSON') from None
+    model = from_json(raw)
+    if not model.dynamics:
+        raise DataError(
+            f'{path}: this curve has no dynamics, and without them every ramp would look like a '
+            'fault; identify it from a longer record, or leave out --model.'
+        )
+    return model
+
+
+def diagnosed_in(
+    log: LogInput, model: Characteristic | None, given: Mapping[str, Any], source: Path,
+    console: Console,
+) -> Result:  # fmt: skip
+    """Align, identify if there is no model, diagnose.
+
+    Raises
+    ------
+    DataError
+        The record cannot carry a diagnosis; the sentence says why.
+    """
+    times = log.readings.time_ns
+    span_s = float(times.max() - times.min()) / 1e9 if len(times) else 0.0
+    settings, notes = settings_for(steps_of(log.readings), span_s, given)
+    notes += [
+        f'{SIGNALS[s].topic} was not logged and is taken as {value:g} {SIGNALS[s].unit}.'
+        for s, value in sorted(log.constants.items())
+    ]
+    for sentence in notes:
+        console.say(sentence)
+    if is_first_run():
+        console.say(SENTENCE)
+    rows = _rows(log, settings, model is None, console)
+    if rows.why:
+        console.warn(rows.why)
+        notes.append(rows.why)
+    step, settle = settings.real('sample_period'), settings.settle_s
+    curve = model or rows.curve
+    exponent = curve.pressure_exponent if curve else settings.real('pressure_exponent')
+    regional: RegionalModel
+    regional = curve.model if curve else first_model(rows.table, step, exponent, settle)
+    record = Record(rows.table, step, exponent, settle, rows.spans_ns)
+    found, views = diagnose_with_views(record, regional, model is not None, console)
+    found = replace(found, notes=(*log.contents.warnings, *notes, *found.notes))
+    ends = int(rows.table.time_ns[0]), int(rows.table.time_ns[-1])
+    return Result(Diagnosed(source.name, *ends, found, *views), exponent)
+
+
+def diagnose_with_views(record: Record, model: RegionalModel, given: bool, console: Console):  # type: ignore[no-untyped-def]
+    """Diagnose, and draw up what the pictures show."""
+    from valveflow_ros.diagnosis.views import views
+
+    found = diagnose(
+        record, model, given, lambda share, what: console.progress(0.4 + 0.5 * share, what)
+    )
+    return found, views(record, found)
+
+
+def _rows(log: LogInput, settings: Settings, wanted: bool, console: Console) -> _Rows:
+    """Align the log and find special segments; without any of them say so and go on."""
+    try:
+        watched = engine.watch(log.readings, settings, console.progress)
+    except DataError as error:
+        table, _, _ = engine_align(log, settings)
+        if not _complete(table):
+            raise
+        why = f'{error} The model is found from all rows instead, without special segments.'
+        return _Rows(table, np.empty((0, 2), dtype=np.int64), None, why)
+    spans = np.array([(s.start_ns, s.end_ns) for s in watched.segments], dtype=np.int64)
+    spans = spans.reshape(-1, 2)
+    if not wanted:
+        return _Rows(watched.table, spans, None)
+    try:
+        curve = engine.identify(watched, console.progress)
+    except DataError as error:
+        return _Rows(watched.table, spans, None, f'{error} All rows are used instead.')
+    if not curve.dynamics:
+        return _Rows(watched.table, spans, None)
+    return _Rows(watched.table, spans, curve)
+
+
+def engine_align(log: LogInput, settings: Settings) -> tuple[SampleTable, Any, Any]:
+    """Put readings into rows."""
+    from valveflow_ros.cli.alignment import align
+
+    return align(log.readings, settings)
+
+
+def _complete(table: SampleTable) -> bool:
+    """Tell whether every needed signal has values."""
+    return len(table) > 0 and all(
+        bool(np.isfinite(table.column(info.signal)).any()) for info in SIGNALS if info.required
+    )
+
+
+def texts(found: Result) -> dict[str, str]:
+    """Return the files of the result by name."""
+    d, page = found.page.diagnosis, found.page
+    extended = model_json(d.final, found.exponent, page.start_ns, d.reference)
+    return {
+        'diagnosis.json': json.dumps(to_json(d), indent=2, allow_nan=False) + '\n',
+        'extended_model.json': json.dumps(extended, indent=2, allow_nan=False) + '\n',
+        'report.html': diagnosis_report(page),
+    }
+
+
+def outcome(found: Result, written: Mapping[str, Path]) -> Outcome:
+    """Return what is printed at the end."""
+    data = {
+        **to_json(found.page.diagnosis),
+        'files': {name: str(path) for name, path in written.items()},
+    }
+    return Outcome(_text(found, written), data)
+
+
+def _text(found: Result, written: Mapping[str, Path]) -> str:
+    d = found.page.diagnosis
+    rows = [
+        [c.name, key, f'{plain(e.value)} {e.unit}'.strip(), interval(e.low, e.high)]
+        for c in d.causes
+        for key, e in c.parameters.items()
+    ]
+    judged = [f'  {name}: {why}' for name, why in d.rejected if 'cannot be judged' in why]
+    parts = [
+        f'{found.page.source}: {d.verdict}. {d.sentence}',
+        columns(rows, ['cause', 'parameter', 'value', '95 % interval']) if rows else '',
+        f'Not told apart: {", ".join(d.not_told_apart)}.' if d.not_told_apart else '',
+        *(f'What would tell: {e}' for e in d.experiments),
+        f'RMSE on sealed blocks: simulation {decimals(d.rmse_simulation, 3)} MW, extended model '
+        f'{decimals(d.rmse_extended, 3)} MW, noise alone about '
+        f'{decimals(d.rmse_noise_floor, 3)} MW.',
+        '\n'.join(['Not judged:', *judged]) if judged else '',
+        *d.notes,
+        f'Wrote {written["report.html"]}, diagnosis.json and extended_model.json.',
+    ]
+    return '\n'.join(part for part in parts if part)

@@ -1,0 +1,1 @@
+"""What the simulation gets wrong: the cause, the extended model, the gain."""

@@ -1,0 +1,54 @@
+"""Part of the power comes behind the reheater, which fills slowly.
+
+The turbine models of IEEE (IEEEG1, TGOV1) split the power: a share is made in front
+of the reheater at once, the rest follows its filling.
+
+    y = alpha y1 + (1 - alpha) y1 / (1 + T s),  y1 = G x
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from valveflow_ros.core.regional_kernel import make_taps
+from valveflow_ros.diagnosis import kernels
+from valveflow_ros.diagnosis.bench import Bench
+from valveflow_ros.diagnosis.cause import Cause, Stage, Start, Unknown, Values
+from valveflow_ros.diagnosis.scene import Scene
+from valveflow_ros.records import FloatArray
+
+_TRIED = tuple((alpha, t) for alpha in (0.2, 0.4, 0.7) for t in (8.0, 20.0, 60.0, 200.0))
+
+
+def act(y: FloatArray, values: Values, scene: Scene) -> FloatArray:
+    """Return the power shown."""
+    alpha, time_s = values
+    taps = make_taps(np.array([time_s]), np.zeros(1), scene.step_s)[0]
+    late = np.empty(len(y))
+    kernels.lag(y, scene.usable, taps, late)
+    return np.asarray(alpha * y + (1.0 - alpha) * late)
+
+
+def starts(bench: Bench) -> Sequence[Start]:
+    """Try shares and time constants."""
+    return bench.best(CAUSE, list(_TRIED), keep=2)
+
+
+def sentence(values: dict[str, float]) -> str:
+    """Say it."""
+    return (
+        f'Only {100.0 * values["alpha"]:.0f} % of the power follow the valve at once; the rest '
+        f'comes {values["time_s"]:.3g} s later, through the reheater.'
+    )
+
+
+CAUSE = Cause(
+    'reheater', 'lag', Stage.OUTPUT,
+    (Unknown('alpha', '', 0.03, 0.0, 1.0), Unknown('time_s', 's', 1.0, 0.5, 1800.0)),
+    act, starts, sentence, ('clock', 'region_lag', 'rate_limit'),
+    'Steps of the opening at constant pressure, power logged every second: two slopes in the '
+    'answer are a reheater.',
+    order=1,
+)  # fmt: skip

@@ -1,0 +1,153 @@
+"""What a cause is: a change of the model with parameters, and a way to look for it."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from valveflow_ros.diagnosis.scene import Scene
+from valveflow_ros.records import BoolArray
+
+if TYPE_CHECKING:
+    from valveflow_ros.diagnosis.bench import Bench
+
+Values = tuple[float, ...]
+
+
+class Stage(enum.IntEnum):
+    """Where in the plant a cause acts, from the position sensor to the power meter.
+
+    What ``act`` of a cause takes and returns:
+
+    - ``OPENING``: (v in % (nn,), values, scene) to the opening behind the fault
+    - ``INPUT``: (u (n,), values, scene, model) to a factor on u
+    - ``FLOW``: (u (n,), values, scene) to MW added to x = F(u)
+    - ``GAIN``: (values, scene, extra) to a factor on x
+    - ``DYNAMICS``: (model, values) to a model with other dynamics
+    - ``OUTPUT``: (y (n,) in MW, values, scene) to the power shown
+    """
+
+    OPENING = 0
+    INPUT = 1
+    FLOW = 2
+    GAIN = 3
+    DYNAMICS = 4
+    OUTPUT = 5
+
+
+class Kind(enum.Enum):
+    """How a parameter is estimated and how its interval is found."""
+
+    SMOOTH = 'smooth'
+    ROUGH = 'rough'
+    LINE = 'line'
+
+
+@dataclass(frozen=True, slots=True)
+class Unknown:
+    """A parameter of a cause.
+
+    Attributes
+    ----------
+    name, unit : str
+    step : float
+        For differences; about a tenth of what matters.
+    low, high : float
+        Bounds of what a plant can have.
+    kind : Kind
+        ``LINE`` parameters are moved by a line search that begins with ``step`` (the cost
+        is not smooth in them), the others by Gauss-Newton.
+    """
+
+    name: str
+    unit: str
+    step: float
+    low: float
+    high: float
+    kind: Kind = Kind.SMOOTH
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Values to begin a full fit from, and what screening expects of them.
+
+    ``gain`` is a log-likelihood on the open blocks; ``extra`` holds what is not a number
+    to be fitted (the times of switches).
+    """
+
+    values: Values
+    gain: float
+    extra: Values = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """One entry of the catalogue.
+
+    Attributes
+    ----------
+    name : str
+        The catalogue's word.
+    family : str
+        Causes of one family are always tried against each other.
+    stage : Stage
+    unknowns : tuple of Unknown
+    act : callable
+        See `Stage`.
+    starts : callable
+        Takes the `Bench` and returns promising values, none if there are none.
+    sentence : callable
+        Takes values by name and says what is wrong, for an operator.
+    hindered : callable
+        Why the record cannot judge this cause; empty if it can.
+    confusers : tuple of str
+        Names of causes that look alike.
+    experiment : str
+        What would tell them apart.
+    """
+
+    name: str
+    family: str
+    stage: Stage
+    unknowns: tuple[Unknown, ...]
+    act: Callable[..., Any]
+    starts: Callable[[Bench], Sequence[Start]]
+    sentence: Callable[[dict[str, float]], str]
+    confusers: tuple[str, ...]
+    experiment: str
+    hindered: Callable[[Scene], str] = field(default=lambda scene: '')
+    slow: bool = False  # a slow wander of the power could be mistaken for it
+    # Infers what is hidden (``extra``) from the sub-blocks allowed, for a given size.
+    infer: Callable[[Bench, Active, BoolArray], Values] | None = None
+    order: int = 0  # among causes of one stage: from the oil to the plug
+
+    def clipped(self, values: Values) -> Values:
+        """Return values within the bounds."""
+        return tuple(
+            min(max(v, u.low), u.high) for v, u in zip(values, self.unknowns, strict=True)
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Active:
+    """A cause with values: a part of an extended model."""
+
+    cause: Cause
+    values: Values
+    extra: Values = ()
+
+    @property
+    def name(self) -> str:
+        """Return the catalogue's word."""
+        return self.cause.name
+
+    @property
+    def size(self) -> int:
+        """Return how many numbers were chosen from the data; every switch is one."""
+        return len(self.values) + len(self.extra)
+
+    def named(self) -> dict[str, float]:
+        """Return the values by name."""
+        return {u.name: v for u, v in zip(self.cause.unknowns, self.values, strict=True)}

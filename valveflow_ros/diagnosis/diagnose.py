@@ -1,0 +1,266 @@
+"""From a record and a model to a diagnosis."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.diagnosis.bench import Bench
+from valveflow_ros.diagnosis.confidence import Certainty
+from valveflow_ros.diagnosis.extended import Extended
+from valveflow_ros.diagnosis.fitting import Task, improve, search_levels, search_lines
+from valveflow_ros.diagnosis.gain import by_segment, noise_floor, rmse, sealed_gain
+from valveflow_ros.diagnosis.grid import make_scene
+from valveflow_ros.diagnosis.hidden import inferred
+from valveflow_ros.diagnosis.outside import actuator_cause, notes, record_causes
+from valveflow_ros.diagnosis.period import Period, period
+from valveflow_ros.diagnosis.quality import Fault, faults
+from valveflow_ros.diagnosis.result import (
+    NAMED,
+    NOTHING,
+    UNEXPLAINED,
+    Diagnosis,
+    Disturbance,
+    NamedCause,
+)
+from valveflow_ros.diagnosis.scene import ORDER, Scene
+from valveflow_ros.diagnosis.search import Found, Progress, search
+from valveflow_ros.diagnosis.simplify import simplified
+from valveflow_ros.diagnosis.structure import Structure, structure
+from valveflow_ros.diagnosis.wander import Wander, wander
+from valveflow_ros.errors import DataError
+from valveflow_ros.records import FloatArray, IntArray, SampleTable
+
+_LEAST_SPREAD = 0.01
+
+
+def _quiet(_share: float, _what: str) -> None:
+    """Show no progress."""
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """What is diagnosed.
+
+    Attributes
+    ----------
+    table : SampleTable
+    step_s : float
+        Step of its rows.
+    pressure_exponent : float
+        Of the model.
+    settle_s : float
+        Time after a gap until the model can be believed.
+    spans_ns : int64 (k, 2)
+        First and last time of special segments.
+    """
+
+    table: SampleTable
+    step_s: float
+    pressure_exponent: float
+    settle_s: float
+    spans_ns: IntArray
+
+    @property
+    def about(self) -> tuple[SampleTable, float, float, float]:
+        """Return what `make_scene` wants first."""
+        return self.table, self.step_s, self.pressure_exponent, self.settle_s
+
+
+@dataclass(frozen=True, slots=True)
+class _Rest:
+    """What the final residual still holds."""
+
+    wander: Wander
+    structure: Structure
+    period: Period
+
+
+def diagnose(
+    record: Record, model: RegionalModel, given: bool = False, progress: Progress = _quiet
+) -> Diagnosis:
+    """Say what the simulation gets wrong, name the cause, extend the model, measure the gain.
+
+    Parameters
+    ----------
+    record : Record
+    model : RegionalModel
+        Curve and dynamics: those identified from this record, or those of an earlier one.
+    given : bool
+        The model comes from elsewhere: its dynamics and number of pieces are taken as they
+        are, and what differs from them is a finding. Otherwise they follow the record.
+
+    Raises
+    ------
+    TooFewSamplesError
+        The record is too short or has too many gaps.
+    DataError
+        The valve hardly moves.
+    """
+    progress(0.02, 'the record itself')
+    bad, wrong = faults(record.table, record.step_s)
+    scene, rough = make_scene(*record.about, bad), make_scene(*record.about, bad, rough=True)
+    _moves(scene)
+    task = Task(scene, scene.open_rows, np.zeros(ORDER), given)
+    start = Extended(model if given else simplified(model))
+    found = search(task, start, progress, rough)
+    progress(0.7, 'what is left')
+    rest = _look_again(found)
+    _withdraw(found, rest)
+    progress(0.8, 'the sealed blocks')
+    return _conclude(record, found, rest, wrong, progress)
+
+
+def _moves(scene: Scene) -> None:
+    """Refuse a record in which nothing happens."""
+    low, high = np.quantile(scene.u[scene.usable > 0], (0.01, 0.99))
+    if high - low < _LEAST_SPREAD * abs(high):
+        raise DataError(
+            f'The valve hardly moves: u stays between {low:.4g} and {high:.4g}. A diagnosis needs '
+            'several loads.'
+        )
+
+
+def _wandering(scene: Scene, bench: Bench, slow: Wander) -> FloatArray | None:
+    """Return the disturbance in MW of every mean, None if there is none."""
+    return slow.level[scene.sub] * bench.here if slow.there else None
+
+
+def _look_again(found: Found) -> _Rest:
+    """Look at what the model with all causes leaves."""
+    bench = Bench(found.task, found.model)
+    slow = wander(bench)
+    left = structure(found.task, found.model, _wandering(found.task.scene, bench, slow))
+    return _Rest(slow, left, period(found.task, found.model))
+
+
+def _withdraw(found: Found, rest: _Rest) -> None:
+    """Take back names of causes in time where the power wanders slowly all the time."""
+    if not rest.wander.there:
+        return
+    for a in found.model.active:
+        if a.cause.slow:
+            found.model = found.model.without(a.name)
+            found.near.pop(a.name, None)
+            found.reasons[a.name] = (
+                'the power wanders slowly all the time, which would look the same'
+            )
+    found.model, _ = improve(found.task, found.model, 3)
+
+
+def _steps(found: Found) -> list[Extended]:
+    """Return the models with one cause more each, fitted to the open blocks."""
+    models = [found.plain]
+    for k in range(1, len(found.model.active)):
+        part = replace(found.model, active=found.model.active[:k])
+        models.append(improve(found.task, part, 2)[0])
+    return models + ([found.model] if found.model.active else [])
+
+
+def _final(found: Found) -> tuple[Task, Extended]:
+    """Fit the extended model to all blocks, the sealed ones too."""
+    task = replace(found.task, rows=found.task.scene.whole)
+    model, cost = improve(task, found.model, 3)
+    model, cost = search_levels(task, model, cost)
+    model, _ = search_lines(task, model, cost)
+    return task, inferred(task, model, np.ones(task.scene.subs, dtype=bool))
+
+
+def _conclude(
+    record: Record, found: Found, rest: _Rest, wrong: tuple[Fault, ...], progress: Progress
+) -> Diagnosis:
+    scene = found.task.scene
+    models = _steps(found)
+    gains = [sealed_gain(found.task, a, b, found.tried) for a, b in itertools.pairwise(models)]
+    task, final = _final(found)
+    progress(0.9, 'how sure it is')
+    estimates = Certainty(task, final).intervals() if final.active else {}
+    causes = tuple(
+        NamedCause(
+            a.name, a.cause.sentence(a.named()), estimates[a.name], gain, a.cause.experiment,
+            found.near.get(a.name, ()), a.extra,
+        )
+        for a, gain in zip(final.active, gains, strict=True)
+    )  # fmt: skip
+    raw = (
+        make_scene(*record.about, np.zeros(record.table.values.shape, dtype=bool))
+        if wrong
+        else None
+    )
+    outside = actuator_cause(found) + record_causes(raw, found, wrong)
+    verdict, dropped = _verdict(found, rest, bool(outside))
+    near = tuple(dict.fromkeys(n for c in causes for n in c.not_told_apart))
+    if verdict == UNEXPLAINED:
+        near = tuple(dict.fromkeys((*(c.name for c in causes), *near)))
+    causes = () if dropped else causes
+    unexplained = _unexplained(rest)
+    before, after = (rmse(found.task, m, scene.sealed_rows) for m in (models[0], models[-1]))
+    explained = rest.structure.explained_mw2 if rest.structure.there else 0.0
+    result = Diagnosis(
+        verdict=verdict, sentence='', causes=causes + outside,
+        not_told_apart=near, experiments=_experiments(causes),
+        disturbance=Disturbance(rest.wander.rms_mw, rest.wander.time_scale_s)
+        if rest.wander.there else None,
+        unexplained_by=unexplained, rejected=tuple(found.reasons.items()),
+        rmse_simulation=before, rmse_extended=before if dropped else after,
+        rmse_noise_floor=noise_floor(found.task, models[-1], explained),
+        segments=by_segment(found.task, models[0], models[-1], record.spans_ns),
+        simulation=models[0], extended=models[0] if dropped else models[-1],
+        final=final.without_causes() if dropped else final,
+        reference=scene.reference, notes=notes(scene),
+    )  # fmt: skip
+    return replace(result, sentence=_sentence(result))
+
+
+def _verdict(found: Found, rest: _Rest, record_wrong: bool) -> tuple[str, bool]:
+    """Return the verdict, and whether names must be taken back.
+
+    Structure that weighs more than what the causes explain means that they are at best near it.
+    """
+    left = 0.0
+    if rest.structure.there:
+        left = max(left, rest.structure.explained_mw2)
+    if rest.period.there:
+        left = max(left, rest.period.variance_mw2)
+    if left > 0.0:
+        rows = found.task.rows
+        own = float(
+            np.mean(found.task.residual(found.plain)[rows] ** 2)
+            - np.mean(found.task.residual(found.model)[rows] ** 2)
+        )
+        if not found.model.active or left > own:
+            return UNEXPLAINED, bool(found.model.active)
+    if found.model.active or record_wrong:
+        return NAMED, False
+    return NOTHING, False
+
+
+def _unexplained(rest: _Rest) -> tuple[str, ...]:
+    names = rest.structure.variables if rest.structure.there else ()
+    return (*names, rest.period.words) if rest.period.there else names
+
+
+def _experiments(causes: tuple[NamedCause, ...]) -> tuple[str, ...]:
+    return tuple(c.experiment for c in causes if c.not_told_apart)
+
+
+def _sentence(d: Diagnosis) -> str:
+    """Return the verdict as one sentence an operator understands."""
+    if d.verdict == NAMED:
+        return ' '.join(c.sentence for c in d.causes)
+    wander = ''
+    if d.disturbance:
+        wander = (
+            f' The power wanders slowly by {d.disturbance.rms_mw:.2g} MW over about '
+            f'{d.disturbance.time_scale_s / 3600.0:.2g} h, which has no cause in these signals.'
+        )
+    if d.verdict == NOTHING:
+        return 'The model explains the unit down to its noise.' + wander
+    near = f'; nearest: {", ".join(d.not_told_apart)}' if d.not_told_apart else ''
+    return (
+        'Something is wrong that no cause of the catalogue explains; it depends on '
+        f'{" and ".join(d.unexplained_by)}{near}.' + wander
+    )

@@ -1,0 +1,148 @@
+"""The extended model: curve, regional dynamics and causes, run on measured inputs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.diagnosis import kernels
+from valveflow_ros.diagnosis.cause import Active, Stage
+from valveflow_ros.diagnosis.scene import Scene
+from valveflow_ros.records import ByteArray, FloatArray
+
+_REMEMBERED = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """What causes make of the inputs: u (n,), MW added to F(u), factor on x (None: nothing)."""
+
+    u: FloatArray
+    added: FloatArray | None
+    gain: FloatArray | None
+
+
+@dataclass(frozen=True, slots=True)
+class Extended:
+    """A model with the causes found so far; none of them is the plain simulation."""
+
+    base: RegionalModel
+    active: tuple[Active, ...] = ()
+
+    def at(self, stage: Stage) -> tuple[Active, ...]:
+        """Return the causes that act at one stage."""
+        return tuple(a for a in self.active if a.cause.stage == stage)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the causes' names in the order found."""
+        return tuple(a.name for a in self.active)
+
+    @property
+    def regional(self) -> RegionalModel:
+        """Return curve and dynamics with what causes change in them."""
+        model = self.base
+        for a in self.at(Stage.DYNAMICS):
+            model = a.cause.act(model, a.values)
+        return model
+
+    def without_causes(self) -> Extended:
+        """Return curve and dynamics alone."""
+        return replace(self, active=())
+
+    def with_cause(self, added: Active) -> Extended:
+        """Return the model with one more cause."""
+        return replace(self, active=(*self.active, added))
+
+    def without(self, name: str) -> Extended:
+        """Return the model without a cause."""
+        return replace(self, active=tuple(a for a in self.active if a.name != name))
+
+    def having(self, changed: Active) -> Extended:
+        """Return the model with other values for one of its causes."""
+        return replace(
+            self, active=tuple(changed if a.name == changed.name else a for a in self.active)
+        )
+
+
+def _input(scene: Scene, model: Extended) -> FloatArray:
+    """Return u behind what the valve does to the opening; the last few are remembered."""
+    chain = sorted(model.at(Stage.OPENING), key=lambda a: a.cause.order)
+    if not chain:
+        return scene.u
+    key = tuple((a.name, a.values) for a in chain)
+    if key not in scene.cache:
+        v = scene.v
+        for a in chain:
+            v = a.cause.act(v, a.values, scene)
+        while len(scene.cache) >= _REMEMBERED:
+            scene.cache.pop(next(iter(scene.cache)))
+        u = scene.coarse(v * scene.density)
+        scene.cache[key] = np.where(scene.usable > 0, u, 0.0)
+    return scene.cache[key]
+
+
+def drive(scene: Scene, model: Extended) -> Drive:
+    """Return what acts on the curve and behind it."""
+    u = _input(scene, model)
+    for a in model.at(Stage.INPUT):
+        u = u * a.cause.act(u, a.values, scene, model.base)
+    added: FloatArray | None = None
+    for a in model.at(Stage.FLOW):
+        part = a.cause.act(u, a.values, scene)
+        added = part if added is None else added + part
+    gain: FloatArray | None = None
+    for a in model.at(Stage.GAIN):
+        factor = a.cause.act(a.values, scene, a.extra)
+        gain = factor if gain is None else gain * factor
+    return Drive(u, added, gain)
+
+
+def flow_of(model: Extended, driven: Drive) -> FloatArray:
+    """Return the steam power x in MW, shape (n,)."""
+    x = np.empty(len(driven.u))
+    m = model.base
+    kernels.flow(driven.u, m.knots, m.left, m.right, x)
+    if driven.added is not None:
+        x += driven.added
+    if driven.gain is not None:
+        x *= driven.gain
+    return x
+
+
+def region_path(model: Extended, x: FloatArray) -> ByteArray:
+    """Return the region of every model row."""
+    out = np.empty(len(x), dtype=np.uint8)
+    kernels.regions(x, model.regional.levels, out)
+    return out
+
+
+def answer(
+    scene: Scene, model: Extended, driven: Drive | None = None, path: ByteArray | None = None
+) -> FloatArray:
+    """Return the predicted means of the power in MW, shape (m,).
+
+    Parameters
+    ----------
+    driven : Drive, optional
+        Of this model, if known already.
+    path : uint8 (n,), optional
+        Regions to keep to. While one differentiates they must not flip: a tangent would
+        become a row of spikes.
+    """
+    x = flow_of(model, driven if driven is not None else drive(scene, model))
+    if path is None:
+        path = region_path(model, x)
+    taps = model.regional.taps(scene.step_s)
+    shown = sorted(model.at(Stage.OUTPUT), key=lambda a: a.cause.order)
+    if not shown:
+        out = np.empty(len(scene.power))
+        kernels.respond_means(x, scene.usable, path, taps, scene.group, out)
+        return out
+    y = np.empty(len(x))
+    kernels.respond(x, scene.usable, path, taps, y)
+    for a in shown:
+        y = a.cause.act(y, a.values, scene)
+    return scene.means(y)

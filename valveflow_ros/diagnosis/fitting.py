@@ -1,0 +1,278 @@
+"""Fit an extended model by its prediction error: tangents, Gauss-Newton, line searches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.core.problem import free_parameters
+from valveflow_ros.core.whitening import fit_ar
+from valveflow_ros.diagnosis.cause import Kind, Stage
+from valveflow_ros.diagnosis.extended import Extended, answer, drive, flow_of, region_path
+from valveflow_ros.diagnosis.scene import ORDER, Scene
+from valveflow_ros.records import BoolArray, FloatArray
+
+_LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4)
+_LINE_SHARES = (1.0, 0.5, 0.25, 0.1, 0.05)
+_SLOW_MEANS = 720  # two hours
+_LARGEST_SUM = 0.9
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What a fit works on: the record, the rows that count, the whitening, what may move.
+
+    ``fixed_dynamics`` holds time constants, delays and levels, as for a given model.
+    """
+
+    scene: Scene
+    rows: BoolArray
+    ar: FloatArray
+    fixed_dynamics: bool = False
+
+    def innovations(self, series: FloatArray) -> FloatArray:
+        """Return whitened rows that count of a series (m,) or table (m, k)."""
+        out = series.copy()
+        for k, a in enumerate(self.ar, start=1):
+            out[k:] -= a * series[:-k]
+        return np.asarray(out[self.rows])
+
+    def residual(self, model: Extended) -> FloatArray:
+        """Return measured minus predicted means in MW, shape (m,); 0 where not scored."""
+        return np.where(self.scene.scored, self.scene.power - answer(self.scene, model), 0.0)
+
+    def cost(self, model: Extended) -> float:
+        """Return the sum of squared innovations."""
+        e = self.innovations(self.residual(model))
+        return float(e @ e)
+
+
+def whitening(scene: Scene, residual: FloatArray) -> FloatArray:
+    """Return AR coefficients of a residual freed of what wanders over hours, shape (4,).
+
+    A misfit that lasts for hours must not be taken for correlation of the noise:
+    whitened away it could not be named any more.
+    """
+    weight = scene.open_rows.astype(np.float64)
+    kernel = np.ones(min(_SLOW_MEANS, max(1, len(residual) // 4)))
+    level = np.convolve(residual * weight, kernel, 'same')
+    level /= np.maximum(np.convolve(weight, kernel, 'same'), 1.0)
+    ar = fit_ar(
+        np.where(weight > 0, residual - level, 0.0), scene.open_rows.astype(np.uint8), ORDER
+    )
+    total = float(ar.sum())
+    return ar * (_LARGEST_SUM / total) if total > _LARGEST_SUM else ar
+
+
+def base_mask(task: Task, model: Extended) -> BoolArray:
+    """Return which packed parameters of curve and dynamics may move."""
+    free = free_parameters(model.base.pieces, model.base.regions)
+    if task.fixed_dynamics:
+        free[-2 * model.base.regions :] = False
+    elif 'clock' in model.names:
+        # Only delay minus lead shows, so the shortest delay stays where it is.
+        free[len(free) - model.base.regions + int(np.argmin(model.base.delays))] = False
+    return free
+
+
+def _base_steps(model: RegionalModel) -> FloatArray:
+    """Return steps for differences in the packed parameters."""
+    j, i = model.pieces, model.regions
+    span = float(model.knots[-1] - model.knots[0])
+    return np.concatenate(
+        [np.ones(j + 1), np.full(j - 1, 1e-3 * span), np.ones(j - 1), np.full(i, 0.02),
+         np.full(i, 0.2)]
+    )  # fmt: skip
+
+
+def base_tangents(task: Task, model: Extended) -> FloatArray:
+    """Return derivatives of the means by the free parameters of curve and dynamics, (m, P)."""
+    scene = task.scene
+    driven = drive(scene, model)
+    path = region_path(model, flow_of(model, driven))
+    here = answer(scene, model, driven, path)
+    packed, steps = model.base.pack(), _base_steps(model.base)
+    columns = []
+    for p in np.flatnonzero(base_mask(task, model)):
+        moved = packed.copy()
+        moved[p] += steps[p]
+        other = replace(model, base=model.base.unpack(moved))
+        columns.append((answer(scene, other, driven, path) - here) / steps[p])
+    return np.column_stack(columns)
+
+
+def _slots(model: Extended) -> list[tuple[int, int]]:
+    """Return (cause, parameter) of every parameter that Gauss-Newton moves."""
+    return [
+        (c, k)
+        for c, a in enumerate(model.active)
+        for k, u in enumerate(a.cause.unknowns)
+        if u.kind is not Kind.LINE
+    ]
+
+
+def _shifted(model: Extended, c: int, k: int, by: float) -> Extended:
+    a = model.active[c]
+    values = list(a.values)
+    values[k] += by
+    return model.having(replace(a, values=a.cause.clipped(tuple(values))))
+
+
+def cause_tangents(task: Task, model: Extended) -> FloatArray:
+    """Return derivatives of the means by the parameters of the causes, (m, Q)."""
+    scene = task.scene
+    slots = _slots(model)
+    if not slots:
+        return np.empty((len(scene.power), 0))
+    path = region_path(model, flow_of(model, drive(scene, model)))
+    columns = []
+    for c, k in slots:
+        stage = model.active[c].cause.stage
+        keep = None if stage == Stage.DYNAMICS else path
+        h = model.active[c].cause.unknowns[k].step
+        up, down = _shifted(model, c, k, h), _shifted(model, c, k, -h)
+        width = up.active[c].values[k] - down.active[c].values[k]
+        change = answer(scene, up, None, keep) - answer(scene, down, None, keep)
+        columns.append(change / max(width, 1e-12))
+    return np.column_stack(columns)
+
+
+def level_tangents(task: Task, model: Extended) -> FloatArray:
+    """Return differences by the levels of the regions, letting rows change region, (m, I - 1)."""
+    if task.fixed_dynamics or not len(model.base.levels):
+        return np.empty((len(task.scene.power), 0))
+    columns = []
+    for k in range(len(model.base.levels)):
+        up, down = model.base.levels.copy(), model.base.levels.copy()
+        up[k], down[k] = up[k] + 1.0, down[k] - 1.0
+        high = answer(task.scene, replace(model, base=model.base.with_levels(up)))
+        low = answer(task.scene, replace(model, base=model.base.with_levels(down)))
+        columns.append(0.5 * (high - low))
+    return np.column_stack(columns)
+
+
+def _levels_along(before: RegionalModel, after: RegionalModel) -> RegionalModel:
+    """Move the levels with the curve, so that the regions change at the same u as before.
+
+    A level that stays while the curve moves by a MW costs more than most causes gain.
+    """
+    if not len(before.levels) or np.any(before.right <= before.left):
+        return after
+    x = np.append(before.left, before.right[-1])
+    inside = (before.levels > x[0]) & (before.levels < x[-1])
+    u = np.interp(before.levels, x, before.knots)
+    levels = np.where(inside, before.levels + after.static(u) - before.static(u), before.levels)
+    return after.with_levels(levels) if np.all(np.diff(levels) > 0.0) else after
+
+
+def _stepped(task: Task, model: Extended, step: FloatArray) -> Extended:
+    """Return the model moved by a step, within bounds."""
+    free = np.flatnonzero(base_mask(task, model))
+    packed = model.base.pack()
+    packed[free] += step[: len(free)]
+    i = model.base.regions
+    packed[-i:] = np.clip(packed[-i:], 0.0, 600.0)
+    low = np.log(0.1 * task.scene.step_s)
+    packed[-2 * i : -i] = np.clip(packed[-2 * i : -i], low, np.log(3600.0))
+    moved = replace(model, base=_levels_along(model.base, model.base.unpack(packed)))
+    for (c, k), by in zip(_slots(model), step[len(free) :], strict=True):
+        moved = _shifted(moved, c, k, float(by))
+    return moved
+
+
+def _possible(model: Extended) -> bool:
+    knots = model.base.knots
+    return bool(np.all(np.diff(knots) > 0.004 * (knots[-1] - knots[0])))
+
+
+def improve(
+    task: Task, model: Extended, steps: int, frozen_base: FloatArray | None = None
+) -> tuple[Extended, float]:
+    """Levenberg-Marquardt over curve, dynamics and causes.
+
+    Parameters
+    ----------
+    frozen_base : float64 (m, P), optional
+        Tangents of curve and dynamics to be used throughout; they change little, and
+        taking them anew costs most of the time.
+    """
+    cost = task.cost(model)
+    damping = 1e-4
+    for _ in range(steps):
+        base = frozen_base if frozen_base is not None else base_tangents(task, model)
+        table = task.innovations(np.column_stack([base, cause_tangents(task, model)]))
+        e = task.innovations(task.residual(model))
+        normal, slope = table.T @ table, table.T @ e
+        scale = np.sqrt(np.diag(normal))
+        scale[scale <= 1e-9 * scale.max()] = np.inf
+        normal = normal / np.outer(scale, scale)
+        better = None
+        for _ in range(5):
+            system = normal + damping * np.eye(len(scale))
+            trial = _stepped(task, model, np.linalg.solve(system, slope / scale) / scale)
+            if _possible(trial):
+                value = task.cost(trial)
+                if value < cost:
+                    better = (trial, value)
+                    break
+            damping *= 10.0
+        if better is None:
+            break
+        gain, (model, cost) = cost - better[1], better
+        damping = max(damping / 10.0, 1e-8)
+        if gain < 1e-6 * cost:
+            break
+    return model, cost
+
+
+def search_levels(
+    task: Task, model: Extended, cost: float, steps: tuple[float, ...] = _LEVEL_STEPS_MW
+) -> tuple[Extended, float]:
+    """Move each level between regions along a line while the cost falls."""
+    if task.fixed_dynamics:
+        return model, cost
+    for k in range(len(model.base.levels)):
+        for step in steps:
+            for sign in (1.0, -1.0):
+                while True:
+                    levels = model.base.levels.copy()
+                    levels[k] += sign * step
+                    if np.any(np.diff(levels) <= 1.0):
+                        break
+                    trial = replace(model, base=model.base.with_levels(levels))
+                    value = task.cost(trial)
+                    if not value < cost:
+                        break
+                    model, cost = trial, value
+    return model, cost
+
+
+def search_lines(task: Task, model: Extended, cost: float) -> tuple[Extended, float]:
+    """Move every parameter of kind ``LINE`` along a line while the cost falls."""
+    for c, a in enumerate(model.active):
+        for k, unknown in enumerate(a.cause.unknowns):
+            if unknown.kind is not Kind.LINE:
+                continue
+            for share in _LINE_SHARES:
+                for sign in (1.0, -1.0):
+                    while True:
+                        trial = _shifted(model, c, k, sign * share * unknown.step)
+                        value = task.cost(trial)
+                        if not value < cost:
+                            break
+                        model, cost = trial, value
+    return model, cost
+
+
+def settle(task: Task, model: Extended, rounds: int, steps: int) -> tuple[Task, Extended, float]:
+    """Alternate between parameters, levels, lines and whitening until all agree."""
+    cost = np.inf
+    for _ in range(rounds):
+        model, cost = improve(task, model, steps)
+        model, cost = search_levels(task, model, cost)
+        model, cost = search_lines(task, model, cost)
+        task = replace(task, ar=whitening(task.scene, task.residual(model)))
+    model, cost = improve(task, model, 2)
+    return task, model, cost

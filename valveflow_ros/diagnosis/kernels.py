@@ -1,0 +1,207 @@
+"""The loops of the extended model: an answer by regions, and what a valve does to a position."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from valveflow_ros.core.jit import jit
+from valveflow_ros.core.regional_kernel import (
+    TAP_0,
+    TAP_1,
+    TAP_2,
+    TAP_A,
+    TAP_WHOLE,
+    curve,
+    region_of,
+)
+from valveflow_ros.records import ByteArray, FloatArray
+
+
+@jit
+def flow(
+    u: FloatArray, knots: FloatArray, left: FloatArray, right: FloatArray, out: FloatArray
+) -> None:
+    """Write x = F(u), shape (n,)."""
+    for t in range(u.size):
+        out[t] = curve(u[t], knots, left, right)
+
+
+@jit
+def regions(x: FloatArray, levels: FloatArray, out: ByteArray) -> None:
+    """Write the region of every flow, shape (n,)."""
+    for t in range(x.size):
+        out[t] = region_of(x[t], levels)
+
+
+@jit
+def respond(
+    x: FloatArray, usable: ByteArray, region: ByteArray, taps: FloatArray, out: FloatArray
+) -> None:
+    """Filter the flow by the taps of the region each row lies in; a gap begins in equilibrium."""
+    state = 0.0
+    age = 0
+    for t in range(x.size):
+        if not usable[t]:
+            age = 0
+            out[t] = 0.0
+            continue
+        if age == 0:
+            state = x[t]
+        r = region[t]
+        whole = int(taps[r, TAP_WHOLE])
+        state = (
+            taps[r, TAP_A] * state
+            + taps[r, TAP_0] * x[t - min(whole, age)]
+            + taps[r, TAP_1] * x[t - min(whole + 1, age)]
+            + taps[r, TAP_2] * x[t - min(whole + 2, age)]
+        )
+        out[t] = state
+        age += 1
+
+
+@jit
+def respond_means(
+    x: FloatArray,
+    usable: ByteArray,
+    region: ByteArray,
+    taps: FloatArray,
+    group: int,
+    out: FloatArray,
+) -> None:
+    """Do what `respond` does and write only means over ``group`` rows."""
+    state = 0.0
+    age = 0
+    for b in range(out.size):
+        total = 0.0
+        for t in range(b * group, (b + 1) * group):
+            if not usable[t]:
+                age = 0
+                continue
+            if age == 0:
+                state = x[t]
+            r = region[t]
+            whole = int(taps[r, TAP_WHOLE])
+            if age > whole + 2:
+                at = t - whole
+                late = taps[r, TAP_0] * x[at] + taps[r, TAP_1] * x[at - 1]
+                late += taps[r, TAP_2] * x[at - 2]
+            else:
+                late = (
+                    taps[r, TAP_0] * x[t - min(whole, age)]
+                    + taps[r, TAP_1] * x[t - min(whole + 1, age)]
+                    + taps[r, TAP_2] * x[t - min(whole + 2, age)]
+                )
+            state = taps[r, TAP_A] * state + late
+            total += state
+            age += 1
+        out[b] = total / group
+
+
+@jit
+def means(x: FloatArray, group: int, out: FloatArray) -> None:
+    """Write means over ``group`` rows."""
+    for b in range(out.size):
+        total = 0.0
+        for t in range(b * group, (b + 1) * group):
+            total += x[t]
+        out[b] = total / group
+
+
+@jit
+def bump(u: FloatArray, centre: float, width: float, out: FloatArray) -> None:
+    """Write a raised cosine of height 1 that ends ``width`` from its centre."""
+    for t in range(u.size):
+        place = (u[t] - centre) / width
+        out[t] = 0.5 + 0.5 * np.cos(np.pi * place) if -1.0 < place < 1.0 else 0.0
+
+
+@jit
+def lag(x: FloatArray, usable: ByteArray, taps: FloatArray, out: FloatArray) -> None:
+    """Pass a series through one first-order lag given by its taps (7,)."""
+    state = 0.0
+    last = 0.0
+    age = 0
+    for t in range(x.size):
+        if not usable[t]:
+            age = 0
+            out[t] = 0.0
+            continue
+        if age == 0:
+            state = last = x[t]
+        state = taps[TAP_A] * state + taps[TAP_1] * last + taps[TAP_0] * x[t]
+        last = x[t]
+        out[t] = state
+        age += 1
+
+
+@jit
+def settled(usable: ByteArray, rows: int, out: ByteArray) -> None:
+    """Write 1 where the last gap lies more than ``rows`` rows back."""
+    age = 0
+    for t in range(usable.size):
+        age = age + 1 if usable[t] else 0
+        out[t] = 1 if age > rows else 0
+
+
+@jit
+def play(v: FloatArray, half: float, out: FloatArray) -> None:
+    """Follow ``v`` only where one flank of a slack of width ``2 half`` pushes; NaN is passed."""
+    state = np.nan
+    for t in range(v.size):
+        if np.isnan(v[t]):
+            out[t] = np.nan
+            continue
+        state = v[t] if np.isnan(state) else min(max(state, v[t] - half), v[t] + half)
+        out[t] = state
+
+
+@jit
+def stick_slip(v: FloatArray, band: float, jump: float, out: FloatArray) -> None:
+    """Stay until the pull exceeds (S + J)/2, then slip to (S - J)/2 from it."""
+    state = np.nan
+    off, near = 0.5 * (band + jump), 0.5 * (band - jump)
+    for t in range(v.size):
+        if np.isnan(v[t]):
+            out[t] = np.nan
+            continue
+        if np.isnan(state):
+            state = v[t]
+        pull = v[t] - state
+        if pull > off:
+            state = v[t] - near
+        elif pull < -off:
+            state = v[t] + near
+        out[t] = state
+
+
+@jit
+def rate_limit(v: FloatArray, largest: float, out: FloatArray) -> None:
+    """Follow ``v`` by at most ``largest`` a row."""
+    state = np.nan
+    for t in range(v.size):
+        if np.isnan(v[t]):
+            out[t] = np.nan
+            continue
+        if np.isnan(state):
+            state = v[t]
+        state += min(max(v[t] - state, -largest), largest)
+        out[t] = state
+
+
+@jit
+def viterbi(cost_on: FloatArray, penalty: float, out: ByteArray) -> None:
+    """Write the path of two states with least cost; ``cost_on`` (n,) is on minus off."""
+    n = cost_on.size
+    back = np.empty((n, 2), dtype=np.uint8)
+    off, on = 0.0, penalty
+    for t in range(n):
+        stay_off, leave = off, on + penalty
+        stay_on, enter = on, off + penalty
+        back[t, 0] = 0 if stay_off <= leave else 1
+        back[t, 1] = 1 if stay_on <= enter else 0
+        off = min(stay_off, leave)
+        on = min(stay_on, enter) + cost_on[t]
+    state = 1 if on < off else 0
+    for t in range(n - 1, -1, -1):
+        out[t] = state
+        state = back[t, state]

@@ -1,0 +1,161 @@
+"""Faults of the record itself: they have a name and are masked, but no model explains them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from valveflow_ros.records import SIGNALS, BoolArray, FloatArray, SampleTable, SignalInfo
+
+FLAT_LEAST_S = 30.0
+_FLAT_FACTOR = 3.0
+_LARGEST_SHARE = 0.5
+_SPIKE_WINDOW, _SPIKE_SD, _LONGEST_SPIKE = 11, 6.0, 2
+_SPIKE_SHARE, _LEAST_SPIKES = 0.01, 4
+_NOISE_ROWS = 3600
+_BACK_SHARE = 0.6
+_LEAP_ROWS, _LEAP_SD = 200, 3.5
+_COARSE_SHARE = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A fault of one signal.
+
+    Attributes
+    ----------
+    name : str
+        'flatline', 'spikes' or 'quantisation'.
+    signal : SignalInfo
+    rows : int
+        Rows that are masked; of a coarse signal, rows that do not change.
+    size : float
+        Longest flat stretch in seconds, typical height of spikes, or the step.
+    """
+
+    name: str
+    signal: SignalInfo
+    rows: int
+    size: float
+
+    @property
+    def sentence(self) -> str:
+        """Say it to an operator."""
+        what = self.signal.topic
+        if self.name == 'flatline':
+            return (
+                f'The record of {what} stands still for up to {self.size:.0f} s at a time; '
+                f'{self.rows} rows were not believed.'
+            )
+        if self.name == 'spikes':
+            return (
+                f'The record of {what} has {self.rows} single wild values of about '
+                f'{self.size:.2g} {self.signal.unit}; they were not believed.'
+            )
+        return (
+            f'{what} is recorded in steps of {self.size:.2g} {self.signal.unit}, coarser than it '
+            'moves from row to row.'
+        )
+
+
+def _runs(x: FloatArray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first row and the length of runs of equal values; NaN equals nothing."""
+    first = np.flatnonzero(np.concatenate([[True], x[1:] != x[:-1]]))
+    return first, np.diff(np.append(first, len(x)))
+
+
+def _flat(x: FloatArray, step_s: float) -> tuple[BoolArray, float]:
+    """Return rows inside runs far longer than this signal's usual ones."""
+    first, length = _runs(x)
+    bad = np.zeros(len(x), dtype=bool)
+    usual = float(np.quantile(length, 0.99))
+    least = max(FLAT_LEAST_S / step_s, _FLAT_FACTOR * usual, 4.0)
+    long = length >= least
+    if length[long].sum() > _LARGEST_SHARE * len(x):
+        return bad, 0.0
+    for a, n in zip(first[long], length[long], strict=True):
+        bad[a + 1 : a + n] = True  # the first value was true when it was written
+    return bad, float(length[long].max(initial=0)) * step_s
+
+
+def _returns(x: FloatArray, a: int, b: int) -> bool:
+    """Tell whether a signal leaps at row ``a`` and is back at row ``b`` all at once.
+
+    A fast move does not come back, and the peak of a lively signal is not reached in one row.
+    """
+    if a == 0 or b >= len(x):
+        return False
+    near = x[max(0, a - _LEAP_ROWS) : b + _LEAP_ROWS]
+    usual = float(np.nanmedian(np.abs(np.diff(near)))) / 0.6745
+    there, back = x[a] - x[a - 1], x[b] - x[b - 1]
+    abrupt = there * back < 0.0 and min(abs(there), abs(back)) > _LEAP_SD * usual
+    leap = float(np.min(np.abs(x[a:b] - x[a - 1])))
+    return bool(abrupt and abs(x[b] - x[a - 1]) < _BACK_SHARE * leap)
+
+
+def _spikes(x: FloatArray) -> tuple[BoolArray, float]:
+    """Return single values far from the median of their neighbours."""
+    good = np.isfinite(x)
+    filled = np.where(good, x, 0.0)
+    away = np.where(good, x - median_filter(filled, _SPIKE_WINDOW), 0.0)
+    size = np.abs(away)
+    bad = np.zeros(len(x), dtype=bool)
+    for a in range(0, len(x), _NOISE_ROWS):
+        part = size[a : a + _NOISE_ROWS]
+        noise = float(np.median(part)) / 0.6745
+        spread = float(np.sqrt(np.mean(np.minimum(part, 4.0 * noise) ** 2)))
+        bad[a : a + _NOISE_ROWS] = part > _SPIKE_SD * max(noise, spread, 1e-12)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], bad.view(np.int8), [0]])))
+    for a, b in zip(edges[::2], edges[1::2], strict=True):
+        bad[a:b] = b - a <= _LONGEST_SPIKE and _returns(x, a, b)
+    bad &= good
+    if not _LEAST_SPIKES <= bad.sum() <= _SPIKE_SHARE * len(x):
+        return np.zeros(len(x), dtype=bool), 0.0
+    return bad, float(np.median(size[bad]))
+
+
+def _coarse(x: FloatArray) -> tuple[int, float]:
+    """Return how many rows do not change and the step of a coarse record; 0 if it is fine."""
+    x = x[np.isfinite(x)]
+    if len(x) < 100:
+        return 0, 0.0
+    change = np.abs(np.diff(x))
+    still = int((change == 0.0).sum())
+    if still <= _COARSE_SHARE * len(change) or still == len(change):
+        return 0, 0.0
+    values = np.unique(x)
+    step = float(np.median(np.diff(values)))
+    moved = float(np.median(change[change > 0.0]))
+    # Steps of one unit of the record are what makes it coarse; large ones are a resting valve.
+    return (still, step) if moved < 2.0 * step else (0, 0.0)
+
+
+def faults(table: SampleTable, step_s: float) -> tuple[BoolArray, tuple[Fault, ...]]:
+    """Look for faults in every signal.
+
+    Returns
+    -------
+    bad : bool (rows, 5)
+        Values that are not to be believed.
+    found : tuple of Fault
+    """
+    bad = np.zeros(table.values.shape, dtype=bool)
+    found = []
+    for info in SIGNALS:
+        x = table.column(info.signal)
+        if not info.required or not np.isfinite(x).any() or np.nanmax(x) == np.nanmin(x):
+            continue
+        still, step = _coarse(x)
+        wild, height = _spikes(x)
+        # A coarse signal stands still all the time; that is named already.
+        flat, longest = (np.zeros(len(x), dtype=bool), 0.0) if still else _flat(x, step_s)
+        if flat.any():
+            found.append(Fault('flatline', info, int(flat.sum()), longest))
+        if wild.any():
+            found.append(Fault('spikes', info, int(wild.sum()), height))
+        if still:
+            found.append(Fault('quantisation', info, still, step))
+        bad[:, info.signal] = flat | wild
+    return bad, tuple(found)

@@ -1,0 +1,187 @@
+"""Whether there is still something in the residual, and on what it depends.
+
+Means of a minute are sorted into cells by one, two or three variables at a time; the mean of
+each cell, estimated on some blocks, is held against other blocks. No function of the
+measured power is among the variables: it would carry the noise into them. The power control
+does carry past noise into the opening; so it is innovations that are looked at, which know
+nothing of the past.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from valveflow_ros.core.whitening import inflation
+from valveflow_ros.diagnosis.extended import Extended
+from valveflow_ros.diagnosis.fitting import Task
+from valveflow_ros.diagnosis.scene import FOLDS, SEALED_FOLD
+from valveflow_ros.records import BoolArray, FloatArray
+
+LEAST_GAIN, LEAST_SIGN, LEAST_MW2 = 14.0, 3.0, 0.02
+_MINUTE_S = 60.0
+_FINE, _MEDIUM, _COARSE, _TRIPLE, _RIPPLE = 24, 8, 4, 4, 48
+_SHRINK = (4.0, 30.0)
+_LAGS = 60
+_ENOUGH = 0.75
+_IN_TRIPLES = ('u', 'pressure', 'temperature', 'ramp', 'opening')
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """What cells explain.
+
+    Attributes
+    ----------
+    variables : tuple of str
+    gain : float
+        Log-likelihood on held-out blocks, the noise's correlation taken into account.
+    sign : float
+        Mean over standard error of the gains of blocks.
+    explained_mw2 : float
+        Variance explained on held-out blocks.
+    """
+
+    variables: tuple[str, ...]
+    gain: float
+    sign: float
+    explained_mw2: float
+
+    @property
+    def there(self) -> bool:
+        """Tell whether it is more than chance."""
+        return self.gain > LEAST_GAIN and self.sign > LEAST_SIGN and self.explained_mw2 > LEAST_MW2
+
+
+def minutes(task: Task, series: FloatArray) -> tuple[FloatArray, BoolArray, np.ndarray, int]:
+    """Return means of a minute, where they are open and whole, their block, rows in each."""
+    scene = task.scene
+    rows = max(1, round(_MINUTE_S / scene.mean_s))
+    m = len(series) // rows
+    mean: FloatArray = series[: m * rows].reshape(m, rows).mean(axis=1)
+    good: BoolArray = np.asarray(task.rows[: m * rows].reshape(m, rows).all(axis=1), dtype=bool)
+    block = scene.block_of_sub[scene.sub[: m * rows : rows]]
+    return mean, good, block, rows
+
+
+def variables(task: Task, model: Extended) -> dict[str, FloatArray]:
+    """Return what the residual might depend on, one value a minute."""
+    scene = task.scene
+
+    def minute(rows: FloatArray) -> FloatArray:
+        return minutes(task, scene.means(rows))[0]
+
+    u, p, t = minute(scene.u), minute(scene.pressure), minute(scene.temperature)
+    time_s = minute(scene.time_s)
+    opening = scene.coarse(np.where(np.isfinite(scene.v), scene.v, 0.0))
+    v = minute(opening)
+    shape = np.polyfit(u, p, 3)
+    busy = minute(np.abs(np.diff(opening, prepend=opening[:1])))
+
+    def since(x: FloatArray, back: int) -> FloatArray:
+        return np.asarray(x - np.concatenate([np.full(min(back, len(x)), x[0]), x[:-back]]))
+
+    def past(x: FloatArray, length: int) -> FloatArray:
+        total = np.cumsum(np.concatenate([[0.0], x]))
+        at = np.arange(len(x))
+        first = np.maximum(at - length, 0)
+        return np.asarray((total[at] - total[first]) / np.maximum(at - first, 1))
+
+    return {
+        'u': u, 'opening': v, 'pressure': p - np.polyval(shape, u), 'temperature': t,
+        'time': time_s, 'time of day': scene.clock_s(time_s), 'ramp': since(u, 3),
+        'slow ramp': since(u, 15), 'pressure change': since(p, 10),
+        'temperature change': since(t, 20), 'valve travel': busy,
+        'load of the last hour': past(u, 60),
+        'load of the last four hours': past(u, 240),
+    }  # fmt: skip
+
+
+def _cells(values: FloatArray, good: BoolArray, count: int) -> np.ndarray:
+    edges = np.quantile(values[good], np.linspace(0.0, 1.0, count + 1)[1:-1])
+    return np.searchsorted(edges, values, side='right')
+
+
+def _tables(
+    values: dict[str, FloatArray], good: BoolArray
+) -> list[tuple[tuple[str, ...], np.ndarray]]:
+    """Return (variables, cell of every minute) for every table that is tried."""
+    medium = {n: _cells(v, good, _MEDIUM) for n, v in values.items()}
+    coarse = {n: _cells(v, good, _TRIPLE) for n, v in values.items()}
+    tables: list[tuple[tuple[str, ...], np.ndarray]] = [
+        ((n,), _cells(v, good, _FINE)) for n, v in values.items()
+    ]
+    for a, b in itertools.combinations(values, 2):
+        tables.append(((a, b), medium[a] * _MEDIUM + medium[b]))
+    for a, b, c in itertools.combinations([n for n in _IN_TRIPLES if n in values], 3):
+        tables.append(((a, b, c), (coarse[a] * _TRIPLE + coarse[b]) * _TRIPLE + coarse[c]))
+    for name in [n for n in ('u', 'opening') if n in values]:
+        ripple = _cells(values[name], good, _RIPPLE)
+        tables.append(((name,), ripple))
+        for other in [n for n in ('pressure', 'temperature', 'ramp') if n in values]:
+            tables.append(((name, other), ripple * _COARSE + coarse[other]))
+    if 'u' in values and 'pressure' in values:
+        ripple = _cells(values['u'], good, 2 * _RIPPLE)
+        tables.append((('u', 'pressure'), ripple * 2 + _cells(values['pressure'], good, 2)))
+    return tables
+
+
+def _held_out(cell: np.ndarray, rest: FloatArray, fold: np.ndarray, shrink: float) -> FloatArray:
+    """Return the gain in squared MW of every row, its cell's mean taken from other folds."""
+    count = int(cell.max()) + 1
+    gain = np.zeros(len(rest))
+    sums = np.array([np.bincount(cell[fold == f], rest[fold == f], count) for f in range(FOLDS)])
+    rows = np.array([np.bincount(cell[fold == f], minlength=count) for f in range(FOLDS)])
+    for f in range(FOLDS):
+        here = fold == f
+        mean = (sums.sum(axis=0) - sums[f]) / (rows.sum(axis=0) - rows[f] + shrink)
+        level = mean[cell[here]]
+        gain[here] = 2.0 * level * rest[here] - level**2
+    return gain
+
+
+def structure(task: Task, model: Extended, wandering: FloatArray | None = None) -> Structure:
+    """Look for structure that the model leaves.
+
+    Parameters
+    ----------
+    wandering : float64 (m,), optional
+        A slow disturbance in MW to be taken away first.
+    """
+    series = task.residual(model)
+    if wandering is not None:
+        series = series - wandering
+    white = np.zeros(len(series))
+    white[task.rows] = task.innovations(series)
+    rest, good, block, _ = minutes(task, white)
+    values = {n: v for n, v in variables(task, model).items() if np.std(v[good]) > 1e-9}
+    if wandering is not None:
+        values.pop('time', None)
+    good &= block % FOLDS != SEALED_FOLD
+    wide = inflation(rest, good.astype(np.uint8), _LAGS)
+    noise = float(np.var(rest[good])) * wide
+    # What lasts for minutes is made smaller by whitening.
+    again = 1.0 / max(1.0 - float(task.ar.sum()), 0.05) ** 2
+    fold, at = block[good] % FOLDS, block[good]
+    tried = []
+    for names, cell in _tables(values, good):
+        for shrink in _SHRINK:
+            gain = _held_out(cell[good], rest[good], fold, shrink * wide)
+            by_block = np.bincount(at, gain)[np.bincount(at) > 0]
+            spread = float(by_block.std(ddof=1)) * np.sqrt(len(by_block))
+            tried.append(
+                Structure(
+                    names, float(gain.sum()) / (2.0 * noise),
+                    float(by_block.sum() / spread) if spread > 0.0 else 0.0,
+                    float(gain.mean()) * again,
+                )
+            )  # fmt: skip
+    best = max(tried, key=lambda s: s.gain)
+    if not best.gain > 0.0:
+        return best
+    # The fewest variables that do nearly as well.
+    good_ones = [s for s in tried if s.gain >= _ENOUGH * best.gain]
+    fewest = min(len(s.variables) for s in good_ones)
+    return max((s for s in good_ones if len(s.variables) == fewest), key=lambda s: s.gain)
