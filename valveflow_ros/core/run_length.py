@@ -60,7 +60,8 @@ def design_chart(
     means = block_means(residual_mw, weight, max(1, round(block_s / step_s)))
     correlation, sd = _correlation(means)
     seen = 1.0 - correlation  # share of a lasting shift that is left in an innovation
-    error = curve_error_mw * seen / sd
+    # Where the curve is wrong by two of its standard errors, that alone must not raise an alarm.
+    error = 2.0 * curve_error_mw * seen / sd
     small = max(_SLACK_SMALL, 0.5 * floor_mw * seen / sd) + error
     slack = (small, max(_SLACK_LARGE + error, small))
     # Each of the two charts may give half of the false alarms.
