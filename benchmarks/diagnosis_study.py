@@ -155,6 +155,15 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return table
 
 
+def _plain(value: Any) -> Any:
+    """JSON has no NaN: absent is null."""
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_plain(v) for v in value]
+    return None if isinstance(value, float) and value != value else value
+
+
 def main() -> None:
     """Run the study, print it, and write it beside the other results."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -185,7 +194,7 @@ def main() -> None:
         'right': sum(bool(r.get('right')) for r in rows), 'records': len(rows),
         'table': table, 'rows': rows,
     }  # fmt: skip
-    path.write_text(json.dumps(total, indent=1) + '\n', encoding='utf-8')
+    path.write_text(json.dumps(_plain(total), indent=1) + '\n', encoding='utf-8')
 
 
 if __name__ == '__main__':

@@ -18,7 +18,7 @@ _PLAY_PERCENT = 1.5
 _FAST_PERCENT, _FAST_S = 0.8, 10.0
 _BEFORE_S, _AFTER_S = 60.0, 300.0
 UNITS = {
-    'u': '% MPa^m', 'pressure': 'MPa off its line', 'temperature': 'degC', 'time': 's',
+    'u': '% MPa^m', 'pressure given u': 'MPa off its line', 'temperature': 'degC', 'time': 's',
     'time of day': 's', 'ramp': 'u in 3 min', 'direction': 'share of the last 1.5 %',
 }  # fmt: skip
 

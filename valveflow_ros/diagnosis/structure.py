@@ -26,7 +26,7 @@ _FINE, _MEDIUM, _COARSE, _TRIPLE, _RIPPLE = 24, 8, 4, 4, 48
 _SHRINK = (4.0, 30.0)
 _LAGS = 60
 _ENOUGH = 0.75
-_IN_TRIPLES = ('u', 'pressure', 'temperature', 'ramp', 'opening')
+_IN_TRIPLES = ('u', 'pressure given u', 'temperature', 'ramp', 'opening')
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,8 @@ def variables(task: Task, model: Extended) -> dict[str, FloatArray]:
         return np.asarray((total[at] - total[first]) / np.maximum(at - first, 1))
 
     return {
-        'u': u, 'opening': v, 'pressure': p - np.polyval(shape, u), 'temperature': t,
+        'u': u, 'opening': v, 'pressure': p,
+        'pressure given u': p - np.polyval(shape, u), 'temperature': t,
         'time': time_s, 'time of day': scene.clock_s(time_s), 'ramp': since(u, 3),
         'slow ramp': since(u, 15), 'pressure change': since(p, 10),
         'temperature change': since(t, 20), 'valve travel': busy,
@@ -117,14 +118,15 @@ def _tables(
         tables.append(((a, b), medium[a] * _MEDIUM + medium[b]))
     for a, b, c in itertools.combinations([n for n in _IN_TRIPLES if n in values], 3):
         tables.append(((a, b, c), (coarse[a] * _TRIPLE + coarse[b]) * _TRIPLE + coarse[c]))
-    for name in [n for n in ('u', 'opening') if n in values]:
+    for name in [n for n in ('u', 'opening', 'pressure') if n in values]:
         ripple = _cells(values[name], good, _RIPPLE)
         tables.append(((name,), ripple))
-        for other in [n for n in ('pressure', 'temperature', 'ramp') if n in values]:
+        for other in [n for n in ('pressure given u', 'temperature', 'ramp') if n in values]:
             tables.append(((name, other), ripple * _COARSE + coarse[other]))
-    if 'u' in values and 'pressure' in values:
+    if 'u' in values and 'pressure given u' in values:
         ripple = _cells(values['u'], good, 2 * _RIPPLE)
-        tables.append((('u', 'pressure'), ripple * 2 + _cells(values['pressure'], good, 2)))
+        side = _cells(values['pressure given u'], good, 2)
+        tables.append((('u', 'pressure given u'), ripple * 2 + side))
     return tables
 
 
