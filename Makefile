@@ -4,6 +4,7 @@
 # make lint    set-up, then ruff and mypy           (make format rewrites the layout)
 # make bench   set-up, then what is fast, measured
 # make study   how good curve, choice, segments, shifts, alarm and baselines are (hours)
+# make study-diagnosis   how often the diagnosis names the right cause, and none where there is none (hours)
 # make certify-partition   the exact partition of 305,633 samples against every break (minutes)
 # make lock    requirements.in -> requirements.lock (UPGRADE=1 takes newer versions)
 # make clean   remove everything the set-up made
@@ -12,7 +13,7 @@
 
 SHELL := bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint format bench study certify-partition lock clean
+.PHONY: help setup demo test lint format bench study study-diagnosis certify-partition lock clean
 
 export PYTHON
 ENV := source ./env.sh &&
@@ -51,6 +52,10 @@ bench: setup
 
 study: setup
 	@$(ENV) for name in $(STUDIES); do python -m benchmarks.$$name || exit 1; done
+
+study-diagnosis: setup
+	@$(ENV) for kind in hidden null pair outside; do \
+	  python -m benchmarks.diagnosis_study --kind $$kind --seeds 20 --first 5000 || exit 1; done
 
 certify-partition: setup
 	@$(ENV) python -m benchmarks.partition --certify --kinds valve --sizes 305633
