@@ -153,10 +153,11 @@ def test_ctrl_c_in_the_middle_of_the_work_leaves_nothing(logs, tmp_path):
     """Stop a real process as soon as it tells that it has begun."""
     words = ['identify', str(logs / 'plant.csv'), '-o', str(tmp_path / 'out')]
     code = (
-        'import os, signal, sys\n'
+        'import os, signal, sys, time\n'
         'from valveflow_ros.cli import engine\n'
         'from valveflow_ros.cli.main import main\n'
-        'engine.fit = lambda task, progress: os.kill(os.getpid(), signal.SIGINT)\n'
+        # The signal may reach another thread first and be told to this one a little later.
+        'engine.fit = lambda *_: (os.kill(os.getpid(), signal.SIGINT), time.sleep(60))\n'
         f'sys.exit(main({words!r}))'
     )
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)

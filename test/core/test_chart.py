@@ -191,3 +191,23 @@ def test_block_means_leave_thin_blocks_out():
     weight = np.array([1, 1, 1, 1, 0, 0, 1, 1, 0, 0, 0, 1], dtype=np.uint8)
     assert block_means(residual, weight, 4) == pytest.approx([1.5, 6.5, math.nan], nan_ok=True)
     assert block_means(residual[:3], weight[:3], 4).shape == (0,)
+
+
+@examples(30)
+@given(
+    st.floats(0.01, 5.0), st.sampled_from([0.0, 0.5, 0.9]), st.sampled_from([0.0, 0.5, 1.0, 5.0]),
+    st.sampled_from([0.0, 0.3]), st.sampled_from([1.0, -1.0]),
+)  # fmt: skip
+def test_whatever_the_noise_a_large_shift_is_found_within_an_hour(
+    sd, correlation, floor, error, sign
+):
+    """On a quiet unit, too, where the floor is many standard deviations wide."""
+    r = sd * correlated(np.random.default_rng(5), 3000, correlation)
+    design = design_chart(r, np.ones(len(r), np.uint8), 60.0, block_s=60.0, run_length_days=1.0,
+                          floor_mw=floor, curve_error_mw=error)  # fmt: skip
+    assert max(design.slack) <= 3.0
+    shift = sign * (5.0 * floor + 20.0 * sd + 5.0 * error)
+    time_ns = START_NS + np.arange(240) * 60 * NS_PER_S
+    record = r[:240] + np.where(np.arange(240) >= 120, shift, 0.0)
+    evidence, _ = ResidualChart(design, 60.0).feed(time_ns, record)
+    assert np.nanmax(sign * evidence[120:180]) > 1.0

@@ -47,6 +47,13 @@ def test_nothing_to_learn_is_no_noise():
     assert relative_noise(noisy, np.ones(5000)) == pytest.approx(0.01, rel=0.2)
 
 
+@pytest.mark.parametrize('rows_s', [10, 60])
+def test_slow_rows_do_not_pass_movement_off_as_noise(rows_s):
+    rng = np.random.default_rng(11)
+    u = 1500.0 + lagged(rng.normal(0.0, 100.0, 40_000 * rows_s), 30.0, 0.0)[::rows_s]
+    assert relative_noise(u, np.ones(len(u))) == 0.0
+
+
 @needs_jit
 def test_sensor_noise_makes_the_plant_slower_and_most_of_it_is_taken_back(monkeypatch):
     one = replace(TRUE, levels=np.empty(0), time_constants=np.array([8.0]), delays=np.array([2.0]))

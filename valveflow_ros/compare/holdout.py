@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from valveflow_ros.core.problem import Samples
-from valveflow_ros.core.refine import LEAST_ROWS
+from valveflow_ros.core.refine import least_rows
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.records import ByteArray, FloatArray
 
@@ -39,8 +39,9 @@ def cut_samples(samples: Samples) -> tuple[Samples, Samples]:
         Too few usable rows.
     """
     usable = int(samples.usable.sum())
-    if usable < LEAST_ROWS:
-        raise TooFewSamplesError('Rows with opening, pressure and power', usable, LEAST_ROWS)
+    least = least_rows(samples.step_s)
+    if usable < least:
+        raise TooFewSamplesError('Rows with opening, pressure and power', usable, least)
     cut = round(LEARN_SHARE * samples.means) * samples.group
     return part_of(samples, 0, cut), part_of(samples, cut, len(samples.u))
 

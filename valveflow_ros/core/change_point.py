@@ -12,6 +12,8 @@ from valveflow_ros.records import FloatArray, IntArray
 
 LEAST_SIDE = 4  # members on either side of a change
 _LARGEST_RHO = 0.9
+_LEAST_VARIANCE = 1e-200  # without any noise; z^2 stays a number
+_FAR = 38.0  # normal deviates whose density is no number any more
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +89,7 @@ def scan(values: FloatArray, weights: FloatArray, first: int = 0) -> Scan | None
 
 def _variance(rest: FloatArray, weights: FloatArray) -> float:
     """Return the variance of a member of weight 1."""
-    return max(float(np.sum(weights * rest**2)) / max(len(rest) - 2, 1), 1e-300)
+    return max(float(np.sum(weights * rest**2)) / max(len(rest) - 2, 1), _LEAST_VARIANCE)
 
 
 def _widening(rest: FloatArray) -> float:
@@ -111,6 +113,8 @@ def _chance(b: float, low: float, high: float) -> float:
     """Return the chance that the maximum over splits exceeds ``b``."""
     if b < 1.0:
         return 1.0
+    if b > _FAR:
+        return 0.0
     spread = math.log(max(high * (1.0 - low) / (low * (1.0 - high)), 1.0))
     density = math.exp(-0.5 * b * b) / math.sqrt(2.0 * math.pi)
     return min(1.0, b * density * ((1.0 - b**-2) * spread + 4.0 * b**-2))
@@ -135,6 +139,8 @@ def moment_of(
     tuple of int
         Median, lower and upper end of the time's distribution, ns. Before the data every
         moment between two members is taken to be as likely as any other, by its length.
+        Series without a moment in common did not change together: then the surest of them
+        tells. 0, 0, 0 if no moment can be told.
     """
     edges = np.unique(np.concatenate(times_ns))
     likelihood = np.zeros(len(edges) - 1)
@@ -142,6 +148,11 @@ def moment_of(
         # A change inside ]edge, next edge[ leaves so many members of this series before it.
         count = np.searchsorted(times, edges[:-1], side='right')
         likelihood += found.likelihood[count]
+    if not np.isfinite(likelihood).any():
+        if len(scans) == 1:
+            return 0, 0, 0
+        surest = min(range(len(scans)), key=lambda k: scans[k].p_value)
+        return moment_of([times_ns[surest]], [scans[surest]], share)
     mass = np.exp(likelihood - likelihood.max()) * np.diff(edges)
     reached = np.concatenate([[0.0], np.cumsum(mass) / mass.sum()])
     tail = 0.5 * (1.0 - share)

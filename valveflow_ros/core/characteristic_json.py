@@ -124,7 +124,7 @@ def to_json(c: Characteristic) -> dict[str, Any]:
         else {},
         'partition': {'pieces': [_piece_json(p) for p in c.partition_pieces]},
         'notes': list(c.notes),
-        'optimal': True,
+        'optimal': bool(c.partition_pieces),
     }
 
 

@@ -26,7 +26,7 @@ from valveflow_ros.core.selection_series import Series
 from valveflow_ros.core.whitening import inflation
 from valveflow_ros.core.window import WindowContents
 from valveflow_ros.errors import DataError, TooFewSamplesError
-from valveflow_ros.records import FloatArray, IntArray, SegmentKind
+from valveflow_ros.records import ByteArray, FloatArray, IntArray, SegmentKind
 
 _EXPLAINED_LEAST = 0.5  # share of the power's variance a curve must explain to be one
 _LEAST_SPREAD = 10.0  # noise sd that the openings must spread over
@@ -73,7 +73,7 @@ def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
         breakpoint_intervals=_no_intervals(chosen),
         choice=choice,
         source=source,
-        residuals=_static_residuals(task, chosen, rows),
+        residuals=_static_residuals(task, chosen),
         partition_pieces=chosen,
     )
     if not settings.flag('refine'):
@@ -170,17 +170,22 @@ def _inflation(contents: WindowContents, part: Partition) -> float:
     Judged on the residual of the richest partition, so that a missing piece is
     not taken for correlation, within segments only.
     """
-    pieces = _pieces_of(part, len(part.cost))
-    series: list[FloatArray] = []
-    for a, b, _ in contents.spans:
-        series += [contents.power_mw[a:b] - _evaluate(pieces, contents.u[a:b]), np.zeros(1)]
-    weight = np.concatenate(
-        [np.append(np.ones(b - a, dtype=np.uint8), np.uint8(0)) for a, b, _ in contents.spans]
-    )
-    residual = np.concatenate(series)
+    residual, weight = _special_residual(contents, _pieces_of(part, len(part.cost)))
     lengths = contents.spans[:, 1] - contents.spans[:, 0]
     longest = int(min(300, max(1, np.median(lengths) // 2)))
     return inflation(residual, weight, longest)
+
+
+def _special_residual(
+    contents: WindowContents, pieces: tuple[Piece, ...]
+) -> tuple[FloatArray, ByteArray]:
+    """Return the residual of the segments one after the other, a row of weight 0 in between."""
+    series: list[FloatArray] = []
+    weights: list[ByteArray] = []
+    for a, b, _ in contents.spans:
+        series += [contents.power_mw[a:b] - _evaluate(pieces, contents.u[a:b]), np.zeros(1)]
+        weights.append(np.append(np.ones(b - a, dtype=np.uint8), np.uint8(0)))
+    return np.concatenate(series), np.concatenate(weights)
 
 
 def _no_intervals(pieces: tuple[Piece, ...]) -> tuple[tuple[float, float], ...]:
@@ -208,17 +213,14 @@ def _source(task: FitTask, rows: np.ndarray) -> Source:
     )
 
 
-def _static_residuals(
-    task: FitTask, pieces: tuple[Piece, ...], rows: np.ndarray
-) -> ResidualStatistics:
+def _static_residuals(task: FitTask, pieces: tuple[Piece, ...]) -> ResidualStatistics:
     """Calibrate on the special segments alone."""
-    c = task.contents
-    rest = c.power_mw[rows] - _evaluate(pieces, c.u[rows])
-    weight = np.ones(len(rest), dtype=np.uint8)
+    rest, weight = _special_residual(task.contents, pieces)
+    rows = rest[weight > 0]
     # A static curve has no error of its own that is known here: that of its mean is the least.
-    sd = float(np.std(rest))
+    sd = float(np.std(rows))
     return residual_statistics(
-        task, rest, weight, task.settings.real('sample_period'), sd, sd / math.sqrt(len(rest))
+        task, rest, weight, task.settings.real('sample_period'), sd, sd / math.sqrt(len(rows))
     )
 
 
@@ -231,13 +233,13 @@ def _only_straight(
     of the valve: pieces of their own would run far off between the clusters.
     """
     notes = (f'The curve is not refined: one straight piece, without dynamics. {why}',)
-    rows = task.contents.special_rows()
     pieces = _pieces_of(part, 1, _inflation(task.contents, part))
     return replace(
         static,
         pieces=pieces,
+        choice=replace(static.choice, confidence={}),
         breakpoint_intervals=(),
-        residuals=_static_residuals(task, pieces, rows),
+        residuals=_static_residuals(task, pieces),
         notes=notes,
     )
 

@@ -111,6 +111,12 @@ def from_refined(
             choice, rule='prediction_error', note=f'{note} {choice.note}'.strip(),
             confidence=dict(result.confidence),
         )  # fmt: skip
+    elif m.pieces != len(static.pieces):
+        note = (
+            f'The rule took {len(static.pieces)} pieces; the refined curve has {m.pieces}, since '
+            'pieces too narrow to be moved were joined with others.'
+        )
+        choice = replace(choice, note=f'{note} {choice.note}'.strip(), confidence={})
     return replace(
         static,
         choice=choice,
@@ -142,8 +148,13 @@ def _line_errors(m: RegionalModel, covariance: FloatArray) -> tuple[FloatArray, 
         slope_of[:, p] = (high.slopes() - low.slopes()) / (2.0 * h)
         intercept_of[:, p] = (high.intercepts() - low.intercepts()) / (2.0 * h)
 
+    # A region without rows has no known dynamics, which no line leans on.
+    dead = np.isnan(np.diag(covariance))
+    known = np.nan_to_num(covariance)
+
     def errors(gradient: FloatArray) -> FloatArray:
-        variance = np.einsum('ip,pq,iq->i', gradient, covariance, gradient)
-        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+        variance = np.einsum('ip,pq,iq->i', gradient, known, gradient)
+        touched = np.any(gradient[:, dead] != 0.0, axis=1)
+        return np.where(touched, np.nan, np.sqrt(np.maximum(variance, 0.0)))
 
     return errors(slope_of), errors(intercept_of)

@@ -14,11 +14,12 @@ from dataclasses import replace
 import numpy as np
 
 from valveflow_ros.core.model import RegionalModel
-from valveflow_ros.core.problem import Problem, Samples, move
+from valveflow_ros.core.problem import Problem, Samples, in_bounds, move
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
 _SEED = 20240229
 _LEAST_PAIRS = 1000
+_LEAST_DOUBLING = 0.85  # of what the movement should grow by from two rows to four
 _MEDIAN_TO_SD = 0.6744897501960817
 
 
@@ -28,21 +29,25 @@ def relative_noise(u: FloatArray, usable: ByteArray) -> float:
     A second difference of values one row apart holds the noise and what a wandering valve moves
     in one row; of values two rows apart the same noise and twice the movement. Their
     extrapolation to no row at all is the noise alone. Straight ramps vanish in both, medians
-    keep leaps out; too few rows, or no noise, give 0.
+    keep leaps out; too few rows, no noise, or rows too slow to tell, give 0.
     """
     run = usable > 0
     if len(u) < _LEAST_PAIRS:
         return 0.0
-    good = run[4:] & run[3:-1] & run[2:-2] & run[1:-3] & run[:-4]
+    good = run[8:] & run[6:-2] & run[5:-3] & run[4:-4] & run[3:-5] & run[2:-6] & run[:-8]
     with np.errstate(divide='ignore', invalid='ignore'):
         level = np.log(np.where(run & (u > 0.0), u, np.nan))
-    near = (level[3:-1] - 2.0 * level[2:-2] + level[1:-3])[good]
-    far = (level[4:] - 2.0 * level[2:-2] + level[:-4])[good]
-    known = np.isfinite(near) & np.isfinite(far)
+    middle = 2.0 * level[4:-4]
+    bends = [(level[4 + k : len(u) - 4 + k] + level[4 - k : len(u) - 4 - k] - middle)[good]
+             for k in (1, 2, 4)]  # fmt: skip
+    known = np.isfinite(bends[0]) & np.isfinite(bends[1]) & np.isfinite(bends[2])
     if known.sum() < _LEAST_PAIRS:
         return 0.0
     # The median of |x| is 0.6745 sd; the noise enters a second difference six times.
-    one, two = ((np.median(np.abs(d[known])) / _MEDIAN_TO_SD) ** 2 for d in (near, far))
+    one, two, four = ((np.median(np.abs(d[known])) / _MEDIAN_TO_SD) ** 2 for d in bends)
+    # Where rows are slow against the valve, movement no longer doubles and would pass for noise.
+    if two - one > 0.1 * one and four - two < _LEAST_DOUBLING * 2.0 * (two - one):
+        return 0.0
     return float(np.sqrt(max(0.0, (2.0 * one - two) / 6.0)))
 
 
@@ -62,5 +67,4 @@ def corrected(
     packed = 2.0 * model.pack() - moved.pack()
     packed[-model.regions :] = np.maximum(packed[-model.regions :], 0.0)
     trial = model.unpack(packed)
-    apart = np.all(np.diff(trial.knots) > 0.004 * (trial.knots[-1] - trial.knots[0]))
-    return trial if apart else model
+    return trial if in_bounds(trial, problem.samples) else model

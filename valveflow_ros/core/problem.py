@@ -130,7 +130,7 @@ def free_parameters(pieces: int, regions: int, jumps: BoolArray | None = None) -
     )
 
 
-def _in_bounds(model: RegionalModel, samples: Samples) -> bool:
+def in_bounds(model: RegionalModel, samples: Samples) -> bool:
     """Tell whether a model is one a plant can have and a filter can run."""
     span = model.knots[-1] - model.knots[0]
     return bool(
@@ -164,7 +164,7 @@ def move(
             n_delays = model.regions
             packed[-n_delays:] = np.maximum(packed[-n_delays:], 0.0)
             trial = model.unpack(packed)
-            if _in_bounds(trial, problem.samples):
+            if in_bounds(trial, problem.samples):
                 value = problem.cost(trial, ar)
                 if value < cost:
                     better = (trial, value)

@@ -38,7 +38,7 @@ class ReferenceKeeper:
     def add(self, segment: SpecialSegment) -> None:
         """Remember a segment that has closed; forget those that have left the window."""
         self._segments.append(segment)
-        while self._segments[0].start_ns <= segment.end_ns - self._window_ns:
+        while self._segments and self._segments[0].start_ns <= segment.end_ns - self._window_ns:
             self._segments.popleft()
 
     def restart(self) -> None:

@@ -26,7 +26,7 @@ from valveflow_ros.core.whitening import ORDER, fit_ar
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
-LEAST_ROWS = 3600
+_LEAST_ROWS, _LEAST_S = 600, 3600.0
 # What an autoregressive model must remember: white noise on top of slow noise has a long tail.
 _MEMORY_S = 40.0
 _NARROWEST = 0.01  # of the range of u: narrower pieces are not given to the search
@@ -82,7 +82,8 @@ def refine(samples: Samples, start: RegionalModel, most_pieces: int | None = Non
     start : RegionalModel
         The curve of the exact partition; its dynamics are not used.
     most_pieces : int, optional
-        Choose the number of pieces too, up to this many; without it ``start``'s number stays.
+        Choose the number of pieces too, up to this many; without it ``start``'s number stays,
+        but for pieces narrower than a hundredth of the range, which are joined with others.
         ``start`` should then have rather too many pieces than too few: the AR model takes the
         misfit of a curve that is too simple for noise.
 
@@ -98,10 +99,11 @@ def refine(samples: Samples, start: RegionalModel, most_pieces: int | None = Non
     problem = Problem(samples)
     _, weight = problem.answer(replace(start, levels=np.empty(0), time_constants=np.ones(1),
                                        delays=np.zeros(1)))  # fmt: skip
-    if int(weight.sum()) * samples.group < LEAST_ROWS:
+    least = least_rows(samples.step_s)
+    if int(weight.sum()) * samples.group < least:
         raise TooFewSamplesError(
             'Rows that follow each other for longer than the transient',
-            int(weight.sum()) * samples.group, LEAST_ROWS,
+            int(weight.sum()) * samples.group, least,
         )  # fmt: skip
     model, likely = _search(Problem(samples.coarser()), _join(start), most_pieces)
     searched = model.pieces
@@ -124,6 +126,11 @@ def refine(samples: Samples, start: RegionalModel, most_pieces: int | None = Non
     model = corrected(samples, fine, model, ar, free)
     found = _conclude(problem, fine, model, free, ar)
     return replace(found, confidence=shifted(likely, model.pieces - searched))
+
+
+def least_rows(step_s: float) -> int:
+    """Return how many rows of a step a refinement needs: an hour, and not too few numbers."""
+    return max(_LEAST_ROWS, round(_LEAST_S / step_s))
 
 
 def _search(

@@ -57,9 +57,14 @@ def design_chart(
         How wrong the curve may be where it was fitted (standard error).
     """
     block_s = max(block_s, step_s)
-    means = block_means(residual_mw, weight, max(1, round(block_s / step_s)))
+    rows = max(1, round(block_s / step_s))
+    block_s = rows * step_s
+    means = block_means(residual_mw, weight, rows)
     correlation, sd = _correlation(means)
     seen = 1.0 - correlation  # share of a lasting shift that is left in an innovation
+    # On a quiet unit what need not be found is many innovations wide, and innovations are
+    # clipped: the slack would swallow every shift. There the width is that of what may pass.
+    sd = max(sd, (0.5 * floor_mw + 2.0 * curve_error_mw) * seen)
     # Where the curve is wrong by two of its standard errors, that alone must not raise an alarm.
     error = 2.0 * curve_error_mw * seen / sd
     small = max(_SLACK_SMALL, 0.5 * floor_mw * seen / sd) + error

@@ -54,13 +54,14 @@ class Series:
 
         What is left over at the end of a run is dropped when it is less than a full mean.
         """
-        group = -(-len(self.u) // most)
-        if group < 2:
-            return self
         run = np.cumsum(self.fresh) - 1
         first = np.flatnonzero(self.fresh)
-        place = np.arange(len(self.u)) - first[run]
         length = np.diff(np.append(first, len(self.u)))
+        # Runs shorter than a mean would vanish: half of them at most may be that short.
+        group = min(-(-len(self.u) // most), max(1, int(np.median(length)) // 2))
+        if group < 2:
+            return self
+        place = np.arange(len(self.u)) - first[run]
         keep = place < (length // group * group)[run]
         shape = (-1, group)
         fresh = (self.fresh[keep]).reshape(shape)[:, 0]

@@ -195,7 +195,7 @@ def judge_shift(
         reference.model_id, current.model_id, reference.source.window_end_ns,
         int(found.time_ns[0]) if len(found) else 0, pieces, *since, '',
     )  # fmt: skip
-    return replace(shift, sentence=shift_sentence(shift))
+    return replace(shift, sentence=shift_sentence(shift, reference.breakpoints))
 
 
 def _comparable(reference: Characteristic, current: Characteristic) -> None:
@@ -265,7 +265,9 @@ def _with_now(
 ) -> PieceShift:
     """Return a piece that moved with what its segments say after the common moment."""
     after = series.part(series.time_ns > since_ns)
-    if not piece.moved or len(after) < LEAST_SIDE:
+    # A series that begins after that moment changed at one of its own.
+    own = math.isfinite(piece.now_mw) and len(series) - len(after) < LEAST_SIDE
+    if not piece.moved or own or len(after) < LEAST_SIDE:
         return piece
     weights = after.weights
     mean = float(np.average(after.residual_mw, weights=weights))

@@ -115,10 +115,9 @@ def bend_certainty(problem: Problem, model: RegionalModel, ar: FloatArray) -> Fl
     j = model.pieces
     free = np.zeros(len(model.pack()), dtype=bool)
     free[: j + 1] = True
-    covariance = np.nan_to_num(
-        covariance_of(problem, model, free, ar, with_levels=False).covariance
-    )
-    covariance = covariance[: j + 1, : j + 1]
+    covariance = covariance_of(problem, model, free, ar, with_levels=False).covariance
+    # A value that no row moves is not known, and no bend at it is certain.
+    covariance = np.nan_to_num(covariance[: j + 1, : j + 1], nan=1e12)
     width = np.diff(model.knots)
     change = np.zeros((j - 1, j + 1))
     for k in range(j - 1):

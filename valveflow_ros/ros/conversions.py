@@ -144,7 +144,8 @@ def characteristic(
     message.delay_stderr = [d.delay_stderr_s for d in curve.dynamics]
     message.power_to_stderr = [d.power_to_stderr_mw for d in curve.dynamics]
     message.cost, message.turning_angle = _selection(curve)
-    message.confidence = [likely for _, likely in sorted(curve.choice.confidence.items())]
+    likely = curve.choice.confidence
+    message.confidence = [likely.get(j, 0.0) for j in range(1, max(likely, default=0) + 1)]
     message.pressure_exponent = curve.pressure_exponent
     message.samples = source.samples
     message.steady_segments = source.steady

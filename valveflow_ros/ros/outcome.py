@@ -56,7 +56,9 @@ def objection(task: FitTask, result: object) -> str:
     chart = result.residuals.chart
     if result.residuals.average_sd_mw <= 0.0 or chart is None or not chart.innovation_mw > 0.0:
         return 'The fit gave residuals without spread.'
-    if not (min(chart.limit) > 0.0 and all(map(math.isfinite, chart.limit + chart.slack))):
+    finite = all(map(math.isfinite, chart.limit + chart.slack))
+    # Innovations are clipped at four: with more slack than this hardly a shift raises an alarm.
+    if not (finite and min(chart.limit) > 0.0 and max(chart.slack) <= 3.0):
         return 'The fit gave no limits for the alarm.'
     if result.source.window_end_ns != int(task.contents.time_ns[-1]):
         return 'The fit answered for other data.'
