@@ -93,14 +93,48 @@ def test_programs_get_the_same_numbers(run, model, tmp_path):
 
 
 def test_a_short_table_says_what_it_costs(run, model, tmp_path):
-    ran = run('compensate', '--model', model(), '-o', tmp_path / 't.csv', '--points', '3')
-    assert ran.status == 0
-    assert '5 points would make the table exact' in ran.err
-    assert 'Not within tolerance' in ran.out
+    table = tmp_path / 't.csv'
+    for points, tolerance, enough in (('2', '0.01', 5), ('3', '0.01', 5), ('2', '8', 4)):
+        said = run('compensate', '--model', model(), '-o', table, '--points', points,
+                   '--tolerance', tolerance).refused()  # fmt: skip
+        assert f'--points {enough} would do' in said
+        assert not table.exists()
+        # What is advised is enough, and one point less is not.
+        run('compensate', '--model', model(), '-o', table, '--points', str(enough - 1),
+            '--tolerance', tolerance).refused()  # fmt: skip
+        ran = run('compensate', '--model', model(), '-o', table, '--points', str(enough),
+                  '--tolerance', tolerance)  # fmt: skip
+        assert ran.status == 0, ran.err
+        table.unlink()
+    none = run('compensate', '--model', model(), '-o', table, '--tolerance', '1e-9',
+               '--u-to', '1300.123456').refused()  # fmt: skip
+    assert 'from rounding' in none
+    assert not table.exists()
     wide = run('compensate', '--model', model(), '-o', tmp_path / 't.csv', '--points', '3',
                '--tolerance', '50', '--overwrite', '--json')  # fmt: skip
     assert wide.json['checks']['passed'] is True
     assert wide.json['checks']['table_mw'] > 1.0
+    assert '5 points would make the table exact' in wide.err
+
+
+def test_full_opening_below_the_table_is_told(run, model, tmp_path):
+    # 100 % at 3 MPa is u = 344, far below the first knot.
+    words = ['compensate', '--model', model(), '--pressure', '3', '--pressure', '12']
+    ran = run(*words, '-o', tmp_path / 't.csv')
+    assert 'At 3 MPa no row of the table is reachable' in ran.out
+    assert 'At 12 MPa the valve is fully open at' in ran.out
+    data = run(*words, '-o', tmp_path / 't2.csv', '--json').json
+    assert data['reachable_rows']['3'] == 0
+    assert 0 < data['reachable_rows']['12'] < 16
+    assert data['full_opening_mw']['3'] is None
+
+
+def test_an_inverse_that_is_not_exact_is_not_written(run, model, tmp_path, monkeypatch):
+    monkeypatch.setattr('valveflow_ros.core.compensation._identity', lambda curve: 0.5)
+    table = tmp_path / 't.csv'
+    said = run('compensate', '--model', model(), '-o', table).refused()
+    assert 'The inverse is not exact: F(F^-1(x)) differs from x by up to 0.5 MW' in said
+    assert not table.exists()
 
 
 def test_a_falling_piece_is_refused_and_can_be_left_out(run, model, tmp_path):

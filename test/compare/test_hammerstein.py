@@ -230,3 +230,16 @@ def test_too_little_data_is_refused_in_a_sentence():
     u = np.linspace(0.0, 1.0, 500)
     with pytest.raises(TooFewSamplesError, match='500 found, at least 3600 needed'):
         fit_hammerstein(samples(u, u), 2)
+
+
+@pytest.mark.parametrize(
+    'gaps', [slice(0, None, 200), slice(0, 8400, 200), slice(8400, None, 200)]
+)
+def test_gaps_closer_than_the_transient_are_refused(gaps):
+    """All through, in the part to learn from, or in the part to choose by."""
+    rng = np.random.default_rng(5)
+    u = rng.uniform(1000.0, 2000.0, 12000)
+    usable = np.ones(len(u), dtype=np.uint8)
+    usable[gaps] = 0
+    with pytest.raises(TooFewSamplesError, match='for longer than the transient'):
+        fit_hammerstein(samples(u, u, usable, group=10, settle_s=210.0), 2)

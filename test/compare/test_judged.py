@@ -136,10 +136,10 @@ def test_a_simulation_that_runs_away_counts_against_it(curve, data):
     trial = trial_of(data(), curve())
     made = predictions(trial, curve, 0.0, 0.0, np.random.default_rng(3))
     away = made['sparse.dynamic'].copy()
-    away[6000:] = np.inf
+    away[4000:] = np.inf
     made['sparse.dynamic'] = away
     j = judge(trial, made)
-    assert j.failed('sparse.dynamic') == 15
+    assert j.failed('sparse.dynamic') == 20
     assert j.mse('sparse.dynamic') == np.inf
     pairs = pairs_on_segments(j, made)
     pair = next(p for p in pairs if p.theirs == 'sparse.dynamic')
@@ -147,6 +147,28 @@ def test_a_simulation_that_runs_away_counts_against_it(curve, data):
     mse, rows = everywhere(trial, made)
     assert mse['sparse.dynamic'] == np.inf
     assert next(p for p in rows if p.baseline == 'sparse').failed > 0
+
+
+def test_one_segment_without_an_answer_decides_nothing(curve, data):
+    trial = trial_of(data(), curve())
+    made = predictions(trial, curve, 3.0, 0.0, np.random.default_rng(3))
+    made['sparse.dynamic'][6000:6100] = np.inf
+    pairs = pairs_on_segments(judge(trial, made), made)
+    pair = next(p for p in pairs if p.theirs == 'sparse.dynamic')
+    assert (pair.failed, pair.judged, pair.outcome) == (1, 30, Outcome.OPEN)
+    assert finding_of(pairs) is Finding.OPEN
+    rows = everywhere(trial, made)[1]
+    assert next(p for p in rows if p.baseline == 'sparse').outcome is Outcome.OPEN
+
+
+def test_one_baseline_alone_confirms_nothing(curve, data):
+    trial = trial_of(data(), curve())
+    made = predictions(trial, curve, 2.0, 3.0, np.random.default_rng(3))
+    both = pairs_on_segments(judge(trial, made), made)
+    alone = [p for p in both if p.baseline == 'hammerstein']
+    assert {p.outcome for p in alone if p.terms is Terms.AS_PAPER} == {Outcome.BETTER}
+    assert finding_of(both) is Finding.CONFIRMED
+    assert finding_of(alone) is Finding.OPEN
 
 
 def test_without_dynamics_there_is_nothing_to_simulate(curve, data):

@@ -174,6 +174,16 @@ def test_of_several_rests_the_curve_keeps_to_one_branch():
     assert np.abs(curve - (GAIN * u + OFFSET)).max() < 0.02 * TIME_S + 0.01
 
 
+@compiled
+def test_a_rest_that_swings_with_sin_u_is_followed():
+    xi = linear_xi()
+    xi[library.NAMES.index('sin u')] = 4.0 / TIME_S
+    u = np.random.default_rng(4).uniform(1000.0, 2000.0, 500)
+    error = model(xi).static(u) - (GAIN * u + OFFSET + 4.0 * np.sin(u))
+    # Straight between places 0.25 apart: 4 * 0.25**2 / 8 at most.
+    assert np.abs(error).max() < 0.035
+
+
 def test_thresholds_rise_from_none():
     assert THRESHOLDS[0] == 0.0
     assert np.all(np.diff(THRESHOLDS) > 0.0)

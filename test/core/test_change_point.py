@@ -95,6 +95,28 @@ def test_two_series_together_date_it_better():
     assert together < 0.7 * alone
 
 
+@pytest.mark.parametrize('surest', [0, 1])
+def test_series_that_never_overlap_are_dated_by_the_surest(surest):
+    """Low load in one week, high load in the next: no moment lies within both."""
+    times = [1000 * np.arange(80, dtype=np.int64) + 10**6 * k for k in range(2)]
+    scans = [scan(*series(k, 80, 50, 3.0 if k == surest else 1.0)) for k in range(2)]
+    assert moment_of(times, scans) == moment_of([times[surest]], [scans[surest]])
+    assert 10**6 * surest <= moment_of(times, scans)[0] <= 10**6 * surest + 79_000
+
+
+def test_members_all_at_one_time_tell_no_moment():
+    assert moment_of([np.zeros(80, dtype=np.int64)], [scan(*series(1, 80))]) == (0, 0, 0)
+
+
+@pytest.mark.parametrize('unit', [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize('n', [12, 400])
+def test_a_change_without_any_noise_is_certain(n, unit):
+    found = scan(unit * np.repeat([0.0, 1.0], n // 2), np.full(n, 900.0))
+    assert (found.place, found.p_value) == (n // 2, 0.0)
+    middle, low, high = moment_of([1000 * np.arange(n, dtype=np.int64)], [found])
+    assert 1000 * (n // 2 - 1) <= low <= middle <= high <= 1000 * (n // 2)
+
+
 def test_short_and_still_series():
     assert scan(*series(1, 2 * LEAST_SIDE - 1)) is None
     assert scan(*series(1, 30), first=27) is None

@@ -137,6 +137,7 @@ def test_a_name_that_is_no_text_is_refused_too(key):
         ({'slope_limit': 2.5}, 'slope_limit'),
         ({'steady_min': 3600.0}, 'steady_min'),
         ({'slope_min': 1800.1}, 'slope_min'),
+        ({'longest_segment': 3600.0, 'window_days': 1.0 / 24.0}, 'window_days'),
     ],
 )  # fmt: skip
 def test_values_at_odds_are_refused_by_the_name_of_one_of_them(values, name):

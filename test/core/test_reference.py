@@ -214,6 +214,33 @@ def test_the_keeper_forgets_segments_with_the_window():
     assert keeper.segments == ()
 
 
+def at(shift, u_from, u_to):
+    """Return the judgement as one of another piece."""
+    return replace(shift, pieces=(replace(shift.pieces[0], u_from=u_from, u_to=u_to),))
+
+
+def test_it_stands_while_what_moved_is_out_of_the_window():
+    alarm, calm = ShiftAlarm(), judged(0.0, 1.0)
+    assert told(alarm, judged(-5.0)) == [AlarmState.UNACKNOWLEDGED]
+    unknown = replace(calm, pieces=(replace(calm.pieces[0], smallest_mw=np.nan),))
+    elsewhere = [at(calm, 1600.0, 2280.0), at(calm, 1150.0, 2280.0), unknown]
+    assert told(alarm, *elsewhere) == []
+    assert alarm.ranges == ((1000.0, 1200.0),)
+    assert told(alarm, at(judged(2.0), 1010.0, 1190.0), *elsewhere) == []
+    assert alarm.ranges == ((1010.0, 1190.0),)
+    assert told(alarm, at(calm, 1005.0, 1400.0)) == [AlarmState.RETURNED_UNACKNOWLEDGED]
+    assert alarm.ranges == ()
+
+
+def test_a_segment_longer_than_the_window_is_not_kept():
+    keeper = ReferenceKeeper(Settings({'window_days': 1.0}))
+    keeper.add(
+        SpecialSegment(1, SegmentKind.STEADY, START_NS, START_NS + 86400 * NS_PER_S, 86400, 1.0,
+                       1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 540.0)
+    )  # fmt: skip
+    assert keeper.segments == ()
+
+
 def test_a_curve_that_cannot_be_compared_says_why():
     monitor = with_curve()
     far = replace(

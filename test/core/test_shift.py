@@ -166,6 +166,28 @@ def test_segments_alone_show_a_change_the_curves_do_not_show_yet():
     assert shift.largest.now_mw == pytest.approx(3.0, abs=0.7)
 
 
+def test_pieces_that_moved_in_weeks_of_their_own_are_judged_all_the_same():
+    """Low load in the first week, high load in the second, each drifting in its week."""
+    moved = [
+        s for s in history(
+            5, 14.0, lambda day, u: 3.0 * (day > 4.0) if u < 1600.0 else -3.0 * (day > 11.0)
+        )
+        if (s.start_ns < START_NS + 7 * DAY_NS) == (0.5 * (s.u_start + s.u_end) < 1600.0)
+    ]  # fmt: skip
+    shift = judge_shift(REFERENCE, curve_of(), moved)
+    assert [p.moved for p in shift.pieces] == [True] * 4
+    assert [p.now_mw for p in shift.pieces] == pytest.approx([3.0, 3.0, -3.0, -3.0], abs=0.7)
+    day = (shift.since_ns - START_NS) / DAY_NS
+    assert min(abs(day - 4.0), abs(day - 11.0)) < 0.5
+
+
+def test_what_was_compared_is_said_when_it_is_less_than_the_reference():
+    assert 'Compared is' not in judge_shift(REFERENCE, curve_of()).sentence
+    half = judge_shift(REFERENCE, curve_of(VALUES[2:], KNOTS[2:]))
+    assert half.sentence.endswith('Compared is u 1600 to 2280 of its u 1060 to 2280.')
+    assert half.sentence.startswith('The curve agrees with the reference')
+
+
 def test_a_shift_from_before_the_data_has_no_date():
     shift = judge_shift(REFERENCE, curve_of(VALUES + 2.0), history(3, change=lambda day, u: 2.0))
     assert all(p.moved for p in shift.pieces)

@@ -21,7 +21,7 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.step_test import StepPlan, step_test
 from valveflow_ros.plant.unit import paper_curve
-from valveflow_ros.records import SampleTable, Signal
+from valveflow_ros.records import NS_PER_S, SampleTable, Signal
 
 SETTINGS = Settings()
 # A plant that settles in seconds, so that tests by hand are short.
@@ -207,6 +207,30 @@ def test_the_result_is_a_characteristic_like_any_other():
     assert all(0.0 < p.slope_stderr < 0.002 for p in curve.pieces)
     made = compensate(curve)
     assert made.identity_mw < 1e-9
+
+
+@pytest.mark.parametrize(
+    'openings',
+    [[40.0, 50.0, 60.0, 50.0, 70.0], np.linspace(40.0, 80.0, 10).tolist()],
+    ids=['one visited again', 'many'],
+)
+def test_a_power_without_noise_is_not_known_without_error(openings):
+    curve = identify_step_test(by_hand(openings, noise=0.0), QUICK).characteristic
+    u = np.unique(openings) * PRESSURE**1.125
+    assert curve(u) == pytest.approx(20.0 + 0.1 * u, abs=1e-6)
+    assert all(0.0 < p.slope_stderr < 0.01 for p in curve.pieces)
+
+
+def test_missing_time_between_two_holds_at_one_opening_parts_them():
+    table = by_hand([40.0, 50.0, 50.0, 60.0, 70.0])
+    time_ns = table.time_ns.copy()
+    time_ns[120:] += 900 * NS_PER_S
+    parted = identify_step_test(replace(table, time_ns=time_ns), QUICK)
+    assert len(identify_step_test(table, QUICK).levels) == 4
+    assert len(parted.levels) == 5
+    # The transient after the gap does not count either.
+    settle = math.ceil(QUICK.settle_s)
+    assert [v.first for v in parted.levels] == [60 * k + settle for k in range(5)]
 
 
 def test_a_level_that_was_held_too_short_is_left_out_and_named():
