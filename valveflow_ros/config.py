@@ -381,8 +381,8 @@ def _check_together(values: Mapping[str, Value]) -> None:
     for name in ('steady_min', 'slope_min'):
         if float(values[name]) > longest:
             raise ParameterError(name, 'must not be above longest_segment')
-    if window_s < longest:
-        raise ParameterError('window_days', f'must hold at least longest_segment ({longest:g} s)')
+    if window_s <= longest:
+        raise ParameterError('window_days', f'must be longer than longest_segment ({longest:g} s)')
     if window_s / period > _MOST_ROWS:
         raise ParameterError(
             'window_days', f'holds more than {_MOST_ROWS:,} rows at this sample_period'

@@ -83,7 +83,7 @@ def _window_days(span_s: float, period: float, longest_s: float) -> float:
     Of rows finer than usual only as many as the log has, for the sake of memory.
     """
     fine = period < float(PARAMETERS['sample_period'].default)
-    least = longest_s / 86400.0 if fine else float(PARAMETERS['window_days'].default)
+    least = 1.1 * longest_s / 86400.0 if fine else float(PARAMETERS['window_days'].default)
     return max(least, math.ceil(100.0 * (span_s / 86400.0 + 0.01)) / 100.0)
 
 

@@ -193,6 +193,11 @@ def _corners(curve: Characteristic) -> tuple[FloatArray, FloatArray]:
     return np.array(x), np.array(u)
 
 
+def corner_count(curve: Characteristic) -> int:
+    """Return the number of points with which a table of this curve is exact."""
+    return len(_corners(curve)[0])
+
+
 def _identity(curve: Characteristic) -> float:
     """Return the largest difference of F(F^-1(x)) from x, outside jumps."""
     x, _ = _corners(curve)

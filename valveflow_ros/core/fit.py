@@ -17,7 +17,7 @@ from valveflow_ros.core.characteristic import (
 )
 from valveflow_ros.core.fit_result import from_refined, residual_statistics
 from valveflow_ros.core.fit_task import FitTask
-from valveflow_ros.core.identifiability import with_support
+from valveflow_ros.core.identifiability import NOT_REFINED, with_support
 from valveflow_ros.core.partition import Partition, partition
 from valveflow_ros.core.problem import Samples
 from valveflow_ros.core.refine import refine
@@ -232,7 +232,7 @@ def _only_straight(
     Few samples lie in a few clusters, and each cluster's own slope is mostly noise
     of the valve: pieces of their own would run far off between the clusters.
     """
-    notes = (f'The curve is not refined: one straight piece, without dynamics. {why}',)
+    notes = (f'{NOT_REFINED}one straight piece, without dynamics. {why}',)
     pieces = _pieces_of(part, 1, _inflation(task.contents, part))
     return replace(
         static,

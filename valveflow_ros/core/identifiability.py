@@ -16,6 +16,7 @@ from valveflow_ros.core.characteristic import Characteristic, Piece, Support
 from valveflow_ros.core.window import WindowContents
 from valveflow_ros.records import FloatArray, SegmentKind
 
+NOT_REFINED = 'The curve is not refined: '  # how a note on that begins
 _LEAST_ROWS = 30  # of a segment on a piece, for it to count there
 _APART = 10.0  # noise sd of u between two levels that are called different
 
@@ -43,6 +44,13 @@ def with_support(
         if not found.identifiable
     ]
     return replace(c, support=support, notes=(*c.notes, *notes))
+
+
+def weaknesses(c: Characteristic) -> tuple[str, ...]:
+    """Return the notes that report a weakness; others only tell how a curve was made."""
+    without = sum(1 for found in c.support if not found.identifiable)
+    unrefined = [n for n in c.notes[: len(c.notes) - without] if n.startswith(NOT_REFINED)]
+    return (*unrefined, *c.notes[len(c.notes) - without :])
 
 
 def support_of(

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 from valveflow_ros.config import Settings
 from valveflow_ros.core.alarms import AlarmChange, AlarmState, Priority
-from valveflow_ros.core.shift import Shift
+from valveflow_ros.core.shift import PieceShift, Shift
 
 # A shift that was seen is over only when it is ten times less sure than it had to be.
 _DOUBT = 10.0
+# Share of a moved piece that must be judged unmoved: the ends of a curve, and its knots, lie
+# a little elsewhere in every window.
+_COVERED = 0.8
 
 
 class ShiftAlarm:
@@ -16,7 +21,9 @@ class ShiftAlarm:
     Notes
     -----
     ISA-18.2 states as in `valveflow_ros.core.alarms.ResidualAlarm`, but without delays:
-    a curve stands on days of data.
+    a curve stands on days of data. A piece that moved and left the window with its load is
+    not known to be back: the alarm stands until its u are judged again, or until there is a
+    new reference.
     """
 
     NAME = 'curve_shift'
@@ -27,6 +34,7 @@ class ShiftAlarm:
         self._value = 0.0
         self._limit = 0.0
         self._sentence = ''
+        self._ranges: list[tuple[float, float]] = []
         self.active = False
         self.state = AlarmState.NORMAL
 
@@ -35,18 +43,25 @@ class ShiftAlarm:
         """Tell whether the alarm is anything but normal."""
         return self.state != AlarmState.NORMAL
 
+    @property
+    def ranges(self) -> tuple[tuple[float, float], ...]:
+        """Return from which u to which u pieces moved that were not judged unmoved since."""
+        return tuple(self._ranges)
+
     def judge(self, shift: Shift, time_ns: int, settings: Settings) -> list[AlarmChange]:
         """Take a judgement; return the change it makes, if any."""
         worst = shift.largest
         if worst is not None:
             self._value, self._limit = worst.shift_mw, worst.smallest_mw
             self._sentence = shift.sentence
+        self._remember(shift, settings)
         if not self.active and worst is not None:
             self.active = True
             self._occurrence += 1
             self._raised_ns = time_ns
             return [self._enter(AlarmState.UNACKNOWLEDGED, time_ns, shift.model_id)]
-        if self.active and not _stands(shift, settings):
+        doubt = any(_stands(p, settings) for p in shift.pieces)
+        if self.active and not doubt and not self._ranges:
             return self.end(shift.sentence, time_ns, shift.model_id, settings)
         return []
 
@@ -57,6 +72,7 @@ class ShiftAlarm:
         if not self.active:
             return []
         self.active = False
+        self._ranges = []
         self._sentence, self._value = sentence, 0.0
         waits = settings.flag('alarm_latch') and self.state == AlarmState.UNACKNOWLEDGED
         after = AlarmState.RETURNED_UNACKNOWLEDGED if waits else AlarmState.NORMAL
@@ -69,6 +85,15 @@ class ShiftAlarm:
         if self.state == AlarmState.RETURNED_UNACKNOWLEDGED:
             return [self._enter(AlarmState.NORMAL, time_ns, model_id)]
         return []
+
+    def _remember(self, shift: Shift, settings: Settings) -> None:
+        """Remember the ranges that moved; forget older ones that are judged anew."""
+        settled = [
+            p for p in shift.pieces
+            if p.moved or (math.isfinite(p.smallest_mw) and not _stands(p, settings))
+        ]  # fmt: skip
+        self._ranges = [r for r in self._ranges if not _covered(r, settled)]
+        self._ranges += [(p.u_from, p.u_to) for p in shift.pieces if p.moved]
 
     def _enter(self, state: AlarmState, time_ns: int, model_id: str) -> AlarmChange:
         previous, self.state = self.state, state
@@ -83,8 +108,15 @@ class ShiftAlarm:
         )  # fmt: skip
 
 
-def _stands(shift: Shift, settings: Settings) -> bool:
+def _covered(span: tuple[float, float], pieces: list[PieceShift]) -> bool:
+    """Tell whether pieces cover nearly all of a range of u."""
+    low, high = span
+    inside = sum(max(0.0, min(p.u_to, high) - max(p.u_from, low)) for p in pieces)
+    return inside >= _COVERED * (high - low)
+
+
+def _stands(piece: PieceShift, settings: Settings) -> bool:
     """Tell whether a shift that was seen before is still there."""
     chance = min(1.0, _DOUBT * (1.0 - settings.real('shift_confidence')))
     least = (1.0 - settings.real('alarm_dead_band')) * settings.real('shift_least')
-    return any(p.p_value < chance and abs(p.shift_mw) >= least for p in shift.pieces)
+    return piece.p_value < chance and abs(piece.shift_mw) >= least

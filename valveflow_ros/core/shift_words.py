@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from valveflow_ros.records import NS_PER_S
+from valveflow_ros.records import NS_PER_S, FloatArray
 
 if TYPE_CHECKING:
     from valveflow_ros.core.shift import PieceShift, Shift
@@ -15,8 +15,28 @@ if TYPE_CHECKING:
 _SURE = 0.9999
 
 
-def shift_sentence(shift: Shift) -> str:
-    """Say which piece moved, by how much, since when and how surely; or that none did."""
+def shift_sentence(shift: Shift, knots: FloatArray) -> str:
+    """Say which piece moved, by how much, since when and how surely; or that none did.
+
+    Parameters
+    ----------
+    shift : Shift
+    knots : float64 (J + 1,)
+        Of the reference; less of it than all may have been compared.
+    """
+    return _judgement(shift) + _compared(shift, float(knots[0]), float(knots[-1]))
+
+
+def _compared(shift: Shift, first: float, last: float) -> str:
+    """Say what was compared if it is not the whole reference."""
+    known = [p for p in shift.pieces if math.isfinite(p.u_from)]
+    low, high = min(p.u_from for p in known), max(p.u_to for p in known)
+    if low <= first and high >= last:
+        return ''
+    return f' Compared is u {low:.0f} to {high:.0f} of its u {first:.0f} to {last:.0f}.'
+
+
+def _judgement(shift: Shift) -> str:
     known = [p for p in shift.pieces if math.isfinite(p.middle_mw)]
     reference = f'the reference of {day(shift.reference_ns)}'
     worst = shift.largest

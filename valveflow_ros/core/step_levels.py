@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ import numpy as np
 from scipy.linalg import solve_toeplitz
 
 from valveflow_ros.config import Settings
-from valveflow_ros.records import FloatArray, IntArray, SampleTable, Signal
+from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SampleTable, Signal
 
 _LEAST_STEP_PERCENT = 0.3  # smaller moves of the opening are wander within a level
 _MAD_TO_SD = 1.4826022185056018
@@ -19,6 +20,8 @@ _SURE = 3.0  # errors by which both halves of a level must differ to be called m
 _ORDER = 2  # of the autoregressive model of the block means
 _LARGEST_SUM = 0.95
 _ROUNDS = 8
+_GAP = 1.5  # sample periods between rows from which on time is missing
+_DUST = 1e-6  # of a power: what it is taken to be wrong by at least
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,18 +58,33 @@ class Level:
         return self.end - self.first
 
 
-def holds(opening: FloatArray, block: int, least_blocks: int) -> list[tuple[int, int]]:
+def holds(
+    opening: FloatArray, block: int, least_blocks: int, gaps: Sequence[int] = ()
+) -> list[tuple[int, int]]:
     """Return the stretches ``[first, end)`` of rows in which the opening was held.
 
     A block mean that leaves the running mean of a stretch by more than the smallest step, or
     more than the noise between rows explains, ends it. Stretches shorter than
-    ``least_blocks`` blocks are moves.
+    ``least_blocks`` blocks are moves. ``gaps`` are rows before which time is missing: nobody
+    knows what the valve did there, so none lies within a stretch.
     """
+    limit = max(_LEAST_STEP_PERCENT, _NOISES * _white(opening) / math.sqrt(block))
+    edges = itertools.pairwise([0, *gaps, len(opening)])
+    return [
+        (begin + a, begin + b)
+        for begin, end in edges
+        for a, b in _stretches(opening[begin:end], block, least_blocks, limit)
+    ]
+
+
+def _stretches(
+    opening: FloatArray, block: int, least_blocks: int, limit: float
+) -> list[tuple[int, int]]:
+    """Return the held stretches of rows without a gap."""
     blocks = len(opening) // block
     table = opening[: blocks * block].reshape(blocks, block)
     good = np.asarray(np.isfinite(table).all(axis=1))
     means = np.where(good, np.where(good[:, None], table, 0.0).mean(axis=1), math.nan)
-    limit = max(_LEAST_STEP_PERCENT, _NOISES * _white(opening) / math.sqrt(block))
     found: list[tuple[int, int]] = []
     begin, total = 0, 0.0
     for k in range(blocks + 1):
@@ -112,14 +130,20 @@ def find_levels(table: SampleTable, u: FloatArray, settings: Settings) -> list[L
     usable = np.isfinite(u) & np.isfinite(table.column(Signal.GENERATED_POWER))
     settle = math.ceil(settings.settle_s / step_s)
     least = max(2, math.ceil(settings.real('steady_min') / step_s))
-    held = holds(np.where(usable, opening, math.nan), block, max(3, math.ceil(least / block)))
+    gaps = np.flatnonzero(np.diff(table.time_ns) > _GAP * step_s * NS_PER_S) + 1
+    held = holds(
+        np.where(usable, opening, math.nan), block, max(3, math.ceil(least / block)),
+        gaps.tolist(),
+    )  # fmt: skip
     parts = [(a + settle, b) if b - a >= settle + least else (b, b) for a, b in held]
     # A log may begin inside a hold that has lasted: nothing tells, so its transient goes too.
     power = np.ascontiguousarray(table.column(Signal.GENERATED_POWER))
     settled = [k for k, (a, b) in enumerate(parts) if b > a]
     blocks = {k: _means(power[slice(*parts[k])], block) for k in settled}
-    moving = {k for k in settled if _moves(blocks, k)}
+    least_sd = _resolution([power[slice(*parts[k])] for k in settled]) / math.sqrt(block)
+    moving = {k for k in settled if _moves(blocks, k, least_sd)}
     sd = long_run_sd([blocks[k] for k in settled if k not in moving] or list(blocks.values()))
+    sd = max(sd, least_sd)
     return [
         _level(table, u, span, part, sd * math.sqrt(block), k in moving, settings)
         for k, (span, part) in enumerate(zip(held, parts, strict=True))
@@ -133,14 +157,31 @@ def _means(values: FloatArray, block: int) -> FloatArray:
     return np.asarray(values[: count * width].reshape(count, width).mean(axis=1))
 
 
-def _moves(blocks: dict[int, FloatArray], k: int) -> bool:
+def _resolution(parts: Sequence[FloatArray]) -> float:
+    """Return the sd of rounding in MW: a power that stands still is not known without error.
+
+    That of the smallest step between the powers logged, and never nothing: without an error
+    a level would weigh infinitely much.
+    """
+    values = np.unique(np.concatenate([*parts, np.empty(0)]))
+    if not len(values):
+        return 0.0
+    span = float(values[-1] - values[0])
+    steps = np.diff(values)
+    steps = steps[steps > _DUST * span]
+    step = float(steps.min()) if len(steps) else 0.0
+    size = span if span > 0.0 else max(1.0, float(np.abs(values).max()))
+    return max(step / math.sqrt(12.0), _DUST * size)
+
+
+def _moves(blocks: dict[int, FloatArray], k: int, least_sd: float) -> bool:
     """Tell whether the halves of a level differ by more than the noise of the others explains."""
     others = [v for number, v in blocks.items() if number != k]
     own = blocks[k]
     half = len(own) // 2
     if not others or half < 1:
         return False
-    error = long_run_sd(others) / math.sqrt(len(own))
+    error = max(long_run_sd(others), least_sd) / math.sqrt(len(own))
     return bool(abs(own[half:].mean() - own[:half].mean()) > _SURE * 2.0 * error)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from valveflow_ros.core.curve_status import CurveStatus
+from valveflow_ros.core.identifiability import weaknesses
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.logs import RecorderState
 from valveflow_ros.ros.diagnostics import Item, Level
@@ -15,22 +16,7 @@ from valveflow_ros.ros.worker import FitWorker
 def fit_item(monitor: Monitor, worker: FitWorker, last_fit_s: float | None) -> Item:
     """Return how the curve is, and the process that fits it."""
     curve = monitor.characteristic
-    noise = monitor.noise()
-    values: dict[str, object] = {
-        'Status': monitor.status.name.lower(),
-        'Model': '' if curve is None else curve.model_id,
-        'Pieces': 0 if curve is None else len(curve.pieces),
-        'Age of the curve (s)': None if curve is None else _age_s(monitor),
-        'Special segments in the window': monitor.segments,
-        'Special samples in the window': monitor.special_samples,
-        'Samples taken': monitor.rows,
-        'Noise of the integrated input (% MPa^e)': noise.input,
-        'Noise of the power (MW)': noise.power_mw,
-        'Temperature spread (K)': math.nan if curve is None else curve.source.temperature_spread_k,
-        'Refit under way for (s)': worker.busy_s,
-        'Last refit took (s)': last_fit_s,
-        'Fit process starts': worker.starts,
-    }
+    values = _fit_values(monitor, worker, last_fit_s)
     if worker.failures_in_a_row:
         sentence = f'{monitor.cause} {worker.failures_in_a_row} failures in a row.'.strip()
         return Item('fit', Level.ERROR, sentence, values)
@@ -47,7 +33,34 @@ def fit_item(monitor: Monitor, worker: FitWorker, last_fit_s: float | None) -> I
             'the method assumes an unchanged one, so the curve is to be doubted.',
             values,
         )
+    weak = weaknesses(curve)
+    if weak:
+        more = f' Weak points in all: {len(weak)}.' if len(weak) > 1 else ''
+        return Item('fit', Level.WARN, weak[0] + more, values)
     return Item('fit', Level.OK, f'A curve of {len(curve.pieces)} pieces.', values)
+
+
+def _fit_values(
+    monitor: Monitor, worker: FitWorker, last_fit_s: float | None
+) -> dict[str, object]:
+    curve = monitor.characteristic
+    noise = monitor.noise()
+    return {
+        'Status': monitor.status.name.lower(),
+        'Model': '' if curve is None else curve.model_id,
+        'Pieces': 0 if curve is None else len(curve.pieces),
+        'Age of the curve (s)': None if curve is None else _age_s(monitor),
+        'Special segments in the window': monitor.segments,
+        'Special samples in the window': monitor.special_samples,
+        'Samples taken': monitor.rows,
+        'Noise of the integrated input (% MPa^e)': noise.input,
+        'Noise of the power (MW)': noise.power_mw,
+        'Temperature spread (K)': math.nan if curve is None else curve.source.temperature_spread_k,
+        'Refit under way for (s)': worker.busy_s,
+        'Last refit took (s)': last_fit_s,
+        'Fit process starts': worker.starts,
+        'Notes': '' if curve is None else ' '.join(curve.notes),
+    }
 
 
 def _age_s(monitor: Monitor) -> float:
@@ -90,7 +103,12 @@ def reference_item(monitor: Monitor) -> Item:
     level = Level.ERROR if keeper.alarm.active else Level.OK
     if keeper.alarm.standing and not keeper.alarm.active:
         level = Level.WARN
-    return Item('reference', level, shift.sentence, values)
+    sentence = shift.sentence
+    if keeper.alarm.active and not shift.moved:
+        spans = ' and '.join(f'u {a:.0f} to {b:.0f}' for a, b in keeper.alarm.ranges)
+        moved = f'what moved, {spans}, is not judged unmoved yet' if spans else 'doubt is left'
+        sentence = f'The alarm stands: {moved}. {sentence}'
+    return Item('reference', level, sentence, values)
 
 
 def recorder_item(recording: Recording) -> Item:
