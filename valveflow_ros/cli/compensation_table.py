@@ -62,12 +62,16 @@ def _cell(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
+def within(made: Compensation, tolerance: float) -> bool:
+    """Tell whether the inverse and the table are as exact as was asked."""
+    return made.identity_mw <= tolerance and made.table_mw <= tolerance
+
+
 def outcome(
     made: Compensation, pressures: Sequence[float], tolerance: float, path: Path
 ) -> Outcome:
     """Return what is printed at the end."""
     x, u = made.power_mw, made.u
-    passed = made.identity_mw <= tolerance and made.table_mw <= tolerance
     text = '\n'.join(
         [
             f'Wrote {counted(len(x), "point")} to {path}: {decimals(float(x[0]), 2)} to '
@@ -80,13 +84,12 @@ def outcome(
             _useful(made),
             made.notes[0],
             *_full_words(made, pressures),
-            f'{"Checked" if passed else "Not within tolerance"}: F(F^-1(x)) differs from x by at '
-            f'most {made.identity_mw:.1e} MW; interpolating in the table as written is off by at '
-            f'most {made.table_mw:.2g} MW ({made.table_u:.2g} in u); tolerance '
-            f'{tolerance:g} MW.',
+            f'Checked: F(F^-1(x)) differs from x by at most {made.identity_mw:.1e} MW; '
+            'interpolating in the table as written is off by at most '
+            f'{made.table_mw:.2g} MW ({made.table_u:.2g} in u); tolerance {tolerance:g} MW.',
         ]
     )
-    return Outcome(text, _data(made, pressures, tolerance, passed, path))
+    return Outcome(text, _data(made, pressures, tolerance, path))
 
 
 def _useful(made: Compensation) -> str:
@@ -121,7 +124,7 @@ def _pieces(made: Compensation, pressures: Sequence[float]) -> str:
 
 
 def _data(
-    made: Compensation, pressures: Sequence[float], tolerance: float, passed: bool, path: Path
+    made: Compensation, pressures: Sequence[float], tolerance: float, path: Path
 ) -> dict[str, Any]:
     table = columns_of(made, pressures)
     return {
@@ -138,6 +141,9 @@ def _data(
         'largest_gain_ratio': made.largest_step,
         'useful_mw': list(made.useful_mw),
         'full_opening_mw': {f'{p:g}': _full(made, p) for p in pressures},
+        'reachable_rows': {
+            f'{p:g}': int(np.count_nonzero(made.u <= _full_u(made, p))) for p in pressures
+        },
         'jumps': [
             {'u': u, 'power_from_mw': low, 'power_to_mw': high} for u, low, high in made.jumps
         ],
@@ -146,7 +152,7 @@ def _data(
             'table_mw': made.table_mw,
             'table_u': made.table_u,
             'tolerance_mw': tolerance,
-            'passed': passed,
+            'passed': within(made, tolerance),
         },
         'notes': list(made.notes),
     }
@@ -154,18 +160,29 @@ def _data(
 
 def _full_words(made: Compensation, pressures: Sequence[float]) -> list[str]:
     """Return a line for each pressure at which the valve is fully open before the table ends."""
-    found = [(p, _full(made, p)) for p in pressures]
     return [
-        f'At {p:g} MPa the valve is fully open at {decimals(x, 1)} MW: openings above 100 % in '
-        'the table are out of reach.'
-        for p, x in found
+        f'At {p:g} MPa no row of the table is reachable: the valve is fully open at u = '
+        f'{decimals(_full_u(made, p), 1)}, below the first row.'
+        if math.isnan(x)
+        else f'At {p:g} MPa the valve is fully open at {decimals(x, 1)} MW: openings above '
+        '100 % in the table are out of reach.'
+        for p, x in ((p, _full(made, p)) for p in pressures)
         if x is not None
     ]
 
 
 def _full(made: Compensation, pressure: float) -> float | None:
-    """Return the power at which the valve is fully open, None if that is beyond the table."""
-    u = 100.0 * pressure**made.curve.pressure_exponent
-    if not made.u[0] <= u <= made.u[-1]:
+    """Return the power at which the valve is fully open.
+
+    None if that is beyond the last row; NaN if it is before the first, where nothing is known.
+    """
+    u = _full_u(made, pressure)
+    if u > made.u[-1]:
         return None
+    if u < made.u[0]:
+        return math.nan
     return float(made.curve.model.static(np.array([u]))[0])
+
+
+def _full_u(made: Compensation, pressure: float) -> float:
+    return float(100.0 * pressure**made.curve.pressure_exponent)

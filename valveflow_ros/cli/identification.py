@@ -131,6 +131,12 @@ def outcome(found: Identified, written: Mapping[str, Path], log: LogInput) -> Ou
     return Outcome(_text(found, written), data)
 
 
+def _files(written: Mapping[str, Path]) -> str:
+    """Name what was written, the page for people first."""
+    others = [path.name for name, path in written.items() if name != 'report.html']
+    return f'Wrote {written["report.html"]} and {" and ".join(others)}.'
+
+
 def _text(found: Identified, written: Mapping[str, Path]) -> str:
     c = found.characteristic
     parts = [
@@ -148,7 +154,7 @@ def _text(found: Identified, written: Mapping[str, Path]) -> str:
         *c.notes,
         '' if found.shift is None else f'Against the reference: {found.shift.sentence}',
         rejected_words(found.counts) if rejected(found.counts) else '',
-        f'Wrote {written["report.html"]} and {written["characteristic.json"].name}.',
+        _files(written),
     ]
     return '\n'.join(part for part in parts if part)
 

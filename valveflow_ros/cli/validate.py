@@ -19,7 +19,10 @@ example:
 
 
 def _positive(words: str) -> float:
-    value = float(words)
+    try:
+        value = float(words)
+    except ValueError:
+        raise ArgumentTypeError(f"must be a number, not '{words}'") from None
     if not 0.0 < value <= 1e4:
         raise ArgumentTypeError(f'must be above 0 and at most 10000 MW, not {words}')
     return value

@@ -169,7 +169,10 @@ def _predictions(
         found['proposed.dynamic'] = dynamic(characteristic, samples)
     found['hammerstein.dynamic'] = hammerstein.model.run(samples)[0]
     if sparse is not None:
-        found['sparse.static'] = sparse.model.static(samples.u)
+        there = samples.usable > 0
+        rests = np.full(len(samples.u), np.nan)
+        rests[there] = sparse.model.static(samples.u[there])
+        found['sparse.static'] = rests
         found['sparse.dynamic'] = sparse.model.run(samples)[0]
     return found
 
@@ -180,17 +183,6 @@ def _sparse(learn: Samples, progress: Callable[[str], None]) -> tuple[SparseFit 
         return fit_sparse(learn, progress), ''
     except DataError as error:
         return None, str(error)
-
-
-def _same_input(truth: Truth | None, characteristic: Characteristic) -> None:
-    if truth is None:
-        return
-    theirs, ours = truth.pressure_exponent, characteristic.pressure_exponent
-    if abs(theirs - ours) > 1e-9:
-        raise DataError(
-            f'The truth is a curve over V p^{theirs:g}, the identified one over V p^{ours:g}: '
-            'the two cannot be held together.'
-        )
 
 
 def line_of(pieces: tuple[Piece, ...]) -> Line:

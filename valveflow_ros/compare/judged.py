@@ -156,9 +156,9 @@ class Judgement:
         ]
         return _weighted([(n, d) for n, d in pairs if np.isfinite(d)])
 
-    def failed(self, name: str) -> int:
+    def failed(self, name: str, kind: SegmentKind | None = None) -> int:
         """Return the number of segments in which the prediction is not finite."""
-        return sum(not np.isfinite(s.scores[name].mse_mw2) for s in self.segments)
+        return sum(not np.isfinite(s.scores[name].mse_mw2) for s in self.kinds(kind))
 
     def passed(self, name: str, *, as_paper: bool) -> tuple[int, int]:
         """Return in how many segments zero mean difference stands, and how many were tested."""

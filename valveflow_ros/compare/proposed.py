@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
-
+from valveflow_ros.compare.holdout import settled_rows
 from valveflow_ros.compare.judged import OtherData, Trial
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.problem import Samples
-from valveflow_ros.records import FloatArray, IntArray
+from valveflow_ros.records import FloatArray
 
 
 def dynamic(characteristic: Characteristic, samples: Samples) -> FloatArray:
@@ -24,15 +23,7 @@ def trial_of(other: OtherData, characteristic: Characteristic) -> Trial:
     """
     samples = other.samples
     flat = characteristic.model
-    age = _rows_since_gap(samples)
     good = samples.usable > 0
     good &= (samples.u >= flat.knots[0]) & (samples.u <= flat.knots[-1])
-    good &= age > round(samples.settle_s / samples.step_s)
+    good &= settled_rows(samples)
     return Trial(other.time_ns, samples.u, samples.power_mw, good, other.spans, samples.step_s)
-
-
-def _rows_since_gap(samples: Samples) -> IntArray:
-    """Return the number of usable rows in a row up to each row, 0 in a gap."""
-    place = np.arange(1, len(samples.u) + 1)
-    last = np.maximum.accumulate(np.where(samples.usable > 0, 0, place))
-    return np.asarray(place - last)

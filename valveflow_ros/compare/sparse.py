@@ -111,7 +111,7 @@ def fit_sparse(samples: Samples, progress: Progress = lambda _: None) -> SparseF
     Raises
     ------
     TooFewSamplesError
-        Too few usable rows.
+        Too few usable rows, or too few that lie far enough behind a gap.
     DataError
         No model of the library can be run over the data without running away.
     """

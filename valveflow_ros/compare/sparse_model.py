@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,9 @@ from valveflow_ros.core.problem import Samples
 from valveflow_ros.records import ByteArray, FloatArray
 
 _START_S = 30.0  # power averaged to begin with after a gap
-_PLACES = 400  # inputs at which the rest is searched
+_PLACES = 400  # inputs at which the rest is searched, at least
+_FINE_U = 0.25  # farthest apart where the rest swings with sin u or cos u: 25 to a period
+_SWINGING = tuple(library.NAMES.index(name) for name in ('sin u', 'cos u'))
 _GRID = 1500  # places at which a change of sign is looked for
 
 
@@ -67,11 +70,14 @@ class SparseModel:
 
         A rest is a power where y' falls through zero. Where there are several, the
         curve goes on to the nearest from the middle of the data outwards. It is
-        searched at evenly spaced inputs and straight between them.
+        searched at evenly spaced inputs and straight between them, so ``u`` should hold no
+        rows of gaps: they stretch the range that is searched.
         """
         u = np.asarray(u, dtype=np.float64)
         low, high = min(self.u_from, float(u.min())), max(self.u_to, float(u.max()))
-        places = np.linspace(low, high, _PLACES)
+        swings = bool(np.any(self.xi[list(_SWINGING)] != 0.0))
+        count = math.ceil((high - low) / _FINE_U) + 1 if swings else 0
+        places = np.linspace(low, high, max(_PLACES, count))
         return np.asarray(np.interp(u, places, self._rests(places)))
 
     def _rests(self, places: FloatArray) -> FloatArray:

@@ -55,7 +55,9 @@ class Pair:
     test : PairedTest
         Of the difference of squared errors, theirs less ours, over segments or blocks.
     failed : int
-        Segments in which theirs is not finite; they count for us.
+        Segments or blocks in which theirs is not finite; the test leaves them out.
+    judged : int
+        All segments or blocks, those among them.
     """
 
     terms: Terms
@@ -65,6 +67,7 @@ class Pair:
     mse_theirs_mw2: float
     test: PairedTest
     failed: int = 0
+    judged: int = 0
 
     @property
     def baseline(self) -> str:
@@ -73,9 +76,13 @@ class Pair:
 
     @property
     def outcome(self) -> Outcome:
-        """Return who is better at the 5 % level."""
+        """Return who is better at the 5 % level.
+
+        Where the test tells nothing, theirs loses only if it mostly gives no answer: a few
+        segments without one are no evidence about the others.
+        """
         if not self.test.zero_is_rejected(_LEVEL):
-            return Outcome.BETTER if self.failed else Outcome.OPEN
+            return Outcome.BETTER if 2 * self.failed > self.judged else Outcome.OPEN
         return Outcome.BETTER if self.test.mean > 0.0 else Outcome.WORSE
 
 
@@ -108,7 +115,8 @@ def pairs_on_segments(
             found.append(
                 Pair(
                     terms, ours, theirs, judgement.mse(ours, kind), judgement.mse(theirs, kind),
-                    judgement.gain(ours, theirs, kind), judgement.failed(theirs),
+                    judgement.gain(ours, theirs, kind), judgement.failed(theirs, kind),
+                    len(judgement.kinds(kind)),
                 )
             )  # fmt: skip
     return tuple(found)
@@ -139,7 +147,10 @@ def everywhere(
     pairs = []
     for theirs in (f'{b}.dynamic' for b in BASELINES if f'{b}.dynamic' in squares):
         test, failed = _over_blocks(squares[theirs], squares[ours], block)
-        pairs.append(Pair(Terms.ALL_ROWS, ours, theirs, mse[ours], mse[theirs], test, failed))
+        blocks = len(np.unique(block))
+        pairs.append(
+            Pair(Terms.ALL_ROWS, ours, theirs, mse[ours], mse[theirs], test, failed, blocks)
+        )
     return mse, tuple(pairs)
 
 
@@ -161,9 +172,11 @@ def finding_of(pairs: Iterable[Pair]) -> Finding:
     """Return what becomes of the finding that the proposed curve beats both others.
 
     Judged as the paper does, on special segments of other data. One baseline that does
-    better contradicts it; both must do worse to confirm it.
+    better contradicts it; both must do worse to confirm it, so both must be there.
     """
-    outcomes = [p.outcome for p in pairs if p.terms is Terms.AS_PAPER]
+    met = [(p.baseline, p.outcome) for p in pairs if p.terms is Terms.AS_PAPER]
+    outcomes = {outcome for _, outcome in met}
     if Outcome.WORSE in outcomes:
         return Finding.CONTRADICTED
-    return Finding.CONFIRMED if set(outcomes) == {Outcome.BETTER} else Finding.OPEN
+    both = {name for name, _ in met} == set(BASELINES)
+    return Finding.CONFIRMED if both and outcomes == {Outcome.BETTER} else Finding.OPEN

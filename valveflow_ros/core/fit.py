@@ -29,6 +29,7 @@ from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.records import ByteArray, FloatArray, IntArray, SegmentKind
 
 _EXPLAINED_LEAST = 0.5  # share of the power's variance a curve must explain to be one
+_ONE_LEVEL_PERCENT = 2.0  # of opening: less than this is one load with its jitter
 _LEAST_SPREAD = 10.0  # noise sd that the openings must spread over
 _RICHER = 3  # pieces more than the paper's rule takes, before pruning
 
@@ -61,7 +62,7 @@ def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
     _moved(task, u)
     _valve_moved(task, rows)
     chosen = _pieces_of(part, selection.pieces, growth)
-    _carries_a_curve(chosen, u, power)
+    _carries_a_curve(task, rows, chosen)
     source = _source(task, rows)
     choice = Choice(
         selection.rule, dict(selection.cost), dict(selection.turning_angle), selection.note,
@@ -143,18 +144,27 @@ def _valve_moved(task: FitTask, rows: IntArray) -> None:
         )
 
 
-def _carries_a_curve(pieces: tuple[Piece, ...], u: FloatArray, power: FloatArray) -> None:
+def _carries_a_curve(task: FitTask, rows: IntArray, pieces: tuple[Piece, ...]) -> None:
     """Refuse a relation so loose that a curve through it would mislead."""
+    u, power = task.contents.u[rows], task.contents.power_mw[rows]
     rest = power - _evaluate(pieces, u)
     total = float(np.var(power))
     explained = 1.0 - float(np.mean(rest**2)) / total if total > 0.0 else 0.0
-    if explained < _EXPLAINED_LEAST:
+    if explained >= _EXPLAINED_LEAST:
+        return
+    opening = task.contents.opening_percent[rows] if len(task.contents.opening_percent) else u[:0]
+    known = opening[np.isfinite(opening)]
+    if len(known) and np.ptp(np.quantile(known, (0.01, 0.99))) < _ONE_LEVEL_PERCENT:
         raise DataError(
-            f'The power hardly follows the valve: the best curve of {len(pieces)} '
-            f'piece{"s" if len(pieces) > 1 else ""} explains {100.0 * explained:.0f} % of its '
-            f'variance (at least {100.0 * _EXPLAINED_LEAST:.0f} % needed). An input that is not '
-            'measured moves it, or a signal is mapped wrongly.'
+            f'The unit stood at one opening, {np.median(known):.4g} %, in all special segments. '
+            'A curve needs several loads: hours at other openings would help.'
         )
+    raise DataError(
+        f'The power hardly follows the valve: the best curve of {len(pieces)} '
+        f'piece{"s" if len(pieces) > 1 else ""} explains {100.0 * explained:.0f} % of its '
+        f'variance (at least {100.0 * _EXPLAINED_LEAST:.0f} % needed). An input that is not '
+        'measured moves it, or a signal is mapped wrongly.'
+    )
 
 
 def _evaluate(pieces: tuple[Piece, ...], u: FloatArray) -> FloatArray:

@@ -80,6 +80,8 @@ def _since(shift: Shift) -> str:
             f'since about {minute(shift.since_ns)} (between {minute(shift.since_low_ns)} and '
             f'{minute(shift.since_high_ns)})'
         )
+    if shift.reference_ns >= shift.first_ns > 0:
+        return 'since when cannot be told (the reference was made from the same days)'
     if shift.first_ns > 0:
         return f'with no change seen since {minute(shift.first_ns)}, so from before that'
     return 'since when is not known'

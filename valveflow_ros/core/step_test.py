@@ -95,6 +95,13 @@ def identify_step_test(table: SampleTable, settings: Settings) -> StepTest:
             f'a curve needs {LEAST_LEVELS}.'
         )
     line = broken_line(points, settings.whole('max_pieces'))
+    if np.any(np.diff(line.values) <= 0.0):
+        worst = int(np.argmin(np.diff(line.values)))
+        raise DataError(
+            f'Between u = {line.knots[worst]:.0f} and {line.knots[worst + 1]:.0f} the power does '
+            'not rise with the opening, so this is no characteristic of a valve: check which '
+            'signals were logged, and that nothing else moved the power.'
+        )
     segments = tuple(_segment(k + 1, table, rows.u, v, settings) for k, v in enumerate(good))
     notes = (*_notes(levels, good, spread, members), *_left_out(levels))
     curve = _characteristic(table, rows.u, inside, good, line, settings, notes)

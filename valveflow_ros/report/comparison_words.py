@@ -59,7 +59,8 @@ def _as_paper(data: Compared) -> str:
 def _against(pair: Pair) -> str:
     said = f'{LABELS[pair.baseline]} has {_mse(pair.mse_theirs_mw2)}'
     if pair.failed:
-        return f'{said}, and gives no finite answer in {counted(pair.failed, "segment")}'
+        said = f'{said}, and gives no finite answer in {counted(pair.failed, "segment")}'
+        return f'{said} ({_tested(pair)})' if math.isfinite(pair.test.p_value) else said
     return f'{said} ({_tested(pair)})'
 
 
