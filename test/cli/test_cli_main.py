@@ -154,9 +154,10 @@ def test_ctrl_c_in_the_middle_of_the_work_leaves_nothing(logs, tmp_path):
     words = ['identify', str(logs / 'plant.csv'), '-o', str(tmp_path / 'out')]
     code = (
         'import os, signal, sys, time\n'
+        # A shell that starts things in the background lets them ignore it.
+        'signal.signal(signal.SIGINT, signal.default_int_handler)\n'
         'from valveflow_ros.cli import engine\n'
         'from valveflow_ros.cli.main import main\n'
-        # The signal may reach another thread first and be told to this one a little later.
         'engine.fit = lambda *_: (os.kill(os.getpid(), signal.SIGINT), time.sleep(60))\n'
         f'sys.exit(main({words!r}))'
     )
