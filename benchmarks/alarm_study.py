@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -147,7 +148,10 @@ def main() -> None:
     print(json.dumps({'plants': summary, 'chart_alone': charts}, indent=1))
     RESULTS.mkdir(exist_ok=True)
     name = f'alarm_{args.first}_{args.first + args.plants - 1}.json'
-    text = json.dumps({'summary': summary, 'chart_alone': charts, 'plants': rows}, indent=1)
+    command = ' '.join(['python -m benchmarks.alarm_study', *sys.argv[1:]])
+    text = json.dumps(
+        {'command': command, 'summary': summary, 'chart_alone': charts, 'plants': rows}, indent=1
+    )
     (RESULTS / name).write_text(text + '\n', encoding='utf-8')
 
 

@@ -211,11 +211,12 @@ def main() -> None:
     parser.add_argument('--first', type=int, default=1)
     parser.add_argument('--days', type=float, default=10.0)
     parser.add_argument('--units', choices=('paper', 'random'), default='paper')
-    parser.add_argument('--figure', type=Path)
+    parser.add_argument('--figure', action='store_true', help='draw what is there, run nothing')
     args = parser.parse_args()
     name = f'compare_study_{args.units}_{args.first}_{args.first + args.seeds - 1}.json'
+    place = RESULTS / name
     if args.figure:
-        draw(RESULTS / name, args.figure)
+        draw(place, place.with_suffix('.png'))
         return
     rows = []
     for seed in range(args.first, args.first + args.seeds):
@@ -229,7 +230,8 @@ def main() -> None:
         f'--days {args.days:g} --units {args.units}'
     )
     content = {'command': command, 'summary': lines, 'rows': rows}
-    (RESULTS / name).write_text(json.dumps(finite(content), indent=1) + '\n', encoding='utf-8')
+    place.write_text(json.dumps(finite(content), indent=1) + '\n', encoding='utf-8')
+    draw(place, place.with_suffix('.png'))
 
 
 if __name__ == '__main__':

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -120,7 +121,10 @@ def main() -> None:
     print(json.dumps(result, indent=1))
     RESULTS.mkdir(exist_ok=True)
     name = f'coverage_{args.first}_{args.first + args.seeds - 1}.json'
-    text = json.dumps({'days': args.days, 'summary': result, 'rows': rows}, indent=1)
+    command = ' '.join(['python -m benchmarks.coverage_study', *sys.argv[1:]])
+    text = json.dumps(
+        {'command': command, 'days': args.days, 'summary': result, 'rows': rows}, indent=1
+    )
     (RESULTS / name).write_text(text + '\n', encoding='utf-8')
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from pathlib import Path
 
@@ -110,7 +111,10 @@ def main() -> None:
     RESULTS.mkdir(exist_ok=True)
     kind = 'paper_study_irregular' if args.irregular else 'paper_study'
     name = f'{kind}_{args.first}_{args.first + args.seeds - 1}.json'
-    text = json.dumps({'days': args.days, 'summary': lines, 'rows': rows}, indent=1)
+    command = ' '.join(['python -m benchmarks.paper_study', *sys.argv[1:]])
+    text = json.dumps(
+        {'command': command, 'days': args.days, 'summary': lines, 'rows': rows}, indent=1
+    )
     (RESULTS / name).write_text(text + '\n', encoding='utf-8')
 
 

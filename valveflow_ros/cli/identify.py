@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from valveflow_ros.cli.console import Console, Outcome
 from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
+from valveflow_ros.cli.parameter_options import add_parameters
 
 if TYPE_CHECKING:
     from valveflow_ros.report.identified import Identified
@@ -37,13 +38,7 @@ def arguments(parser: ArgumentParser) -> None:
         '-o', '--output', metavar='DIR', type=Path, required=True,
         help='folder for the results, made if absent',
     )  # fmt: skip
-    parser.add_argument(
-        '--params', metavar='FILE', type=Path, help='parameters, a YAML file as the node takes it'
-    )
-    parser.add_argument(
-        '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs',
-        help='one parameter, such as time_constant=120; stands above the file',
-    )  # fmt: skip
+    add_parameters(parser)
     parser.add_argument(
         '--reference', metavar='FILE', type=Path,
         help='a characteristic.json to judge the curve against: DIR gets shift.json',

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from valveflow_ros.cli.console import Console, Outcome
 from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
+from valveflow_ros.cli.parameter_options import add_parameters
 
 _DESCRIPTION = """\
 Hold a characteristic against a log it was not made from: in each steady-state and
@@ -50,13 +51,7 @@ def arguments(parser: ArgumentParser) -> None:
         '--tolerance', metavar='MW', type=_positive,
         help='a mean difference that does not matter (default: the parameter alarm_floor, 1 MW)',
     )  # fmt: skip
-    parser.add_argument(
-        '--params', metavar='FILE', type=Path, help='parameters, a YAML file as the node takes it'
-    )
-    parser.add_argument(
-        '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs',
-        help='one parameter, such as time_constant=120; stands above the file',
-    )  # fmt: skip
+    add_parameters(parser)
     add_mapping(parser)
 
 
