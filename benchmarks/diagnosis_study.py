@@ -21,9 +21,9 @@ import numpy as np
 
 from benchmarks.diagnosis_cases import EFFECTS, OUTSIDE, PAIRS, Case, hidden, null, outside
 from valveflow_ros.config import Settings
-from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.events import FitRequested, SegmentClosed
-from valveflow_ros.core.fit import fit
+from valveflow_ros.core.fit import fit, outline
+from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.diagnosis.diagnose import Record, diagnose
 from valveflow_ros.diagnosis.grid import make_scene
@@ -36,8 +36,8 @@ RESULTS = Path(__file__).parent / 'results'
 OTHER_SEED = 1_000_003  # of the record that an earlier model comes from
 
 
-def identify(log: SimulatedLog, days: float) -> tuple[Characteristic, IntArray, Settings]:
-    """Find the curve as `valveflow identify` does."""
+def watched(log: SimulatedLog, days: float) -> tuple[FitTask, IntArray, Settings]:
+    """Find special segments, and what a curve is found from."""
     settings = Settings(
         {'refit_period': 0.0, 'window_days': max(days, 0.1),
          'sample_period': log.unit.sample_period_s}
@@ -48,21 +48,22 @@ def identify(log: SimulatedLog, days: float) -> tuple[Characteristic, IntArray, 
         (e.segment.start_ns, e.segment.end_ns) for e in fed.events if isinstance(e, SegmentClosed)
     ]
     (task,) = (e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
-    return fit(task), np.array(spans, dtype=np.int64).reshape(-1, 2), settings
+    return task, np.array(spans, dtype=np.int64).reshape(-1, 2), settings
 
 
 def run(case: Case, days: float) -> tuple[Diagnosis, SimulatedLog, Record, dict[str, float]]:
     """Simulate and diagnose one plant."""
     log = simulate(days, case.seed, case.unit, effects=case.effects)
     begin = time.process_time()
-    curve, spans, settings = identify(log, days)
-    middle = time.process_time()
-    model = curve.model
+    task, spans, settings = watched(log, days)
     if case.given:
-        model = identify(simulate(days, case.seed + OTHER_SEED, case.unit), days)[0].model
+        model = fit(watched(simulate(days, case.seed + OTHER_SEED, case.unit), days)[0]).model
+    else:
+        model = outline(task)
+    middle = time.process_time()
     record = Record(
-        log.table, settings.real('sample_period'), curve.pressure_exponent, settings.settle_s,
-        spans,
+        log.table, settings.real('sample_period'), settings.real('pressure_exponent'),
+        settings.settle_s, spans,
     )  # fmt: skip
     again = time.process_time()
     found = diagnose(record, model, case.given)

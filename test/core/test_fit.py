@@ -21,7 +21,7 @@ from streams import (
 from valveflow_ros.config import Settings
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.characteristic_json import from_json, to_json
-from valveflow_ros.core.fit import fit
+from valveflow_ros.core.fit import fit, outline
 from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.offline import feed_rows
@@ -361,3 +361,12 @@ def test_four_days_of_the_simulated_plant_give_its_curve_and_dynamics():
         assert found.delay_stderr_s < 2.0
     u = np.linspace(c.breakpoints[0], c.breakpoints[-1], 200)
     assert np.abs(c(u) - truth(u)).max() < 2.5
+    # The outline is what the fit has before its last step: near, and with the same regions.
+    rough = outline(request.task)
+    assert rough.regions == len(c.dynamics)
+    assert np.abs(rough.static(u) - c(u)).max() < 2.0
+
+
+def test_an_outline_without_dynamics_is_refused():
+    with pytest.raises(TooFewSamplesError, match='follow each other'):
+        outline(task(broken_up(window(), 20)))

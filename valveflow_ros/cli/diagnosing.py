@@ -39,11 +39,11 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class _Rows:
-    """Aligned rows, special segments, and the curve where one was found."""
+    """Aligned rows, special segments, and the model where one was found."""
 
     table: SampleTable
     spans_ns: IntArray
-    curve: Characteristic | None
+    model: RegionalModel | None
     why: str = ''
 
 
@@ -96,10 +96,10 @@ def diagnosed_in(
         console.warn(rows.why)
         notes.append(rows.why)
     step, settle = settings.real('sample_period'), settings.settle_s
-    curve = model or rows.curve
-    exponent = curve.pressure_exponent if curve else settings.real('pressure_exponent')
-    regional: RegionalModel
-    regional = curve.model if curve else first_model(rows.table, step, exponent, settle)
+    exponent = model.pressure_exponent if model else settings.real('pressure_exponent')
+    regional = model.model if model else rows.model
+    if regional is None:
+        regional = first_model(rows.table, step, exponent, settle)
     record = Record(rows.table, step, exponent, settle, rows.spans_ns)
     found, views = diagnose_with_views(record, regional, model is not None, console)
     found = replace(found, notes=(*log.contents.warnings, *notes, *found.notes))
@@ -132,12 +132,9 @@ def _rows(log: LogInput, settings: Settings, wanted: bool, console: Console) -> 
     if not wanted:
         return _Rows(watched.table, spans, None)
     try:
-        curve = engine.identify(watched, console.progress)
+        return _Rows(watched.table, spans, engine.outlined(watched, console.progress))
     except DataError as error:
         return _Rows(watched.table, spans, None, f'{error} All rows are used instead.')
-    if not curve.dynamics:
-        return _Rows(watched.table, spans, None)
-    return _Rows(watched.table, spans, curve)
 
 
 def engine_align(log: LogInput, settings: Settings) -> tuple[SampleTable, Any, Any]:

@@ -11,8 +11,9 @@ from valveflow_ros.config import Settings
 from valveflow_ros.core.align import Aligner
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.events import FitRequested, JournalEntry, JournalKind, SegmentClosed
-from valveflow_ros.core.fit import fit
+from valveflow_ros.core.fit import fit, outline
 from valveflow_ros.core.fit_task import FitTask
+from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.noise import WARM_UP, WINDOW
 from valveflow_ros.core.offline import feed_aligned
@@ -85,6 +86,11 @@ def watch(readings: Readings, settings: Settings, progress: Progress = quiet) ->
 def identify(watched: Watched, progress: Progress = quiet) -> Characteristic:
     """Fit the curve; raises `DataError` with the reason if the data carry none."""
     return fit(watched.task, lambda what: progress(0.6, what))
+
+
+def outlined(watched: Watched, progress: Progress = quiet) -> RegionalModel:
+    """Find curve and dynamics to begin a diagnosis with; raises `DataError` as `identify`."""
+    return outline(watched.task, lambda what: progress(0.6, what))
 
 
 def check_signals(table: SampleTable, counts: dict[str, dict[str, int]]) -> None:

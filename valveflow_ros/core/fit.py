@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,26 +15,40 @@ from valveflow_ros.core.characteristic import (
     ResidualStatistics,
     Source,
 )
+from valveflow_ros.core.fit_refusals import (
+    carries_a_curve,
+    enough_samples,
+    evaluate,
+    input_moved,
+    valve_moved,
+)
 from valveflow_ros.core.fit_result import from_refined, residual_statistics
 from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.identifiability import NOT_REFINED, with_support
+from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.partition import Partition, partition
 from valveflow_ros.core.problem import Samples
-from valveflow_ros.core.refine import refine
+from valveflow_ros.core.refine import refine, search
 from valveflow_ros.core.selection import select
 from valveflow_ros.core.selection_series import Series
 from valveflow_ros.core.whitening import inflation
 from valveflow_ros.core.window import WindowContents
 from valveflow_ros.errors import DataError, TooFewSamplesError
-from valveflow_ros.records import ByteArray, FloatArray, IntArray, SegmentKind
+from valveflow_ros.records import ByteArray, FloatArray, SegmentKind
 
-_EXPLAINED_LEAST = 0.5  # share of the power's variance a curve must explain to be one
-_ONE_LEVEL_PERCENT = 2.0  # of opening: less than this is one load with its jitter
-_LEAST_SPREAD = 10.0  # noise sd that the openings must spread over
 _RICHER = 3  # pieces more than the paper's rule takes, before pruning
 
 
 Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class _Begun:
+    """The exact partition of the special segments, and the static curve taken from it."""
+
+    static: Characteristic
+    part: Partition
+    u_special: FloatArray
 
 
 def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
@@ -45,9 +59,36 @@ def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
     DataError
         The data do not carry a curve; the sentence says why and what would help.
     """
+    begun = _begin(task, progress)
+    if not task.settings.flag('refine'):
+        return with_support(begun.static, task.contents, task.input_noise).with_id()
+    refined = _refined(task, begun, progress)
+    return with_support(refined, task.contents, task.input_noise).with_id()
+
+
+def outline(task: FitTask, progress: Progress = lambda _: None) -> RegionalModel:
+    """Find curve and dynamics without the last fit on single rows and without errors.
+
+    A start for those who fit everything themselves, in two thirds of the time of `fit`.
+
+    Raises
+    ------
+    DataError
+        The data do not carry a curve, or no dynamics; the sentence says why.
+    """
+    begun = _begin(task, progress)
+    progress('curve and dynamics together')
+    try:
+        return search(_samples(task), *_refinement(task, begun))
+    except np.linalg.LinAlgError as error:
+        raise DataError(f'Curve and dynamics could not be found together: {error}.') from None
+
+
+def _begin(task: FitTask, progress: Progress) -> _Begun:
+    """Partition the special segments and choose the number of pieces."""
     settings, contents = task.settings, task.contents
     rows = contents.special_rows()
-    _enough(task, len(rows))
+    enough_samples(task, len(rows))
     u, power = contents.u[rows], contents.power_mw[rows]
     progress('exact partition')
     least = max(2, math.ceil(settings.real('min_piece_share') * len(np.unique(u))))
@@ -59,11 +100,10 @@ def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
         correlation_inflation=growth,
         series=Series.of_spans(contents.u, contents.power_mw, contents.spans),
     )
-    _moved(task, u)
-    _valve_moved(task, rows)
+    input_moved(task, u)
+    valve_moved(task, rows)
     chosen = _pieces_of(part, selection.pieces, growth)
-    _carries_a_curve(task, rows, chosen)
-    source = _source(task, rows)
+    carries_a_curve(task, rows, chosen)
     choice = Choice(
         selection.rule, dict(selection.cost), dict(selection.turning_angle), selection.note,
         dict(selection.confidence),
@@ -73,14 +113,11 @@ def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
         pieces=chosen,
         breakpoint_intervals=_no_intervals(chosen),
         choice=choice,
-        source=source,
+        source=_source(task, rows),
         residuals=_static_residuals(task, chosen),
         partition_pieces=chosen,
     )
-    if not settings.flag('refine'):
-        return with_support(static, contents, task.input_noise).with_id()
-    refined = _refined(task, static, part, u, progress)
-    return with_support(refined, contents, task.input_noise).with_id()
+    return _Begun(static, part, u)
 
 
 def _pieces_of(part: Partition, pieces: int, inflation: float = 1.0) -> tuple[Piece, ...]:
@@ -91,87 +128,6 @@ def _pieces_of(part: Partition, pieces: int, inflation: float = 1.0) -> tuple[Pi
               p.intercept_stderr * wider, p.samples)
         for p in part.pieces(pieces)
     )  # fmt: skip
-
-
-def _enough(task: FitTask, samples: int) -> None:
-    """Refuse a window that cannot carry a fit, and say what would help."""
-    c = task.contents
-    usable = np.isfinite(c.u) & np.isfinite(c.power_mw)
-    if not usable.any():
-        raise DataError('There is no row with opening, pressure and power together.')
-    if np.ptp(c.u[usable]) == 0.0:
-        raise DataError(
-            'The integrated input never changes: a curve needs the valve at several openings.'
-        )
-    need = task.settings.whole('min_fit_samples')
-    if samples < need:
-        raise TooFewSamplesError(
-            'Samples in steady-state and slope-response segments', samples, need,
-            'Longer data, or calmer operation at several loads, would help.',
-        )  # fmt: skip
-
-
-def _moved(task: FitTask, u: FloatArray) -> None:
-    """Refuse samples that lie at one opening: their scatter has no slope to tell."""
-    low, high = np.quantile(u, (0.01, 0.99))
-    if high - low < _LEAST_SPREAD * task.input_noise:
-        raise DataError(
-            f'The unit stood at one opening: in the special segments u lies between {low:.4g} and '
-            f'{high:.4g}, hardly more than its noise of {task.input_noise:.2g}. A curve needs '
-            'several loads.'
-        )
-
-
-def _valve_moved(task: FitTask, rows: IntArray) -> None:
-    """Refuse samples whose u was moved by the pressure alone.
-
-    They may follow a curve well, since power follows the pressure; but it is no
-    characteristic of the valve, and a dead transmitter gives the same.
-    """
-    if not len(task.contents.opening_percent):
-        return
-    opening, u = task.contents.opening_percent[rows], task.contents.u[rows]
-    known = np.isfinite(opening)
-    if not known.any() or not np.median(opening[known]) > 0.0:
-        return
-    low, high = np.quantile(opening[known], (0.01, 0.99))
-    moved_u = (high - low) * float(np.median(u[known]) / np.median(opening[known]))
-    if moved_u < _LEAST_SPREAD * task.input_noise:
-        raise DataError(
-            f'The valve did not move: in the special segments its opening lies between {low:.4g} '
-            f'and {high:.4g} %, and u follows the pressure alone. Hours at several openings are '
-            'needed; if the valve did move, the transmitter of its opening is dead.'
-        )
-
-
-def _carries_a_curve(task: FitTask, rows: IntArray, pieces: tuple[Piece, ...]) -> None:
-    """Refuse a relation so loose that a curve through it would mislead."""
-    u, power = task.contents.u[rows], task.contents.power_mw[rows]
-    rest = power - _evaluate(pieces, u)
-    total = float(np.var(power))
-    explained = 1.0 - float(np.mean(rest**2)) / total if total > 0.0 else 0.0
-    if explained >= _EXPLAINED_LEAST:
-        return
-    opening = task.contents.opening_percent[rows] if len(task.contents.opening_percent) else u[:0]
-    known = opening[np.isfinite(opening)]
-    if len(known) and np.ptp(np.quantile(known, (0.01, 0.99))) < _ONE_LEVEL_PERCENT:
-        raise DataError(
-            f'The unit stood at one opening, {np.median(known):.4g} %, in all special segments. '
-            'A curve needs several loads: hours at other openings would help.'
-        )
-    raise DataError(
-        f'The power hardly follows the valve: the best curve of {len(pieces)} '
-        f'piece{"s" if len(pieces) > 1 else ""} explains {100.0 * explained:.0f} % of its '
-        f'variance (at least {100.0 * _EXPLAINED_LEAST:.0f} % needed). An input that is not '
-        'measured moves it, or a signal is mapped wrongly.'
-    )
-
-
-def _evaluate(pieces: tuple[Piece, ...], u: FloatArray) -> FloatArray:
-    inner = np.array([p.u_to for p in pieces[:-1]])
-    k = np.searchsorted(inner, u, side='right')
-    slopes = np.array([p.slope for p in pieces])
-    return np.asarray(slopes[k] * u + np.array([p.intercept for p in pieces])[k])
 
 
 def _inflation(contents: WindowContents, part: Partition) -> float:
@@ -193,7 +149,7 @@ def _special_residual(
     series: list[FloatArray] = []
     weights: list[ByteArray] = []
     for a, b, _ in contents.spans:
-        series += [contents.power_mw[a:b] - _evaluate(pieces, contents.u[a:b]), np.zeros(1)]
+        series += [contents.power_mw[a:b] - evaluate(pieces, contents.u[a:b]), np.zeros(1)]
         weights.append(np.append(np.ones(b - a, dtype=np.uint8), np.uint8(0)))
     return np.concatenate(series), np.concatenate(weights)
 
@@ -259,34 +215,37 @@ def _rich(part: Partition, pieces: int) -> tuple[Piece, ...]:
     return _pieces_of(part, min(len(part.cost), pieces + _RICHER))
 
 
-def _refined(
-    task: FitTask,
-    static: Characteristic,
-    part: Partition,
-    u_special: FloatArray,
-    progress: Progress,
-) -> Characteristic:
-    """Refine on all rows; where that is not possible the partition's curve stands, and says so."""
-    c, settings = task.contents, task.settings
+def _samples(task: FitTask) -> Samples:
+    """Return all rows of the window."""
+    c, step = task.contents, task.settings.real('sample_period')
     usable = (np.isfinite(c.u) & np.isfinite(c.power_mw)).astype(np.uint8)
-    step = settings.real('sample_period')
     # A jump in time is a gap even where no row stands in it.
     usable[1:][np.diff(c.time_ns) > 1.5e9 * step] = 0
-    progress('curve and dynamics together')
-    samples = Samples(
+    return Samples(
         u=np.where(usable > 0, c.u, 0.0),
         power_mw=np.where(usable > 0, c.power_mw, 0.0),
         usable=usable,
         step_s=step,
-        settle_s=settings.settle_s,
-        group=max(1, round(settings.real('block') / step)),
+        settle_s=task.settings.settle_s,
+        group=max(1, round(task.settings.real('block') / step)),
     )
-    most, start = None, static.model
-    if settings.text('selection_rule') == 'prediction_error':
-        most = settings.whole('max_pieces')
-        start = replace(static, pieces=_rich(part, len(static.pieces))).model
+
+
+def _refinement(task: FitTask, begun: _Begun) -> tuple[RegionalModel, int | None]:
+    """Return the curve to begin with, and how many pieces it may get (None: those it has)."""
+    static = begun.static
+    if task.settings.text('selection_rule') != 'prediction_error':
+        return static.model, None
+    rich = replace(static, pieces=_rich(begun.part, len(static.pieces)))
+    return rich.model, task.settings.whole('max_pieces')
+
+
+def _refined(task: FitTask, begun: _Begun, progress: Progress) -> Characteristic:
+    """Refine on all rows; where that is not possible the partition's curve stands, and says so."""
+    progress('curve and dynamics together')
+    samples = _samples(task)
     try:
-        result = refine(samples, start, most)
+        result = refine(samples, *_refinement(task, begun))
     except (np.linalg.LinAlgError, TooFewSamplesError) as error:
-        return _only_straight(task, static, part, str(error))
-    return from_refined(task, static, result, samples, u_special)
+        return _only_straight(task, begun.static, begun.part, str(error))
+    return from_refined(task, begun.static, result, samples, begun.u_special)

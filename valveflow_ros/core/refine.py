@@ -96,16 +96,7 @@ def refine(samples: Samples, start: RegionalModel, most_pieces: int | None = Non
     -------
     Refined
     """
-    problem = Problem(samples)
-    _, weight = problem.answer(replace(start, levels=np.empty(0), time_constants=np.ones(1),
-                                       delays=np.zeros(1)))  # fmt: skip
-    least = least_rows(samples.step_s)
-    if int(weight.sum()) * samples.group < least:
-        raise TooFewSamplesError(
-            'Rows that follow each other for longer than the transient',
-            int(weight.sum()) * samples.group, least,
-        )  # fmt: skip
-    model, likely = _search(Problem(samples.coarser()), _join(start), most_pieces)
+    problem, (model, likely) = Problem(samples), _outlined(samples, start, most_pieces)
     searched = model.pieces
     fine = Problem(samples.finer())
     order = int(np.clip(round(_MEMORY_S / (fine.samples.step_s * fine.samples.group)), ORDER, 20))
@@ -126,6 +117,32 @@ def refine(samples: Samples, start: RegionalModel, most_pieces: int | None = Non
     model = corrected(samples, fine, model, ar, free)
     found = _conclude(problem, fine, model, free, ar)
     return replace(found, confidence=shifted(likely, model.pieces - searched))
+
+
+def search(samples: Samples, start: RegionalModel, most_pieces: int | None) -> RegionalModel:
+    """Find regions and pieces on means of ten seconds: `refine` without its last fit.
+
+    Raises
+    ------
+    TooFewSamplesError
+        As for `refine`.
+    """
+    return _outlined(samples, start, most_pieces)[0]
+
+
+def _outlined(
+    samples: Samples, start: RegionalModel, most_pieces: int | None
+) -> tuple[RegionalModel, dict[int, float]]:
+    """Search on coarse rows, if there are enough of them."""
+    _, weight = Problem(samples).answer(
+        replace(start, levels=np.empty(0), time_constants=np.ones(1), delays=np.zeros(1))
+    )
+    rows, least = int(weight.sum()) * samples.group, least_rows(samples.step_s)
+    if rows < least:
+        raise TooFewSamplesError(
+            'Rows that follow each other for longer than the transient', rows, least
+        )
+    return _search(Problem(samples.coarser()), _join(start), most_pieces)
 
 
 def least_rows(step_s: float) -> int:
