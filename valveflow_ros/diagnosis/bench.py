@@ -151,11 +151,17 @@ class Bench:
     def displaced(self, cause: Cause, values: Values, extra: Values = ()) -> Start:
         """Run the model with a cause of given size and return what that is worth."""
         model = self.model.with_cause(Active(cause, cause.clipped(values), extra))
-        change = self.task.innovations(answer(self.scene, model) - self.here)
+        change = self.task.innovations(self._explained(model))
         left = self.rest - change
         toward = self.n.T @ left
         cost = float(left @ left) - float(toward @ self._inverse @ toward)
         return Start(cause.clipped(values), (self.floor - cost) / (2.0 * self.variance), extra)
+
+    def _explained(self, model: Extended) -> FloatArray:
+        """Return by how much a cause more moves the prediction in MW, shape (m,)."""
+        if not model.active[-1].cause.draws:
+            return answer(self.scene, model) - self.here
+        return self.scene.power - self.here - self.task.residual(model)
 
     def best(self, cause: Cause, grid: list[Values], keep: int = 1) -> list[Start]:
         """Return the best of some values."""

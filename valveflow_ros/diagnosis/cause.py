@@ -43,6 +43,7 @@ class Kind(enum.Enum):
     SMOOTH = 'smooth'
     ROUGH = 'rough'
     LINE = 'line'
+    HELD = 'held'
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +59,9 @@ class Unknown:
         Bounds of what a plant can have.
     kind : Kind
         ``LINE`` parameters are moved by a line search that begins with ``step`` (the cost
-        is not smooth in them), the others by Gauss-Newton.
+        is not smooth in them), ``HELD`` ones not at all, the others by Gauss-Newton.
+    concealed : float
+        How much larger it may be without showing in any record; belongs to its interval.
     """
 
     name: str
@@ -67,6 +70,7 @@ class Unknown:
     low: float
     high: float
     kind: Kind = Kind.SMOOTH
+    concealed: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +125,11 @@ class Cause:
     slow: bool = False  # a slow wander of the power could be mistaken for it
     # Infers what is hidden (``extra``) from the sub-blocks allowed, for a given size.
     infer: Callable[[Bench, Active, BoolArray], Values] | None = None
+    of_model: bool = False  # an identification that is free to choose may find it too
     order: int = 0  # among causes of one stage: from the oil to the plug
+    # How many paths the noise may make of it, and what acts in one of them; see `draws`.
+    draws: int = 0
+    draw: Callable[[int], Callable[..., Any]] | None = None
 
     def clipped(self, values: Values) -> Values:
         """Return values within the bounds."""

@@ -1,8 +1,12 @@
 """How sure the parameters of the causes are: 95 % intervals.
 
 Smooth parameters get the sandwich of the joint Gauss-Newton matrix with scores summed over
-blocks; the others (dead bands, onsets, limits) the profile of the likelihood, widened by the
-same ratio of robust to plain variance.
+blocks; dead bands and limits the profile of the likelihood, widened by the same ratio of
+robust to plain variance. Where the likelihood jumps (an onset, a level, a band of sticking) its
+ratio is no chi-square: the highest of two random walks that fall away from the true place is
+below c with probability (1 - exp(-c / 2))^2, which is 0.95 at c = 7.35 (Siegmund, Adv. Appl.
+Prob. 20, 1988, 645; Eo and Morley, Quant. Econ. 6, 2015, 463). What acts on the opening is
+known no better than the opening is measured: two standard deviations of its noise are added.
 """
 
 from __future__ import annotations
@@ -12,8 +16,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.diagnosis.cause import Kind
-from valveflow_ros.diagnosis.evidence import long_run_variance
+from valveflow_ros.diagnosis.catalogue import catalogue
+from valveflow_ros.diagnosis.cause import Kind, Stage, Unknown
+from valveflow_ros.diagnosis.draws import free
+from valveflow_ros.diagnosis.evidence import colour, long_run_variance
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import (
     Task,
@@ -25,6 +31,9 @@ from valveflow_ros.records import FloatArray
 
 _Z95 = 1.959963984540054
 _CHI95 = 3.841458820694124
+_JUMP95 = 7.352
+_NOISES = 2.0
+_PLACES, _MISSES = 120, 8
 _DOUBLINGS, _HALVINGS = 12, 7
 _PROFILE_BLOCK_SUBS = 2
 
@@ -43,6 +52,7 @@ class Certainty:
     """The joint linearisation of a fitted model, from which all intervals come."""
 
     def __init__(self, task: Task, model: Extended) -> None:
+        model = free(model, catalogue())
         self.task, self.model = task, model
         causes = cause_tangents(task, model)
         table = task.innovations(
@@ -57,6 +67,7 @@ class Certainty:
         self.variance = float(self.e @ self.e) / len(self.e)
         self.inverse = np.linalg.pinv(self.table.T @ self.table, hermitian=True)
         scene = task.scene
+        self._colour = colour(task, self.e)
         self._group = scene.sub[task.rows] // _PROFILE_BLOCK_SUBS
 
     def _widening(self, column: FloatArray) -> float:
@@ -99,15 +110,21 @@ class Certainty:
             toward = others.T @ e
             return float(e @ e) - float(toward @ inverse @ toward)
 
-        unknown, here = self.model.active[c].cause.unknowns[k], self.model.active[c].values[k]
-        base = cost(here)
-        influence = self.table @ self.inverse[:, own] if own is not None else np.ones(1)
-        wide = self._widening(influence) if own is not None else 1.0
-        most = base + _CHI95 * self.variance * wide
-        return (
-            _crossing(cost, here, -unknown.step, unknown.low, most),
-            _crossing(cost, here, unknown.step, unknown.high, most),
-        )
+        cause = self.model.active[c].cause
+        unknown, here = cause.unknowns[k], self.model.active[c].values[k]
+        if unknown.kind is Kind.LINE:
+            most = cost(here) + _JUMP95 * self.variance * self._colour
+            low, high = (_last_place(cost, here, sign * unknown.step, unknown, most)
+                         for sign in (-1.0, 1.0))  # fmt: skip
+        else:
+            influence = self.table @ self.inverse[:, own] if own is not None else np.ones(1)
+            most = cost(here) + _CHI95 * self.variance * self._widening(influence)
+            low = _crossing(cost, here, -unknown.step, unknown.low, most)
+            high = _crossing(cost, here, unknown.step, unknown.high, most)
+        if cause.stage is Stage.OPENING and unknown.unit == '%':
+            margin = _NOISES * self.task.scene.reference.opening_noise
+            low, high = max(low - margin, unknown.low), min(high + margin, unknown.high)
+        return low, high
 
     def intervals(self) -> dict[str, dict[str, Estimate]]:
         """Return all estimates by cause and parameter."""
@@ -119,12 +136,14 @@ class Certainty:
             for k, unknown in enumerate(a.cause.unknowns):
                 value = a.values[k]
                 own = None if unknown.kind is Kind.LINE else column
-                if unknown.kind is Kind.SMOOTH:
+                if own is not None and unknown.kind is Kind.SMOOTH:
                     low, high = value - _Z95 * errors[column], value + _Z95 * errors[column]
                 else:
                     low, high = self.profile(c, k, own)
                 column += own is not None
-                out[a.name][unknown.name] = Estimate(value, low, high, unknown.unit)
+                out[a.name][unknown.name] = Estimate(
+                    value, low, high + unknown.concealed, unknown.unit
+                )
         return out
 
 
@@ -148,3 +167,27 @@ def _crossing(
         middle = 0.5 * (inside + outside)
         inside, outside = (inside, middle) if cost(middle) > most else (middle, outside)
     return outside
+
+
+def _last_place(
+    cost: Callable[[float], float], here: float, step: float, unknown: Unknown, most: float
+) -> float:
+    """Return the last place in one direction whose cost is below ``most``.
+
+    The cost is ragged: the walk goes on over some places that are too dear, in strides that
+    grow where it gets far.
+    """
+    stride, place, last, misses = 0.02 * step, here, here, 0
+    for count in range(_PLACES):
+        place += stride
+        if not unknown.low <= place <= unknown.high:
+            return unknown.low if step < 0.0 else unknown.high
+        if cost(place) <= most:
+            last, misses = place, 0
+        else:
+            misses += 1
+        if misses >= _MISSES:
+            break
+        if count % 10 == 9 and misses == 0:
+            stride *= 2.0
+    return last + stride if last != here else here + np.sign(step) * abs(stride)

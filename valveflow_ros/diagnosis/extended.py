@@ -12,7 +12,7 @@ from valveflow_ros.diagnosis.cause import Active, Stage
 from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.records import ByteArray, FloatArray
 
-_REMEMBERED = 6
+_REMEMBERED = 24
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,13 +72,14 @@ def _input(scene: Scene, model: Extended) -> FloatArray:
     chain = sorted(model.at(Stage.OPENING), key=lambda a: a.cause.order)
     if not chain:
         return scene.u
-    key = tuple((a.name, a.values) for a in chain)
+    key = tuple((a.name, a.values, a.extra) for a in chain)
     if key not in scene.cache:
         v = scene.v
         for a in chain:
             v = a.cause.act(v, a.values, scene)
-        while len(scene.cache) >= _REMEMBERED:
-            scene.cache.pop(next(iter(scene.cache)))
+        inputs = [k for k in scene.cache if isinstance(k, tuple)]
+        if len(inputs) >= _REMEMBERED:
+            del scene.cache[inputs[0]]
         u = scene.coarse(v * scene.density)
         scene.cache[key] = np.where(scene.usable > 0, u, 0.0)
     return scene.cache[key]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +10,8 @@ import numpy as np
 from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.problem import free_parameters
 from valveflow_ros.core.whitening import fit_ar
-from valveflow_ros.diagnosis.cause import Kind, Stage
+from valveflow_ros.diagnosis.cause import Cause, Kind, Stage, Values
+from valveflow_ros.diagnosis.draws import believed_residual, drawn
 from valveflow_ros.diagnosis.extended import Extended, answer, drive, flow_of, region_path
 from valveflow_ros.diagnosis.scene import ORDER, Scene
 from valveflow_ros.records import BoolArray, FloatArray
@@ -41,6 +43,8 @@ class Task:
 
     def residual(self, model: Extended) -> FloatArray:
         """Return measured minus predicted means in MW, shape (m,); 0 where not scored."""
+        if (a := drawn(model)) is not None:
+            return believed_residual(self.scene, model, a, self.ar)
         return np.where(self.scene.scored, self.scene.power - answer(self.scene, model), 0.0)
 
     def cost(self, model: Extended) -> float:
@@ -109,7 +113,7 @@ def _slots(model: Extended) -> list[tuple[int, int]]:
         (c, k)
         for c, a in enumerate(model.active)
         for k, u in enumerate(a.cause.unknowns)
-        if u.kind is not Kind.LINE
+        if u.kind in (Kind.SMOOTH, Kind.ROUGH)
     ]
 
 
@@ -249,20 +253,34 @@ def search_levels(
     return model, cost
 
 
+def _directions(cause: Cause) -> list[Values]:
+    """Return steps along which parameters of kind ``LINE`` are searched: each, and in pairs."""
+    lines = [k for k, u in enumerate(cause.unknowns) if u.kind is Kind.LINE]
+    out = []
+    for k in lines:
+        out.append({k: 1.0})
+    for k, other in itertools.combinations(lines, 2):
+        out += [{k: 1.0, other: 1.0}, {k: 1.0, other: -1.0}]
+    return [
+        tuple(d.get(k, 0.0) * u.step for k, u in enumerate(cause.unknowns)) for d in out
+    ]  # fmt: skip
+
+
 def search_lines(task: Task, model: Extended, cost: float) -> tuple[Extended, float]:
     """Move every parameter of kind ``LINE`` along a line while the cost falls."""
     for c, a in enumerate(model.active):
-        for k, unknown in enumerate(a.cause.unknowns):
-            if unknown.kind is not Kind.LINE:
-                continue
-            for share in _LINE_SHARES:
-                for sign in (1.0, -1.0):
-                    while True:
-                        trial = _shifted(model, c, k, sign * share * unknown.step)
-                        value = task.cost(trial)
-                        if not value < cost:
-                            break
-                        model, cost = trial, value
+        directions = _directions(a.cause)
+        for share in _LINE_SHARES if directions else ():
+            for direction, sign in itertools.product(directions, (1.0, -1.0)):
+                while True:
+                    trial = model
+                    for k, by in enumerate(direction):
+                        if by:
+                            trial = _shifted(trial, c, k, sign * share * by)
+                    value = task.cost(trial)
+                    if not value < cost:
+                        break
+                    model, cost = trial, value
     return model, cost
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.scene import ORDER, Reference, Scene
+from valveflow_ros.diagnosis.sensor_noise import sensor_noise
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.records import (
     NS_PER_S,
@@ -90,13 +91,13 @@ def make_scene(
         usable=usable,
         power=np.where(scored, power, 0.0), scored=scored, whole=whole,
         sub=np.arange(m) // _sub_rows(m, step * group),
-        reference=_reference(pressure, temperature, power, scored, step),
+        reference=_reference(pressure, temperature, power, scored, step, v),
     )  # fmt: skip
 
 
 def _reference(
     pressure: FloatArray, temperature: FloatArray, power: FloatArray, scored: BoolArray,
-    step_s: float,
+    step_s: float, opening: FloatArray,
 ) -> Reference:  # fmt: skip
     """Return the means of a record and its line of sliding pressure."""
     means = pressure.reshape(len(power), -1).mean(axis=1)[scored]
@@ -104,7 +105,7 @@ def _reference(
     log = np.log(np.maximum(pressure, 1e-6))
     return Reference(
         len(pressure) * step_s, float(temperature.mean()), float(log.mean()), float(level),
-        float(slope),
+        float(slope), sensor_noise(opening),
     )  # fmt: skip
 
 

@@ -28,6 +28,8 @@ class Reference:
         Means over it.
     pressure_level, pressure_slope : float
         Line of the sliding pressure over the power, MPa and MPa per MW.
+    opening_noise : float
+        Standard deviation of the white noise of the opening, %; 0 where it is not known.
     """
 
     span_s: float
@@ -35,6 +37,7 @@ class Reference:
     log_pressure: float
     pressure_level: float
     pressure_slope: float
+    opening_noise: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,8 @@
     y in the row of time t was measured at t + d,  d > 0
 
 A power stamped too late is the same as a longer delay and cannot be told from it; of one
-stamped too early only the part shows that the shortest delay does not hide.
+stamped too early only the part shows that the shortest delay does not hide: ``d_s`` is that
+part, and its interval reaches higher by the longest delay a unit may have.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from valveflow_ros.diagnosis.cause import Cause, Stage, Start, Unknown, Values
 from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.records import FloatArray
 
+# Between valve and generator little more than the filling of a chest: 3 to 10 s in the paper.
+_LONGEST_DELAY_S = 15.0
 _TRIED_S = (3.0, 6.0, 10.0, 16.0, 25.0, 40.0)
 
 
@@ -45,7 +48,7 @@ def sentence(values: dict[str, float]) -> str:
 
 CAUSE = Cause(
     'clock', 'lag', Stage.OUTPUT,
-    (Unknown('d_s', 's', 0.5, 0.0, 60.0),),
+    (Unknown('d_s', 's', 0.5, 0.0, 60.0, concealed=_LONGEST_DELAY_S),),
     act, starts, sentence, ('reheater', 'region_lag'),
     'Compare the clocks of both loggers, or record both signals with one of them.',
     order=2,

@@ -59,6 +59,8 @@ def _search(bench: Bench, size: float) -> Start | None:
             break
         _, found = bench.modulated([GAIN], path[None, :].astype(np.float64))
         size, share = float(found[0]), float(path.mean())
+    if path.mean() > 0.5:  # what is rarer is the event
+        path, size = (1 - path).astype(np.uint8), -size
     times = _switches(bench, path)
     return bench.displaced(CAUSE, (size,), times) if len(times) >= _LEAST_SWITCHES else None
 

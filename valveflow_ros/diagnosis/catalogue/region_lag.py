@@ -63,4 +63,5 @@ CAUSE = Cause(
     ),
     act, starts, sentence, ('reheater', 'backlash', 'rate_limit'),
     'Run the same ramp at two speeds: what a lag does grows with the speed.',
+    of_model=True,
 )  # fmt: skip

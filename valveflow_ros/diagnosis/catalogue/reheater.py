@@ -15,7 +15,7 @@ import numpy as np
 from valveflow_ros.core.regional_kernel import make_taps
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.bench import Bench
-from valveflow_ros.diagnosis.cause import Cause, Stage, Start, Unknown, Values
+from valveflow_ros.diagnosis.cause import Cause, Kind, Stage, Start, Unknown, Values
 from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.records import FloatArray
 
@@ -46,7 +46,11 @@ def sentence(values: dict[str, float]) -> str:
 
 CAUSE = Cause(
     'reheater', 'lag', Stage.OUTPUT,
-    (Unknown('alpha', '', 0.03, 0.0, 1.0), Unknown('time_s', 's', 1.0, 0.5, 1800.0)),
+    (
+        # The same delayed area (1 - alpha) T looks nearly the same: no ellipse holds them.
+        Unknown('alpha', '', 0.03, 0.0, 1.0, Kind.ROUGH),
+        Unknown('time_s', 's', 1.0, 0.5, 1800.0, Kind.ROUGH),
+    ),
     act, starts, sentence, ('clock', 'region_lag', 'rate_limit'),
     'Steps of the opening at constant pressure, power logged every second: two slopes in the '
     'answer are a reheater.',

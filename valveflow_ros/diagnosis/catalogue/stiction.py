@@ -2,13 +2,14 @@
 
 The two-parameter picture of Choudhury in the form of He: the valve stays until the pull
 exceeds (S + J) / 2, then slips and stays (S - J) / 2 behind. The moment it slips hangs on
-every hundredth of a per cent of the measured opening, so the path is averaged over
-a few draws of the sensor's noise.
+every hundredth of a per cent of the measured opening, so several paths are run, each
+with a draw of the sensor's noise (see `draws`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,44 +20,70 @@ from valveflow_ros.diagnosis.cause import Cause, Kind, Stage, Start, Unknown, Va
 from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.records import FloatArray
 
-_DRAWS = 10
+_DRAWS, _ROUGH_DRAWS = 10, 5
 _SEED = 20_240
 _BANDS = (0.3, 0.5, 0.7, 0.95, 1.25, 1.6, 2.1, 2.8)
-_FACTORS, _SHARES = (0.88, 0.94, 1.0, 1.07, 1.15), (0.3, 0.5, 0.62, 0.7, 0.78, 0.9)
-_LIKE_SLACK, _WORTH_A_LOOK = 3.0, 10.0
+_FACTORS = (0.88, 0.94, 1.0, 1.07, 1.15)
+_OVER_SLACK, _SHARES = (0.97, 1.04, 1.1), (0.15, 0.4, 0.6, 0.75, 0.9)
+_LIKE_SLACK = 3.0
+_STEPS = (0.04, 0.02, 0.01, 0.005)
 _SHIFT = 7_919
 
 
-def _noise_of(v: FloatArray) -> float:
-    """Return the sd of the white noise of a position.
+def _noise(v: FloatArray, scene: Scene) -> FloatArray:
+    """Return noise like that of the position sensor, the same for every call."""
+    if 'noise of v' not in scene.cache:
+        normal = np.random.default_rng(_SEED).standard_normal(len(v))
+        scene.cache['noise of v'] = scene.reference.opening_noise * normal
+    return scene.cache['noise of v']
 
-    A position that wanders has E (v[t + h] - v[t])^2 = 2 (noise + c h); two lags separate them.
-    """
-    near, far = (float(np.nanmedian((v[h:] - v[:-h]) ** 2)) / 0.455 for h in (1, 2))
-    return float(np.sqrt(max(near - 0.5 * far, 0.0)))
+
+def draw(number: int) -> Callable[[FloatArray, Values, Scene], FloatArray]:
+    """Return what acts in one draw of the noise."""
+
+    def path(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
+        out = np.empty(len(v))
+        moved = v + np.roll(_noise(v, scene), number * _SHIFT)
+        kernels.stick_slip(moved, values[0], min(values[1], values[0]), out)
+        return out
+
+    return path
 
 
 def act(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
     """Return the mean position of the plug over the draws."""
-    band, jump = values[0], min(values[1], values[0])
-    noise = _noise_of(v) * np.random.default_rng(_SEED).standard_normal(len(v))
-    total, path = np.zeros(len(v)), np.empty(len(v))
-    for draw in range(_DRAWS):
-        kernels.stick_slip(v + np.roll(noise, draw * _SHIFT), band, jump, path)
-        total += path
+    total = np.zeros(len(v))
+    for k in range(_DRAWS):
+        total += draw(k)(v, values, scene)
     return np.asarray(total / _DRAWS)
 
 
 def starts(bench: Bench) -> Sequence[Start]:
-    """Try some bands; round the best of them look closely, since the path forgives little."""
+    """Begin at the slack it looks like, then walk downhill: the path forgives little."""
     slack = bench.best(backlash.CAUSE, [(s,) for s in _BANDS])
     if not slack or slack[0].gain < _LIKE_SLACK:
         return []  # a valve that sticks looks loose first of all
-    band = bench.best(CAUSE, [(s, 0.6 * s) for s in _BANDS])
-    if not band or band[0].gain < _WORTH_A_LOOK:
-        return band
-    near = band[0].values[0]
-    return bench.best(CAUSE, [(near * f, near * f * j) for f in _FACTORS for j in _SHARES])
+    (near,) = bench.best(backlash.CAUSE, [(slack[0].values[0] * f,) for f in _FACTORS])
+    rough = replace(CAUSE, draws=_ROUGH_DRAWS)
+    width = near.values[0]
+    tried = bench.best(rough, [(width * f, width * f * j) for f in _OVER_SLACK for j in _SHARES])
+    return [_downhill(bench, rough, tried[0], width)] if tried else []
+
+
+def _downhill(bench: Bench, cause: Cause, best: Start, width: float) -> Start:
+    """Move where the valve breaks loose, (S + J)/2, and where it stops, (S - J)/2, in turn."""
+    for step in _STEPS:
+        for by_band, by_jump in ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0)):
+            while True:
+                band, jump = best.values[0] + step * width * by_band, best.values[1]
+                jump += step * width * by_jump
+                if not 0.0 <= jump <= band:
+                    break
+                trial = bench.displaced(cause, (band, jump))
+                if not trial.gain > best.gain:
+                    break
+                best = trial
+    return best
 
 
 def sentence(values: dict[str, float]) -> str:
@@ -70,10 +97,10 @@ def sentence(values: dict[str, float]) -> str:
 CAUSE = Cause(
     'stiction', 'slack', Stage.OPENING,
     (
-        Unknown('s_percent', '%', 0.1, 0.02, 20.0, Kind.LINE),
-        Unknown('j_percent', '%', 0.1, 0.0, 20.0, Kind.LINE),
+        Unknown('s_percent', '%', 0.04, 0.02, 20.0, Kind.LINE),
+        Unknown('j_percent', '%', 0.04, 0.0, 20.0, Kind.LINE),
     ),
     act, starts, sentence, ('backlash',),
     'A slow ramp below 0.05 %/s, with the position logged to 0.01 %: slipping shows as stairs.',
-    order=1,
+    order=1, draws=_DRAWS, draw=draw,
 )  # fmt: skip
