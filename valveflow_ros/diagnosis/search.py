@@ -6,8 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from valveflow_ros.diagnosis.bench import Bench
+from valveflow_ros.diagnosis.bumps import without_bumps
 from valveflow_ros.diagnosis.catalogue import catalogue
 from valveflow_ros.diagnosis.cause import Active, Start
+from valveflow_ros.diagnosis.draws import held
 from valveflow_ros.diagnosis.evidence import Evidence, colour, weigh
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import (
@@ -18,6 +20,7 @@ from valveflow_ros.diagnosis.fitting import (
     search_lines,
     settle,
 )
+from valveflow_ros.diagnosis.rebuild import rebuilt
 from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.records import FloatArray
 
@@ -30,6 +33,7 @@ SCREEN_LEAST = 6.0
 SCREEN_SHARE = 0.1
 NOT_TOLD_APART = 10.0
 KEPT_LEAST = 8.0
+STRONG = 300.0  # log-likelihood of a cause that may have led the identification astray
 _SHORT_STEPS_MW = (1.0, 0.4)
 
 
@@ -78,6 +82,7 @@ def search(task: Task, start: Extended, progress: Progress, rough: Scene | None 
     """Fit the plain model, then add causes while one of them stands up to all tests."""
     progress(0.05, 'simulation fitted to the record')
     task, plain, _ = settle(task, start, rounds=2, steps=4)
+    task, plain = without_bumps(task, plain)
     found = Found(task, plain, plain, rough=rough)
     barred: set[str] = set()
     for name, cause in catalogue().items():
@@ -118,9 +123,32 @@ def _add(found: Found, barred: set[str]) -> bool:
             if other is not rival:
                 by = other.score - rival.score
                 found.reasons[other.added.name] = f'{name} explains the data better by {by:.1f}'
-        found.task, found.model, _ = settle(found.task, rival.model, rounds=1, steps=3)
+        if rival.added.cause.of_model and not found.task.fixed_dynamics:
+            _absorb(found, rival)
+        else:
+            _take(found, rival, evidence.gain)
         return True
     return False
+
+
+def _take(found: Found, rival: Rival, gain: float) -> None:
+    """Fit the model with its new cause, and find curve and regions anew where that is due."""
+    found.task, settled, _ = settle(found.task, rival.model, rounds=1, steps=3)
+    found.model = held(found.task.scene, settled, found.task.ar)
+    if gain > STRONG and not found.task.fixed_dynamics:
+        found.task, found.model = rebuilt(found.task, found.model)
+
+
+def _absorb(found: Found, rival: Rival) -> None:
+    """Make what an identification may find too a part of the plain model: it is no fault."""
+    name = rival.added.name
+    found.evidence.pop(name, None)
+    found.near.pop(name, None)
+    found.reasons[name] = 'it became a part of the plain model, which was free to have it'
+    whole = replace(rival.model.without(name), base=rival.model.regional)
+    found.task, found.model, _ = settle(found.task, whole, rounds=1, steps=3)
+    plain = replace(found.plain, base=rival.added.cause.act(found.plain.base, rival.added.values))
+    found.plain, _ = improve(found.task, plain, 4)
 
 
 def _shortlist(bench: Bench, barred: set[str]) -> list[tuple[str, Start]]:

@@ -26,10 +26,15 @@ def simplified(model: RegionalModel) -> RegionalModel:
         weakest = int(np.argmin(bend))
         if bend[weakest] >= SHALLOW:
             return model
-        model = replace(
-            model,
-            knots=np.delete(model.knots, weakest + 1),
-            left=np.delete(model.left, weakest + 1),
-            right=np.delete(model.right, weakest),
-        )
+        model = without_knot(model, weakest + 1)
     return model
+
+
+def without_knot(model: RegionalModel, knot: int) -> RegionalModel:
+    """Return the curve with the two pieces at an inner knot made one."""
+    return replace(
+        model,
+        knots=np.delete(model.knots, knot),
+        left=np.delete(model.left, knot),
+        right=np.delete(model.right, knot - 1),
+    )

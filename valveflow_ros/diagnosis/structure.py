@@ -97,6 +97,8 @@ def variables(task: Task, model: Extended) -> dict[str, FloatArray]:
         'temperature change': since(t, 20), 'valve travel': busy,
         'load of the last hour': past(u, 60),
         'load of the last four hours': past(u, 240),
+        'load of hours before': past(np.concatenate([np.full(60, u[0]), u[:-60]]), 120),
+        'travel of the last hour': past(np.minimum(busy, np.quantile(busy, 0.999)), 60),
     }  # fmt: skip
 
 
@@ -150,17 +152,28 @@ def structure(task: Task, model: Extended, wandering: FloatArray | None = None) 
     Parameters
     ----------
     wandering : float64 (m,), optional
-        A slow disturbance in MW to be taken away first.
+        A slow disturbance in MW. It is taken away first; where nothing is left then, what looks
+        like it may still hang on something measured, but not on the time.
     """
-    series = task.residual(model)
-    if wandering is not None:
-        series = series - wandering
+    everything = task.residual(model)
+    values = variables(task, model)
+    if wandering is None:
+        return _tabulated(task, everything, values)
+    values.pop('time')
+    left = _tabulated(task, everything - wandering, values)
+    if left.there:
+        return left
+    values.pop('time of day')
+    whole = _tabulated(task, everything, values)
+    return whole if whole.there else left
+
+
+def _tabulated(task: Task, series: FloatArray, values: dict[str, FloatArray]) -> Structure:
+    """Return the best table of a residual."""
     white = np.zeros(len(series))
     white[task.rows] = task.innovations(series)
     rest, good, block, _ = minutes(task, white)
-    values = {n: v for n, v in variables(task, model).items() if np.std(v[good]) > 1e-9}
-    if wandering is not None:
-        values.pop('time', None)
+    values = {n: v for n, v in values.items() if np.std(v[good]) > 1e-9}
     good &= block % FOLDS != SEALED_FOLD
     wide = inflation(rest, good.astype(np.uint8), _LAGS)
     noise = float(np.var(rest[good])) * wide
