@@ -24,7 +24,7 @@ STRICT := $(wildcard $(addprefix valveflow_ros/,errors.py records.py config.py \
   core plant logs report cli compare diagnosis) tools)
 BENCHMARKS := node_load partition reading ten_days
 STUDIES := paper_study coverage_study selection_study segment_study shift_study alarm_study \
-  compare_study study_figures
+  compare_study study_figures refinery_valves
 
 help:
 	@sed -n 's/^# //p;/^$$/q' Makefile
@@ -54,8 +54,8 @@ study: setup
 	@$(ENV) for name in $(STUDIES); do python -m benchmarks.$$name || exit 1; done
 
 study-diagnosis: setup
-	@$(ENV) for kind in hidden null pair outside; do \
-	  python -m benchmarks.diagnosis_study --kind $$kind --seeds 20 --first 5000 || exit 1; done
+	@$(ENV) for kind in hidden null pair confounded outside; do \
+	  python -m benchmarks.diagnosis_study --kind $$kind --seeds 20 --first 6000 --high 3 || exit 1; done
 
 certify-partition: setup
 	@$(ENV) python -m benchmarks.partition --certify --kinds valve --sizes 305633

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.plant.effect import Effect, Values
-from valveflow_ros.plant.hooks import Forcing, Hooks
 from valveflow_ros.plant.random_unit import random_unit
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.plant.unit import UnitDescription
@@ -27,6 +25,7 @@ class Case:
     effects: tuple[EffectSpec, ...]
     names: tuple[str, ...]
     given: bool = False
+    outside_share: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -39,18 +38,41 @@ class Setting:
     low: float = 2.0
     high: float = 4.0
 
+    def _relative(self, here: float, paper: float) -> float:
+        rated = self.unit.programme.load_high_mw
+        return here / paper * PAPER_RATED_MW / rated
+
     @property
     def noise(self) -> float:
-        """Return the noise of this unit, relative to the paper's."""
+        """Return the long-run sd of this unit's noise relative to the paper's, per rated power.
+
+        What lasts is hidden by the spectrum of the noise at low frequencies.
+        """
+        n, p = self.unit.noise, UnitDescription().noise
+        return self._relative(
+            n.slow_mw * np.sqrt(n.slow_time_s), p.slow_mw * np.sqrt(p.slow_time_s)
+        )
+
+    @property
+    def quick_noise(self) -> float:
+        """Return the sd of this unit's noise relative to the paper's, per rated power."""
         n = self.unit.noise
-        rated = self.unit.programme.load_high_mw
-        return float(np.hypot(n.slow_mw, n.white_mw)) / PAPER_NOISE_MW * PAPER_RATED_MW / rated
+        return self._relative(float(np.hypot(n.slow_mw, n.white_mw)), PAPER_NOISE_MW)
+
+    @property
+    def times(self) -> float:
+        """Draw a multiple of the smallest detectable amplitude."""
+        return float(np.exp(self.rng.uniform(np.log(self.low), np.log(self.high))))
 
     @property
     def size(self) -> float:
-        """Draw a multiple of the smallest detectable amplitude in ten days of the paper's unit."""
-        times = np.exp(self.rng.uniform(np.log(self.low), np.log(self.high)))
-        return float(times * self.noise * np.sqrt(10.0 / self.days))
+        """Draw a multiple of what is detectable in ten days of the paper's unit, what lasts."""
+        return self.times * self.noise * float(np.sqrt(10.0 / self.days))
+
+    @property
+    def quick(self) -> float:
+        """Draw a multiple of what is detectable in ten days of the paper's unit, what is fast."""
+        return self.times * self.quick_noise * float(np.sqrt(10.0 / self.days))
 
     @property
     def sign(self) -> float:
@@ -105,13 +127,19 @@ def _curve_shape(s: Setting) -> str:
 
 
 def _stiction(s: Setting) -> str:
-    band = 1.0 * s.rng.uniform(1.0, 1.8)
+    band = s.quick  # 1 % is told from a mere slack
     return _text('stiction', s_percent=band, j_percent=0.7 * band)
 
 
 def _clock(s: Setting) -> str:
     least = min(r.delay_s for r in s.unit.regions)
-    return _text('clock', d_s=least + 10.0 + 5.0 * (s.size - 2.0 * s.noise))
+    return _text('clock', d_s=least + 10.0 * s.quick)
+
+
+def _reheater(s: Setting) -> str:
+    # What shows is the power that comes late, (1 - alpha) T.
+    alpha = s.rng.uniform(0.25, 0.4)
+    return _text('reheater', alpha=alpha, time_s=14.0 * s.quick / (1.0 - alpha))
 
 
 def _region_lag(s: Setting) -> str:
@@ -146,14 +174,12 @@ EFFECTS: dict[str, Callable[[Setting], str]] = {
     'curve_step': _curve_step,
     'intervals': _intervals,
     'diurnal': lambda s: _text('diurnal', a=0.0009 * s.size, peak_h=s.rng.uniform(0.0, 24.0)),
-    'backlash': lambda s: _text('backlash', w_percent=0.09 * s.size),
+    'backlash': lambda s: _text('backlash', w_percent=0.09 * s.quick),
     'stiction': _stiction,
-    'rate_limit': lambda s: _text('rate_limit', r_percent_per_s=0.3 / s.size),
+    'rate_limit': lambda s: _text('rate_limit', r_percent_per_s=0.3 / s.quick),
     'saturation': lambda s: _text('saturation', max_percent=s.rng.uniform(80.0, 85.0)),
     'region_lag': _region_lag,
-    'reheater': lambda s: _text(
-        'reheater', alpha=s.rng.uniform(0.25, 0.4), time_s=s.rng.uniform(20.0, 40.0)
-    ),
+    'reheater': _reheater,
     'clock': _clock,
     'curve_shape': _curve_shape,
 }
@@ -180,45 +206,31 @@ def hidden(names: tuple[str, ...], seed: int, days: float, times: tuple[float, f
     )  # fmt: skip
 
 
-def _install(change: Callable[[Forcing, float], None], size: float) -> Callable[..., None]:
-    def install(values: Values, hooks: Hooks) -> None:
-        hooks.forcing.append(lambda rows: change(rows, size))
-
-    return install
-
-
-def _period(rows: Forcing, mw: float) -> None:
-    rows.offset_mw[:] += mw * np.sqrt(2.0) * np.sin(2.0 * np.pi * rows.time_s / 5400.0)
+CONFOUNDED = (
+    'temperature, T follows p', 'exponent, T follows p', 'gain_step', 'gain_drift',
+    'backlash, earlier model', 'region_lag',
+)  # fmt: skip
 
 
-def _signs(rows: Forcing, mw: float) -> None:
-    t, p = rows.temperature_degc, rows.pressure_mpa
-    rows.offset_mw[:] += mw * np.sign(t - 539.0) * np.sign(p - 13.5)
+def confounded(label: str, seed: int, days: float, times: tuple[float, float]) -> Case:
+    """Return a plant whose effect is easily taken for another."""
+    name = label.partition(',')[0]
+    case = hidden((name,), seed, days, times)
+    if label.endswith('T follows p'):
+        plan = replace(case.unit.programme, temperature_pressure_correlation=0.8)
+        case = replace(case, unit=replace(case.unit, programme=plan))
+    given = case.given or label.endswith('earlier model')
+    return replace(case, kind='confounded', label=label, given=given)
 
 
-def _daily_temperature(rows: Forcing, mw: float) -> None:
-    angle = 2.0 * np.pi * rows.clock_s / 86_400.0
-    rows.offset_mw[:] += mw * np.sign(np.cos(angle)) * np.tanh(rows.temperature_degc - 539.0)
-
-
-def _ripple(rows: Forcing, mw: float) -> None:
-    rows.offset_mw[:] += mw * np.sqrt(2.0) * np.sin(8.0 * rows.pressure_mpa)
-
-
-OUTSIDE: dict[str, Callable[[Forcing, float], None]] = {
-    'period of 90 min': _period, 'sign(T) sign(p)': _signs,
-    'T by night and day': _daily_temperature,
-    'ripple in p': _ripple,
-}  # fmt: skip
-OUTSIDE_SHARE = 0.4  # of the sd of the noise of ten-second means: 16 % of its variance
+LEAST_SHARE, LARGEST_SHARE = 0.33, 0.6  # of the noise's sd: 11 to 36 % of its variance
 
 
 def outside(label: str, seed: int) -> Case:
-    """Return a plant with something no cause of the catalogue explains."""
-    unit = UnitDescription()
-    size = OUTSIDE_SHARE * 2.07
-    effect = Effect(label.replace(' ', '_'), label, (), _install(OUTSIDE[label], size))
-    return Case('outside', label, seed, unit, (EffectSpec.of(effect),), ())
+    """Return a plant with something in its record that no cause of the catalogue explains."""
+    rng = np.random.default_rng([seed, len(label)])
+    share = float(rng.uniform(LEAST_SHARE, LARGEST_SHARE))
+    return Case('outside', label, seed, _unit(rng), (), (), outside_share=share)
 
 
 def null(seed: int) -> Case:

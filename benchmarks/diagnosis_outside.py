@@ -1,0 +1,149 @@
+"""Effects that no cause of the catalogue explains, drawn and added to a simulated record.
+
+Each is a function of what was measured (never of the noise), freed of what a curve of u could
+take up, and scaled to a share of the noise of ten-second means. It is added to the power after
+the simulation, so the power control does not see it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.signal import lfilter
+
+from valveflow_ros.plant.simulator import SimulatedLog
+from valveflow_ros.records import FloatArray, SampleTable, Signal
+
+_MEAN_S = 10.0
+_HATS = 25
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Series of a record, one value a row, and chance; all but ``step_s`` are float64 (n,)."""
+
+    rng: np.random.Generator
+    step_s: float
+    time_s: FloatArray
+    clock_s: FloatArray
+    u: FloatArray
+    opening: FloatArray
+    pressure: FloatArray
+    temperature: FloatArray
+
+    def slow(self, x: FloatArray, time_s: float) -> FloatArray:
+        """Return a series behind a first-order lag."""
+        keep = float(np.exp(-self.step_s / time_s))
+        return np.asarray(lfilter([1.0 - keep], [1.0, -keep], x - x[0]) + x[0])
+
+    def before(self, x: FloatArray, time_s: float) -> FloatArray:
+        """Return a series as it was some time ago."""
+        rows = min(round(time_s / self.step_s), len(x) - 1)
+        return np.concatenate([np.full(rows, x[0]), x[: len(x) - rows]])
+
+    def change(self, x: FloatArray, time_s: float) -> FloatArray:
+        """Return by how much a series changed in some time."""
+        return x - self.before(x, time_s)
+
+    @property
+    def spare_pressure(self) -> FloatArray:
+        """Return the pressure off its line over u."""
+        return np.asarray(self.pressure - np.polyval(np.polyfit(self.u, self.pressure, 3), self.u))
+
+
+def _z(x: FloatArray) -> FloatArray:
+    return np.asarray((x - x.mean()) / max(float(x.std()), 1e-12))
+
+
+def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _period(m: Measured) -> FloatArray:
+    wave = _log_uniform(m.rng, 1200.0, 18_000.0)
+    return np.sin(2.0 * np.pi * (m.time_s / wave + m.rng.random()))
+
+
+def _square(m: Measured) -> FloatArray:
+    return np.sign(_period(m))
+
+
+def _sawtooth(m: Measured) -> FloatArray:
+    wave = m.rng.uniform(1.2, 2.6) * 86_400.0
+    return np.asarray(np.mod(m.time_s / wave + m.rng.random(), 1.0) - 0.5)
+
+
+def _signs_of_three(m: Measured) -> FloatArray:
+    ramp = m.change(m.u, 180.0)
+    return np.sign(_z(m.temperature)) * np.sign(m.spare_pressure) * np.sign(ramp)
+
+
+def _direction(m: Measured) -> FloatArray:
+    moved = np.tanh(_z(m.change(m.opening, 1800.0)))
+    return moved * np.sign(m.u - np.median(m.u))
+
+
+def _ripple_by_pressure(m: Measured) -> FloatArray:
+    return np.sin(m.u / m.rng.uniform(25.0, 60.0)) * np.sign(m.spare_pressure)
+
+
+def _travel(m: Measured) -> FloatArray:
+    moved = np.abs(m.change(m.opening, 10.0))
+    return _z(m.slow(np.minimum(moved, np.quantile(moved, 0.999)), 3600.0))
+
+
+OUTSIDE: dict[str, Callable[[Measured], FloatArray]] = {
+    'period': _period,
+    'square wave': _square,
+    'sawtooth of days': _sawtooth,
+    'sign(T) sign(p given u)': lambda m: np.sign(_z(m.temperature)) * np.sign(m.spare_pressure),
+    'three signs': _signs_of_three,
+    'T x ramp': lambda m: _z(m.temperature) * np.tanh(_z(m.change(m.u, 300.0))),
+    'T squared': lambda m: np.minimum(_z(m.temperature) ** 2, 6.0),
+    'T by night and day': lambda m: (
+        np.tanh(_z(m.temperature)) * np.sign(np.cos(2.0 * np.pi * m.clock_s / 86_400.0))
+    ),
+    'ripple in p': lambda m: np.sin(m.pressure / m.rng.uniform(0.1, 0.25)),
+    'ripple in T': lambda m: np.sin(m.temperature / m.rng.uniform(0.4, 1.0)),
+    'ripple in u, sign of p': _ripple_by_pressure,
+    'rise of p x T': lambda m: np.tanh(_z(m.change(m.pressure, 600.0))) * _z(m.temperature),
+    'direction x load': _direction,
+    'load of hours before': lambda m: _z(m.slow(m.u, _log_uniform(m.rng, 3000.0, 12_000.0))),
+    'load two hours ago': lambda m: np.sign(_z(m.before(m.u, 7200.0))),
+    'travel of the valve': _travel,
+}  # fmt: skip
+
+
+def added_to(log: SimulatedLog, label: str, seed: int, share: float) -> SimulatedLog:
+    """Return the record with an effect of ``share`` times the noise's sd in its power."""
+    table = log.table
+    v, p, t = (
+        table.column(s)
+        for s in (Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE, Signal.MAIN_STEAM_TEMPERATURE)
+    )
+    time_s = (table.time_ns - table.time_ns[0]) / 1e9
+    clock_s = (table.time_ns % (86_400 * 10**9)) / 1e9
+    rng = np.random.default_rng([seed, *(ord(c) for c in label)])
+    step = float(time_s[1] - time_s[0])
+    measured = Measured(rng, step, time_s, clock_s, v * p**log.unit.pressure_exponent, v, p, t)
+    series = _net(OUTSIDE[label](measured), measured.u)
+    rows = max(1, round(_MEAN_S / step))
+    size = share * _sd_of_means(log.noise_mw, rows) / _sd_of_means(series, rows)
+    values = table.values.copy()
+    values[:, Signal.GENERATED_POWER] += size * series
+    return replace(log, table=SampleTable(table.time_ns, values, table.quality))
+
+
+def _net(x: FloatArray, u: FloatArray) -> FloatArray:
+    """Take away what a curve of u could explain."""
+    knots = np.quantile(u, np.linspace(0.0, 1.0, _HATS)) + 1e-6 * np.arange(_HATS)
+    hats = np.column_stack([np.interp(u[::10], knots, row) for row in np.eye(_HATS)])
+    found = np.linalg.lstsq(hats, x[::10], rcond=None)[0]
+    return np.asarray(x - np.interp(u, knots, found))
+
+
+def _sd_of_means(x: FloatArray, rows: int) -> float:
+    whole = len(x) // rows * rows
+    return float(x[:whole].reshape(-1, rows).mean(axis=1).std())
