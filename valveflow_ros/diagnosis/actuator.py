@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valveflow_ros.diagnosis.actuator_sizes import sized
 from valveflow_ros.diagnosis.gain import sign_flip
 from valveflow_ros.diagnosis.scene import FOLDS, SEALED_FOLD, SUBS_IN_BLOCK, Scene
 from valveflow_ros.records import BoolArray, FloatArray
@@ -24,6 +25,7 @@ _PENALTY = 10.0
 _LEAST_SHARE = 0.05
 _DEPENDENT = 10.0  # rows that count as one: what is left is not white
 _CHI95 = 3.84
+_TOP_PERCENT, _MOSTLY_AT_TOP = 0.3, 0.3
 _SHARES = (0.1, 0.05, 0.02, 0.008, 0.003, 0.001)
 
 Values = tuple[float, ...]
@@ -150,7 +152,7 @@ def judge(scene: Scene) -> ActuatorFault | None:
     if hindered(scene):
         return None
     both = np.isfinite(scene.command[1:]) & np.isfinite(scene.v[1:]) & np.isfinite(scene.v[:-1])
-    offset = float(np.median((scene.v - scene.command)[1:][both]))
+    offset = _offset(scene.command[1:][both], scene.v[1:][both])
     pairs = _Pairs(
         scene.command[1:][both] + offset, scene.v[:-1][both], scene.v[1:][both], scene.fine_s
     )
@@ -175,9 +177,24 @@ def judge(scene: Scene) -> ActuatorFault | None:
     if not rms[1] < rms[0]:
         return None
     chance = min(1.0, len(fits) * sign_flip(scores))
-    return ActuatorFault(
-        best.plan.name, _intervals(fitted, best, effective), rms[0], rms[1], chance
+    sharp = sized(best.plan.name, scene.command + offset, scene.v, scene.fine_s, best.values)
+    parameters = (
+        dict(zip(best.plan.keys, sharp, strict=True))
+        if sharp
+        else _intervals(fitted, best, effective)
     )
+    return ActuatorFault(best.plan.name, parameters, rms[0], rms[1], chance)
+
+
+def _offset(c: FloatArray, v: FloatArray) -> float:
+    """Return by how much the position reads more than the command: the median.
+
+    Where the valve stands at its highest much of the time, that may be a stop, and the lower
+    half of the commands tells it.
+    """
+    at_top = float(np.mean(v > np.quantile(v, 0.999) - _TOP_PERCENT))
+    asked = c <= np.median(c) if at_top > _MOSTLY_AT_TOP else slice(None)
+    return float(np.median((v - c)[asked]))
 
 
 def _fitted(pairs: _Pairs, plan: _Plan) -> _Fit:

@@ -15,6 +15,9 @@ from valveflow_ros.diagnosis.result import NamedCause
 from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.diagnosis.search import Found
 
+_BETWEEN = 'Between the commanded and the measured opening: '
+_SLACK = 'The valve follows only after a slack of {w_percent:.2g} % of opening is taken up.'
+
 
 def actuator_cause(found: Found) -> tuple[NamedCause, ...]:
     """Return the fault between command and position sensor, its size in MW of power."""
@@ -33,7 +36,8 @@ def actuator_cause(found: Found) -> tuple[NamedCause, ...]:
     return (
         NamedCause(
             fault.name,
-            'Between the commanded and the measured opening: ' + cause.sentence(values),
+            _BETWEEN
+            + (_SLACK.format(**values) if 'w_percent' in values else cause.sentence(values)),
             {k: Estimate(*v, units[k]) for k, v in fault.parameters.items()},
             gain,
             cause.experiment,
