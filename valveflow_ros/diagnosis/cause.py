@@ -130,6 +130,9 @@ class Cause:
     # How many paths the noise may make of it, and what acts in one of them; see `draws`.
     draws: int = 0
     draw: Callable[[int], Callable[..., Any]] | None = None
+    # A simpler cause it becomes at some values, and those values near given ones.
+    contains: str = ''
+    simpler: Callable[[Values], list[Values]] | None = None
 
     def clipped(self, values: Values) -> Values:
         """Return values within the bounds."""

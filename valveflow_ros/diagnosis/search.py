@@ -187,7 +187,26 @@ def _rivals(found: Found, barred: set[str]) -> list[Rival]:
         rival = Rival(model, added, cost / (2.0 * variance) + PENALTY * added.size)
         if added.name not in best or rival.score < best[added.name].score:
             best[added.name] = rival
-    return sorted(best.values(), key=lambda r: r.score)
+    fair = [_fair(found.task, rival, best, variance) for rival in best.values()]
+    return sorted(fair, key=lambda r: r.score)
+
+
+def _fair(task: Task, rival: Rival, others: dict[str, Rival], variance: float) -> Rival:
+    """Return a rival that contains a simpler one scored by what it has more, and by that alone.
+
+    Several draws of the noise smooth a path, and that is worth something without any jump.
+    """
+    cause = rival.added.cause
+    if cause.simpler is None or cause.contains not in others:
+        return rival
+    plain = min(
+        task.cost(rival.model.having(replace(rival.added, values=v)))
+        for v in cause.simpler(rival.added.values)
+    )
+    simpler = others[cause.contains]
+    more = (plain - task.cost(rival.model)) / (2.0 * variance)
+    extra = PENALTY * (rival.added.size - simpler.added.size)
+    return replace(rival, score=max(rival.score, simpler.score - more + extra))
 
 
 def _refit(task: Task, model: Extended, tangents: FloatArray | None) -> tuple[Extended, float]:

@@ -26,6 +26,7 @@ _BANDS = (0.3, 0.5, 0.7, 0.95, 1.25, 1.6, 2.1, 2.8)
 _FACTORS = (0.88, 0.94, 1.0, 1.07, 1.15)
 _OVER_SLACK, _SHARES = (0.97, 1.04, 1.1), (0.15, 0.4, 0.6, 0.75, 0.9)
 _LIKE_SLACK = 3.0
+_SLACKS = (0.8, 0.86, 0.91, 0.95, 0.98, 1.0, 1.03, 1.07)
 _STEPS = (0.04, 0.02, 0.01, 0.005)
 _SHIFT = 7_919
 
@@ -86,6 +87,11 @@ def _downhill(bench: Bench, cause: Cause, best: Start, width: float) -> Start:
     return best
 
 
+def simpler(values: Values) -> list[Values]:
+    """Return values without a jump, which are a slack of about the same width."""
+    return [(values[0] * f, 0.0) for f in _SLACKS]
+
+
 def sentence(values: dict[str, float]) -> str:
     """Say it."""
     return (
@@ -102,5 +108,5 @@ CAUSE = Cause(
     ),
     act, starts, sentence, ('backlash',),
     'A slow ramp below 0.05 %/s, with the position logged to 0.01 %: slipping shows as stairs.',
-    order=1, draws=_DRAWS, draw=draw,
+    order=1, draws=_DRAWS, draw=draw, contains='backlash', simpler=simpler,
 )  # fmt: skip
