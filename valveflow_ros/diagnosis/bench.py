@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 
 from valveflow_ros.diagnosis.cause import Active, Cause, Start, Values
-from valveflow_ros.diagnosis.evidence import nuisance
 from valveflow_ros.diagnosis.extended import Drive, Extended, answer, drive, flow_of, region_path
 from valveflow_ros.diagnosis.fitting import Task
+from valveflow_ros.diagnosis.nuisance import nuisance
 from valveflow_ros.diagnosis.scene import DAY_S, Scene
 from valveflow_ros.records import FloatArray
 

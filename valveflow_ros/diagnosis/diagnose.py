@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +11,7 @@ from valveflow_ros.diagnosis.bench import Bench
 from valveflow_ros.diagnosis.confidence import Certainty
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import Task, improve, search_levels, search_lines
-from valveflow_ros.diagnosis.gain import by_segment, noise_floor, rmse, sealed_gain
+from valveflow_ros.diagnosis.gain import by_segment, noise_floor, rmse
 from valveflow_ros.diagnosis.grid import make_scene
 from valveflow_ros.diagnosis.hidden import inferred
 from valveflow_ros.diagnosis.outside import actuator_cause, notes, record_causes
@@ -27,12 +26,13 @@ from valveflow_ros.diagnosis.result import (
     NamedCause,
 )
 from valveflow_ros.diagnosis.scene import ORDER, Scene
+from valveflow_ros.diagnosis.sealed import confirm, gains_of, steps
 from valveflow_ros.diagnosis.search import Found, Progress, search
 from valveflow_ros.diagnosis.simplify import simplified
 from valveflow_ros.diagnosis.structure import Structure, structure
 from valveflow_ros.diagnosis.wander import Wander, wander
 from valveflow_ros.errors import DataError
-from valveflow_ros.records import FloatArray, IntArray, SampleTable
+from valveflow_ros.records import BoolArray, FloatArray, IntArray, SampleTable
 
 _LEAST_SPREAD = 0.01
 
@@ -56,6 +56,9 @@ class Record:
         Time after a gap until the model can be believed.
     spans_ns : int64 (k, 2)
         First and last time of special segments.
+    measured : SampleTable, optional
+        The rows as measured, where causes were taken out of ``table``: faults of the
+        signals are looked for in these (a plug that a slack lets rest is no dead transmitter).
     """
 
     table: SampleTable
@@ -63,6 +66,11 @@ class Record:
     pressure_exponent: float
     settle_s: float
     spans_ns: IntArray
+    measured: SampleTable | None = None
+
+    def faults(self) -> tuple[BoolArray, tuple[Fault, ...]]:
+        """Return which values are not to be believed, shape (n, 5), and what is wrong."""
+        return faults(self.table if self.measured is None else self.measured, self.step_s)
 
     @property
     def about(self) -> tuple[SampleTable, float, float, float]:
@@ -101,16 +109,17 @@ def diagnose(
         The valve hardly moves.
     """
     progress(0.02, 'the record itself')
-    bad, wrong = faults(record.table, record.step_s)
+    bad, wrong = record.faults()
     scene, rough = make_scene(*record.about, bad), make_scene(*record.about, bad, rough=True)
     _moves(scene)
     task = Task(scene, scene.open_rows, np.zeros(ORDER), given)
     start = Extended(model if given else simplified(model))
     found = search(task, start, progress, rough)
-    progress(0.7, 'what is left')
+    progress(0.7, 'the sealed blocks')
+    confirm(found)
+    progress(0.8, 'what is left')
     rest = _look_again(found)
     _withdraw(found, rest)
-    progress(0.8, 'the sealed blocks')
     return _conclude(record, found, rest, wrong, progress)
 
 
@@ -151,15 +160,6 @@ def _withdraw(found: Found, rest: _Rest) -> None:
     found.model, _ = improve(found.task, found.model, 3)
 
 
-def _steps(found: Found) -> list[Extended]:
-    """Return the models with one cause more each, fitted to the open blocks."""
-    models = [found.plain]
-    for k in range(1, len(found.model.active)):
-        part = replace(found.model, active=found.model.active[:k])
-        models.append(improve(found.task, part, 2)[0])
-    return models + ([found.model] if found.model.active else [])
-
-
 def _final(found: Found) -> tuple[Task, Extended]:
     """Fit the extended model to all blocks, the sealed ones too."""
     task = replace(found.task, rows=found.task.scene.whole)
@@ -173,8 +173,8 @@ def _conclude(
     record: Record, found: Found, rest: _Rest, wrong: tuple[Fault, ...], progress: Progress
 ) -> Diagnosis:
     scene = found.task.scene
-    models = _steps(found)
-    gains = [sealed_gain(found.task, a, b, found.tried) for a, b in itertools.pairwise(models)]
+    models = steps(found)
+    gains = gains_of(found, models)
     task, final = _final(found)
     progress(0.9, 'how sure it is')
     estimates = Certainty(task, final).intervals() if final.active else {}
@@ -260,7 +260,8 @@ def _sentence(d: Diagnosis) -> str:
     if d.verdict == NOTHING:
         return 'The model explains the unit down to its noise.' + wander
     near = f'; nearest: {", ".join(d.not_told_apart)}' if d.not_told_apart else ''
+    besides = ''.join(f' Found besides: {c.sentence}' for c in d.causes)
     return (
         'Something is wrong that no cause of the catalogue explains; it depends on '
-        f'{" and ".join(d.unexplained_by)}{near}.' + wander
+        f'{" and ".join(d.unexplained_by)}{near}.' + wander + besides
     )

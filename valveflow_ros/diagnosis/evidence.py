@@ -9,13 +9,9 @@ import numpy as np
 
 from valveflow_ros.core.whitening import inflation
 from valveflow_ros.diagnosis.extended import Extended, answer
-from valveflow_ros.diagnosis.fitting import (
-    Task,
-    base_mask,
-    base_tangents,
-    cause_tangents,
-    level_tangents,
-)
+from valveflow_ros.diagnosis.fitting import Task
+from valveflow_ros.diagnosis.hidden import fair_open_residual
+from valveflow_ros.diagnosis.nuisance import nuisance
 from valveflow_ros.diagnosis.scene import FOLDS, SEALED_FOLD
 from valveflow_ros.records import FloatArray
 
@@ -24,26 +20,6 @@ _RIDGE = 1e-4  # of a column's own square
 _MEMORY_S = 1200.0
 LEAST_GAIN, LEAST_SIGN = 16.0, 1.0
 _WALD_LEVEL, _WALD_EACH = 10.0, 5.0
-
-
-def nuisance(task: Task, model: Extended) -> FloatArray:
-    """Return whitened tangents of everything the model could move itself, columns scaled to 1.
-
-    A delay at its bound 0 cannot move down and is left out: it would swallow a clock offset.
-    """
-    free = np.flatnonzero(base_mask(task, model))
-    base = base_tangents(task, model)
-    first_delay = len(model.base.pack()) - model.base.regions
-    at_bound = [
-        k for k, p in enumerate(free)
-        if p >= first_delay and model.base.delays[p - first_delay] <= 0.0
-    ]  # fmt: skip
-    base = np.delete(base, at_bound, axis=1)
-    table = task.innovations(
-        np.column_stack([base, cause_tangents(task, model), level_tangents(task, model)])
-    )
-    norm = np.sqrt((table**2).sum(axis=0))
-    return np.asarray(table[:, norm > 1e-9 * norm.max()] / norm[norm > 1e-9 * norm.max()])
 
 
 def _by_block(task: Task, table: FloatArray) -> tuple[FloatArray, np.ndarray]:
@@ -156,10 +132,16 @@ def weigh(task: Task, without: Extended, model: Extended, size: int) -> Evidence
     gains = held_out(task, without) - held_out(task, model)
     spread = float(gains.std(ddof=1)) if len(gains) > 1 else 0.0
     sign = float(gains.mean()) / spread * np.sqrt(len(gains)) if spread > 0.0 else 0.0
-    return Evidence(
-        float(gains.sum()) / (2.0 * variance), _wald(task, without, model, e),
-        float(sign), size,
-    )  # fmt: skip
+    gain = float(gains.sum()) / (2.0 * variance) - _hindsight(task, model, e) / (2.0 * variance)
+    return Evidence(gain, _wald(task, without, model, e), float(sign), size)
+
+
+def _hindsight(task: Task, model: Extended, e: FloatArray) -> float:
+    """Return what a hidden state explains only because it was found in the same rows."""
+    if all(a.cause.infer is None for a in model.active):
+        return 0.0
+    fair = task.innovations(fair_open_residual(task, model))
+    return max(float(fair @ fair - e @ e), 0.0)
 
 
 def _wald(task: Task, without: Extended, model: Extended, e: FloatArray) -> float:

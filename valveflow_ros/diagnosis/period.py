@@ -13,7 +13,7 @@ from valveflow_ros.diagnosis.fitting import Task
 LARGEST_P = 1e-5
 _MEAN_S = 60.0
 _NEIGHBOURS = 101
-_SHORTEST_S, _LONGEST_S = 240.0, 8.0 * 3600.0
+_SHORTEST_S, _LONGEST_S = 240.0, 5.5 * 3600.0
 
 
 @dataclass(frozen=True, slots=True)

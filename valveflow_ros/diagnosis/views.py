@@ -7,7 +7,6 @@ import numpy as np
 from valveflow_ros.diagnosis.diagnose import Record
 from valveflow_ros.diagnosis.fitting import Task
 from valveflow_ros.diagnosis.grid import make_scene
-from valveflow_ros.diagnosis.quality import faults
 from valveflow_ros.diagnosis.result import Diagnosis
 from valveflow_ros.diagnosis.scene import ORDER
 from valveflow_ros.diagnosis.signature import Answer, Signature, after_moves, signatures
@@ -15,7 +14,7 @@ from valveflow_ros.diagnosis.signature import Answer, Signature, after_moves, si
 
 def views(record: Record, found: Diagnosis) -> tuple[tuple[Signature, ...], tuple[Answer, ...]]:
     """Return residuals by variable and around fast moves, before and after extending."""
-    bad, _ = faults(record.table, record.step_s)
+    bad, _ = record.faults()
     scene = make_scene(record.table, record.step_s, record.pressure_exponent, record.settle_s, bad)
     task = Task(scene, scene.whole, np.zeros(ORDER))
     return (
