@@ -8,6 +8,7 @@ import numpy as np
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.align import Aligned, Aligner
+from valveflow_ros.core.corrector import Corrector
 from valveflow_ros.records import IntArray, Readings, SampleTable
 
 Progress = Callable[[float, str], None]
@@ -19,13 +20,17 @@ def quiet(_share: float, _what: str) -> None:
 
 
 def align(
-    readings: Readings, settings: Settings, progress: Progress = quiet
+    readings: Readings,
+    settings: Settings,
+    progress: Progress = quiet,
+    corrector: Corrector | None = None,
 ) -> tuple[SampleTable, IntArray, dict[str, dict[str, int]]]:
     """Return all rows, the rows before which the clock was set back, and the counts."""
     aligner = Aligner(settings)
     tables: list[SampleTable] = []
     resets: list[int] = []
-    for aligned in aligned_blocks(aligner, readings, progress, 'putting rows together'):
+    blocks = aligned_blocks(aligner, readings, progress, 'putting rows together')
+    for aligned in corrected(blocks, corrector):
         resets += [sum(map(len, tables)) + int(k) for k in aligned.resets]
         tables.append(aligned.table)
     table = SampleTable.concatenate(tables)
@@ -40,3 +45,18 @@ def aligned_blocks(
         progress(0.1 + 0.4 * start / len(readings), what)
         yield aligner.feed(readings.part(start, min(start + _BLOCK, len(readings))))
     yield aligner.finish()
+
+
+def corrected(blocks: Iterator[Aligned], corrector: Corrector | None) -> Iterator[Aligned]:
+    """Yield blocks whose rows are freed of the causes of a corrector, if there is one."""
+    if corrector is None:
+        yield from blocks
+        return
+    for block in blocks:
+        tables, start = [], 0
+        for reset in block.resets.tolist():
+            tables.append(corrector.correct(block.table.part(start, reset)))
+            corrector.restart()
+            start = reset
+        tables.append(corrector.correct(block.table.part(start, len(block.table))))
+        yield Aligned(SampleTable.concatenate(tables), block.resets)

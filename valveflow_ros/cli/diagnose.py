@@ -34,7 +34,8 @@ def arguments(parser: ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--model', metavar='FILE', type=Path,
-        help='characteristic.json of an earlier identification; found anew without it',
+        help='characteristic.json or extended_model.json of an earlier log, to be held against '
+        'this one; found anew without it',
     )  # fmt: skip
     add_parameters(parser)
     add_mapping(parser)
@@ -47,10 +48,14 @@ def run(options: Namespace, console: Console) -> Outcome:
     from valveflow_ros.cli.diagnosing import diagnosed_in, outcome, read_model, texts
     from valveflow_ros.cli.files import check_folder, write_texts
     from valveflow_ros.cli.log_input import open_input
+    from valveflow_ros.cli.model_file import check_exponent
     from valveflow_ros.cli.parameters import read_parameters
 
     given = read_parameters(options.params, options.pairs)
     model = read_model(options.model) if options.model else None
+    if model is not None:
+        check_exponent(model, options.model, given)
+        given = {**given, 'pressure_exponent': model.pressure_exponent}
     check_folder(options.output)
     console.progress(0.02, 'reading')
     log = open_input(options.log, mapping, console)

@@ -14,19 +14,24 @@ from valveflow_ros.cli import engine
 from valveflow_ros.cli.console import Console, Outcome
 from valveflow_ros.cli.first_run import SENTENCE, is_first_run
 from valveflow_ros.cli.log_input import LogInput, steps_of
+from valveflow_ros.cli.model_file import read_either
 from valveflow_ros.cli.parameters import settings_for
 from valveflow_ros.cli.report_words import columns
 from valveflow_ros.config import Settings
 from valveflow_ros.core.characteristic import Characteristic
-from valveflow_ros.core.characteristic_json import from_json
+from valveflow_ros.core.corrector import Corrector
 from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.diagnose import Record, diagnose
 from valveflow_ros.diagnosis.diagnosis_json import model_json, to_json
+from valveflow_ros.diagnosis.extended_model import ExtendedModel
 from valveflow_ros.diagnosis.first_model import first_model
-from valveflow_ros.errors import DataError, RecordingError
+from valveflow_ros.diagnosis.on_top import on_top
+from valveflow_ros.errors import DataError
 from valveflow_ros.records import SIGNALS, IntArray, SampleTable
 from valveflow_ros.report.diagnosis import Diagnosed, diagnosis_report
 from valveflow_ros.report.numbers import decimals, interval, plain
+from valveflow_ros.report.words import held_words
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +40,7 @@ class Result:
 
     page: Diagnosed
     exponent: float
+    on_top_of: ExtendedModel | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,20 +53,16 @@ class _Rows:
     why: str = ''
 
 
-def read_model(path: Path) -> Characteristic:
-    """Read ``characteristic.json``.
+def read_model(path: Path) -> Characteristic | ExtendedModel:
+    """Read ``characteristic.json`` or ``extended_model.json``.
 
     Raises
     ------
     RecordingError, DataError
     """
-    try:
-        raw = json.loads(path.read_text(encoding='utf-8'))
-    except OSError as error:
-        raise RecordingError(path, f'cannot be read ({(error.strerror or "").lower()})') from None
-    except ValueError:
-        raise RecordingError(path, 'is no JSON') from None
-    model = from_json(raw)
+    model = read_either(path)
+    if isinstance(model, ExtendedModel):
+        return model
     if not model.dynamics:
         raise DataError(
             f'{path}: this curve has no dynamics, and without them every ramp would look like a '
@@ -70,10 +72,13 @@ def read_model(path: Path) -> Characteristic:
 
 
 def diagnosed_in(
-    log: LogInput, model: Characteristic | None, given: Mapping[str, Any], source: Path,
-    console: Console,
+    log: LogInput, model: Characteristic | ExtendedModel | None, given: Mapping[str, Any],
+    source: Path, console: Console,
 ) -> Result:  # fmt: skip
     """Align, identify if there is no model, diagnose.
+
+    Where the model is an extended one, it is what the log is held against: its causes are
+    taken out of the rows, and what differs after that is a finding.
 
     Raises
     ------
@@ -91,20 +96,24 @@ def diagnosed_in(
         console.say(sentence)
     if is_first_run():
         console.say(SENTENCE)
-    rows = _rows(log, settings, model is None, console)
+    earlier = model if isinstance(model, ExtendedModel) and model.held else None
+    rows = _rows(log, settings, model is None, console, earlier)
     if rows.why:
         console.warn(rows.why)
         notes.append(rows.why)
     step, settle = settings.real('sample_period'), settings.settle_s
     exponent = model.pressure_exponent if model else settings.real('pressure_exponent')
-    regional = model.model if model else rows.model
+    regional = rows.model if model is None else _regional(model)
     if regional is None:
         regional = first_model(rows.table, step, exponent, settle)
     record = Record(rows.table, step, exponent, settle, rows.spans_ns)
+    if earlier is not None:
+        record = on_top(record, earlier, engine_align(log, settings)[0])
+        notes.append(held_words(earlier.held))
     found, views = diagnose_with_views(record, regional, model is not None, console)
     found = replace(found, notes=(*log.contents.warnings, *notes, *found.notes))
     ends = int(rows.table.time_ns[0]), int(rows.table.time_ns[-1])
-    return Result(Diagnosed(source.name, *ends, found, *views), exponent)
+    return Result(Diagnosed(source.name, *ends, found, *views), exponent, earlier)
 
 
 def diagnose_with_views(record: Record, model: RegionalModel, given: bool, console: Console):  # type: ignore[no-untyped-def]
@@ -117,12 +126,23 @@ def diagnose_with_views(record: Record, model: RegionalModel, given: bool, conso
     return found, views(record, found)
 
 
-def _rows(log: LogInput, settings: Settings, wanted: bool, console: Console) -> _Rows:
+def _regional(model: Characteristic | ExtendedModel) -> RegionalModel:
+    return model.model.base if isinstance(model, ExtendedModel) else model.model
+
+
+def _rows(
+    log: LogInput, settings: Settings, wanted: bool, console: Console,
+    earlier: ExtendedModel | None = None,
+) -> _Rows:  # fmt: skip
     """Align the log and find special segments; without any of them say so and go on."""
+    step_s = settings.real('sample_period')
+    corrector = None if earlier is None else corrector_of(earlier, step_s)
     try:
-        watched = engine.watch(log.readings, settings, console.progress)
+        watched = engine.watch(log.readings, settings, console.progress, corrector)
     except DataError as error:
-        table, _, _ = engine_align(log, settings)
+        if corrector is not None:
+            corrector.restart()
+        table, _, _ = engine_align(log, settings, corrector)
         if not _complete(table):
             raise
         why = f'{error} The model is found from all rows instead, without special segments.'
@@ -137,11 +157,13 @@ def _rows(log: LogInput, settings: Settings, wanted: bool, console: Console) -> 
         return _Rows(watched.table, spans, None, f'{error} All rows are used instead.')
 
 
-def engine_align(log: LogInput, settings: Settings) -> tuple[SampleTable, Any, Any]:
+def engine_align(
+    log: LogInput, settings: Settings, corrector: Corrector | None = None
+) -> tuple[SampleTable, Any, Any]:
     """Put readings into rows."""
-    from valveflow_ros.cli.alignment import align
+    from valveflow_ros.cli.alignment import align, quiet
 
-    return align(log.readings, settings)
+    return align(log.readings, settings, quiet, corrector)
 
 
 def _complete(table: SampleTable) -> bool:
@@ -154,7 +176,7 @@ def _complete(table: SampleTable) -> bool:
 def texts(found: Result) -> dict[str, str]:
     """Return the files of the result by name."""
     d, page = found.page.diagnosis, found.page
-    extended = model_json(d.final, found.exponent, page.start_ns, d.reference)
+    extended = model_json(d.final, found.exponent, page.start_ns, d.reference, found.on_top_of)
     return {
         'diagnosis.json': json.dumps(to_json(d), indent=2, allow_nan=False) + '\n',
         'extended_model.json': json.dumps(extended, indent=2, allow_nan=False) + '\n',

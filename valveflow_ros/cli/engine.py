@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.cli.alignment import Progress, aligned_blocks, quiet
+from valveflow_ros.cli.alignment import Progress, aligned_blocks, corrected, quiet
 from valveflow_ros.config import Settings
 from valveflow_ros.core.align import Aligner
 from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.corrector import Corrector
 from valveflow_ros.core.events import FitRequested, JournalEntry, JournalKind, SegmentClosed
 from valveflow_ros.core.fit import fit, outline
 from valveflow_ros.core.fit_task import FitTask
@@ -48,8 +49,15 @@ class Watched:
     clock_resets: int
 
 
-def watch(readings: Readings, settings: Settings, progress: Progress = quiet) -> Watched:
+def watch(
+    readings: Readings,
+    settings: Settings,
+    progress: Progress = quiet,
+    corrector: Corrector | None = None,
+) -> Watched:
     """Feed a whole log to a monitor and ask it for a fit.
+
+    With a ``corrector`` everything sees the rows freed of its causes.
 
     Raises
     ------
@@ -60,7 +68,8 @@ def watch(readings: Readings, settings: Settings, progress: Progress = quiet) ->
     tables: list[SampleTable] = []
     segments: list[SpecialSegment] = []
     resets = 0
-    for aligned in aligned_blocks(aligner, readings, progress, 'finding segments'):
+    blocks = aligned_blocks(aligner, readings, progress, 'finding segments')
+    for aligned in corrected(blocks, corrector):
         if len(aligned.resets):
             resets += len(aligned.resets)
             tables.clear()
@@ -80,6 +89,8 @@ def watch(readings: Readings, settings: Settings, progress: Progress = quiet) ->
     first = int(task.contents.time_ns[0])
     held = table.part(int(np.searchsorted(table.time_ns, first)), len(table))
     inside = tuple(s for s in segments if s.start_ns >= first)
+    if corrector is not None:
+        task = replace(task, held=corrector.held)
     return Watched(held, inside, counts, task, resets)
 
 

@@ -16,10 +16,16 @@ from valveflow_ros.cli.log_input import LogInput, steps_of
 from valveflow_ros.cli.manual_test import advice_for, found_in_step_test, refusal
 from valveflow_ros.cli.parameters import settings_for
 from valveflow_ros.cli.report_words import columns, rejected_words
+from valveflow_ros.config import Settings
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.characteristic_json import to_json
+from valveflow_ros.core.corrector import Corrector
 from valveflow_ros.core.shift import ShiftLimits, judge_shift
 from valveflow_ros.core.shift_json import shift_json
+from valveflow_ros.diagnosis import model_json
+from valveflow_ros.diagnosis.corrector import corrector_of
+from valveflow_ros.diagnosis.extended import Extended
+from valveflow_ros.diagnosis.extended_model import ExtendedModel
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.answer import explained, opening_gain, temperature_words
@@ -36,6 +42,7 @@ from valveflow_ros.report.numbers import (
     with_error,
 )
 from valveflow_ros.report.quality import rejected
+from valveflow_ros.report.words import held_words
 
 
 def found_in(
@@ -44,8 +51,11 @@ def found_in(
     source: Path,
     console: Console,
     step_test: bool = False,
+    extended: ExtendedModel | None = None,
 ) -> Identified:
     """Run the engine and the fit, or identify a manual step test.
+
+    Causes of an ``extended`` model are taken out of the rows first.
 
     Raises
     ------
@@ -63,7 +73,9 @@ def found_in(
     if is_first_run():
         console.say(SENTENCE)
     try:
-        watched = engine.watch(log.readings, settings, console.progress)
+        watched = engine.watch(
+            log.readings, settings, console.progress, _corrector(extended, settings)
+        )
         characteristic = engine.identify(watched, console.progress)
     except DataError as error:
         raise refusal(error, log.readings, settings) from None
@@ -79,6 +91,10 @@ def found_in(
         segments=watched.segments, counts=watched.counts, settings=settings,
         notes=(*log.contents.warnings, *(d.sentence for d in log.doubts), *notes),
     )  # fmt: skip
+
+
+def _corrector(extended: ExtendedModel | None, settings: Settings) -> Corrector | None:
+    return None if extended is None else corrector_of(extended, settings.real('sample_period'))
 
 
 def _constant_notes(log: LogInput) -> list[str]:
@@ -102,8 +118,8 @@ def judged(found: Identified, reference: Characteristic) -> Identified:
     return replace(found, shift=shift, reference=reference)
 
 
-def texts(found: Identified) -> dict[str, str]:
-    """Return the files of the result by name."""
+def texts(found: Identified, extended: ExtendedModel | None = None) -> dict[str, str]:
+    """Return the files of the result by name; an extended model gets the new curve."""
     content = json.dumps(to_json(found.characteristic), indent=2, allow_nan=False)
     files = {
         'characteristic.json': content + '\n',
@@ -112,6 +128,10 @@ def texts(found: Identified) -> dict[str, str]:
     if found.shift is not None:
         told = json.dumps(shift_json(found.shift), indent=2, allow_nan=False)
         files['shift.json'] = told + '\n'
+    if extended is not None and found.characteristic.dynamics:
+        anew = Extended(found.characteristic.model, extended.model.active)
+        told = json.dumps(model_json.to_json(replace(extended, model=anew)), indent=2)
+        files['extended_model.json'] = told + '\n'
     return files
 
 
@@ -151,6 +171,7 @@ def _text(found: Identified, written: Mapping[str, Path]) -> str:
         f'{counted(c.source.samples, "sample")}. Typical difference '
         f'{plain(c.residuals.rmse_mw, 2)} MW.',
         temperature_words(c),
+        held_words(c.held),
         *c.notes,
         '' if found.shift is None else f'Against the reference: {found.shift.sentence}',
         rejected_words(found.counts) if rejected(found.counts) else '',

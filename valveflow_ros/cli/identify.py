@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from valveflow_ros.cli.console import Console, Outcome
 from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
 from valveflow_ros.cli.parameter_options import add_parameters
+from valveflow_ros.cli.usage import UsageError
 
 if TYPE_CHECKING:
     from valveflow_ros.report.identified import Identified
@@ -25,7 +26,10 @@ example:
 and for a table with names of your own:
   valveflow identify history.csv -o result --column valve_opening=CV_POS
       --column main_steam_pressure=PT_100:bar --column generated_power=MW_GROSS
-      --constant main_steam_temperature=540"""
+      --constant main_steam_temperature=540
+
+with the causes that diagnose found in an earlier log held:
+  valveflow identify plant.mcap -o result --model earlier/extended_model.json"""
 
 
 def arguments(parser: ArgumentParser) -> None:
@@ -39,6 +43,11 @@ def arguments(parser: ArgumentParser) -> None:
         help='folder for the results, made if absent',
     )  # fmt: skip
     add_parameters(parser)
+    parser.add_argument(
+        '--model', metavar='FILE', type=Path,
+        help='an extended_model.json of diagnose: its causes are held, curve and dynamics found '
+        'anew',
+    )  # fmt: skip
     parser.add_argument(
         '--reference', metavar='FILE', type=Path,
         help='a characteristic.json to judge the curve against: DIR gets shift.json',
@@ -57,17 +66,26 @@ def run(options: Namespace, console: Console) -> Outcome:
     from valveflow_ros.cli.files import check_folder, write_texts
     from valveflow_ros.cli.identification import found_in, judged, outcome, texts
     from valveflow_ros.cli.log_input import open_input
-    from valveflow_ros.cli.model_file import read_model
+    from valveflow_ros.cli.model_file import check_exponent, read_extended, read_model
     from valveflow_ros.cli.parameters import read_parameters
 
     given = read_parameters(options.params, options.pairs)
     check_folder(options.output)
     reference = read_model(options.reference) if options.reference else None
+    extended = None
+    # A file of the node's parameters may name a model too.
+    if named := options.model or given.get('model_file'):
+        path = Path(str(named)).expanduser()
+        if options.step_test:
+            raise UsageError('--step-test and --model do not go together.')
+        extended = read_extended(path)
+        check_exponent(extended, path, given)
+        given = {**given, 'pressure_exponent': extended.pressure_exponent}
     console.progress(0.02, 'reading')
     log = open_input(options.log, mapping, console)
-    found: Identified = found_in(log, given, options.log, console, options.step_test)
+    found: Identified = found_in(log, given, options.log, console, options.step_test, extended)
     if reference is not None:
         found = judged(found, reference)
     console.progress(0.9, 'writing the report')
-    written = write_texts(options.output, texts(found))
+    written = write_texts(options.output, texts(found, extended))
     return outcome(found, written, log)

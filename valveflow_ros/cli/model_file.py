@@ -1,15 +1,21 @@
-"""Read a ``characteristic.json``."""
+"""Read a ``characteristic.json`` or an ``extended_model.json``."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+from valveflow_ros.cli.usage import UsageError
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.characteristic_json import from_json
+from valveflow_ros.diagnosis import model_json
+from valveflow_ros.diagnosis.extended_model import ExtendedModel
 from valveflow_ros.errors import DataError, RecordingError
 
 _MOST_BYTES = 50_000_000
+_CURVE, _EXTENDED = 'characteristic.json', 'extended_model.json'
 
 
 def read_model(path: Path) -> Characteristic:
@@ -20,12 +26,49 @@ def read_model(path: Path) -> Characteristic:
     RecordingError
         It cannot be read, or is no characteristic this version can read.
     """
-    if path.is_dir() and (path / 'characteristic.json').is_file():
-        path = path / 'characteristic.json'
+    model = read_either(path)
+    if isinstance(model, ExtendedModel):
+        raise RecordingError(path, 'is an extended model; here a characteristic.json is wanted')
+    return model
+
+
+def read_extended(path: Path) -> ExtendedModel:
+    """Return the extended model in a file.
+
+    Raises
+    ------
+    RecordingError
+        It cannot be read, or is no extended model this version can use.
+    """
+    model = read_either(path, (_EXTENDED,))
+    if isinstance(model, Characteristic):
+        raise RecordingError(path, 'is a characteristic; here an extended_model.json is wanted')
+    return model
+
+
+def read_either(
+    path: Path, names: tuple[str, ...] = (_CURVE, _EXTENDED)
+) -> Characteristic | ExtendedModel:
+    """Return what a file holds, a characteristic or an extended model.
+
+    Parameters
+    ----------
+    path : Path
+        The file, or a folder with one of ``names`` in it.
+    names : tuple of str
+
+    Raises
+    ------
+    RecordingError
+        It cannot be read, or is none this version can use.
+    """
+    if path.is_dir():
+        path = next((path / name for name in names if (path / name).is_file()), path)
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise RecordingError(path, 'is too large to be a flow characteristic')
-        return from_json(json.loads(path.read_text(encoding='utf-8')))
+        raw = json.loads(path.read_text(encoding='utf-8'))
+        return model_json.from_json(raw) if model_json.is_model(raw) else from_json(raw)
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise RecordingError(path, f'cannot be read ({reason})') from None
@@ -33,3 +76,20 @@ def read_model(path: Path) -> Characteristic:
         raise RecordingError(path, 'is no flow characteristic: it holds no JSON') from None
     except DataError as error:
         raise RecordingError(path, f'cannot be used. {str(error).rstrip(".")}') from None
+
+
+def check_exponent(
+    model: Characteristic | ExtendedModel, path: Path, given: Mapping[str, Any]
+) -> None:
+    """Refuse a pressure exponent that is not the model's.
+
+    Raises
+    ------
+    UsageError
+    """
+    wanted = given.get('pressure_exponent')
+    if wanted is not None and abs(float(wanted) - model.pressure_exponent) > 1e-9:
+        raise UsageError(
+            f'{path} is a curve over V p^{model.pressure_exponent:g}, but the parameter '
+            f'pressure_exponent is set to {float(wanted):g}: leave it out, the model decides.'
+        )

@@ -37,7 +37,7 @@ def arguments(parser: ArgumentParser) -> None:
     parser.add_argument('log', metavar='LOG', type=Path, help='the log to judge by')
     parser.add_argument(
         '--model', metavar='FILE', type=Path, required=True,
-        help='a characteristic.json, as identify writes it',
+        help='a characteristic.json of identify, or an extended_model.json of diagnose',
     )  # fmt: skip
     parser.add_argument(
         '-o', '--output', metavar='DIR', type=Path, required=True,
@@ -60,14 +60,15 @@ def run(options: Namespace, console: Console) -> Outcome:
     mapping = read_mapping(options.column, options.constant)
     console.progress(0.0, 'starting')
     from valveflow_ros.cli.files import check_folder, write_texts
-    from valveflow_ros.cli.model_file import read_model
+    from valveflow_ros.cli.model_file import check_exponent, read_either, read_model
     from valveflow_ros.cli.parameters import read_parameters
-    from valveflow_ros.cli.validating import check_exponent, outcome, texts, validated
+    from valveflow_ros.cli.validating import outcome, refuse_two, texts, validated
 
     given = read_parameters(options.params, options.pairs)
     check_folder(options.output)
-    model = read_model(options.model)
+    model = read_either(options.model)
     against = None if options.against is None else read_model(options.against)
+    refuse_two(model, against)
     check_exponent(model, options.model, given)
     data = validated(options, model, against, mapping, given, console)
     console.progress(0.9, 'writing the report')

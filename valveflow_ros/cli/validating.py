@@ -17,6 +17,7 @@ from valveflow_ros.compare.data import other_data
 from valveflow_ros.compare.validation import validate
 from valveflow_ros.compare.validation_json import to_json
 from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.diagnosis.extended_model import ExtendedModel
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.report.comparison_csv import segments_csv
 from valveflow_ros.report.comparison_validation import (
@@ -27,26 +28,27 @@ from valveflow_ros.report.comparison_validation import (
     verdict_words,
 )
 from valveflow_ros.report.numbers import decimals, interval, percent, plain
+from valveflow_ros.report.words import held_words
 
 
-def check_exponent(model: Characteristic, path: Path, given: Mapping[str, Any]) -> None:
-    """Refuse a pressure exponent that is not the model's.
+def refuse_two(model: Characteristic | ExtendedModel, against: Characteristic | None) -> None:
+    """Refuse to hold an extended model against another curve.
 
     Raises
     ------
     UsageError
+        An extended model judges rows freed of its causes, which the other curve is not made for.
     """
-    wanted = given.get('pressure_exponent')
-    if wanted is not None and abs(float(wanted) - model.pressure_exponent) > 1e-9:
+    if against is not None and isinstance(model, ExtendedModel):
         raise UsageError(
-            f'{path} is a curve over V p^{model.pressure_exponent:g}, but the parameter '
-            f'pressure_exponent is set to {float(wanted):g}: leave it out, the model decides.'
+            '--against takes two curves over the same rows, and those of an extended model are '
+            'freed of its causes: validate each by itself and compare their errors.'
         )
 
 
 def validated(
     options: Namespace,
-    model: Characteristic,
+    model: Characteristic | ExtendedModel,
     against: Characteristic | None,
     mapping: Columns,
     given: Mapping[str, Any],
@@ -62,21 +64,37 @@ def validated(
     console.progress(0.02, 'reading')
     log = read(options.log, mapping, console)
     settings = {**given, 'pressure_exponent': model.pressure_exponent}
-    seen = see(log, options.log.name, settings, console, console.progress)
+    extended = model if isinstance(model, ExtendedModel) else None
+    curve: Characteristic = model.characteristic() if isinstance(model, ExtendedModel) else model
+    seen = see(log, options.log.name, settings, console, console.progress, extended)
     console.progress(0.7, 'judging')
     tolerance = options.tolerance or seen.settings.real('alarm_floor')
     other = other_data(seen.contents, seen.settings)
-    result = validate(model, other, tolerance, against)
+    result = validate(curve, other, tolerance, against)
     if result.outside_share > OUTSIDE_FLAG:
         console.warn(
             f'{percent(result.outside_share, 2)} of the special samples lie beyond the ends of '
             'the curve and were not judged.'
         )
+    held = _held(curve, extended is not None, console)
     second = '' if options.against is None else _name(options.against, options.model)
     return Validated(
         options.log.name, _name(options.model, options.against), second, result, seen.contents,
-        seen.notes,
+        seen.notes, held,
     )  # fmt: skip
+
+
+def _held(curve: Characteristic, taken_out: bool, console: Console) -> str:
+    """Say which causes were taken out of the rows, or that they should have been."""
+    if taken_out or not curve.held:
+        return held_words(curve.held)
+    told = (
+        'The curve was identified with causes held '
+        f'({", ".join(h.name for h in curve.held)}), which this log is not freed of: give the '
+        'extended_model.json beside it as --model.'
+    )
+    console.warn(told)
+    return told
 
 
 def _name(path: Path, other: Path | None) -> str:
@@ -91,6 +109,7 @@ def texts(data: Validated) -> tuple[dict[str, Any], dict[str, str]]:
         'log': data.source,
         'model': data.model,
         'against': data.other or None,
+        'held': [h.name for h in data.result.characteristic.held],
         'words': verdict_words(data),
     }
     return content, {
@@ -111,6 +130,7 @@ def _text(data: Validated, written: Mapping[str, Path]) -> str:
     parts = [
         f'{data.model}, held against {data.source}:',
         *verdict_words(data),
+        data.held,
         _pieces(data),
         _errors(data),
         f'Wrote {written["report.html"]}, {written["validation.json"].name} and segments.csv.',

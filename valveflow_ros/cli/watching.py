@@ -15,6 +15,8 @@ from valveflow_ros.cli.mapping import Mapping as Columns
 from valveflow_ros.cli.parameters import settings_for
 from valveflow_ros.config import Settings
 from valveflow_ros.core.window import WindowContents
+from valveflow_ros.diagnosis.corrector import corrector_of
+from valveflow_ros.diagnosis.extended_model import ExtendedModel
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import NS_PER_S, Readings
 
@@ -56,9 +58,11 @@ def read(path: Path, columns: Columns, console: Console) -> LogInput:
 
 def see(
     log: LogInput, source: str, given: Mapping[str, Any], console: Console,
-    progress: Callable[[float, str], None],
+    progress: Callable[[float, str], None], extended: ExtendedModel | None = None,
 ) -> Seen:  # fmt: skip
     """Run the engine over a log and find its special segments.
+
+    With an ``extended`` model the rows are freed of its causes.
 
     Raises
     ------
@@ -72,8 +76,10 @@ def see(
         console.say(sentence)
     if is_first_run():
         console.say(SENTENCE)
+    step_s = settings.real('sample_period')
+    corrector = None if extended is None else corrector_of(extended, step_s)
     try:
-        watched = engine.watch(log.readings, settings, progress)
+        watched = engine.watch(log.readings, settings, progress, corrector)
     except DataError as error:
         raise DataError(f'{source}: {error}') from None
     told = (*log.contents.warnings, *(d.sentence for d in log.doubts), *notes)

@@ -88,6 +88,18 @@ class Source:
 
 
 @dataclass(frozen=True, slots=True)
+class HeldCause:
+    """A cause of the diagnosis that was taken out of the rows before the curve was fitted.
+
+    ``values`` are its parameters by name; ``sentence`` says it to a person.
+    """
+
+    name: str
+    values: tuple[tuple[str, float], ...]
+    sentence: str
+
+
+@dataclass(frozen=True, slots=True)
 class ResidualStatistics:
     """What residuals of this curve look like on the data it was fitted to (MW).
 
@@ -106,7 +118,10 @@ class ResidualStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Characteristic:
-    """A fitted flow characteristic x = F(u)."""
+    """A fitted flow characteristic x = F(u).
+
+    Where causes were ``held`` the curve is that of the plant without them.
+    """
 
     pressure_exponent: float
     pieces: tuple[Piece, ...]
@@ -119,6 +134,7 @@ class Characteristic:
     notes: tuple[str, ...] = ()
     support: tuple[Support, ...] = ()
     model_id: str = field(default='')
+    held: tuple[HeldCause, ...] = field(default=(), repr=False)
 
     @property
     def breakpoints(self) -> FloatArray:
@@ -182,7 +198,9 @@ class Characteristic:
 
     def with_id(self) -> Characteristic:
         """Return a copy whose `model_id` is a hash of its numbers."""
-        digest = hashlib.sha256(repr(replace(self, model_id='')).encode()).hexdigest()
+        # Held causes count where there are some; the names of other curves stay what they were.
+        told = repr(replace(self, model_id='')) + (repr(self.held) if self.held else '')
+        digest = hashlib.sha256(told.encode()).hexdigest()
         return replace(self, model_id=digest[:12])
 
 

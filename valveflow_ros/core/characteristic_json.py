@@ -15,6 +15,7 @@ from valveflow_ros.core.characteristic import (
     Support,
 )
 from valveflow_ros.core.chart import ChartDesign
+from valveflow_ros.core.held_json import held_from, held_json
 from valveflow_ros.core.json_field import Field
 from valveflow_ros.errors import DataError
 
@@ -124,6 +125,7 @@ def to_json(c: Characteristic) -> dict[str, Any]:
         else {},
         'partition': {'pieces': [_piece_json(p) for p in c.partition_pieces]},
         'notes': list(c.notes),
+        **held_json(c.held),
         'optimal': bool(c.partition_pieces),
     }
 
@@ -171,6 +173,7 @@ def from_json(raw: object) -> Characteristic:
         notes=tuple(n.text() for n in notes.items()) if notes else (),
         support=_support(top.key('pieces')),
         model_id=name.text() if name else '',
+        held=held_from(top.may_have('held')),
     )
 
 

@@ -116,6 +116,7 @@ def _begin(task: FitTask, progress: Progress) -> _Begun:
         source=_source(task, rows),
         residuals=_static_residuals(task, chosen),
         partition_pieces=chosen,
+        held=task.held,
     )
     return _Begun(static, part, u)
 

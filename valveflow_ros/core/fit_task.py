@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from valveflow_ros.config import Settings
+from valveflow_ros.core.characteristic import HeldCause
 from valveflow_ros.core.window import WindowContents
 
 
@@ -20,6 +21,8 @@ class FitTask:
     settings : Settings
     input_noise, power_noise_mw : float
         The segmenter's noise levels at that moment.
+    held : tuple of HeldCause
+        Causes that were taken out of the rows.
     """
 
     request_ns: int
@@ -27,3 +30,4 @@ class FitTask:
     settings: Settings
     input_noise: float
     power_noise_mw: float
+    held: tuple[HeldCause, ...] = ()

@@ -12,13 +12,14 @@ _LARGEST = 1e30  # no number of a plant is larger; products of two still are fin
 class Field:
     """A place in the JSON that knows its path, so that an error can name it."""
 
-    def __init__(self, value: object, path: str) -> None:
+    def __init__(self, value: object, path: str, whole: str = 'characteristic') -> None:
         self._value = value
         self._path = path
+        self._whole = whole
 
     def fail(self, problem: str) -> DataError:
         """Return the error that says what is wrong with this place."""
-        return DataError(f"The characteristic cannot be used: '{self._path}' {problem}.")
+        return DataError(f"The {self._whole} cannot be used: '{self._path}' {problem}.")
 
     def key(self, name: str) -> Field:
         """Return the member of this object that has to be there."""
@@ -26,8 +27,8 @@ class Field:
         if not isinstance(self._value, dict):
             raise self.fail('is not an object')
         if name not in self._value:
-            raise Field(None, path).fail('is missing')
-        return Field(self._value[name], path)
+            raise Field(None, path, self._whole).fail('is missing')
+        return Field(self._value[name], path, self._whole)
 
     def may_have(self, name: str) -> Field | None:
         """Return a member, or None."""
@@ -38,7 +39,13 @@ class Field:
         """Return the members of this list."""
         if not isinstance(self._value, list):
             raise self.fail('is not a list')
-        return [Field(v, f'{self._path}[{k}]') for k, v in enumerate(self._value)]
+        return [Field(v, f'{self._path}[{k}]', self._whole) for k, v in enumerate(self._value)]
+
+    def members(self) -> list[tuple[str, Field]]:
+        """Return the members of this object with their names."""
+        if not isinstance(self._value, dict):
+            raise self.fail('is not an object')
+        return [(str(name), self.key(name)) for name in self._value]
 
     def real(self, low: float = -math.inf, high: float = math.inf) -> float:
         """Return a number inside limits."""

@@ -7,7 +7,15 @@ from collections.abc import Callable, Iterator, Sequence
 
 from valveflow_ros.core.align import Aligned, Aligner
 from valveflow_ros.core.characteristic_json import from_json
-from valveflow_ros.core.events import Event, FitRequested, JournalEntry, JournalKind
+from valveflow_ros.core.diagnosing import ASKED
+from valveflow_ros.core.diagnosis_task import DiagnosisTask
+from valveflow_ros.core.events import (
+    DiagnosisRequested,
+    Event,
+    FitRequested,
+    JournalEntry,
+    JournalKind,
+)
 from valveflow_ros.core.fit import fit
 from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.monitor import BY_HAND, Monitor
@@ -69,17 +77,24 @@ class JournalReplayer:
     monitor : Monitor
         Fresh, with the settings of the live run.
     journal : sequence of JournalEntry
-        In the order written. Requests the engine makes by itself come anew
-        and are not repeated; everything else is.
+        In the order written. What the engine says and asks for by itself comes anew
+        and is not repeated; everything else is.
+    diagnose : callable, optional
+        Computes a diagnosis and returns its content; without it none that the journal holds can
+        be repeated.
     """
 
-    def __init__(self, monitor: Monitor, journal: Sequence[JournalEntry]) -> None:
+    def __init__(
+        self,
+        monitor: Monitor,
+        journal: Sequence[JournalEntry],
+        diagnose: Callable[[DiagnosisTask], str] | None = None,
+    ) -> None:
         self._monitor = monitor
-        self._due = [
-            entry for entry in journal
-            if entry.kind != JournalKind.FIT_REQUESTED or entry.text == BY_HAND
-        ]  # fmt: skip
+        self._due = [entry for entry in journal if _from_outside(entry)]
         self._tasks: dict[int, FitTask] = {}
+        self._diagnose = diagnose
+        self._diagnosis: DiagnosisTask | None = None
 
     def feed(self, table: SampleTable) -> list[Event]:
         """Feed rows; return the events."""
@@ -98,6 +113,9 @@ class JournalReplayer:
             self._keep(fed.events)
 
     def _keep(self, events: list[Event]) -> None:
+        for event in events:
+            if isinstance(event, DiagnosisRequested):
+                self._diagnosis = event.task
         self._tasks.update(
             (event.task.request_ns, event.task)
             for event in events
@@ -116,6 +134,14 @@ class JournalReplayer:
             events = monitor.request_fit()
             self._keep(events)
             return events
+        if entry.kind == JournalKind.DIAGNOSE:
+            events = monitor.request_diagnosis()
+            self._keep(events)
+            return events
+        if entry.kind == JournalKind.DIAGNOSED:
+            return self._conclude(entry)
+        if entry.kind == JournalKind.DIAGNOSIS_FAILED:
+            return monitor.diagnosing.refuse(entry.request_ns, entry.text)
         if entry.kind == JournalKind.FIT_ADOPTED:
             return self._adopt(entry)
         if entry.kind == JournalKind.FIT_REFUSED:
@@ -147,6 +173,24 @@ class JournalReplayer:
                 'the readings, the settings or the program are not those of the run.'
             )
         return self._monitor.adopt(entry.request_ns, found)
+
+    def _conclude(self, entry: JournalEntry) -> list[Event]:
+        """Compute the diagnosis that was published; the journal's line tells if it is the same."""
+        task, self._diagnosis = self._diagnosis, None
+        if task is None or task.request_ns != entry.request_ns:
+            raise DataError('The journal has a diagnosis that was never asked for.')
+        if self._diagnose is None:
+            raise DataError('The journal has a diagnosis, which cannot be repeated here.')
+        return self._monitor.diagnosing.adopt(entry.request_ns, self._diagnose(task))
+
+
+def _from_outside(entry: JournalEntry) -> bool:
+    """Tell whether the engine would not come to this by itself."""
+    if entry.kind == JournalKind.MISMATCH:
+        return False
+    if entry.kind == JournalKind.FIT_REQUESTED:
+        return entry.text == BY_HAND
+    return entry.kind != JournalKind.DIAGNOSE or entry.text == ASKED
 
 
 def _held(entry: JournalEntry, what: str) -> dict[str, object]:

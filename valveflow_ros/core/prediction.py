@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import enum
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from valveflow_ros.config import Settings
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.chart import ResidualChart
 from valveflow_ros.core.jit import jit
@@ -219,6 +220,14 @@ class Predictor:
             past=np.zeros(int(_LONGEST_DELAY_S / step_s) + 4),
         )  # fmt: skip
 
+    @classmethod
+    def of(cls, characteristic: Characteristic, settings: Settings) -> Predictor:
+        """Return what predicts from a curve with these settings."""
+        return cls(
+            characteristic, settings.real('sample_period'), settings.settle_s,
+            settings.real('alarm_average'), settings.real('alarm_limit'),
+        )  # fmt: skip
+
     @property
     def warm_up_rows(self) -> int:
         """Return how many rows bring the filter into its stride."""
@@ -255,6 +264,18 @@ class Predictor:
         )
         _predict(time_ns, u, power_mw, kinds, self._filter, out)
         return out
+
+
+def as_measured(block: PredictionBlock, measured_mw: FloatArray) -> PredictionBlock:
+    """Return the predictions of corrected rows as predictions of what was measured.
+
+    The residual stays; what the correction took out of the power is put back on both sides.
+    """
+    taken_out = measured_mw - block.measured_mw
+    return replace(
+        block, measured_mw=measured_mw, static_mw=block.static_mw + taken_out,
+        dynamic_mw=block.dynamic_mw + taken_out,
+    )  # fmt: skip
 
 
 def no_prediction(

@@ -144,6 +144,29 @@ def settled(usable: ByteArray, rows: int, out: ByteArray) -> None:
 
 
 @jit
+def play_step(state: float, v: float, half: float) -> float:
+    """Return where the plug stands after the position became ``v``; NaN is a plug not seen yet."""
+    return v if np.isnan(state) else min(max(state, v - half), v + half)
+
+
+@jit
+def slip_step(state: float, v: float, off: float, near: float) -> float:
+    """Return where a sticking plug stands: it slips to ``near`` when pulled by ``off``."""
+    pull = v - state
+    if pull > off:
+        state = v - near
+    elif pull < -off:
+        state = v + near
+    return state
+
+
+@jit
+def rate_step(state: float, v: float, largest: float) -> float:
+    """Return where a slow plug stands that moves by at most ``largest``."""
+    return v if np.isnan(state) else state + min(max(v - state, -largest), largest)
+
+
+@jit
 def play(v: FloatArray, half: float, out: FloatArray) -> None:
     """Follow ``v`` only where one flank of a slack of width ``2 half`` pushes; NaN is passed."""
     state = np.nan
@@ -151,7 +174,7 @@ def play(v: FloatArray, half: float, out: FloatArray) -> None:
         if np.isnan(v[t]):
             out[t] = np.nan
             continue
-        state = v[t] if np.isnan(state) else min(max(state, v[t] - half), v[t] + half)
+        state = play_step(state, v[t], half)
         out[t] = state
 
 
@@ -166,11 +189,7 @@ def stick_slip(v: FloatArray, band: float, jump: float, out: FloatArray) -> None
             continue
         if np.isnan(state):
             state = v[t]
-        pull = v[t] - state
-        if pull > off:
-            state = v[t] - near
-        elif pull < -off:
-            state = v[t] + near
+        state = slip_step(state, v[t], off, near)
         out[t] = state
 
 
@@ -182,9 +201,7 @@ def rate_limit(v: FloatArray, largest: float, out: FloatArray) -> None:
         if np.isnan(v[t]):
             out[t] = np.nan
             continue
-        if np.isnan(state):
-            state = v[t]
-        state += min(max(v[t] - state, -largest), largest)
+        state = rate_step(state, v[t], largest)
         out[t] = state
 
 

@@ -20,7 +20,7 @@ from valveflow_ros.report.numbers import (
     with_error,
 )
 from valveflow_ros.report.page import notice, paragraph, table, text
-from valveflow_ros.report.words import input_unit
+from valveflow_ros.report.words import held_words, input_unit
 
 _FLAT = 0.2  # a piece this much flatter than the steepest is said to answer hardly at all
 
@@ -112,7 +112,7 @@ def _warnings(data: Identified) -> str:
             'A piece does not rise, so the curve has no inverse there and cannot be compensated '
             'as it stands. A flat end is ordinary; a falling piece elsewhere is not.'
         )
-    return told + ''.join(notice(text(n)) for n in c.notes)
+    return told + ''.join(notice(text(n)) for n in (held_words(c.held), *c.notes) if n)
 
 
 def pieces_table(data: Identified) -> str:

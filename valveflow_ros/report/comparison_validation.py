@@ -44,6 +44,8 @@ class Validated:
     result : Validation
     contents : WindowContents
     notes : tuple of str
+    held : str
+        What there is to say of causes held; empty without any.
     """
 
     source: str
@@ -52,6 +54,7 @@ class Validated:
     result: Validation
     contents: WindowContents
     notes: tuple[str, ...] = ()
+    held: str = ''
 
 
 def verdict_words(data: Validated) -> list[str]:
@@ -161,6 +164,7 @@ def validation_report(data: Validated) -> str:
             [
                 paragraph(text(first), 'answer'),
                 *(_told(sentence, v) for sentence in rest),
+                notice(text(data.held)) if data.held else '',
                 pieces_table(v),
             ],
         ),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fractions import Fraction
 
+from valveflow_ros.core.characteristic import HeldCause
 from valveflow_ros.report.numbers import plain
 
 
@@ -23,3 +24,20 @@ def input_unit(value: float) -> str:
 def input_title(value: float) -> str:
     """Return the title of an axis of u as HTML."""
     return f'integrated input u = V p<sup>{exponent(value)}</sup> ({input_unit(value)})'
+
+
+def held_words(held: tuple[HeldCause, ...]) -> str:
+    """Say which causes were taken out of the rows; nothing where none were."""
+    if not held:
+        return ''
+    names = ', '.join(_held(h) for h in held)
+    return (
+        f'Held, and taken out of opening and power before anything else: {names}. The curve is '
+        f'that of the unit without {"it" if len(held) == 1 else "them"}. '
+        + ' '.join(h.sentence for h in held)
+    )
+
+
+def _held(h: HeldCause) -> str:
+    values = ', '.join(f'{name} = {value:.4g}' for name, value in h.values)
+    return f'{h.name} ({values})'

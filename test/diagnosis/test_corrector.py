@@ -1,0 +1,199 @@
+"""Rows freed of causes as they come: against the extended model itself, and by relations."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from diagnosis_records import EXPONENT, SETTLE_S, STEP_S, record, rough_model, table, unit
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_diagnosis_parts import TYPICAL
+
+from valveflow_ros.core.units import integrated_input
+from valveflow_ros.diagnosis.catalogue import catalogue
+from valveflow_ros.diagnosis.cause import Active
+from valveflow_ros.diagnosis.corrector import corrector_of
+from valveflow_ros.diagnosis.extended import Extended, answer
+from valveflow_ros.diagnosis.extended_model import ExtendedModel
+from valveflow_ros.diagnosis.grid import make_scene
+from valveflow_ros.records import NS_PER_S, Quality, SampleTable, Signal
+
+pytestmark = pytest.mark.skipif(
+    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled loops'
+)
+NAMES = sorted(catalogue())
+VALUES = {**TYPICAL, 'clock': (4.0,)}  # a whole number of rows
+SEVERAL = ('rate_limit', 'backlash', 'exponent', 'input_drift', 'curve_shape', 'temperature',
+           'gain_step', 'region_lag', 'reheater', 'output_offset_drift')  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def rows() -> SampleTable:
+    return table(0.4, 2, (), unit())
+
+
+@pytest.fixture(scope='module')
+def scene(rows):
+    return make_scene(*record(rows).about, np.zeros(rows.values.shape, dtype=bool))
+
+
+def active(name: str) -> Active:
+    extra = (3600.0, 9000.0, 20_000.0) if name == 'intervals' else ()
+    return Active(catalogue()[name], VALUES[name], extra)
+
+
+def model_of(scene, *names: str) -> ExtendedModel:
+    extended = Extended(rough_model(), tuple(active(n) for n in names))
+    return ExtendedModel(extended, EXPONENT, scene.start_ns, scene.reference)
+
+
+def corrected(model: ExtendedModel, rows: SampleTable) -> SampleTable:
+    return corrector_of(model, STEP_S).correct(rows)
+
+
+def plain_answer(rows: SampleTable) -> np.ndarray:
+    """What curve and dynamics alone say to rows, as the pipeline runs them."""
+    u = integrated_input(
+        rows.column(Signal.VALVE_OPENING), rows.column(Signal.MAIN_STEAM_PRESSURE), EXPONENT
+    )
+    usable = np.isfinite(u).astype(np.uint8)
+    return rough_model().respond(np.nan_to_num(u), usable, STEP_S, SETTLE_S)[0]
+
+
+def same(a: SampleTable, b: SampleTable) -> bool:
+    return (
+        np.array_equal(a.time_ns, b.time_ns)
+        and a.values.tobytes() == b.values.tobytes()
+        and np.array_equal(a.quality, b.quality)
+    )
+
+
+def means_of(scene, shown: np.ndarray) -> np.ndarray:
+    return shown[: len(scene.u)].reshape(-1, scene.group).mean(axis=1)
+
+
+@pytest.mark.parametrize('names', [*((n,) for n in NAMES), SEVERAL], ids=lambda n: '+'.join(n))
+def test_what_is_left_is_what_the_extended_model_leaves(scene, rows, names):
+    """y' - plain(u') = y - extended(inputs), by the loops the diagnosis itself uses."""
+    model = model_of(scene, *names)
+    after = corrected(model, rows)
+    measured = rows.column(Signal.GENERATED_POWER)
+    left = after.column(Signal.GENERATED_POWER) - plain_answer(after)
+    if 'clock' in names:  # the power belongs to inputs two rows later
+        left[:-2] = left[2:]
+        left[-2:] = 0.0
+    expected = answer(scene, model.model)
+    told = means_of(scene, measured - left)
+    here = np.flatnonzero(scene.scored)[:-1]
+    # The catalogue draws the sensor's noise of a stiction over the record, this row by row.
+    limit = 0.6 if 'stiction' in names else 1e-8
+    assert np.abs(told - expected)[here].max() < limit
+    assert np.abs(expected - answer(scene, model.model.without_causes()))[here].max() > 1e-3
+
+
+def test_sticking_is_drawn_anew_and_means_the_same(scene, rows):
+    model = model_of(scene, 'stiction')
+    after = corrected(model, rows).column(Signal.VALVE_OPENING)
+    act = catalogue()['stiction'].act(scene.v, VALUES['stiction'], scene)
+    stays = np.std(rows.column(Signal.VALVE_OPENING) - act)
+    assert np.std(after - act) < 0.25 * stays
+    assert abs(float(np.mean(after - act))) < 0.05 * stays
+
+
+def test_without_causes_rows_pass_bit_for_bit(scene, rows):
+    assert same(corrected(model_of(scene), rows), rows)
+    on_top = replace(model_of(scene), on_top_of=model_of(scene))
+    assert same(corrected(on_top, rows), rows)
+
+
+@settings(max_examples=12)
+@given(
+    st.sampled_from([('clock', *SEVERAL), ('stiction', 'choked', 'diurnal', 'curve_step'),
+                     ('saturation', 'intervals', 'gain_drift', 'input_step')]),
+    st.lists(st.integers(1, 1499), max_size=12, unique=True),
+    st.lists(st.tuples(st.integers(0, 1499), st.integers(0, 3)), max_size=10),
+    st.lists(st.integers(1, 1498), max_size=3, unique=True),
+)  # fmt: skip
+def test_any_cutting_gives_the_same_bits(scene, rows, names, cuts, missing, gaps):
+    part = rows.part(0, 1500)
+    values, quality = part.values.copy(), part.quality.copy()
+    for row, signal in missing:
+        values[row, signal] = np.nan
+        quality[row, signal] = Quality.BAD
+    time_ns = part.time_ns.copy()
+    for gap in gaps:
+        time_ns[gap:] += 300 * NS_PER_S
+    part = SampleTable(time_ns, values, quality)
+    model = model_of(scene, *names)
+    whole = corrected(model, part)
+    corrector = corrector_of(model, STEP_S)
+    edges = [0, *sorted(cuts), len(part)]
+    pieces = [corrector.correct(part.part(a, b)) for a, b in itertools.pairwise(edges)]
+    assert same(SampleTable.concatenate(pieces), whole)
+    corrector.restart()
+    assert same(corrector.correct(part), whole)
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_rows_one_by_one_are_rows_at_once(scene, rows, name):
+    part, model = rows.part(0, 150), model_of(scene, name)
+    corrector = corrector_of(model, STEP_S)
+    single = [corrector.correct(part.part(k, k + 1)) for k in range(len(part))]
+    assert same(SampleTable.concatenate(single), corrected(model, part))
+    assert len(corrector.correct(part.part(3, 3))) == 0
+
+
+def test_pressure_temperature_and_command_stay(scene, rows):
+    after = corrected(model_of(scene, *SEVERAL), rows)
+    for signal in (Signal.MAIN_STEAM_PRESSURE, Signal.MAIN_STEAM_TEMPERATURE,
+                   Signal.VALVE_COMMAND):  # fmt: skip
+        np.testing.assert_array_equal(after.column(signal), rows.column(signal))
+
+
+def test_two_models_on_top_of_each_other_are_one_after_the_other(scene, rows):
+    first, second = model_of(scene, 'backlash', 'gain_step'), model_of(scene, 'reheater')
+    both = replace(second, on_top_of=first)
+    assert same(corrected(both, rows), corrected(second, corrected(first, rows)))
+    assert [h.name for h in corrector_of(both, STEP_S).held] == [
+        'backlash', 'gain_step', 'reheater',
+    ]  # fmt: skip
+
+
+def shift_of(model: ExtendedModel, rows: SampleTable) -> float:
+    """What a correction takes out of the power as a share of it, in the median."""
+    after = corrected(model, rows)
+    taken = rows.column(Signal.GENERATED_POWER) - after.column(Signal.GENERATED_POWER)
+    # Around a change of region the two simulations differ by more than the share.
+    return float(np.median(taken / plain_answer(rows)))
+
+
+def later(rows: SampleTable, days: float) -> SampleTable:
+    return replace(rows, time_ns=rows.time_ns + round(days * 86_400 * NS_PER_S))
+
+
+def test_beyond_its_record_a_drift_goes_on_and_steps_stay(scene, rows):
+    drift = model_of(scene, 'gain_drift')
+    grown = shift_of(drift, later(rows, 20.0)) - shift_of(drift, rows)
+    assert grown == pytest.approx(2.0 * VALUES['gain_drift'][0], rel=1e-3)
+    step = model_of(scene, 'gain_step')
+    assert shift_of(step, later(rows, 20.0)) == pytest.approx(0.5 * VALUES['gain_step'][0])
+    hidden = model_of(scene, 'intervals')  # 1.5 h of 9.6 on, then on again for good
+    on = 1.0 - (5400.0 + (0.4 * 86_400.0 - 20_000.0)) / (0.4 * 86_400.0)
+    assert shift_of(hidden, later(rows, 20.0)) == pytest.approx(VALUES['intervals'][0] * on)
+
+
+def test_a_gap_is_a_new_beginning_of_the_response_but_not_of_the_plug(scene, rows):
+    """Rows behind a gap come out as those of a corrector that has seen nothing."""
+    held = model_of(scene, 'gain_step', 'reheater')
+    first, behind = rows.part(0, 700), later(rows.part(700, 1400), 0.1)
+    corrector = corrector_of(held, STEP_S)
+    corrector.correct(first)
+    assert same(corrector.correct(behind), corrected(held, behind))
+    slack = model_of(scene, 'backlash')
+    corrector = corrector_of(slack, STEP_S)
+    corrector.correct(first)
+    assert not same(corrector.correct(behind), corrected(slack, behind))

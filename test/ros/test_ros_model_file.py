@@ -1,0 +1,115 @@
+"""The extended model in the node: its file, its recording, its replay."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from extended_file import extended_json, write_extended
+from ros_helpers import PATIENCE_S, Processes, wait_until
+
+from valveflow_ros.config import Settings
+from valveflow_ros.diagnosis.model_json import to_json
+from valveflow_ros.errors import ParameterError, RecordingError
+from valveflow_ros.logs import open_log
+from valveflow_ros.ros import model_file
+from valveflow_ros.ros import verify as verifying
+from valveflow_ros.ros.demo_processes import ros_arguments
+from valveflow_ros.ros.session import Session
+
+HELD = {'backlash': {'w_percent': 0.5}, 'gain_drift': {'g': 0.05}, 'clock': {'d_s': 3.0}}
+
+
+def test_a_model_is_read_from_its_file(tmp_path: Path) -> None:
+    assert model_file.extended_of(Settings()) is None
+    assert model_file.ready(None, Settings()) is None
+    assert model_file.attached(None) == {}
+    path = write_extended(tmp_path / 'extended_model.json', **HELD)
+    settings = Settings({'model_file': str(path)})
+    given = model_file.extended_of(settings)
+    assert given is not None
+    assert to_json(given) == extended_json(**HELD)
+    corrector = model_file.ready(given, settings)
+    assert corrector is not None
+    assert [h.name for h in corrector.held] == list(HELD)
+    kept = model_file.attached(given)[model_file.ATTACHMENT]
+    assert json.loads(kept) == extended_json(**HELD)
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('{', 'cannot be used'),
+        ('{"format": "valveflow/characteristic"}', "'format' must be"),
+        (None, 'no such file'),
+        ('\udcff', 'cannot be used'),
+        (json.dumps({**extended_json(), 'pressure_exponent': 1.0}), 'pressure exponent 1, the'),
+        (json.dumps({**extended_json(), 'causes': None}), "'causes' is not a list"),
+        ('[' * 100_000, 'cannot be used'),
+    ],
+)  # fmt: skip
+def test_a_bad_file_is_refused_with_a_sentence(
+    tmp_path: Path, text: str | None, said: str
+) -> None:
+    path = tmp_path / 'extended_model.json'
+    if text is not None:
+        path.write_text(text, encoding='utf-8', errors='surrogateescape')
+    with pytest.raises(ParameterError) as caught:
+        model_file.extended_of(Settings({'model_file': str(path)}))
+    assert said in str(caught.value)
+    assert str(caught.value).startswith("Parameter 'model_file' names")
+
+
+def test_a_bad_model_keeps_the_node_unconfigured(tmp_path: Path) -> None:
+    """Before anything is started that would have to be ended again."""
+    settings = Settings({'model_file': str(tmp_path / 'gone.json')})
+    with pytest.raises(ParameterError, match='no such file'):
+        Session(SimpleNamespace(), settings, lambda: False, print)  # type: ignore[arg-type]
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+def test_the_node_takes_causes_out_and_its_recording_repeats(
+    processes: Processes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = write_extended(tmp_path / 'extended_model.json', **HELD)
+    parameters = {
+        'record_directory': f'"{tmp_path / "recordings"}"', 'unit_tag': '"unit"',
+        'input_reliability': 'reliable', 'refit_period': 3600.0, 'refit_segments': 0,
+        'model_file': f'"{model}"', 'use_sim_time': True,
+    }  # fmt: skip
+    monitor = processes.start('valveflow_ros.ros.monitor_main', *ros_arguments(parameters))
+    plant = processes.start(
+        'valveflow_ros.ros.simulator_main',
+        *ros_arguments({'seed': 7, 'rate': 0.0, 'wait': PATIENCE_S, 'days': 0.02,
+                        'use_clock': True}),
+    )  # fmt: skip
+    wait_until(lambda: plant.poll() is not None, 'the end of the plant')
+    monitor.terminate()
+    assert monitor.wait(10.0) == 0, processes.output(monitor)
+    said = processes.output(monitor)
+    assert 'Traceback' not in said
+    assert 'by model_file: backlash, gain_drift, clock.' in said
+    (folder,) = (tmp_path / 'recordings').iterdir()
+    model.unlink()  # the recording has its own
+    result = verifying.verify(folder)
+    assert result.identical, result.difference
+    assert result.compared['prediction'] > 1500
+    log = open_log(folder)
+    assert json.loads(log.attachments[model_file.ATTACHMENT]) == extended_json(**HELD)
+    # Rows as measured would have another u from the first one on.
+    monkeypatch.setattr(verifying, '_corrector', lambda *_: None)
+    assert 'Prediction number 1 differs' in verifying.verify(folder).difference
+
+
+def test_a_recording_without_its_model_is_not_verified(tmp_path: Path) -> None:
+    log = SimpleNamespace(path=tmp_path, attachments={})
+    settings = Settings({'model_file': 'gone.json'})
+    with pytest.raises(RecordingError, match='lacks the attachment'):
+        verifying._corrector(log, settings)  # type: ignore[arg-type]
+    log.attachments = {model_file.ATTACHMENT: b'{}'}
+    with pytest.raises(RecordingError, match='an extended model that cannot be used'):
+        verifying._corrector(log, settings)  # type: ignore[arg-type]
+    assert verifying._corrector(log, Settings()) is None  # type: ignore[arg-type]

@@ -1,0 +1,235 @@
+"""Take the causes of an extended model out of rows as they come.
+
+What the pipeline then sees is a plant without the causes:
+
+- a cause of the opening or of the input u goes into the opening: V' f for what passes the
+  plug at V, so that u = V' f p^m is what acts on the curve;
+- a cause of the flow, of the gain, of the dynamics or of the power shown is taken out of the
+  power by the difference of two simulations, y' = y - (y_extended - y_plain), both run on that u.
+  The difference hangs on inputs alone, so noise of y is neither amplified nor fed back;
+- of a clock that is late the power is delayed to the inputs it belongs to: a row's residual is
+  then that of power stamped so much earlier.
+
+Hence y' - plain(u') = y - extended(inputs), whatever curve is put for both sides' F up to the
+product of its change and the size of the cause.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from valveflow_ros.core.characteristic import HeldCause
+from valveflow_ros.core.corrector import Corrector
+from valveflow_ros.core.units import integrated_input
+from valveflow_ros.diagnosis import kernels as flows
+from valveflow_ros.diagnosis import streaming_kernels as kernels
+from valveflow_ros.diagnosis.cause import Active, Stage
+from valveflow_ros.diagnosis.extended import Extended
+from valveflow_ros.diagnosis.extended_model import ExtendedModel
+from valveflow_ros.diagnosis.scene import Scene
+from valveflow_ros.diagnosis.streaming import (
+    CLOCK,
+    REFILL,
+    LateClock,
+    Refill,
+    Response,
+    check_streams,
+    valves,
+)
+from valveflow_ros.records import (
+    NS_PER_S,
+    ByteArray,
+    FloatArray,
+    IntArray,
+    Quality,
+    SampleTable,
+    Signal,
+)
+
+# Functions like exp take several numbers at once; blocks of whole such handfuls round alike.
+_HANDFUL = 16
+
+
+def corrector_of(given: ExtendedModel, step_s: float) -> Corrector:
+    """Return what takes all causes of a model out of rows ``step_s`` apart.
+
+    Raises
+    ------
+    DataError
+        A cause cannot be taken out of rows as they come.
+    """
+    own = ModelCorrector(given, step_s)
+    if given.on_top_of is None:
+        return own
+    return ChainCorrector(corrector_of(given.on_top_of, step_s), own)
+
+
+class ChainCorrector:
+    """Two correctors, one after the other."""
+
+    def __init__(self, first: Corrector, second: Corrector) -> None:
+        self._first, self._second = first, second
+
+    @property
+    def held(self) -> tuple[HeldCause, ...]:
+        """Return the causes of both."""
+        return self._first.held + self._second.held
+
+    def correct(self, table: SampleTable) -> SampleTable:
+        """Correct by both."""
+        return self._second.correct(self._first.correct(table))
+
+    def restart(self) -> None:
+        """Forget all rows."""
+        self._first.restart()
+        self._second.restart()
+
+
+class ModelCorrector:
+    """Take the causes of one extended model out of rows.
+
+    Parameters
+    ----------
+    given : ExtendedModel
+    step_s : float
+        Step of the rows.
+
+    Notes
+    -----
+    Beyond the record that the model comes from a drift goes on in its straight line, a step
+    stays, a daily swing repeats, and ``intervals`` keep the state of their last switch, since
+    later ones are not known. Before the record a drift is continued backwards.
+
+    After a gap the responses begin in equilibrium, as the simulation does; the plug keeps
+    its place. The power of a late clock is not known for as long as the clock is late.
+
+    Raises
+    ------
+    DataError
+        A cause cannot be taken out of rows as they come.
+    """
+
+    def __init__(self, given: ExtendedModel, step_s: float) -> None:
+        check_streams(given.model.active)
+        self._given, self._step_s = given, step_s
+        self._model = given.model
+        self.held = ExtendedModel(
+            given.model, given.pressure_exponent, given.start_ns, given.reference
+        ).held
+        self._inputs = self._model.at(Stage.INPUT)
+        self._flows, self._gains = self._model.at(Stage.FLOW), self._model.at(Stage.GAIN)
+        self._shown = sorted(
+            (a for a in self._model.at(Stage.OUTPUT) if a.name != CLOCK),
+            key=lambda a: a.cause.order,
+        )
+        differs = (*self._flows, *self._gains, *self._shown, *self._model.at(Stage.DYNAMICS))
+        self._differs = bool(differs)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all rows."""
+        reference, step = self._given.reference, self._step_s
+        self._valves = valves(self._model.at(Stage.OPENING), reference)
+        self._plain = Response(self._model.base, step)
+        self._extended = Response(self._model.regional, step)
+        self._refills = {a.name: Refill(a, step) for a in self._shown if a.name == REFILL}
+        late = [a.values[0] for a in self._model.active if a.name == CLOCK]
+        self._clock = LateClock(sum(late), step) if late else None
+        self._temperature = np.array([reference.temperature_degc])
+        self._follows = np.array([np.iinfo(np.int64).min // 2, kernels.NO_DATA], dtype=np.int64)
+
+    def correct(self, table: SampleTable) -> SampleTable:
+        """Return the rows without the causes."""
+        if not self._model.active or not len(table):
+            return table
+        opening = table.column(Signal.VALVE_OPENING).copy()
+        for valve in self._valves:
+            opening = valve.feed(opening, table.time_ns)
+        scene = self._scene(table, opening)
+        factor = np.ones(len(scene.u))
+        u = scene.u
+        for a in self._inputs:
+            part = a.cause.act(u, a.values, scene, self._model.base)
+            u, factor = u * part, factor * part
+        n = len(table)
+        jumps, begin = self._beginnings(table.time_ns, u[:n])
+        power = table.column(Signal.GENERATED_POWER).copy()
+        if self._clock is not None:
+            power = self._clock.feed(power, jumps)
+        if self._differs:
+            power -= self._difference(scene, u, begin)[:n]
+        return _with(table, opening * factor[:n], power)
+
+    def _scene(self, table: SampleTable, opening: FloatArray) -> Scene:
+        """Return the rows as causes without a memory want them, a whole number of handfuls."""
+        pressure = np.ascontiguousarray(table.column(Signal.MAIN_STEAM_PRESSURE))
+        u = integrated_input(opening, pressure, self._given.pressure_exponent)
+        temperature = np.empty(len(table))
+        kernels.filled(
+            np.ascontiguousarray(table.column(Signal.MAIN_STEAM_TEMPERATURE)),
+            self._temperature, temperature,
+        )  # fmt: skip
+        time_s = (table.time_ns - self._given.start_ns) / NS_PER_S
+        columns = (opening, pressure, u, temperature, time_s)
+        v, p, u, temperature, time_s = (_padded(c) for c in columns)
+        none = np.zeros(len(u), dtype=bool)
+        return Scene(
+            start_ns=self._given.start_ns, fine_s=self._step_s, step_s=self._step_s,
+            settle_s=0.0, exponent=self._given.pressure_exponent, v=v, density=np.ones(len(u)),
+            command=v, u=u, pressure=p, temperature=temperature, time_s=time_s,
+            usable=np.isfinite(u).astype(np.uint8), power=np.zeros(len(u)), scored=none,
+            whole=none, sub=np.zeros(len(u), dtype=np.int64), reference=self._given.reference,
+        )  # fmt: skip
+
+    def _beginnings(self, time_ns: IntArray, u: FloatArray) -> tuple[ByteArray, ByteArray]:
+        jumps = np.empty(len(u), dtype=np.uint8)
+        begin = np.empty(len(u), dtype=np.uint8)
+        gap_ns = round(1.5 * self._step_s * NS_PER_S)
+        kernels.beginnings(time_ns, u, gap_ns, self._follows, jumps, begin)
+        return jumps, begin
+
+    def _difference(self, scene: Scene, u: FloatArray, begin: ByteArray) -> FloatArray:
+        """Return by how much the extended model shows more than the plain one, MW."""
+        n = len(begin)
+        plain = _flow(self._model, u)
+        x = plain.copy()
+        for a in self._flows:
+            x += a.cause.act(u, a.values, scene)
+        for a in self._gains:
+            x *= a.cause.act(a.values, scene, a.extra)
+        y = np.full(len(u), np.nan)
+        y[:n] = self._extended.feed(x[:n], begin)
+        for a in self._shown:
+            y = self._show(a, y, scene, begin)
+        y[:n] -= self._plain.feed(plain[:n], begin)
+        return y
+
+    def _show(self, a: Active, y: FloatArray, scene: Scene, begin: ByteArray) -> FloatArray:
+        if a.name not in self._refills:
+            return np.asarray(a.cause.act(y, a.values, scene))
+        out = y.copy()
+        out[: len(begin)] = self._refills[a.name].feed(y[: len(begin)], begin)
+        return out
+
+
+def _flow(model: Extended, u: FloatArray) -> FloatArray:
+    """Return F(u) in MW."""
+    x = np.empty(len(u))
+    m = model.base
+    flows.flow(u, m.knots, m.left, m.right, x)
+    return x
+
+
+def _padded(x: FloatArray) -> FloatArray:
+    """Return a copy whose last value is repeated up to a whole number of handfuls."""
+    return np.concatenate([x, np.full(-len(x) % _HANDFUL, x[-1])])
+
+
+def _with(table: SampleTable, opening: FloatArray, power: FloatArray) -> SampleTable:
+    """Return the rows with another opening and power."""
+    values, quality = table.values.copy(), table.quality.copy()
+    for signal, column in ((Signal.VALVE_OPENING, opening), (Signal.GENERATED_POWER, power)):
+        values[:, signal] = column
+        quality[~np.isfinite(column), signal] = Quality.BAD
+        values[~np.isfinite(column), signal] = np.nan
+    return SampleTable(table.time_ns, values, quality)
