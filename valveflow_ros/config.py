@@ -186,6 +186,9 @@ _MODEL = (
               'Spread of the main steam temperature over the special samples (central 95 %) '
               "beyond which the paper's condition of an unchanged temperature is flagged.",
               0.1, 500.0),
+    Parameter('model_file', '', '',
+              'An extended_model.json of valveflow diagnose: its causes are taken out of opening '
+              'and power before anything else; empty takes out nothing.'),
 )  # fmt: skip
 
 _FIT = (
@@ -241,6 +244,22 @@ _SHIFT = (
               live=True),
 )  # fmt: skip
 
+_DIAGNOSIS = (
+    Parameter('mismatch_limit', 3.5, 'sd',
+              'The model is said to fit no longer where a statistic of its residual is further '
+              'from zero than this many of its standard errors.', 2.0, 100.0, live=True),
+    Parameter('diagnosis_on_mismatch', True, '',
+              'Diagnose when the model no longer fits.', live=True),
+    Parameter('diagnosis_hour', 2, 'h UTC',
+              'Diagnose every night at this hour of the time of the samples; -1 does not.',
+              -1, 23, live=True),
+    Parameter('diagnosis_pause', 3.0, 'h',
+              'Least time between two diagnoses that were not asked for by hand.',
+              0.0, 8760.0, live=True),
+    Parameter('diagnosis_timeout', 3600.0, 's', 'A diagnosis that takes longer is ended.',
+              1.0, 86400.0),
+)  # fmt: skip
+
 _RECORD = (
     Parameter('record', True, '', 'Record inputs and outputs to MCAP.'),
     Parameter('record_directory', '', '',
@@ -268,6 +287,7 @@ TABLE: tuple[Parameter, ...] = (
     *_FIT,
     *_ALARM,
     *_SHIFT,
+    *_DIAGNOSIS,
     *_RECORD,
 )
 PARAMETERS: dict[str, Parameter] = {row.name: row for row in TABLE}

@@ -162,7 +162,11 @@ def test_shifting_time_shifts_the_stamps_and_nothing_else(seed, harms, seconds):
     )
     for name in ('static_mw', 'residual_mw', 'average_mw', 'state'):
         assert frozen(column(here, name)) == frozen(column(there, name))
-    assert [type(e) for e in here] == [type(e) for e in there]
+    # Where rows are cut into blocks of predictions depends on the hour; what happens does not.
+    kinds = [
+        [type(e) for e in events if not isinstance(e, PredictionBlock)] for events in (here, there)
+    ]
+    assert kinds[0] == kinds[1]
     for a, b in zip(of_type(here, AlarmChange), of_type(there, AlarmChange), strict=True):
         assert (a.time_ns + shift, a.state) == (b.time_ns, b.state)
 

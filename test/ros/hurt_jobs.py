@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import time
@@ -87,3 +88,32 @@ ALL = (good, raises, refuses, greedy, nothing, nan, backwards, of_other_data, re
 def told(task: Any) -> Any:
     """Do the one of `ALL` whose number is the task's name."""
     return ALL[task.request_ns](task)
+
+
+def diagnosed(task: Any) -> Any:
+    """Return a small diagnosis at once."""
+    from valveflow_ros.core.diagnosis_task import DiagnosisContent
+
+    content = {
+        'verdict': 'nothing', 'sentence': 'The model explains the unit.', 'causes': [],
+        'not_told_apart': [], 'unexplained_by': [], 'rejected': [], 'disturbance': None,
+        'rmse_simulation': 2.0, 'rmse_extended': 2.0, 'rmse_noise_floor': None,
+    }  # fmt: skip
+    return DiagnosisContent(task.window_end_ns, json.dumps(content))
+
+
+def diagnosed_other_data(task: Any) -> Any:
+    """Answer for a window that was not asked about."""
+    return replace(diagnosed(task), window_end_ns=1)
+
+
+def no_verdict(task: Any) -> Any:
+    """Give a verdict that does not exist."""
+    content = diagnosed(task)
+    return replace(content, text=content.text.replace('nothing', 'perhaps'))
+
+
+def half(task: Any) -> Any:
+    """Give half of a result."""
+    content = diagnosed(task)
+    return replace(content, text='{"verdict": "named", "sentence": "Something."}')

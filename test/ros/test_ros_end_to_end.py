@@ -24,7 +24,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
-from valveflow_msgs.msg import Alarm, FlowCharacteristic, JournalEntry, Prediction
+from valveflow_msgs.msg import Alarm, Diagnosis, FlowCharacteristic, JournalEntry, Prediction
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.events import JournalKind
@@ -183,7 +183,11 @@ def live_parameter_and_acknowledgement(listener: Listener, monitor: Any) -> None
     assert answer.success, answer.message
     answer = listener.trigger('diagnose')
     assert not answer.success
-    assert answer.message.endswith('.')
+    assert answer.message.startswith('A diagnosis needs a day of data; the window holds ')
+    diagnosis = listener.latched(Diagnosis, 'diagnosis')
+    assert diagnosis.verdict == Diagnosis.UNKNOWN
+    assert diagnosis.sentence.startswith('Not diagnosed yet')
+    assert listener.value('diagnosis', 'Running') == 'no'
 
 
 def nothing_lost(listener: Listener, rows: int) -> None:

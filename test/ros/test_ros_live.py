@@ -16,7 +16,7 @@ from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import Readings, table_to_readings
 from valveflow_ros.ros.inputs import Row
 from valveflow_ros.ros.live import LiveEngine
-from valveflow_ros.ros.outcome import FitOutcome
+from valveflow_ros.ros.outcome import Outcome
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
 from valveflow_ros.ros.simulator_steps import effects_of
 
@@ -29,7 +29,7 @@ class SlowWorker:
 
     def __init__(self, looks: int) -> None:
         self._looks = looks
-        self._waiting: list[tuple[int, FitOutcome]] = []
+        self._waiting: list[tuple[int, Outcome]] = []
         self._look = 0
         self.refuse_next = False
 
@@ -42,10 +42,10 @@ class SlowWorker:
                 result = fit(task)  # type: ignore[arg-type]
             except DataError as error:
                 result = str(error)
-        outcome = FitOutcome(task.request_ns, result, 0.5)  # type: ignore[attr-defined,arg-type]
+        outcome = Outcome(task.request_ns, result, 0.5)  # type: ignore[attr-defined,arg-type]
         self._waiting.append((self._look + self._looks, outcome))
 
-    def poll(self) -> list[FitOutcome]:
+    def poll(self) -> list[Outcome]:
         self._look += 1
         due = [outcome for look, outcome in self._waiting if look <= self._look]
         self._waiting = [entry for entry in self._waiting if entry[0] > self._look]

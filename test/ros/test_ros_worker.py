@@ -17,7 +17,7 @@ from valveflow_ros.config import Settings
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.fit import fit
 from valveflow_ros.ros.frames import FrameReader, send
-from valveflow_ros.ros.outcome import FitOutcome
+from valveflow_ros.ros.outcome import Outcome
 from valveflow_ros.ros.warmup import made_up_task
 from valveflow_ros.ros.worker import FIT_JOB, FitWorker
 
@@ -35,7 +35,7 @@ def worker(job: str, timeout_s: float = 120.0) -> Iterator[FitWorker]:
         made.close()
 
 
-def outcome_of(made: FitWorker) -> FitOutcome:
+def outcome_of(made: FitWorker) -> Outcome:
     made.submit(TASK)
     (outcome,) = wait_until(made.poll, 'the outcome')
     assert outcome.request_ns == TASK.request_ns

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from valveflow_ros.core.alarms import AlarmChange
 from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.diagnosis_task import DiagnosisTask
 from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.prediction import PredictionBlock
 from valveflow_ros.core.shift import Shift
@@ -24,6 +25,9 @@ class JournalKind(enum.IntEnum):
     RESET = 6
     DIAGNOSE = 7
     SETTINGS = 8
+    DIAGNOSED = 9
+    DIAGNOSIS_FAILED = 10
+    MISMATCH = 11
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,12 +74,40 @@ class ReferenceSet:
     characteristic: Characteristic
 
 
+@dataclass(frozen=True, slots=True)
+class DiagnosisRequested:
+    """A diagnosis is wanted; somebody has to compute ``task`` and hand the outcome back."""
+
+    task: DiagnosisTask
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosed:
+    """A diagnosis has ended.
+
+    Attributes
+    ----------
+    task : DiagnosisTask
+        What was diagnosed.
+    content : str
+        What `diagnosis.json` would hold; empty if there is no result.
+    reason : str
+        Why there is none.
+    """
+
+    task: DiagnosisTask
+    content: str
+    reason: str
+
+
 Event = (
     PredictionBlock
     | SegmentClosed
     | FitRequested
     | CurveAdopted
     | ReferenceSet
+    | DiagnosisRequested
+    | Diagnosed
     | AlarmChange
     | JournalEntry
 )

@@ -11,7 +11,9 @@ from valveflow_ros.config import Settings
 from valveflow_ros.core.alarms import Judged, ResidualAlarm
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.characteristic_json import to_json
+from valveflow_ros.core.corrector import Correction, Corrector
 from valveflow_ros.core.curve_status import CurveStatus
+from valveflow_ros.core.diagnosing import Diagnosing
 from valveflow_ros.core.events import (
     CurveAdopted,
     Event,
@@ -40,20 +42,22 @@ class Monitor:
     Parameters
     ----------
     settings : Settings
+    corrector : Corrector, optional
+        Takes known causes out of the rows before anything looks at them.
 
     Notes
     -----
     The state changes by rows and by the calls `adopt`, `refuse`, `acknowledge`, `request_fit`,
-    `set_reference`, `restart` and `reconfigure`, nothing else, and each such call leaves a
-    `JournalEntry` with the number of rows before it. Rows and journal together
-    give the same events again, bit for bit.
+    `set_reference`, `request_diagnosis`, `restart` and `reconfigure`, and those of `diagnosing`,
+    nothing else, and each such call leaves a `JournalEntry` with the number of rows before it.
+    Rows and journal together give the same events again, bit for bit.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, corrector: Corrector | None = None) -> None:
         self.settings = settings
-        self._step_s = settings.real('sample_period')
+        self._correction = Correction(corrector)
         self._segmenter = Segmenter(settings)
-        self._window = self._window_of()
+        self._window = RollingWindow.of(settings)
         self.alarm = ResidualAlarm(settings)
         self._predictor: Predictor | None = None
         self._rows = 0
@@ -61,6 +65,7 @@ class Monitor:
         self.judged = Judged(0, math.nan, math.nan)
         self._refits = Refits()
         self.reference = ReferenceKeeper(settings)
+        self.diagnosing = Diagnosing(settings, self.alarm, self._journal)
         self.status = CurveStatus.UNKNOWN
         self.cause = 'No curve yet: not enough special segments.'
 
@@ -109,7 +114,7 @@ class Monitor:
         changed = self.settings.live_changes(settings)
         if not changed:
             return []
-        self.settings = settings
+        self.settings = self.diagnosing.settings = settings
         self.alarm.configure(settings)
         if self._predictor is not None:
             self._predictor.limit_mw = settings.real('alarm_limit')
@@ -117,18 +122,21 @@ class Monitor:
         return [self._journal(JournalKind.SETTINGS, 0, '', text)]
 
     def feed(self, table: SampleTable) -> Fed:
-        """Take rows until they end or a fit is wanted."""
+        """Take rows until they end, or a fit or a diagnosis is wanted."""
         events: list[Event] = []
-        rows = Rows.of(table, self.settings.real('pressure_exponent'))
+        rows = Rows.of(table, self.settings.real('pressure_exponent'), self._correction)
         done = 0
         while done < len(table):
             until, by_time = self._refits.rows_until_due(table.time_ns[done:], self.settings)
-            taken, closed = self._take(rows.part(done, done + until), events)
+            most = min(until, self.diagnosing.rows_until_look(table.time_ns[done:]))
+            taken, closed = self._take(rows.part(done, done + most), events)
             done += taken
-            # Decisions fall only where a segment closes or the period ends, never where
-            # a block happens to end: cutting must not matter.
-            if self._due(closed, by_time and taken == until):
-                events += self._ask()
+            # Decisions never fall where a block happens to end: cutting must not matter.
+            looked = self.diagnosing.look(self._last_ns, self._window, self.characteristic)
+            events += looked
+            asked = self._ask() if self._due(closed, by_time and taken == until) else []
+            events += asked
+            if asked or looked:
                 break
         return Fed(done, events)
 
@@ -139,7 +147,7 @@ class Monitor:
         """
         if not self._refits.settle(request_ns):
             return []
-        self._predictor = self._predictor_of(characteristic)
+        self._predictor = Predictor.of(characteristic, self.settings)
         self._predictor.warm_up(*self._window.tail(self._predictor.warm_up_rows))
         self.status = CurveStatus.FRESH
         self.cause = ''
@@ -168,6 +176,10 @@ class Monitor:
         if not self._window.segments:
             raise DataError('There is no special segment to fit yet.')
         return self._ask(BY_HAND)
+
+    def request_diagnosis(self) -> list[Event]:
+        """Ask for a diagnosis now; raises `DataError` where that makes no sense."""
+        return self.diagnosing.request(self._last_ns, self._window, self.characteristic)
 
     def acknowledge(self) -> list[Event]:
         """Acknowledge the alarms.
@@ -207,24 +219,17 @@ class Monitor:
         """Forget the rows after the clock went back; curve and alarm stay."""
         pending = self._refits.pending_ns
         events: list[Event] = [] if pending is None else self.refuse(pending, reason)
+        self._correction.restart()
         self._segmenter = Segmenter(self.settings, self._refits.segments_seen)
-        self._window = self._window_of()
+        self._window = RollingWindow.of(self.settings)
+        events += self.diagnosing.restart(reason)
         self._refits.restart()
         self.reference.restart()
         if self._predictor is not None:
-            self._predictor = self._predictor_of(self._predictor.characteristic)
+            self._predictor = Predictor.of(self._predictor.characteristic, self.settings)
             self.status = CurveStatus.STALE
             self.cause = reason
         return [*events, self._journal(JournalKind.RESET, 0, '', reason)]
-
-    def _window_of(self) -> RollingWindow:
-        return RollingWindow(86400.0 * self.settings.real('window_days'), self._step_s)
-
-    def _predictor_of(self, characteristic: Characteristic) -> Predictor:
-        return Predictor(
-            characteristic, self._step_s, self.settings.settle_s,
-            self.settings.real('alarm_average'), self.settings.real('alarm_limit'),
-        )  # fmt: skip
 
     def _take(self, rows: Rows, events: list[Event]) -> tuple[int, bool]:
         """Run rows up to the next segment's close through everything.
@@ -237,9 +242,11 @@ class Monitor:
         n = segmented.rows
         rows = rows.part(0, n)
         self._window.append(
-            rows.time_ns, rows.u, rows.power_mw, rows.temperature_degc, rows.opening_percent
-        )
+            rows.time_ns, rows.u, rows.power_mw, rows.temperature_degc, rows.opening_percent,
+            rows.command_percent,
+        )  # fmt: skip
         block = self._predict(rows, segmented)
+        self.diagnosing.watch(block, rows.temperature_degc, self.characteristic)
         self._rows += n
         self._last_ns = int(rows.time_ns[-1])
         self.judged = Judged(self._last_ns, float(block.evidence[-1]), float(block.shift_mw[-1]))
@@ -249,8 +256,8 @@ class Monitor:
     def _predict(self, rows: Rows, segmented: Segmented) -> PredictionBlock:
         columns = rows.time_ns, rows.u, rows.power_mw, segmented.kinds
         if self._predictor is None:
-            return no_prediction(*columns)
-        return self._predictor.predict(*columns)
+            return rows.shown(no_prediction(*columns))
+        return rows.shown(self._predictor.predict(*columns))
 
     def _say(self, block: PredictionBlock, segmented: Segmented, events: list[Event]) -> None:
         """Append what the rows brought; a segment can only have closed at the last of them."""
@@ -280,8 +287,9 @@ class Monitor:
         request_ns = self._refits.ask(self._last_ns)
         noise = self._segmenter.noise()
         task = FitTask(
-            request_ns, self._window.contents(), self.settings, noise.input, noise.power_mw
-        )
+            request_ns, self._window.contents(), self.settings, noise.input, noise.power_mw,
+            self._correction.held,
+        )  # fmt: skip
         entry = self._journal(JournalKind.FIT_REQUESTED, request_ns, '', text)
         return [entry, FitRequested(task)]
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from valveflow_ros.config import Settings
 from valveflow_ros.core.segmenter import FoundSegment
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SegmentKind
 
@@ -26,6 +27,8 @@ class WindowContents:
         Special segments as (first row, end row, kind), rows counted within these arrays.
     opening_percent : float64 (n,) or (0,)
         The opening that u was made from, NaN where it was not given; empty where unknown.
+    command_percent : float64 (n,) or (0,)
+        The commanded opening, NaN where there was none; empty where there never was.
     """
 
     time_ns: IntArray
@@ -34,6 +37,7 @@ class WindowContents:
     temperature_degc: FloatArray
     spans: IntArray
     opening_percent: FloatArray = field(default_factory=lambda: np.empty(0))
+    command_percent: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def special_rows(self) -> IntArray:
         """Return the rows that lie in special segments, in order of time."""
@@ -60,10 +64,15 @@ class RollingWindow:
         self._rows = max(16, int(np.ceil(window_s / period_s)) + 1)
         self._room = min(_FIRST_ROOM, self._rows * 5 // 4 + 16)
         self._time_ns = np.empty(self._room, dtype=np.int64)
-        self._data = np.empty((4, self._room))
+        self._data = np.empty((5, self._room))
         self._end = 0
         self._base = 0
         self._segments: deque[FoundSegment] = deque()
+
+    @classmethod
+    def of(cls, settings: Settings) -> RollingWindow:
+        """Return an empty window of the length in the settings."""
+        return cls(86400.0 * settings.real('window_days'), settings.real('sample_period'))
 
     def __len__(self) -> int:
         """Return the number of rows held."""
@@ -84,6 +93,14 @@ class RollingWindow:
         """Return the number of samples in those segments."""
         return sum(s.segment.samples for s in self._segments)
 
+    @property
+    def span_s(self) -> float:
+        """Return the time from the oldest row inside the window to the newest."""
+        if self._end == 0:
+            return 0.0
+        held_ns = int(self._time_ns[self._end - 1]) - int(self._time_ns[0])
+        return min(held_ns, self._window_ns) / NS_PER_S
+
     def append(
         self,
         time_ns: IntArray,
@@ -91,6 +108,7 @@ class RollingWindow:
         power_mw: FloatArray,
         temperature_degc: FloatArray,
         opening_percent: FloatArray | None = None,
+        command_percent: FloatArray | None = None,
     ) -> None:
         """Append rows; rows that have left the window are forgotten."""
         done = 0
@@ -104,6 +122,7 @@ class RollingWindow:
             self._data[1, place] = power_mw[part]
             self._data[2, place] = temperature_degc[part]
             self._data[3, place] = np.nan if opening_percent is None else opening_percent[part]
+            self._data[4, place] = np.nan if command_percent is None else command_percent[part]
             self._end += take
             done += take
         self._forget()
@@ -131,6 +150,7 @@ class RollingWindow:
             for s in self._segments
             if s.first_row >= offset
         ]
+        command = self._data[4, first : self._end]
         return WindowContents(
             self._time_ns[first : self._end].copy(),
             self._data[0, first : self._end].copy(),
@@ -138,6 +158,8 @@ class RollingWindow:
             self._data[2, first : self._end].copy(),
             np.array(spans, dtype=np.int64).reshape(-1, 3),
             self._data[3, first : self._end].copy(),
+            # Most units do not log it, and a snapshot goes to another process.
+            command.copy() if np.isfinite(command).any() else np.empty(0),
         )
 
     def _make_room(self) -> None:
@@ -146,7 +168,7 @@ class RollingWindow:
         if self._room < limit:
             self._room = min(limit, 2 * self._room)
             time_ns = np.empty(self._room, dtype=np.int64)
-            data = np.empty((4, self._room))
+            data = np.empty((5, self._room))
             time_ns[: self._end] = self._time_ns[: self._end]
             data[:, : self._end] = self._data[:, : self._end]
             self._time_ns, self._data = time_ns, data

@@ -1,10 +1,14 @@
-"""What is worth a line in the log: alarms, new curves, refusals."""
+"""What is worth a line in the log: alarms, new curves, diagnoses, refusals."""
 
 from __future__ import annotations
 
+import json
+
 from valveflow_ros.core.alarms import AlarmChange, AlarmState
+from valveflow_ros.core.diagnosing import FITS_AGAIN
 from valveflow_ros.core.events import (
     CurveAdopted,
+    Diagnosed,
     Event,
     JournalEntry,
     JournalKind,
@@ -30,8 +34,28 @@ def line_of(event: Event) -> tuple[Level, str] | None:
         )
     if isinstance(event, ReferenceSet):
         return Level.OK, f'the reference is now curve {event.characteristic.model_id}'
-    if isinstance(event, JournalEntry) and event.kind == JournalKind.FIT_REFUSED:
+    if isinstance(event, Diagnosed):
+        return _diagnosis_line(event)
+    if isinstance(event, JournalEntry):
+        return _journal_line(event)
+    return None
+
+
+def _diagnosis_line(event: Diagnosed) -> tuple[Level, str]:
+    if not event.content:
+        return Level.WARN, f'no diagnosis: {event.reason}'
+    content = json.loads(event.content)
+    level = Level.OK if content['verdict'] == 'nothing' else Level.WARN
+    return level, f'diagnosis: {content["sentence"]}'
+
+
+def _journal_line(event: JournalEntry) -> tuple[Level, str] | None:
+    if event.kind == JournalKind.FIT_REFUSED:
         return Level.WARN, f'no new curve: {event.text}'
-    if isinstance(event, JournalEntry) and event.kind == JournalKind.RESET:
+    if event.kind == JournalKind.RESET:
         return Level.WARN, event.text
+    if event.kind == JournalKind.MISMATCH:
+        return Level.OK if event.text == FITS_AGAIN else Level.WARN, event.text
+    if event.kind == JournalKind.DIAGNOSE:
+        return Level.OK, f'diagnosis started: {event.text}'
     return None

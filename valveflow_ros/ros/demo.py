@@ -28,7 +28,7 @@ from valveflow_ros.ros.stops import StopFlag
 _DAY_NS = 86400 * 10**9
 _FAULT = 'curve_step'
 _FAULT_MW = -12.0
-_FAULT_FROM = 0.9  # share of the run after which the fault begins
+_FAULT_FROM = 0.5  # share of the run after which the fault begins
 _QUIET_LOOKS = 3
 _LONGEST_WAIT_S = 120.0
 
@@ -116,6 +116,8 @@ class Demo:
                 'record_directory': self.folder / 'recordings',
                 'refit_period': 14400.0,
                 'refit_segments': 0,
+                # Here a night is over before a diagnosis is.
+                'diagnosis_hour': -1,
                 # The plant does not wait for the disk; neither does a demo for a slow one.
                 'record_flush': 1.0,
             },
@@ -144,7 +146,7 @@ class Demo:
     def _follow(
         self, watch: Watch, executor: SingleThreadedExecutor, monitor: Process, plant: Process
     ) -> None:
-        """Listen until the plant has ended and the monitor has nothing left to do."""
+        """Listen until the plant has ended, all of it was diagnosed, and nothing is left to do."""
         quiet, seen, samples = 0, 0, -1
         ended_s: float | None = None
         while not self._stop and quiet < _QUIET_LOOKS:
@@ -161,9 +163,12 @@ class Demo:
                 raise ValveflowError(f'The monitor does not come to rest; see {monitor.log}.')
             if watch.health_seen > seen:
                 seen = watch.health_seen
-                still = watch.samples == samples and not watch.refitting
+                still = watch.samples == samples and not watch.busy
                 quiet = quiet + 1 if still else 0
                 samples = watch.samples
+            if quiet == _QUIET_LOOKS and not watch.asked:
+                watch.ask_for_diagnosis()
+                quiet = 0
 
     def _close(self, monitor: Process, watch: Watch, seconds: float) -> None:
         status = monitor.end()
@@ -178,7 +183,9 @@ class Demo:
         recording = max((self.folder / 'recordings').iterdir(), key=lambda p: p.stat().st_mtime)
         result = self.folder / 'result'
         ok = self._run('replay --verify', 'ros.replay_main', str(recording), '--verify')
-        ok &= self._run('valveflow identify', 'cli', 'identify', str(recording), '-o', str(result))
+        for verb in ('identify', 'diagnose'):
+            files = str(recording), '-o', str(result / verb)
+            ok &= self._run(f'valveflow {verb}', 'cli', verb, *files)
         curve = self._last_clean(watch.curves)
         if curve is None:
             tell('No curve was found before the fault.')
@@ -194,8 +201,24 @@ class Demo:
             )
         else:
             tell('The fault raised no alarm.')
+        named = self._named(watch)
         self._point_out(recording, result)
-        return 0 if ok and told and watch.acknowledged else 1
+        return 0 if ok and told and watch.acknowledged and named else 1
+
+    def _named(self, watch: Watch) -> bool:
+        """Tell what the last diagnosis named, and whether that is what was hidden."""
+        last = watch.diagnoses[-1] if watch.diagnoses else None
+        found = [] if last is None else [cause.name for cause in last.causes]
+        tell(f'Hidden was {_FAULT}; the diagnosis named {", ".join(found) or "nothing"}.')
+        if last is not None:
+            tell(f'  {last.sentence}')
+            if last.rmse_extended < last.rmse_simulation:
+                tell(
+                    f'  On time it had not seen, the error falls from {last.rmse_simulation:.2f} '
+                    f'to {last.rmse_extended:.2f} MW with the cause in the model (noise: '
+                    f'{last.rmse_noise_floor:.2f} MW).'
+                )
+        return found == [_FAULT]
 
     def _run(self, what: str, module: str, *arguments: str) -> bool:
         """Run a command of ours to its end; show its last line."""
@@ -236,11 +259,12 @@ class Demo:
 
     def _point_out(self, recording: Path, result: Path) -> None:
         files = sorted(recording.glob('*.mcap'))
-        table = result / 'characteristic.json'
+        table = result / 'identify' / 'characteristic.json'
         pieces = len(json.loads(table.read_text())['pieces']) if table.exists() else 0
         tell(f'Recording  {", ".join(map(str, files))}')
-        report = result / 'report.html'
+        report = result / 'identify' / 'report.html'
         tell(f'Report     {report} ({pieces} pieces over the whole run, fault included)')
+        tell(f'Diagnosis  {result / "diagnose" / "report.html"}')
         tell('Replay it to another monitor (after: source env.sh):')
         tell(f'  python -m valveflow_ros.ros.replay_main {recording} --rate 600')
         tell('  python -m valveflow_ros.ros.monitor_main --ros-args -p use_sim_time:=true')

@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.task import Future
 from std_srvs.srv import Trigger
-from valveflow_msgs.msg import Alarm, FlowCharacteristic
+from valveflow_msgs.msg import Alarm, Diagnosis, FlowCharacteristic
 
 from valveflow_ros.ros.conversions import from_time
 
@@ -22,6 +22,11 @@ _STATES = {
     Alarm.UNACKNOWLEDGED: 'ALARM',
     Alarm.ACKNOWLEDGED: 'acknowledged',
     Alarm.RETURNED_UNACKNOWLEDGED: 'the alarm has gone by itself',
+}
+
+_VERDICTS = {
+    Diagnosis.NOTHING: 'nothing is wrong',
+    Diagnosis.UNEXPLAINED: 'unexplained',
 }
 
 
@@ -47,14 +52,18 @@ class Watch(Node):
         self.alarms: list[Alarm] = []
         self.acknowledged = 0
         self.samples = 0
-        self.refitting = False
+        self.busy = False
+        self.diagnoses: list[Diagnosis] = []
+        self.asked = False
         self.health_seen = 0
         self.create_subscription(
             FlowCharacteristic, f'{_MONITOR}/characteristic', self._on_curve, _LATCHED
         )
         self.create_subscription(Alarm, f'{_MONITOR}/alarms', self._on_alarm, _LATCHED)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_health, 10)
+        self.create_subscription(Diagnosis, f'{_MONITOR}/diagnosis', self._on_diagnosis, _LATCHED)
         self._client = self.create_client(Trigger, f'{_MONITOR}/acknowledge_alarms')
+        self._diagnose = self.create_client(Trigger, f'{_MONITOR}/diagnose')
 
     def plant_time(self, time_ns: int) -> str:
         """Return a time as the plant's day and hour."""
@@ -69,6 +78,23 @@ class Watch(Node):
             self._acknowledge_at_s = None
             self._answer = self._client.call_async(Trigger.Request())
             self._answer.add_done_callback(self._on_answer)
+
+    def ask_for_diagnosis(self) -> None:
+        """Have the monitor diagnose all that it has seen; the health says when it has done so."""
+        self.asked = True
+        answer = self._diagnose.call_async(Trigger.Request())
+        answer.add_done_callback(lambda future: self._tell_answer('diagnose', future))
+
+    def _on_diagnosis(self, message: Diagnosis) -> None:
+        if message.verdict == Diagnosis.UNKNOWN and not message.model_id:
+            return
+        self.diagnoses.append(message)
+        until = self.plant_time(from_time(message.header.stamp))
+        names = ', '.join(cause.name for cause in message.causes)
+        word = f'named {names}' if names else _VERDICTS.get(message.verdict, 'unknown')
+        self._tell(
+            f'              diagnosis of the data until {until}: {word}. {message.sentence}'
+        )
 
     def _on_curve(self, message: FlowCharacteristic) -> None:
         when = self.plant_time(from_time(message.window_end))
@@ -96,16 +122,24 @@ class Watch(Node):
             self._acknowledge_at_s = time.monotonic() + _BEFORE_ACKNOWLEDGING_S
 
     def _on_health(self, message: DiagnosticArray) -> None:
+        refitting = diagnosing = False
         for status in message.status:
             if status.name.endswith(' fit'):
                 values = {item.key: item.value for item in status.values}
                 self.samples = int(values.get('Samples taken', '0'))
-                self.refitting = values.get('Refit under way for (s)', 'unknown') != 'unknown'
-                self.health_seen += 1
+                refitting = values.get('Refit under way for (s)', 'unknown') != 'unknown'
+            elif status.name.endswith(' diagnosis'):
+                values = {item.key: item.value for item in status.values}
+                diagnosing = values.get('Running', 'no') == 'yes'
+        self.busy = refitting or diagnosing
+        self.health_seen += 1
 
     def _on_answer(self, future: Future) -> None:
-        response = future.result()
-        if response is None:
-            return
-        self.acknowledged += int(response.success)
-        self._tell(f'              service acknowledge_alarms answers: {response.message}')
+        response = self._tell_answer('acknowledge_alarms', future)
+        self.acknowledged += int(response is not None and response.success)
+
+    def _tell_answer(self, service: str, future: Future) -> Trigger.Response | None:
+        response: Trigger.Response | None = future.result()
+        if response is not None:
+            self._tell(f'              service {service} answers: {response.message}')
+        return response

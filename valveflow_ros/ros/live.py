@@ -1,28 +1,29 @@
-"""The engine as the node runs it: rows as they come, fits by a worker. Nothing here knows ROS."""
+"""The engine as the node runs it: rows as they come, long work elsewhere. Nothing knows ROS."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.align import Aligner
 from valveflow_ros.core.characteristic import Characteristic
-from valveflow_ros.core.events import Event, FitRequested
-from valveflow_ros.core.fit_task import FitTask
+from valveflow_ros.core.corrector import Corrector
+from valveflow_ros.core.diagnosis_task import DiagnosisContent
+from valveflow_ros.core.events import DiagnosisRequested, Event, FitRequested
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.offline import CLOCK_BACK
 from valveflow_ros.records import Readings, SampleTable
 from valveflow_ros.ros.inputs import Row
-from valveflow_ros.ros.outcome import FitOutcome
+from valveflow_ros.ros.outcome import Outcome
 
 
 class Worker(Protocol):
-    """Whoever computes fits."""
+    """Whoever computes fits or diagnoses."""
 
-    def submit(self, task: FitTask) -> None:
+    def submit(self, task: Any) -> None:
         """Take a task; its outcome comes with a later `poll`."""
 
-    def poll(self) -> list[FitOutcome]:
+    def poll(self) -> list[Outcome]:
         """Return the outcomes there are, without waiting."""
 
 
@@ -33,13 +34,26 @@ class LiveEngine:
     ----------
     settings : Settings
     worker : Worker
+        For fits.
+    diagnosis_worker : Worker, optional
+        For diagnoses; without one none is ever finished.
+    corrector : Corrector, optional
+        Takes known causes out of the rows.
     """
 
-    def __init__(self, settings: Settings, worker: Worker) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        worker: Worker,
+        diagnosis_worker: Worker | None = None,
+        corrector: Corrector | None = None,
+    ) -> None:
         self.aligner = Aligner(settings)
-        self.monitor = Monitor(settings)
+        self.monitor = Monitor(settings, corrector)
         self.last_fit_s: float | None = None
+        self.last_diagnosis_s: float | None = None
         self._worker = worker
+        self._diagnosis_worker = diagnosis_worker
 
     def feed(self, rows: list[Row]) -> list[Event]:
         """Take readings in their order of arrival."""
@@ -62,8 +76,23 @@ class LiveEngine:
             if isinstance(outcome.result, Characteristic):
                 events += self.monitor.adopt(outcome.request_ns, outcome.result)
             else:
-                events += self.monitor.refuse(outcome.request_ns, outcome.result)
+                events += self.monitor.refuse(outcome.request_ns, str(outcome.result))
+        return events + self._poll_diagnosis()
+
+    def _poll_diagnosis(self) -> list[Event]:
+        events: list[Event] = []
+        diagnosing = self.monitor.diagnosing
+        for outcome in self._diagnosis_worker.poll() if self._diagnosis_worker else ():
+            self.last_diagnosis_s = outcome.seconds
+            if isinstance(outcome.result, DiagnosisContent):
+                events += diagnosing.adopt(outcome.request_ns, outcome.result.text)
+            else:
+                events += diagnosing.refuse(outcome.request_ns, str(outcome.result))
         return events
+
+    def request_diagnosis(self) -> list[Event]:
+        """Ask for a diagnosis now; raises `DataError` where that makes no sense."""
+        return self._pass_on(self.monitor.request_diagnosis())
 
     def request_fit(self) -> list[Event]:
         """Ask for a fit now; raises `DataError` where that makes no sense."""
@@ -94,4 +123,6 @@ class LiveEngine:
         for event in events:
             if isinstance(event, FitRequested):
                 self._worker.submit(event.task)
+            elif isinstance(event, DiagnosisRequested) and self._diagnosis_worker:
+                self._diagnosis_worker.submit(event.task)
         return events

@@ -192,8 +192,9 @@ class MonitorNode(LifecycleNode):
         if session is not None:
             session.record(DIAGNOSTICS, data, now_ns)
         alike: dict[tuple[Level, str], list[str]] = {}
-        # The alarm has its own line in the log, when it happens.
-        for item in self._changes.pick((i for i in items if i.name != 'alarm'), now_s):
+        # These have a line of their own in the log, when it happens.
+        others = (i for i in items if i.name not in ('alarm', 'model', 'diagnosis'))
+        for item in self._changes.pick(others, now_s):
             alike.setdefault((item.level, item.sentence), []).append(item.name)
         for (level, sentence), names in alike.items():
             self._log(level, f'{", ".join(names)}: {sentence}')
@@ -242,6 +243,5 @@ class MonitorNode(LifecycleNode):
         return f'Curve {curve.model_id} is the reference that later ones are judged against.'
 
     def _diagnose(self, session: Session) -> str:
-        raise ValveflowError(
-            'This version does not diagnose while it runs yet; nothing was changed.'
-        )
+        session.tell(session.engine.request_diagnosis())
+        return 'A diagnosis was started; the result follows on ~/diagnosis.'

@@ -1,32 +1,36 @@
-"""What comes back from a fit, and whether it may be believed."""
+"""What comes back from a worker, and whether it may be believed."""
 
 from __future__ import annotations
 
 import itertools
+import json
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.diagnosis_task import DiagnosisContent, DiagnosisTask
 from valveflow_ros.core.fit_task import FitTask
+from valveflow_ros.ros.diagnosis_message import VERDICTS, diagnosis
+from valveflow_ros.ros.encoding import encode
 
 
 @dataclass(frozen=True, slots=True)
-class FitOutcome:
-    """A curve, or the sentence why there is none.
+class Outcome:
+    """A curve or what a diagnosis gave, or the sentence why there is none.
 
     Attributes
     ----------
     request_ns : int
         Which request it answers.
-    result : Characteristic or str
+    result : Characteristic, DiagnosisContent or str
     seconds : float
         How long it took, with the way there and back.
     """
 
     request_ns: int
-    result: Characteristic | str
+    result: Characteristic | DiagnosisContent | str
     seconds: float
 
 
@@ -64,4 +68,18 @@ def objection(task: FitTask, result: object) -> str:
         return 'The fit answered for other data.'
     if replace(result, model_id='').with_id().model_id != result.model_id:
         return 'The fit gave a curve that does not fit its own name.'
+    return ''
+
+
+def content_objection(task: DiagnosisTask, result: object) -> str:
+    """Return why the result of a diagnosis is not to be published, empty if nothing says so."""
+    if not isinstance(result, DiagnosisContent):
+        return 'The diagnosis gave no result.'
+    if result.window_end_ns != task.window_end_ns:
+        return 'The diagnosis answered for other data.'
+    content = json.loads(result.text)
+    if content['verdict'] not in VERDICTS or not content['sentence']:
+        return 'The diagnosis gave no verdict.'
+    # What cannot be told as a message is no result.
+    encode(diagnosis(content, task, ''))
     return ''

@@ -11,7 +11,14 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from std_msgs.msg import Float64MultiArray
-from valveflow_msgs.msg import Alarm, FlowCharacteristic, JournalEntry, Prediction, SpecialSegment
+from valveflow_msgs.msg import (
+    Alarm,
+    Diagnosis,
+    FlowCharacteristic,
+    JournalEntry,
+    Prediction,
+    SpecialSegment,
+)
 
 from valveflow_ros.core import events as engine
 from valveflow_ros.core.alarms import AlarmChange
@@ -20,7 +27,7 @@ from valveflow_ros.core.curve_status import CurveStatus
 from valveflow_ros.core.events import JournalKind
 from valveflow_ros.core.prediction import PredictionBlock
 from valveflow_ros.core.shift import Shift
-from valveflow_ros.ros import conversions
+from valveflow_ros.ros import conversions, diagnosis_message
 from valveflow_ros.ros.encoding import encode
 from valveflow_ros.ros.prediction_bytes import prediction_bytes
 
@@ -45,6 +52,7 @@ OUTPUTS: Mapping[str, OutputTopic] = {
     'prediction': OutputTopic(Prediction, 'valveflow_msgs/msg/Prediction', False),
     'segments': OutputTopic(SpecialSegment, 'valveflow_msgs/msg/SpecialSegment', False),
     'alarms': OutputTopic(Alarm, 'valveflow_msgs/msg/Alarm', True),
+    'diagnosis': OutputTopic(Diagnosis, 'valveflow_msgs/msg/Diagnosis', True),
     'journal': OutputTopic(JournalEntry, 'valveflow_msgs/msg/JournalEntry', False),
 }
 
@@ -82,6 +90,8 @@ class Outputs:
     def first(self) -> Iterator[Output]:
         """Yield what stands there before anything has happened."""
         yield from self._curve_messages()
+        message = diagnosis_message.unknown(diagnosis_message.NOT_YET, self._tag)
+        yield _output('diagnosis', message, 0)
 
     def of(self, events: Sequence[engine.Event]) -> Iterator[Output]:
         """Yield the messages of the events of one call of the engine.
@@ -125,6 +135,9 @@ class Outputs:
         elif isinstance(event, engine.ReferenceSet):
             self.reference_id, self.shift = event.characteristic.model_id, None
             yield from self._curve_messages()
+        elif isinstance(event, engine.Diagnosed):
+            message = diagnosis_message.of(event, tag)
+            yield _output('diagnosis', message, event.task.window_end_ns)
         elif isinstance(event, engine.JournalEntry):
             yield _output('journal', conversions.journal(event, tag), event.time_ns)
             if self._note(event):

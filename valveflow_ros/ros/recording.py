@@ -57,9 +57,17 @@ class Recording:
         outputs of the contract were found in this run.
     at_s : float
         Time of the start, seconds since the epoch.
+    more : mapping, optional
+        Other attachments by name.
     """
 
-    def __init__(self, settings: Settings, topics: Mapping[str, Any], at_s: float) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        topics: Mapping[str, Any],
+        at_s: float,
+        more: Mapping[str, bytes] | None = None,
+    ) -> None:
         self.problem = ''
         self.folder: Path | None = None
         self._recorder: Recorder | None = None
@@ -76,6 +84,7 @@ class Recording:
         attachments = {
             PARAMETERS: _json(dict(settings)),
             TOPICS: _json(topics),
+            **(more or {}),
         }
         try:
             self.folder = new_folder(settings, at_s)

@@ -14,7 +14,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from valveflow_ros.config import Settings
 from valveflow_ros.core.events import Event
 from valveflow_ros.logs import RecorderStatus
-from valveflow_ros.ros import graph, work_health
+from valveflow_ros.ros import diagnosis_health, graph, model_file, work_health
 from valveflow_ros.ros.chronicle import line_of
 from valveflow_ros.ros.diagnostics import Item, Level
 from valveflow_ros.ros.input_health import InputHealth
@@ -27,7 +27,7 @@ from valveflow_ros.ros.reference_file import reference_of
 from valveflow_ros.ros.stamps import LogClock
 from valveflow_ros.ros.taking import Taker
 from valveflow_ros.ros.warmup import warm_up
-from valveflow_ros.ros.worker import FitWorker
+from valveflow_ros.ros.worker import DiagnosisWorker, FitWorker
 
 DIAGNOSTICS = '/diagnostics'
 _GRAPH_S = 2.0
@@ -59,13 +59,16 @@ class Session:
         self._settings = settings
         self._log_clock = LogClock()
         self._reference = reference_of(settings)
+        self._extended = model_file.extended_of(settings)
         self.inputs = {topic.name: node.resolve_topic_name(topic.name) for topic in INPUTS}
         self.outputs = {name: node.resolve_topic_name(f'~/{name}') for name in OUTPUTS}
         self.worker = FitWorker(settings.real('refit_timeout'))
         self.worker.start()
+        self.diagnosis_worker = DiagnosisWorker(settings.real('diagnosis_timeout'))
         try:
             self.warm_up_s = warm_up(settings, self.worker, stop)
-            self.engine = LiveEngine(settings, self.worker)
+            corrector = model_file.ready(self._extended, settings)
+            self.engine = LiveEngine(settings, self.worker, self.diagnosis_worker, corrector)
             # Each event costs the executor time at every look, and nobody listens to these.
             silent = PublisherEventCallbacks(use_default_callbacks=False)
             self._publishers = {
@@ -117,6 +120,9 @@ class Session:
         if not self._begun:
             self._begun = True
             self._say(self._outputs.first())
+            if self._extended is not None:
+                names = ', '.join(h.name for h in self._extended.held) or 'nothing'
+                self._log(Level.OK, f'Taken out of the rows, by model_file: {names}.')
             if self._reference is not None:
                 self.tell(self.engine.set_reference(self._reference))
 
@@ -174,6 +180,12 @@ class Session:
         items.append(work_health.fit_item(monitor, self.worker, self.engine.last_fit_s))
         items.append(work_health.alarm_item(monitor))
         items.append(work_health.reference_item(monitor))
+        items.append(diagnosis_health.model_item(monitor))
+        items.append(
+            diagnosis_health.diagnosis_item(
+                monitor, self.diagnosis_worker, self.engine.last_diagnosis_s
+            )
+        )
         items.append(work_health.recorder_item(self.recording))
         return items
 
@@ -185,6 +197,7 @@ class Session:
         """End everything; the recording is a finished file afterwards."""
         self.hush()
         self.worker.close()
+        self.diagnosis_worker.close()
         status = self.recording.close()
         for publisher in self._publishers.values():
             self._node.destroy_publisher(publisher)
@@ -198,7 +211,8 @@ class Session:
 
     def _open_recording(self) -> Recording:
         topics: dict[str, Any] = {'inputs': self.inputs, 'outputs': self.outputs}
-        recording = Recording(self._settings, topics, time.time())
+        model = model_file.attached(self._extended)
+        recording = Recording(self._settings, topics, time.time(), model)
         reliable = self._settings.text('input_reliability') == 'reliable'
         for topic in INPUTS:
             recording.offer(

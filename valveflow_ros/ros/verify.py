@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
@@ -14,19 +15,24 @@ from valveflow_msgs.msg import JournalEntry as JournalMessage
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.align import Aligner
+from valveflow_ros.core.corrector import Corrector
+from valveflow_ros.core.diagnosis_task import DiagnosisContent, DiagnosisTask
 from valveflow_ros.core.events import Event, JournalEntry
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.offline import JournalReplayer
-from valveflow_ros.errors import RecordingError, ValveflowError
+from valveflow_ros.diagnosis import model_json
+from valveflow_ros.errors import DataError, RecordingError, ValveflowError
 from valveflow_ros.logs import LogContents, LoggedMessage, open_log
 from valveflow_ros.records import Readings
-from valveflow_ros.ros import conversions
+from valveflow_ros.ros import conversions, model_file
 from valveflow_ros.ros.inputs import Decoder, Row
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
 from valveflow_ros.ros.recording import PARAMETERS, TOPICS
+from valveflow_ros.ros.worker import DiagnosisWorker
 
 # Small, so that what is said before a decision that cannot be repeated is compared first.
 _BLOCK = 500
+_LOOK_S = 0.05
 Progress = Callable[[int], None]
 
 
@@ -120,18 +126,63 @@ def _replayed(
 ) -> Iterator[Output]:
     """Yield what the engine says to the recorded inputs and decisions."""
     speaker = Outputs(settings.text('unit_tag'))
-    yield from speaker.first()
-    monitor = Monitor(settings)
-    replayer = JournalReplayer(monitor, list(_journal(log, outputs)))
+    # A recording of an earlier version has no topics that came later.
+    kept = set(outputs.values())
+    yield from (output for output in speaker.first() if output.name in kept)
+    monitor = Monitor(settings, _corrector(log, settings))
+    replayer = JournalReplayer(monitor, list(_journal(log, outputs)), diagnosed_elsewhere)
     aligner, decoder = Aligner(settings), Decoder(settings)
     messages = _messages(log, inputs)
     while block := list(islice(messages, _BLOCK)):
         result.inputs += len(block)
         rows = [row for message in block for row in _rows(decoder, inputs, message)]
         # Restarts of the clock stand in the journal, so the rows alone are enough here.
-        yield from speaker.of(_fed(replayer, aligner, rows))
+        said = speaker.of(_fed(replayer, aligner, rows))
+        yield from (output for output in said if output.name in kept)
         result.rows = monitor.rows
         progress(result.inputs)
+
+
+def _corrector(log: LogContents, settings: Settings) -> Corrector | None:
+    """Return what took causes out of the rows in the run.
+
+    Raises
+    ------
+    RecordingError
+        The model is not in the recording, or cannot be used.
+    """
+    if not settings.text(model_file.PARAMETER):
+        return None
+    try:
+        given = model_json.from_json(json.loads(log.attachments[model_file.ATTACHMENT]))
+        return model_file.ready(given, settings)
+    except KeyError:
+        problem = f"lacks the attachment '{model_file.ATTACHMENT}' that its run was made with"
+        raise RecordingError(log.path, problem) from None
+    except (ValueError, ValveflowError) as error:
+        problem = f'holds an extended model that cannot be used ({str(error).rstrip(".")})'
+        raise RecordingError(log.path, problem) from None
+
+
+def diagnosed_elsewhere(task: DiagnosisTask) -> str:
+    """Compute a diagnosis in a process like the one of the run, on which its last bits depend.
+
+    Raises
+    ------
+    DataError
+        It gave no result.
+    """
+    worker = DiagnosisWorker(task.settings.real('diagnosis_timeout'))
+    worker.submit(task)
+    try:
+        while not (outcomes := worker.poll()):
+            time.sleep(_LOOK_S)
+    finally:
+        worker.close()
+    result = outcomes[0].result
+    if not isinstance(result, DiagnosisContent):
+        raise DataError(f'A diagnosis cannot be repeated. {result}')
+    return result.text
 
 
 def _messages(log: LogContents, topics: Iterable[str]) -> Iterator[LoggedMessage]:

@@ -20,6 +20,7 @@ from valveflow_ros.core.characteristic import (
 )
 from valveflow_ros.core.chart import ChartDesign
 from valveflow_ros.core.fit_task import FitTask
+from valveflow_ros.core.mismatch import Mismatch
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.prediction import Predictor
 from valveflow_ros.core.window import WindowContents
@@ -113,4 +114,6 @@ def _predict(settings: Settings, curve: Characteristic, c: WindowContents) -> No
     few = slice(0, _FEW)
     kinds = np.ones(_FEW, dtype=np.uint8)
     block = predictor.predict(c.time_ns[few], c.u[few], c.power_mw[few], kinds)
+    watch = Mismatch(settings.real('sample_period'))
+    watch.feed(block, c.temperature_degc[few], curve.model)
     ResidualAlarm(settings).feed(block.time_ns, block.evidence, block.shift_mw, curve.model_id)

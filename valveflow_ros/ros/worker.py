@@ -1,7 +1,7 @@
-"""Fits in a process of their own, so that no sample waits for one.
+"""Fits and diagnoses in processes of their own, so that no sample waits for one.
 
-The process is started once, is given low priority, and ends with the monitor.
-When it is killed, hangs or fails, that is seen at the next `FitWorker.poll`; the
+A process is started once or when it is needed, is given low priority, and ends with the monitor.
+When it is killed, hangs or fails, that is seen at the next `Worker.poll`; the
 request gets an outcome that says so, and a new process is started after a pause
 that doubles while failures follow each other.
 """
@@ -17,13 +17,15 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
-from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.diagnosis_task import DiagnosisTask
 from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.ros.frames import FrameReader, send
-from valveflow_ros.ros.outcome import FitOutcome, objection
+from valveflow_ros.ros.outcome import Outcome, content_objection, objection
 
 FIT_JOB = 'valveflow_ros.core.fit:fit'
+DIAGNOSIS_JOB = 'valveflow_ros.diagnosis.from_window:diagnose_window'
 _FIRST_PAUSE_S = 0.5
 _LONGEST_PAUSE_S = 60.0
 # One core is what the machine can spare, and one thread adds up in one order only.
@@ -32,21 +34,51 @@ _ONE_THREAD = dict.fromkeys(
 )
 
 
+@dataclass(frozen=True, slots=True)
+class Trade:
+    """What a worker does.
+
+    Attributes
+    ----------
+    word : str
+        What one piece of work is called.
+    parameter : str
+        Which parameter limits its time.
+    objection : callable
+        Says why a result is not to be believed, or nothing.
+    nice : int
+        How far the process stands back.
+    stays : bool
+        The process waits for the next task; otherwise it is started for each.
+    """
+
+    word: str
+    parameter: str
+    objection: Callable[[Any, object], str]
+    nice: int
+    stays: bool
+
+
+FIT = Trade('fit', 'refit_timeout', objection, 10, True)
+DIAGNOSIS = Trade('diagnosis', 'diagnosis_timeout', content_objection, 19, False)
+
+
 @dataclass(slots=True)
 class _Running:
     number: int
-    task: FitTask
+    task: FitTask | DiagnosisTask
     begun_s: float
     sent: bool = False
 
 
-class FitWorker:
-    """Computes one fit at a time.
+class Worker:
+    """Computes one task at a time.
 
     Parameters
     ----------
+    trade : Trade
     timeout_s : float
-        A fit that takes longer is ended.
+        What takes longer is ended.
     job : str
         The function that is called, as ``module:function``.
     clock : callable
@@ -54,14 +86,12 @@ class FitWorker:
     """
 
     def __init__(
-        self,
-        timeout_s: float,
-        job: str = FIT_JOB,
-        clock: Callable[[], float] = time.monotonic,
+        self, trade: Trade, timeout_s: float, job: str, clock: Callable[[], float]
     ) -> None:
         self._timeout_s = timeout_s
         self._job = job
         self._clock = clock
+        self._trade = trade
         self._process: subprocess.Popen[bytes] | None = None
         self._reader: FrameReader | None = None
         self._running: _Running | None = None
@@ -78,18 +108,20 @@ class FitWorker:
 
     @property
     def busy_s(self) -> float | None:
-        """Return how long the fit at hand has been running, None without one."""
+        """Return how long the task at hand has been running, None without one."""
         return None if self._running is None else self._clock() - self._running.begun_s
 
-    def start(self) -> None:
+    def start(self, outcomes: list[Outcome] | None = None) -> None:
         """Start the process; call it from the thread that lives as long as the monitor.
+
+        What becomes of the task at hand, if it cannot be started, is added to ``outcomes``.
 
         The kernel ends the process when the thread that started it ends.
         """
         command = [sys.executable, '-m', 'valveflow_ros.ros.worker_child']
         try:
             self._process = subprocess.Popen(
-                [*command, str(os.getpid()), self._job],
+                [*command, str(os.getpid()), self._job, str(self._trade.nice), self._trade.word],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 bufsize=0,
@@ -98,39 +130,41 @@ class FitWorker:
                 start_new_session=True,
             )
         except OSError as error:
-            self._failed(f'The fit process could not be started ({error.strerror}).', [])
+            sentence = f'The {self._trade.word} process could not be started ({error.strerror}).'
+            self._failed(sentence, [] if outcomes is None else outcomes)
             return
         self.starts += 1
         assert self._process.stdout is not None
         os.set_blocking(self._process.stdout.fileno(), False)
         self._reader = FrameReader(self._process.stdout.fileno())
 
-    def submit(self, task: FitTask) -> None:
+    def submit(self, task: FitTask | DiagnosisTask) -> None:
         """Take a task; one that is still running is given up."""
         if self._running is not None and self._process is not None:
             self._end()
-            self.start()
         self._number += 1
         self._running = _Running(self._number, task, self._clock())
         self._send()
 
-    def poll(self) -> list[FitOutcome]:
+    def poll(self) -> list[Outcome]:
         """Return the outcomes there are, and see to the process; never waits."""
-        outcomes: list[FitOutcome] = []
+        outcomes: list[Outcome] = []
         if self._process is None:
-            if self._clock() >= self._start_at_s:
-                self.start()
+            wanted = self._trade.stays or self._running is not None
+            if wanted and self._clock() >= self._start_at_s:
+                self.start(outcomes)
                 self._send()
             return outcomes
         self._take_results(outcomes)
+        word = self._trade.word
         if self._reader is not None and self._reader.ended:
             status = self._end()
-            self._failed(f'The fit process ended unexpectedly ({status}).', outcomes)
+            self._failed(f'The {word} process ended unexpectedly ({status}).', outcomes)
         elif self.busy_s is not None and self.busy_s > self._timeout_s:
             self._end()
             self._failed(
-                f'The fit took longer than {self._timeout_s:g} s and was ended '
-                '(parameter refit_timeout).',
+                f'The {word} took longer than {self._timeout_s:g} s and was ended '
+                f'(parameter {self._trade.parameter}).',
                 outcomes,
             )
         return outcomes
@@ -141,31 +175,46 @@ class FitWorker:
             self._end()
         self._running = None
 
-    def _take_results(self, outcomes: list[FitOutcome]) -> None:
+    def _believed(self, task: Any, result: Any) -> Any:
+        """Return the result, or why it is not believed."""
+        if isinstance(result, str):
+            return result
+        word = self._trade.word
+        try:
+            problem = self._trade.objection(task, result)
+        except Exception as error:  # noqa: BLE001 - anything may stand in its fields
+            problem = f'The {word} gave a result that cannot be checked ({type(error).__name__}).'
+        return problem or result
+
+    def _take_results(self, outcomes: list[Outcome]) -> None:
         assert self._reader is not None
         try:
             results = self._reader.ready()
         except Exception:  # noqa: BLE001 - unpickling what a hurt process wrote may raise anything
             self._end()
-            self._failed('The fit process gave an answer that cannot be read.', outcomes)
+            self._failed(
+                f'The {self._trade.word} process gave an answer that cannot be read.', outcomes
+            )
             return
         for number, result in results:
             running = self._running
             if running is None or running.number != number:
                 continue
-            self._conclude(_believed(running.task, result), outcomes)
+            self._conclude(self._believed(running.task, result), outcomes)
             self.failures_in_a_row = 0
             self._pause_s = _FIRST_PAUSE_S
+        if results and self._running is None and not self._trade.stays:
+            self._end()
 
-    def _conclude(self, result: Characteristic | str, outcomes: list[FitOutcome]) -> None:
+    def _conclude(self, result: Any, outcomes: list[Outcome]) -> None:
         running = self._running
         if running is None:
             return
         self._running = None
         seconds = self._clock() - running.begun_s
-        outcomes.append(FitOutcome(running.task.request_ns, result, seconds))
+        outcomes.append(Outcome(running.task.request_ns, result, seconds))
 
-    def _failed(self, sentence: str, outcomes: list[FitOutcome]) -> None:
+    def _failed(self, sentence: str, outcomes: list[Outcome]) -> None:
         self.failures_in_a_row += 1
         self._start_at_s = self._clock() + self._pause_s
         self._pause_s = min(2.0 * self._pause_s, _LONGEST_PAUSE_S)
@@ -185,7 +234,7 @@ class FitWorker:
             # A descriptor of its own: the other may be closed, and its number be
             # somebody else's, while this thread still writes.
             args=(os.dup(process.stdin.fileno()), (running.number, running.task)),
-            name='fit sender',
+            name=f'{self._trade.word} sender',
             daemon=True,
         )
         thread.start()
@@ -214,12 +263,25 @@ def _send_quietly(descriptor: int, item: object) -> None:
         os.close(descriptor)
 
 
-def _believed(task: FitTask, result: object) -> Characteristic | str:
-    """Return the result, or why it is not believed."""
-    if isinstance(result, str):
-        return result
-    try:
-        problem = objection(task, result)
-    except Exception as error:  # noqa: BLE001 - anything may stand in its fields
-        problem = f'The fit gave a curve that cannot be checked ({type(error).__name__}).'
-    return problem or result  # type: ignore[return-value]
+class FitWorker(Worker):
+    """Computes one fit at a time."""
+
+    def __init__(
+        self,
+        timeout_s: float,
+        job: str = FIT_JOB,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        super().__init__(FIT, timeout_s, job, clock)
+
+
+class DiagnosisWorker(Worker):
+    """Computes one diagnosis at a time, in a process that is there only while it does."""
+
+    def __init__(
+        self,
+        timeout_s: float,
+        job: str = DIAGNOSIS_JOB,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        super().__init__(DIAGNOSIS, timeout_s, job, clock)

@@ -1,4 +1,4 @@
-"""The process that computes fits: started by `FitWorker`, ends with it."""
+"""The process that computes fits or diagnoses: started by a `Worker`, ends with it."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ def load(job: str) -> Callable[[Any], Any]:
     return getattr(importlib.import_module(module), function)  # type: ignore[no-any-return]
 
 
-def answer(work: Callable[[Any], Any], task: Any) -> Any:
+def answer(work: Callable[[Any], Any], task: Any, word: str = 'fit') -> Any:
     """Do the work; return its result, or a sentence why there is none."""
     try:
         return work(task)
     except DataError as error:
         return str(error)
     except MemoryError:
-        return 'The fit needed more memory than there is.'
+        return f'The {word} needed more memory than there is.'
     except Exception as error:  # noqa: BLE001 - whatever it is, the monitor goes on
-        return f'The fit failed unexpectedly: {with_place(error)}.'
+        return f'The {word} failed unexpectedly: {with_place(error)}.'
 
 
 def main(arguments: list[str]) -> int:
@@ -49,11 +49,12 @@ def main(arguments: list[str]) -> int:
     Parameters
     ----------
     arguments : list of str
-        The parent's process id and the job as ``module:function``.
+        The parent's process id, the job as ``module:function``, how far to stand back, and what
+        the job is called.
     """
-    parent, job = int(arguments[0]), arguments[1]
+    parent, job, nice, word = int(arguments[0]), arguments[1], int(arguments[2]), arguments[3]
     die_with(parent)
-    os.nice(10)
+    os.nice(nice)
     results = os.dup(1)
     # Nothing that a library prints may get between the results.
     os.dup2(2, 1)
@@ -64,7 +65,7 @@ def main(arguments: list[str]) -> int:
             number, task = tasks.wait()
         except EOFError:
             return 0
-        send(results, (number, answer(work, task)))
+        send(results, (number, answer(work, task, word)))
 
 
 if __name__ == '__main__':
@@ -73,4 +74,4 @@ if __name__ == '__main__':
     except BrokenPipeError:
         sys.exit(0)
     except Exception as error:  # noqa: BLE001 - the monitor sees the end and says so
-        sys.exit(f'valveflow fit process: {one_line(error)}')
+        sys.exit(f'valveflow worker process: {one_line(error)}')

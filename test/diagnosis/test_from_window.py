@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from diagnosis_records import EXPONENT, STEP_S, table, unit
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.events import DiagnosisRequested
+from valveflow_ros.core.monitor import Monitor
+from valveflow_ros.core.offline import feed_rows
+from valveflow_ros.core.units import integrated_input
+from valveflow_ros.core.window import WindowContents
+from valveflow_ros.diagnosis.diagnose import Record, diagnose
+from valveflow_ros.diagnosis.diagnosis_json import to_json
+from valveflow_ros.diagnosis.from_window import diagnose_window, table_of
+from valveflow_ros.records import SampleTable, Signal
+
+
+def contents_of(samples: SampleTable) -> WindowContents:
+    opening = samples.column(Signal.VALVE_OPENING)
+    pressure = samples.column(Signal.MAIN_STEAM_PRESSURE)
+    return WindowContents(
+        samples.time_ns, integrated_input(opening, pressure, EXPONENT),
+        samples.column(Signal.GENERATED_POWER), samples.column(Signal.MAIN_STEAM_TEMPERATURE),
+        np.empty((0, 3), dtype=np.int64), opening, samples.column(Signal.VALVE_COMMAND),
+    )  # fmt: skip
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.tuples(st.integers(-200, 10_500), st.integers(0, 30_000)), min_size=1))
+def test_the_pressure_comes_back_as_it_was_read(rows: list[tuple[int, int]]) -> None:
+    """Opening in hundredths of a percent, pressure in kPa: bit for bit, or not at all."""
+    opening, pressure = np.array(rows).T / np.array([[100.0], [1000.0]])
+    nan = np.full(len(rows), np.nan)
+    samples = SampleTable.from_columns(
+        np.arange(len(rows)),
+        {Signal.VALVE_OPENING: opening, Signal.MAIN_STEAM_PRESSURE: pressure,
+         Signal.GENERATED_POWER: nan, Signal.VALVE_COMMAND: opening},
+    )  # fmt: skip
+    found = table_of(contents_of(samples), EXPONENT)
+    known = (opening > 0.0) & (pressure > 0.0)
+    expected = np.where(known, pressure, np.nan)
+    np.testing.assert_array_equal(found.column(Signal.MAIN_STEAM_PRESSURE), expected)
+    np.testing.assert_array_equal(found.column(Signal.VALVE_COMMAND), opening)
+
+
+@pytest.mark.slow
+def test_the_window_is_diagnosed_as_the_record_is() -> None:
+    """The same rows from a file and from the running monitor give the same diagnosis."""
+    samples = table(1.5, 3, ('backlash:w_percent=1.2',), unit())
+    monitor = Monitor(
+        Settings({'sample_period': STEP_S, 'refit_period': 100_000.0, 'refit_segments': 0})
+    )
+    feed_rows(monitor, samples)
+    curve = monitor.characteristic
+    assert curve is not None
+    (task,) = (e.task for e in monitor.request_diagnosis() if isinstance(e, DiagnosisRequested))
+    assert task.window_end_ns == samples.time_ns[-1]
+    found = diagnose_window(task)
+    spans = np.array(
+        [(task.contents.time_ns[a], task.contents.time_ns[b - 1])
+         for a, b, _ in task.contents.spans]
+    )  # fmt: skip
+    record = Record(samples, STEP_S, EXPONENT, Settings().settle_s, spans)
+    truth = to_json(diagnose(record, curve.model))
+    content = json.loads(found.text)
+    assert found.window_end_ns == task.window_end_ns
+    assert [c['name'] for c in content['causes']] == ['backlash']
+    assert content == truth
