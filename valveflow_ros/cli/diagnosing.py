@@ -27,6 +27,8 @@ from valveflow_ros.diagnosis.diagnosis_json import model_json, to_json
 from valveflow_ros.diagnosis.extended_model import ExtendedModel
 from valveflow_ros.diagnosis.first_model import first_model
 from valveflow_ros.diagnosis.on_top import on_top
+from valveflow_ros.diagnosis.result import Diagnosis
+from valveflow_ros.diagnosis.views import Views, views
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import SIGNALS, IntArray, SampleTable
 from valveflow_ros.report.diagnosis import Diagnosed, diagnosis_report
@@ -110,16 +112,20 @@ def diagnosed_in(
     if earlier is not None:
         record = on_top(record, earlier, engine_align(log, settings)[0])
         notes.append(held_words(earlier.held))
-    found, views = diagnose_with_views(record, regional, model is not None, console)
+    found, (signatures, answers, maps) = diagnose_with_views(
+        record, regional, model is not None, console
+    )
     found = replace(found, notes=(*log.contents.warnings, *notes, *found.notes))
     ends = int(rows.table.time_ns[0]), int(rows.table.time_ns[-1])
-    return Result(Diagnosed(source.name, *ends, found, *views), exponent, earlier)
+    return Result(
+        Diagnosed(source.name, *ends, found, signatures, answers, maps), exponent, earlier
+    )
 
 
-def diagnose_with_views(record: Record, model: RegionalModel, given: bool, console: Console):  # type: ignore[no-untyped-def]
+def diagnose_with_views(
+    record: Record, model: RegionalModel, given: bool, console: Console
+) -> tuple[Diagnosis, Views]:
     """Diagnose, and draw up what the pictures show."""
-    from valveflow_ros.diagnosis.views import views
-
     found = diagnose(
         record, model, given, lambda share, what: console.progress(0.4 + 0.5 * share, what)
     )

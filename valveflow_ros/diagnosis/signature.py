@@ -14,6 +14,7 @@ from valveflow_ros.records import BoolArray, FloatArray
 BINS = 20
 _SHIFTS = 60
 _SEED = 11
+_NORMAL99 = 2.576
 _PLAY_PERCENT = 1.5
 _FAST_PERCENT, _FAST_S = 0.8, 10.0
 _BEFORE_S, _AFTER_S = 60.0, 300.0
@@ -32,6 +33,8 @@ class Signature:
     variable, unit : str
     middle, before, after : float64 (k,)
         Middle of each bin, mean residual in MW of the plain and of the extended model.
+    chance : float64 (k,)
+        How far the mean of a bin strays by chance in one of a hundred records, MW.
     share_before, share_after, share_chance : float
         Part of the residual's variance between bins, and what chance reaches in one of a
         hundred records (residual shifted in time).
@@ -42,6 +45,7 @@ class Signature:
     middle: FloatArray
     before: FloatArray
     after: FloatArray
+    chance: FloatArray
     share_before: float
     share_after: float
     share_chance: float
@@ -72,12 +76,13 @@ def _direction(task: Task) -> FloatArray:
 def _signature(
     name: str, value: FloatArray, old: FloatArray, new: FloatArray, good: BoolArray
 ) -> Signature:
-    edges = np.quantile(value[good], np.linspace(0.0, 1.0, BINS + 1)[1:-1])
-    cell = np.searchsorted(edges, value[good], side='right')
-    count = np.maximum(np.bincount(cell, minlength=BINS), 1)
+    # Values that many minutes share (the end of a slack) would make bins without any.
+    edges = np.unique(np.quantile(value[good], np.linspace(0.0, 1.0, BINS + 1)[1:-1]))
+    cell = np.unique(np.searchsorted(edges, value[good], side='right'), return_inverse=True)[1]
+    count = np.bincount(cell)
 
     def means(x: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(cell, x, BINS) / count)
+        return np.asarray(np.bincount(cell, x) / count)
 
     def share(x: FloatArray) -> float:
         x = x - x.mean()
@@ -86,10 +91,12 @@ def _signature(
     rng = np.random.default_rng(_SEED)
     n = int(good.sum())
     low = min(n // 4, 1440)
-    chance = [share(np.roll(new[good], int(rng.integers(low, n - low)))) for _ in range(_SHIFTS)]
+    rolled = [np.roll(new[good], int(rng.integers(low, n - low))) for _ in range(_SHIFTS)]
+    spread = np.sqrt(np.mean([(means(x) - x.mean()) ** 2 for x in rolled], axis=0))
     return Signature(
         name, UNITS[name], means(value[good]), means(old[good]), means(new[good]),
-        share(old[good]), share(new[good]), float(np.quantile(chance, 0.99)),
+        _NORMAL99 * spread, share(old[good]), share(new[good]),
+        float(np.quantile([share(x) for x in rolled], 0.99)),
     )  # fmt: skip
 
 

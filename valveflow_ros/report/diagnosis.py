@@ -9,8 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from valveflow_ros import __version__
+from valveflow_ros.diagnosis.residual_map import ResidualMap
 from valveflow_ros.diagnosis.result import NAMED, NOTHING, Diagnosis, NamedCause
 from valveflow_ros.diagnosis.signature import Answer, Signature
+from valveflow_ros.report.diagnosis_map import map_figure
 from valveflow_ros.report.figure import Figure, Spec, rounded, token
 from valveflow_ros.report.numbers import decimals, interval, moment, percent, plain
 from valveflow_ros.report.page import Section, notice, page, paragraph, table, text
@@ -28,6 +30,7 @@ class Diagnosed:
     diagnosis: Diagnosis
     signatures: tuple[Signature, ...]
     answers: tuple[Answer, ...]
+    maps: tuple[ResidualMap, ...] = ()
 
 
 def diagnosis_report(data: Diagnosed) -> str:
@@ -68,6 +71,7 @@ def _wrong(data: Diagnosed) -> Section:
     parts += [_signature_figure(s) for s in worst]
     if data.answers:
         parts.append(_answer_figure(data.answers))
+    parts += [map_figure(m) for m in data.maps]
     return Section('1. What is wrong', parts)
 
 
@@ -76,6 +80,17 @@ def _line(x: np.ndarray, y: np.ndarray, name: str, colour: str, dash: str = 'sol
         'type': 'scatter', 'mode': 'lines+markers', 'name': name, 'x': rounded(x, 6),
         'y': rounded(y, 4), 'line': {'color': token(colour), 'width': 2, 'dash': dash},
         'marker': {'size': 5},
+    }  # fmt: skip
+
+
+def _band(x: np.ndarray, width: np.ndarray) -> Spec:
+    """Return the band round zero that chance fills."""
+    return {
+        'type': 'scatter', 'mode': 'lines', 'name': 'by chance (99 %)', 'fill': 'toself',
+        'x': rounded(np.concatenate([x, x[::-1]]), 6),
+        'y': rounded(np.concatenate([width, -width[::-1]]), 4),
+        'line': {'width': 0, 'color': token('band')}, 'fillcolor': token('band'),
+        'hoverinfo': 'skip',
     }  # fmt: skip
 
 
@@ -88,12 +103,14 @@ def _signature_figure(s: Signature) -> Figure:
     name = s.variable.replace(' ', '-')
     return Figure(
         f'residual-{name}',
-        f'<b>Measured minus simulated power against {text(s.variable)}.</b> Means of twenty bins '
-        'with equally many minutes; a model that is right stays at zero.',
+        f'<b>Measured minus simulated power against {text(s.variable)}.</b> Means of bins '
+        'with equally many minutes. A model that is right stays in the band, which is what chance '
+        'reaches in one of a hundred records.',
         f'Mean residual against {s.variable}, from {plain(float(s.before.min()), 2)} to '
         f'{plain(float(s.before.max()), 2)} MW before and {plain(float(s.after.min()), 2)} to '
         f'{plain(float(s.after.max()), 2)} MW after.',
-        [_line(x, s.before, 'simulation', 'raw', 'dash'),
+        [_band(x, s.chance),
+         _line(x, s.before, 'simulation', 'raw', 'dash'),
          _line(x, s.after, 'extended model', 'curve')],
         {'xaxis': {'title': {'text': f'{s.variable} ({unit})'}},
          'yaxis': {'title': {'text': 'mean residual (MW)'}}},
@@ -145,7 +162,8 @@ def _why(d: Diagnosis) -> Section:
         )
     if d.rejected:
         rows = [[text(name), text(reason)] for name, reason in d.rejected]
-        parts += [paragraph('Put away:'), table(['cause', 'why not'], rows)]
+        parts += [paragraph(f'Put away ({len(rows)}):'), table(['cause', 'why not'], rows)]
+    parts += [paragraph(text(note)) for note in d.notes]
     return Section('2. Why', parts)
 
 
