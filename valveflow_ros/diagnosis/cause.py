@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.records import BoolArray
 
@@ -78,12 +79,14 @@ class Start:
     """Values to begin a full fit from, and what screening expects of them.
 
     ``gain`` is a log-likelihood on the open blocks; ``extra`` holds what is not a number
-    to be fitted (the times of switches).
+    to be fitted (the times of switches); ``base`` is the curve and the dynamics to begin with
+    where those of the plain model have swallowed much of the cause.
     """
 
     values: Values
     gain: float
     extra: Values = ()
+    base: RegionalModel | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -175,7 +175,10 @@ def _rivals(found: Found, barred: set[str]) -> list[Rival]:
     refits = []
     for name, start in shortlist:
         added = Active(catalogue()[name], start.values, start.extra)
-        refits.append(_refit(found.task, found.model.with_cause(added), tangents))
+        model, frozen = found.model, tangents
+        if start.base is not None:
+            model, frozen = replace(model, base=start.base), None
+        refits.append(_refit(found.task, model.with_cause(added), frozen))
     if not refits:
         return []
     # The noise is what the best of them leaves.
