@@ -147,8 +147,9 @@ def test_constant_temperature_and_missing_command_are_said():
 @pytest.mark.slow
 def test_missing_rows_and_another_time_change_no_name():
     effects = ('temperature:k=-0.0016',)
-    samples = table(4.0, 1, effects, unit())
-    assert names(diagnose(record(masked(samples, 0.01, 1)), rough_model())) == {'temperature'}
+    samples = masked(table(4.0, 1, effects, unit()), 0.01, 1)
+    later = SampleTable(samples.time_ns + 3 * 3600 * 10**9, samples.values, samples.quality)
+    assert names(diagnose(record(later), rough_model())) == {'temperature'}
 
 
 @pytest.mark.slow
