@@ -35,6 +35,7 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.records import BoolArray, FloatArray, IntArray, SampleTable
 
 _LEAST_SPREAD = 0.01
+_LAST_STEPS = 10  # knots go slowly beside a bump
 
 
 def _quiet(_share: float, _what: str) -> None:
@@ -163,7 +164,7 @@ def _withdraw(found: Found, rest: _Rest) -> None:
 def _final(found: Found) -> tuple[Task, Extended]:
     """Fit the extended model to all blocks, the sealed ones too."""
     task = replace(found.task, rows=found.task.scene.whole)
-    model, cost = improve(task, found.model, 3)
+    model, cost = improve(task, found.model, _LAST_STEPS)
     model, cost = search_levels(task, model, cost)
     model, _ = search_lines(task, model, cost)
     return task, inferred(task, model, np.ones(task.scene.subs, dtype=bool))
