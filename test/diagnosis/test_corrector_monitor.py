@@ -186,7 +186,8 @@ def test_a_plant_with_an_effect_gives_the_curve_of_the_plant_without():
 
 
 def test_an_opening_that_a_held_stop_lets_rest_is_no_fault_of_its_signal(rows):
-    model = model_of(rows, {'saturation': (70.0,)})
+    stop = float(np.quantile(rows.column(Signal.VALVE_OPENING), 0.8))
+    model = model_of(rows, {'saturation': (stop,)})
     corrector = corrector_of(model, STEP_S)
     rests = record(corrector.correct(rows))
     assert rests.faults()[1]  # it would be taken for one
