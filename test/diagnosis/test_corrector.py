@@ -89,10 +89,14 @@ def test_what_is_left_is_what_the_extended_model_leaves(scene, rows, names):
     expected = answer(scene, model.model)
     told = means_of(scene, measured - left)
     here = np.flatnonzero(scene.scored)[:-1]
-    # The catalogue draws the sensor's noise of a stiction over the record, this row by row.
-    limit = 0.6 if 'stiction' in names else 1e-8
-    assert np.abs(told - expected)[here].max() < limit
-    assert np.abs(expected - answer(scene, model.model.without_causes()))[here].max() > 1e-3
+    effect = (expected - answer(scene, model.model.without_causes()))[here]
+    assert np.abs(effect).max() > 1e-3
+    if 'stiction' in names:
+        # The catalogue draws the sensor's noise over the record, this row by row: single slips
+        # fall on other rows, by far the most of the effect is the same.
+        assert np.std((told - expected)[here]) < 0.25 * np.std(effect)
+    else:
+        assert np.abs(told - expected)[here].max() < 1e-8
 
 
 def test_sticking_is_drawn_anew_and_means_the_same(scene, rows):
