@@ -54,8 +54,9 @@ study: setup
 	@$(ENV) for name in $(STUDIES); do python -m benchmarks.$$name || exit 1; done
 
 study-diagnosis: setup
-	@$(ENV) for kind in hidden null pair confounded outside; do \
-	  python -m benchmarks.diagnosis_study --kind $$kind --seeds 20 --first 6000 --high 3 || exit 1; done
+	@$(ENV) python -m benchmarks.diagnosis_study --kind null --seeds 150 --first 9000
+	@$(ENV) for kind in hidden pair confounded outside; do \
+	  python -m benchmarks.diagnosis_study --kind $$kind --seeds 20 --first 9000 --high 3 || exit 1; done
 
 certify-partition: setup
 	@$(ENV) python -m benchmarks.partition --certify --kinds valve --sizes 305633
