@@ -14,14 +14,11 @@ import numpy as np
 from valveflow_ros.diagnosis.bench import Bench
 from valveflow_ros.diagnosis.catalogue import catalogue
 from valveflow_ros.diagnosis.extended import Extended
-from valveflow_ros.diagnosis.fitting import Task, improve, settle
+from valveflow_ros.diagnosis.fitting import Task, settle
 from valveflow_ros.diagnosis.simplify import simplified, without_knot
 
 _WIDTHS = (0.5, 0.8, 1.2)  # of the shorter piece beside the knee
 _PLACES = (-0.15, 0.0, 0.15)
-_NEAR, _STEPS = 3.0, 8
-_WORTH = 10.0  # log-likelihood that a knee, two numbers, must be worth
-CURVE_SHAPE = 'curve_shape'
 
 
 def without_bumps(task: Task, plain: Extended) -> tuple[Task, Extended]:
@@ -32,24 +29,6 @@ def without_bumps(task: Task, plain: Extended) -> tuple[Task, Extended]:
             task, smaller, _ = settle(task, smaller, rounds=1, steps=4)
             return without_bumps(task, smaller)
     return task, plain
-
-
-def without_spare_knots(task: Task, model: Extended) -> Extended:
-    """Return the model without knees beside a bump that only stood in for a part of it."""
-    bump = next(a for a in model.active if a.name == CURVE_SHAPE)
-    _, centre, width = bump.values
-    cost = task.cost(model)
-    inner = model.base.knots[1:-1]
-    near = np.flatnonzero(np.abs(inner - centre) < _NEAR * width) + 1
-    for knot in sorted(near.tolist(), key=lambda k: abs(model.base.knots[k] - centre)):
-        if model.base.pieces < 2:
-            break
-        smaller = replace(model, base=without_knot(model.base, knot))
-        smaller, value = improve(task, smaller, _STEPS)
-        variance = value / max(int(task.rows.sum()), 1)
-        if (value - cost) / (2.0 * variance) < _WORTH:
-            return without_spare_knots(task, smaller)
-    return model
 
 
 def _suspects(plain: Extended) -> list[int]:
@@ -67,7 +46,7 @@ def _width(plain: Extended, knot: int) -> float:
 
 def _as_good(task: Task, plain: Extended, smaller: Extended, u: float, width: float) -> bool:
     """Tell whether a bump at ``u`` brings the smaller model to the cost of the plain one."""
-    bench, cause = Bench(task, smaller), catalogue()[CURVE_SHAPE]
+    bench, cause = Bench(task, smaller), catalogue()['curve_shape']
     gain = max(
         bench.scaled_height(cause, (u + place * width, share * width)).gain
         for share in _WIDTHS

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from valveflow_ros.diagnosis.bench import Bench
-from valveflow_ros.diagnosis.bumps import CURVE_SHAPE, without_bumps, without_spare_knots
+from valveflow_ros.diagnosis.bumps import without_bumps
 from valveflow_ros.diagnosis.catalogue import catalogue
 from valveflow_ros.diagnosis.cause import Active, Start
 from valveflow_ros.diagnosis.draws import held
@@ -135,8 +135,6 @@ def _take(found: Found, rival: Rival, gain: float) -> None:
     """Fit the model with its new cause, and find curve and regions anew where that is due."""
     found.task, settled, _ = settle(found.task, rival.model, rounds=1, steps=3)
     found.model = held(found.task.scene, settled, found.task.ar)
-    if rival.added.name == CURVE_SHAPE:
-        found.model = without_spare_knots(found.task, found.model)
     if gain > STRONG and not found.task.fixed_dynamics:
         found.task, found.model = rebuilt(found.task, found.model)
 
