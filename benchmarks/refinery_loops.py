@@ -1,6 +1,6 @@
 """Simulated flow, pressure and level loops under PI control, with and without a sticking valve.
 
-They are for fixing and trying thresholds of `valveflow_ros.diagnosis.loop`; nothing in them
+They are for fixing and trying thresholds of `refinery_judge`; nothing in them
 was taken from the measured loops but their length and step.
 """
 

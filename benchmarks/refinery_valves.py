@@ -7,8 +7,8 @@ process variable (PV) of refinery control loops, with a label for each valve. Wi
 ``--data`` the folder in VALVEFLOW_SHARED_DATA is read, or ``shared/data`` beside this checkout;
 where there is none, only simulated loops are scored.
 
-What was fixed on what: the thresholds of `valveflow_ros.diagnosis.loop` on the simulated loops
-of `benchmarks.refinery_loops` with seeds below 300; they were tried on seeds from 5000, and
+What was fixed on what: the thresholds of `refinery_judge` on the simulated loops
+of `refinery_loops` with seeds below 300; they were tried on seeds from 5000, and
 then applied once to the measured windows. After that, only the search for the sizes of a valve
 already named was changed, on simulated loops. Horch's test has its published borders.
 
@@ -36,8 +36,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.horch import STICTION, UNDECIDED, horch
+from benchmarks.refinery_judge import LEAST_GAIN, LEAST_JUMP_GAIN, LoopVerdict, judge_loop
 from benchmarks.refinery_loops import KINDS, NULLS, simulate_loop
-from valveflow_ros.diagnosis.loop import LEAST_GAIN, LEAST_JUMP_GAIN, LoopVerdict, judge_loop
 from valveflow_ros.records import FloatArray
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -15,6 +15,9 @@ predicted without a plug: in a linear loop with Gaussian disturbances nothing pr
 than a linear function of both pasts, whatever feedback made of them. And the gain must stay
 without the stretch of the record that favours it most, and is cut down where the plug explains
 less than the command it should replace.
+
+It is a study and no part of the package: `valveflow diagnose` has the measured position and needs
+no loop, and on measured loops Horch's test does better (`refinery_valves`).
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from valveflow_ros.diagnosis.loop_score import LEAST_REVERSALS, LoopScore
+from benchmarks.refinery_score import LEAST_REVERSALS, LoopScore
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import FloatArray
 
@@ -45,7 +48,7 @@ _FINEST = (0.01, 0.003)
 _LEAST_JUMP = 0.1  # share of the band
 
 LEAST_GAIN = 15.0
-"""Log-likelihood asked for. Fixed on simulated loops, `benchmarks.refinery_valves`."""
+"""Log-likelihood asked for. Fixed on simulated loops, `refinery_valves`."""
 LEAST_JUMP_GAIN = 4.0
 """By how much a jump must improve on none before backlash is called stiction. Fixed there."""
 
@@ -98,11 +101,6 @@ def judge_loop(command: FloatArray, response: FloatArray, step_s: float) -> Loop
         The process variable, in any unit, in the same rows.
     step_s : float
         Time between rows in s. Rows closer than 5 s are averaged after the plug has moved.
-
-    Notes
-    -----
-    The jump is known less well than the band: what happens between rows is not seen, and the
-    top of a command's swing is missed, so that many sticking valves are called slack.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""How much better a plug predicts a response than the command does; see `diagnosis.loop`."""
+"""How much better a plug predicts a response than the command does; see `refinery_judge`."""
 
 from __future__ import annotations
 

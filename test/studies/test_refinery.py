@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks import refinery_score
 from benchmarks import refinery_valves as study
 from benchmarks.horch import NO_STICTION, STICTION, UNDECIDED, cross_correlation, horch
+from benchmarks.refinery_judge import LEAST_GAIN, judge_loop
 from benchmarks.refinery_loops import simulate_loop
-from valveflow_ros.diagnosis import loop_score
-from valveflow_ros.diagnosis.loop import LEAST_GAIN, judge_loop
-from valveflow_ros.diagnosis.loop_score import LoopScore
+from benchmarks.refinery_score import LoopScore
 from valveflow_ros.errors import DataError
 
 pytestmark = pytest.mark.skipif(
@@ -171,10 +171,10 @@ def test_the_score_is_that_of_plain_least_squares(sticking):
     band, jump = 2.0 / inner.span, 1.2 / inner.span
     y = (response - response.mean()) / response.std()
     t = y[32:]
-    own = np.column_stack([np.ones(len(t)), naive_past(y, loop_score.OWN)])
+    own = np.column_stack([np.ones(len(t)), naive_past(y, refinery_score.OWN)])
     scaled = (command - command.mean()) / inner.span
     path = naive_plug(scaled, band, jump)
-    x, plug = naive_past(scaled, loop_score.COMMAND), naive_past(path, loop_score.PLUG)
+    x, plug = naive_past(scaled, refinery_score.COMMAND), naive_past(path, refinery_score.PLUG)
 
     def left(*tables):
         table = np.column_stack(tables)
