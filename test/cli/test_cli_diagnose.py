@@ -54,6 +54,8 @@ def test_the_page_tells_four_steps(diagnosed):
     for step in ('1. What is wrong', '2. Why', '3. The extended model', '4. The proof'):
         assert step in page
     assert 'single wild values' in page
+    assert 'time (UTC)' in page
+    assert 'days after' not in page
 
 
 def test_a_model_that_is_none_is_refused(run, logs, tmp_path):

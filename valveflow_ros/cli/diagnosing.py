@@ -27,13 +27,18 @@ from valveflow_ros.diagnosis.diagnosis_json import model_json, to_json
 from valveflow_ros.diagnosis.extended_model import ExtendedModel
 from valveflow_ros.diagnosis.first_model import first_model
 from valveflow_ros.diagnosis.on_top import on_top
-from valveflow_ros.diagnosis.result import Diagnosis
+from valveflow_ros.diagnosis.result import NAMED, NOTHING, UNEXPLAINED, Diagnosis
 from valveflow_ros.diagnosis.views import Views, views
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import SIGNALS, IntArray, SampleTable
 from valveflow_ros.report.diagnosis import Diagnosed, diagnosis_report
-from valveflow_ros.report.numbers import decimals, interval, plain
+from valveflow_ros.report.diagnosis_words import cells
+from valveflow_ros.report.numbers import decimals
 from valveflow_ros.report.words import held_words
+
+_VERDICTS = {
+    NAMED: 'cause found', NOTHING: 'nothing is wrong', UNEXPLAINED: 'something is unexplained',
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,20 +206,16 @@ def outcome(found: Result, written: Mapping[str, Path]) -> Outcome:
 
 def _text(found: Result, written: Mapping[str, Path]) -> str:
     d = found.page.diagnosis
-    rows = [
-        [c.name, key, f'{plain(e.value)} {e.unit}'.strip(), interval(e.low, e.high)]
-        for c in d.causes
-        for key, e in c.parameters.items()
-    ]
+    rows = [[c.name, key, *cells(e)] for c in d.causes for key, e in c.parameters.items()]
     judged = [f'  {name}: {why}' for name, why in d.rejected if 'cannot be judged' in why]
     parts = [
-        f'{found.page.source}: {d.verdict}. {d.sentence}',
+        f'{found.page.source}: {_VERDICTS[d.verdict]}. {d.sentence}',
         columns(rows, ['cause', 'parameter', 'value', '95 % interval']) if rows else '',
         f'Not told apart: {", ".join(d.not_told_apart)}.' if d.not_told_apart else '',
-        *(f'What would tell: {e}' for e in d.experiments),
-        f'RMSE on sealed blocks: simulation {decimals(d.rmse_simulation, 3)} MW, extended model '
-        f'{decimals(d.rmse_extended, 3)} MW, noise alone about '
-        f'{decimals(d.rmse_noise_floor, 3)} MW.',
+        *(f'What would tell them apart: {e}' for e in d.experiments),
+        'Error (RMSE) on blocks of time that nothing was fitted to: simulation '
+        f'{decimals(d.rmse_simulation, 3)} MW, extended model {decimals(d.rmse_extended, 3)} MW, '
+        f'noise alone about {decimals(d.rmse_noise_floor, 3)} MW.',
         '\n'.join(['Not judged:', *judged]) if judged else '',
         *d.notes,
         f'Wrote {written["report.html"]}, diagnosis.json and extended_model.json.',

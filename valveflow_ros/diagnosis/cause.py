@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.diagnosis.estimate import Estimate, dates
 from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.records import BoolArray
 
@@ -63,6 +65,8 @@ class Unknown:
         is not smooth in them), ``HELD`` ones not at all, the others by Gauss-Newton.
     concealed : float
         How much larger it may be without showing in any record; belongs to its interval.
+    dated : bool
+        It is a time in days after the first row, and people are told its date.
     """
 
     name: str
@@ -72,6 +76,21 @@ class Unknown:
     high: float
     kind: Kind = Kind.SMOOTH
     concealed: float = 0.0
+    dated: bool = False
+
+
+class Told(dict[str, float]):
+    """Values by name, for a sentence.
+
+    Attributes
+    ----------
+    onset : str
+        When it set in, as a date with its interval; empty for a cause without an onset.
+    """
+
+    def __init__(self, values: Mapping[str, float], onset: str = '') -> None:
+        super().__init__(values)
+        self.onset = onset
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +125,7 @@ class Cause:
     starts : callable
         Takes the `Bench` and returns promising values, none if there are none.
     sentence : callable
-        Takes values by name and says what is wrong, for an operator.
+        Takes what is to be told (see `Told`) and says what is wrong, for an operator.
     hindered : callable
         Why the record cannot judge this cause; empty if it can.
     confusers : tuple of str
@@ -121,7 +140,7 @@ class Cause:
     unknowns: tuple[Unknown, ...]
     act: Callable[..., Any]
     starts: Callable[[Bench], Sequence[Start]]
-    sentence: Callable[[dict[str, float]], str]
+    sentence: Callable[[Told], str]
     confusers: tuple[str, ...]
     experiment: str
     hindered: Callable[[Scene], str] = field(default=lambda scene: '')
@@ -165,3 +184,21 @@ class Active:
     def named(self) -> dict[str, float]:
         """Return the values by name."""
         return {u.name: v for u, v in zip(self.cause.unknowns, self.values, strict=True)}
+
+    def sentence(self, start_ns: int, estimates: Mapping[str, Estimate] | None = None) -> str:
+        """Return what is wrong, for an operator.
+
+        Parameters
+        ----------
+        start_ns : int
+            Time of the first row, ns since 1970 UTC.
+        estimates : mapping, optional
+            The values with their intervals, by name; without them none are told.
+        """
+        values, onset = self.named(), ''
+        for u in self.cause.unknowns:
+            if u.dated:
+                bare = Estimate(values[u.name], math.nan, math.nan, u.unit, start_ns)
+                at, between = dates(estimates[u.name] if estimates else bare)
+                onset = f'{at} on (95 % interval {between})' if between else f'{at} on'
+        return self.cause.sentence(Told(values, onset))

@@ -12,13 +12,14 @@ known no better than the opening is measured: two standard deviations of its noi
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from valveflow_ros.diagnosis.catalogue import catalogue
 from valveflow_ros.diagnosis.cause import Kind, Stage, Unknown
 from valveflow_ros.diagnosis.draws import free
+from valveflow_ros.diagnosis.estimate import Estimate
 from valveflow_ros.diagnosis.evidence import colour, long_run_variance
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import (
@@ -36,16 +37,6 @@ _NOISES = 2.0
 _PLACES, _MISSES = 120, 8
 _DOUBLINGS, _HALVINGS = 12, 7
 _PROFILE_BLOCK_SUBS = 2
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """A value with its 95 % interval; ``low`` and ``high`` are NaN where not known."""
-
-    value: float
-    low: float
-    high: float
-    unit: str
 
 
 class Certainty:
@@ -142,8 +133,9 @@ class Certainty:
                     low, high = self.profile(c, k, own)
                 column += own is not None
                 out[a.name][unknown.name] = Estimate(
-                    value, low, high + unknown.concealed, unknown.unit
-                )
+                    value, low, high + unknown.concealed, unknown.unit,
+                    self.task.scene.start_ns if unknown.dated else None,
+                )  # fmt: skip
         return out
 
 

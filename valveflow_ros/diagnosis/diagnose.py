@@ -181,8 +181,8 @@ def _conclude(
     estimates = Certainty(task, final).intervals() if final.active else {}
     causes = tuple(
         NamedCause(
-            a.name, a.cause.sentence(a.named()), estimates[a.name], gain, a.cause.experiment,
-            found.near.get(a.name, ()), a.extra,
+            a.name, a.sentence(scene.start_ns, estimates[a.name]), estimates[a.name], gain,
+            a.cause.experiment, found.near.get(a.name, ()), a.extra,
         )
         for a, gain in zip(final.active, gains, strict=True)
     )  # fmt: skip

@@ -18,14 +18,15 @@ def _number(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _cause(c: NamedCause) -> dict[str, Any]:
+def cause_json(c: NamedCause) -> dict[str, Any]:
+    """Return a cause; its parameters stay numbers, a time says what it counts from."""
     return {
         'name': c.name,
         'sentence': c.sentence,
         'parameters': {
             key: {
                 'value': _number(e.value), 'low': _number(e.low), 'high': _number(e.high),
-                'unit': e.unit,
+                'unit': e.full_unit, **({} if e.origin_ns is None else {'origin_ns': e.origin_ns}),
             }
             for key, e in c.parameters.items()
         },
@@ -47,7 +48,7 @@ def to_json(d: Diagnosis) -> dict[str, Any]:
         'version': VERSION,
         'verdict': d.verdict,
         'sentence': d.sentence,
-        'causes': [_cause(c) for c in d.causes],
+        'causes': [cause_json(c) for c in d.causes],
         'not_told_apart': list(d.not_told_apart),
         'experiments': list(d.experiments),
         'disturbance': {

@@ -103,7 +103,10 @@ class Evidence:
                 f'{LEAST_GAIN:.0f} are asked for'
             )
         if not self.wald > self.least_wald:
-            told.append(f'its size is uncertain (Wald {self.wald:.1f} of {self.least_wald:.0f})')
+            told.append(
+                f'its size is uncertain (Wald statistic {self.wald:.1f}, '
+                f'{self.least_wald:.0f} are asked for)'
+            )
         if not self.sign > LEAST_SIGN:
             told.append(f'too few blocks agree (t = {self.sign:.1f})')
         return '; '.join(told)

@@ -48,7 +48,7 @@ class ExtendedModel:
         """Return the causes, the earlier ones first."""
         earlier = () if self.on_top_of is None else self.on_top_of.held
         return earlier + tuple(
-            HeldCause(a.name, tuple(a.named().items()), a.cause.sentence(a.named()))
+            HeldCause(a.name, tuple(a.named().items()), a.sentence(self.start_ns))
             for a in self.model.active
         )
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from valveflow_ros.diagnosis import actuator
 from valveflow_ros.diagnosis.catalogue import catalogue
-from valveflow_ros.diagnosis.confidence import Estimate
+from valveflow_ros.diagnosis.cause import Told
+from valveflow_ros.diagnosis.estimate import Estimate
 from valveflow_ros.diagnosis.gain import Gain, rmse
 from valveflow_ros.diagnosis.quality import Fault
 from valveflow_ros.diagnosis.result import NamedCause
@@ -37,7 +38,7 @@ def actuator_cause(found: Found) -> tuple[NamedCause, ...]:
         NamedCause(
             fault.name,
             _BETWEEN
-            + (_SLACK.format(**values) if 'w_percent' in values else cause.sentence(values)),
+            + (_SLACK.format(**values) if 'w_percent' in values else cause.sentence(Told(values))),
             {k: Estimate(*v, units[k]) for k, v in fault.parameters.items()},
             gain,
             cause.experiment,

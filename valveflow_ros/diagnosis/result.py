@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from valveflow_ros.diagnosis.confidence import Estimate
+from valveflow_ros.diagnosis.estimate import Estimate
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.gain import Gain, SegmentGain
 from valveflow_ros.diagnosis.scene import Reference

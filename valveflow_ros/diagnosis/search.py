@@ -122,7 +122,9 @@ def _add(found: Found, barred: set[str]) -> bool:
         for other in rivals:
             if other is not rival:
                 by = other.score - rival.score
-                found.reasons[other.added.name] = f'{name} explains the data better by {by:.1f}'
+                found.reasons[other.added.name] = (
+                    f'{name} explains the data better, by {by:.1f} in log-likelihood'
+                )
         if rival.added.cause.of_model and not found.task.fixed_dynamics:
             _absorb(found, rival)
         else:

@@ -10,7 +10,7 @@ from valveflow_ros.records import FloatArray
 
 TEN_DAYS_S = 10.0 * DAY_S
 
-ONSET = Unknown('t0_days', 'd', 2.0 / 24.0, 0.0, 400.0, Kind.LINE)
+ONSET = Unknown('t0_days', 'd', 2.0 / 24.0, 0.0, 400.0, Kind.LINE, dated=True)
 
 
 def ramp(scene: Scene, time_s: FloatArray) -> FloatArray:
@@ -46,11 +46,6 @@ def _at_least(scene: Scene, days: float) -> str:
         f'it changes with time, and the record lasts {scene.days:.2g} days; '
         f'at least {days:g} are needed'
     )
-
-
-def onset_words(values: dict[str, float]) -> str:
-    """Return when, for a sentence."""
-    return f'{values["t0_days"]:.2f} days after the beginning'
 
 
 def change(share: float) -> str:

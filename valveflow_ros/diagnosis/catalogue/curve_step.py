@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from valveflow_ros.diagnosis.bench import CURVE, HATS, Bench
-from valveflow_ros.diagnosis.catalogue._time import ONSET, a_day, onset_words, since
-from valveflow_ros.diagnosis.cause import Cause, Kind, Stage, Start, Unknown, Values
+from valveflow_ros.diagnosis.catalogue._time import ONSET, a_day, since
+from valveflow_ros.diagnosis.cause import Cause, Kind, Stage, Start, Told, Unknown, Values
 from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.records import FloatArray
 
@@ -45,10 +45,10 @@ def starts(bench: Bench) -> Sequence[Start]:
     return bench.best(CAUSE, [values])
 
 
-def sentence(values: dict[str, float]) -> str:
+def sentence(values: Told) -> str:
     """Say it."""
     return (
-        f'From {onset_words(values)} on the curve lacks part of its course: '
+        f'From {values.onset} the curve lacks part of its course: '
         f'{values["s_mw"]:+.2g} MW above u = {values["u_to"]:.0f}, nothing below '
         f'{values["u_from"]:.0f} (a valve that sticks, or another order of opening).'
     )

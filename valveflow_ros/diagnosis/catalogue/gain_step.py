@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from valveflow_ros.diagnosis.bench import GAIN, Bench
-from valveflow_ros.diagnosis.catalogue._time import ONSET, a_day, change, onset_words, since
-from valveflow_ros.diagnosis.cause import Cause, Stage, Start, Unknown, Values
+from valveflow_ros.diagnosis.catalogue._time import ONSET, a_day, change, since
+from valveflow_ros.diagnosis.cause import Cause, Stage, Start, Told, Unknown, Values
 from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.records import FloatArray
 
@@ -28,10 +28,10 @@ def starts(bench: Bench) -> Sequence[Start]:
     return bench.best_onset(CAUSE, bench.only(GAIN))
 
 
-def sentence(values: dict[str, float]) -> str:
+def sentence(values: Told) -> str:
     """Say it."""
     return (
-        f'From {onset_words(values)} on the same flow gives {change(values["g"])} power, at every '
+        f'From {values.onset} the same flow gives {change(values["g"])} power, at every '
         'load alike (maintenance, power meter, a heater or extraction).'
     )
 

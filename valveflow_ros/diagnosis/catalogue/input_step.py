@@ -13,8 +13,8 @@ import numpy as np
 
 from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.diagnosis.bench import INPUT, Bench
-from valveflow_ros.diagnosis.catalogue._time import ONSET, a_day, change, onset_words, since
-from valveflow_ros.diagnosis.cause import Cause, Stage, Start, Unknown, Values
+from valveflow_ros.diagnosis.catalogue._time import ONSET, a_day, change, since
+from valveflow_ros.diagnosis.cause import Cause, Stage, Start, Told, Unknown, Values
 from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.records import FloatArray
 
@@ -29,10 +29,10 @@ def starts(bench: Bench) -> Sequence[Start]:
     return bench.best_onset(CAUSE, bench.only(INPUT))
 
 
-def sentence(values: dict[str, float]) -> str:
+def sentence(values: Told) -> str:
     """Say it."""
     return (
-        f'From {onset_words(values)} on the same reading of opening and pressure passes '
+        f'From {values.onset} the same reading of opening and pressure passes '
         f'{change(values["g"])} steam (a transmitter was recalibrated or failed partly).'
     )
 

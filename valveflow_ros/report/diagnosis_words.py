@@ -1,0 +1,58 @@
+"""How a diagnosis is put for people: its variables, its parameters, times as dates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from valveflow_ros.diagnosis.estimate import Estimate, dates, told
+from valveflow_ros.report.numbers import UNKNOWN, interval, plain
+
+# What the residual is held against: in a sentence, and at an axis.
+_VARIABLES = {
+    'u': ('the integrated input u', 'integrated input u (% MPa^m)'),
+    'pressure given u': ('the steam pressure given u', 'pressure above its usual at that u (MPa)'),
+    'temperature': ('the steam temperature', 'main steam temperature (°C)'),
+    'time': ('time', 'time (UTC)'),
+    'time of day': ('the time of day', 'time of day (h UTC)'),
+    'ramp': ('the ramp rate', 'change of u in 3 min (% MPa^m)'),
+    'direction': ('the direction of motion', 'last motion (−1 closing, +1 opening)'),
+}
+_MOST_SPANS = 20
+
+
+def variable(name: str) -> str:
+    """Return a variable as it stands in a sentence."""
+    return _VARIABLES.get(name, (name, name))[0]
+
+
+def axis_title(name: str) -> str:
+    """Return what stands at the axis of a variable."""
+    return _VARIABLES.get(name, (name, name))[1]
+
+
+def cells(estimate: Estimate) -> tuple[str, str]:
+    """Return a parameter with its unit, and its 95 % interval; a time and its own as dates."""
+    if estimate.origin_ns is not None:
+        at, between = dates(estimate)
+        return at, between or UNKNOWN
+    value = f'{plain(estimate.value)} {estimate.unit}'.strip()
+    return value, interval(estimate.low, estimate.high)
+
+
+def times_in_effect(switches_s: Sequence[float], start_ns: int, end_ns: int) -> str:
+    """Return when a cause was in effect that is switched in and out, as dates.
+
+    Parameters
+    ----------
+    switches_s : sequence of float
+        In, out, in, ...: seconds after the first row.
+    start_ns, end_ns : int
+        First and last row.
+    """
+    moments = [told(start_ns, s) for s in switches_s]
+    if len(moments) % 2:
+        moments.append(told(end_ns, 0.0))
+    spans = [f'{a} to {b}' for a, b in zip(moments[::2], moments[1::2], strict=True)]
+    shown = '; '.join(spans[:_MOST_SPANS])
+    more = len(spans) - _MOST_SPANS
+    return f'{shown}; and {more} times more' if more > 0 else shown
