@@ -51,9 +51,9 @@ def test_the_pressure_comes_back_as_it_was_read(rows: list[tuple[int, int]]) -> 
 @pytest.mark.slow
 def test_the_window_is_diagnosed_as_the_record_is() -> None:
     """The same rows from a file and from the running monitor give the same diagnosis."""
-    samples = table(1.5, 3, ('backlash:w_percent=1.2',), unit())
+    samples = table(1.02, 3, ('temperature:k=-0.004',), unit())
     monitor = Monitor(
-        Settings({'sample_period': STEP_S, 'refit_period': 100_000.0, 'refit_segments': 0})
+        Settings({'sample_period': STEP_S, 'refit_period': 80_000.0, 'refit_segments': 0})
     )
     feed_rows(monitor, samples)
     curve = monitor.characteristic
@@ -69,5 +69,5 @@ def test_the_window_is_diagnosed_as_the_record_is() -> None:
     truth = to_json(diagnose(record, curve.model))
     content = json.loads(found.text)
     assert found.window_end_ns == task.window_end_ns
-    assert [c['name'] for c in content['causes']] == ['backlash']
+    assert [c['name'] for c in content['causes']] == ['temperature']
     assert content == truth

@@ -5,11 +5,16 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
 
 import hurt_jobs
 import pytest
+from rclpy.lifecycle import TransitionCallbackReturn as Transition
+from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
-from ros_helpers import wait_until
+from ros_helpers import Processes, wait_until
 from test_ros_live import SlowWorker, rows_of
 from valveflow_msgs.msg import Diagnosis
 
@@ -28,12 +33,13 @@ from valveflow_ros.core.offline import JournalReplayer
 from valveflow_ros.errors import DataError
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.unit import UnitDescription
-from valveflow_ros.records import Readings, table_to_readings
+from valveflow_ros.records import NS_PER_S, Readings, table_to_readings
 from valveflow_ros.ros import diagnosis_message
 from valveflow_ros.ros.chronicle import line_of
 from valveflow_ros.ros.diagnosis_health import diagnosis_item, model_item
 from valveflow_ros.ros.diagnostics import Level
 from valveflow_ros.ros.live import LiveEngine
+from valveflow_ros.ros.monitor_node import MonitorNode
 from valveflow_ros.ros.outputs import Output, Outputs
 from valveflow_ros.ros.simulator_steps import effects_of
 from valveflow_ros.ros.verify import diagnosed_elsewhere
@@ -42,7 +48,7 @@ from valveflow_ros.ros.worker import DiagnosisWorker
 from valveflow_ros.ros.worker_child import answer
 
 pytestmark = pytest.mark.usefixtures('jobs_on_path')
-STEP_S = 10.0
+STEP_S, FAULT_DAYS = 10.0, 0.5
 SETTINGS = Settings(
     {'sample_period': STEP_S, 'refit_period': 28800.0, 'refit_segments': 0, 'diagnosis_hour': 2}
 )
@@ -189,3 +195,50 @@ def test_replaying_the_journal_repeats_each_diagnosis_byte_for_byte(
     entry = JournalEntry(0, JournalKind.DIAGNOSED, 5, 0, '', '')
     with pytest.raises(DataError, match='never asked for'):
         JournalReplayer(Monitor(SETTINGS), [entry]).feed(table)
+
+
+@pytest.mark.ros
+def test_a_node_that_comes_late_hears_the_diagnosis(
+    context: Any, processes: Processes, tmp_path: Path
+) -> None:
+    """A day of data, the real processes for curve and diagnosis, DDS, a listener of its own."""
+    unit = replace(UnitDescription(), sample_period_s=STEP_S)
+    effects = effects_of([f'gain_step:g=-0.03,t0_days={FAULT_DAYS}'])
+    log = simulate(1.02, 5, unit, effects=effects)
+    overrides = [
+        Parameter('record_directory', value=str(tmp_path / 'recordings')),
+        Parameter('unit_tag', value='unit 1'),
+        Parameter('sample_period', value=STEP_S),
+        Parameter('refit_period', value=86_400.0),
+        Parameter('refit_segments', value=0),
+        Parameter('refine', value=False),
+        Parameter('selection_rule', value='paper'),
+        Parameter('diagnosis_hour', value=-1),
+    ]
+    node = MonitorNode(context=context, parameter_overrides=overrides)
+    try:
+        assert node.trigger_configure() == node.trigger_activate() == Transition.SUCCESS
+        session = node.session
+        assert session is not None
+        session.tell(session.engine.feed(rows_of(table_to_readings(log.table))))
+        wait_until(lambda: node.step() or session.engine.monitor.characteristic, 'the curve')
+        session.tell(session.engine.request_diagnosis())
+        wait_until(lambda: node.step() or session.engine.monitor.diagnosing.last, 'a diagnosis')
+        listener = processes.start('late_listener', session.outputs['diagnosis'])
+        wait_until(lambda: listener.poll() is not None, 'the end of the listener')
+    finally:
+        node.end_session()
+        node.destroy_node()
+    said = json.loads(processes.output(listener))
+    assert (said['verdict'], said['tag']) == (Diagnosis.NAMED, 'unit 1')
+    last = session.engine.monitor.diagnosing.last
+    assert said['sentence'] == json.loads(last.content)['sentence']
+    assert said['model_id'] == last.task.curve.model_id
+    assert said['until'] == list(divmod(int(log.table.time_ns[-1]), NS_PER_S))
+    assert said['rmse'][1] < said['rmse'][0]
+    (step,) = (c for c in said['causes'] if 't0_days' in c['values'])
+    begin_s = int(log.table.time_ns[0]) / NS_PER_S
+    onset = datetime.fromtimestamp(begin_s + FAULT_DAYS * 86_400.0, tz=timezone.utc)
+    assert f'{onset:%Y-%m-%d}' in step['sentence']
+    assert step['values']['t0_days'] == pytest.approx(FAULT_DAYS, abs=0.05)
+    assert any(unit.startswith('days since 20') for unit in step['units'])
