@@ -18,6 +18,14 @@ from valveflow_ros.errors import ParameterError
 Value = bool | int | float | str
 
 
+# What the engine's memory does not depend on.
+_APART = frozenset({
+    'autostart', 'input_reliability', 'refit_timeout', 'diagnosis_timeout', 'reference_file',
+    'record', 'record_directory', 'record_flush', 'record_rotation', 'record_queue',
+    'record_keep', 'keep_state', 'state_directory', 'state_period',
+})  # fmt: skip
+
+
 @dataclass(frozen=True, slots=True)
 class Parameter:
     """One row of the table.
@@ -40,6 +48,11 @@ class Parameter:
     high: float | None = None
     choices: tuple[str, ...] = ()
     live: bool = False
+
+    @property
+    def of_state(self) -> bool:
+        """Tell whether a state made with another value cannot be gone on with."""
+        return not (self.live or self.name in _APART)
 
     def check(self, value: object) -> Value:
         """Return ``value`` in this row's type, or raise `ParameterError`.
@@ -231,6 +244,15 @@ _ALARM = (
               0.0, 0.9, live=True),
     Parameter('alarm_latch', True, '',
               'An alarm stays until it has returned and was acknowledged.', live=True),
+    Parameter('alarm_shelve_time', 28800.0, 's',
+              'An alarm that was put aside comes back by itself after this time.',
+              60.0, 604800.0, live=True),
+    Parameter('alarm_suppress_time', 600.0, 's',
+              'The residual alarm is suppressed when it could not be judged for this long.',
+              1.0, 86400.0, live=True),
+    Parameter('alarm_flood', 5, '',
+              'Most announcements of one alarm in ten minutes; more are counted and held back.',
+              1, 100, live=True),
 )  # fmt: skip
 
 _SHIFT = (
@@ -273,6 +295,14 @@ _RECORD = (
     Parameter('record_keep', 0, '',
               'Finished files kept in a recording, the oldest go first; 0 keeps all.',
               0, 1_000_000),
+    Parameter('keep_state', True, '',
+              'Save window, curve and alarms, and go on with them after the next start.'),
+    Parameter('state_directory', '', '',
+              'Folder of the saved state, for one monitor only; empty means state_ and the '
+              'unit_tag below record_directory, and none if nothing is recorded.'),
+    Parameter('state_period', 3600.0, 's',
+              'Longest time between saved states; a new curve or alarm saves one within seconds.',
+              1.0, 86400.0),
     Parameter('diagnostics_period', 1.0, 's', 'Time between messages on /diagnostics.', 0.1, 60.0,
               live=True),
 )  # fmt: skip

@@ -1,68 +1,85 @@
-"""The residual alarm: ISA-18.2 states with delays, dead band, latch and acknowledgement."""
+"""The residual alarm: whether the plant has left the curve, with delays and a dead band."""
 
 from __future__ import annotations
 
-import enum
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 
 from valveflow_ros.config import Settings
+from valveflow_ros.core.alarm_records import AlarmChange, AlarmState, Judged, Priority
+from valveflow_ros.core.alarm_voice import Content, VoicedAlarm
 from valveflow_ros.core.jit import jit
+from valveflow_ros.core.state import State, put_back
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
 
-
-class AlarmState(enum.IntEnum):
-    """States of an alarm (ANSI/ISA-18.2, figure of alarm state transitions)."""
-
-    NORMAL = 0
-    UNACKNOWLEDGED = 1
-    ACKNOWLEDGED = 2
-    RETURNED_UNACKNOWLEDGED = 3
-    SHELVED = 4
-    SUPPRESSED = 5
-    OUT_OF_SERVICE = 6
-
-
-class Priority(enum.IntEnum):
-    """How soon somebody has to look; residual alarms ask for maintenance, not for a trip."""
-
-    LOW = 1
-    MEDIUM = 2
-    HIGH = 3
-
-
-@dataclass(frozen=True, slots=True)
-class AlarmChange:
-    """One change of an alarm's state."""
-
-    time_ns: int
-    name: str
-    state: AlarmState
-    previous: AlarmState
-    priority: Priority
-    value: float
-    limit: float
-    unit: str
-    sentence: str
-    occurrence: int
-    raised_ns: int
-    model_id: str
-
-
-class Judged(NamedTuple):
-    """A moment, the evidence then, and the shift it speaks of."""
-
-    time_ns: int
-    evidence: float
-    shift_mw: float
-
+__all__ = ['AlarmChange', 'AlarmState', 'Judged', 'Priority', 'ResidualAlarm']
 
 _LIMIT = 1.0
-# Places in the alarm's memory.
-_ACTIVE, _SINCE, _COUNTING, _LAST_NS = range(4)
+# Places in the alarm's memory: the condition, the delay that runs, the time of the last row; how
+# long nothing could be judged and how long it could be again, and whether it is suppressed for it;
+# what happened at the last row, and the step of time before it.
+_ACTIVE, _SINCE, _COUNTING, _LAST_NS, _BLIND, _SIGHT, _DARK, _WHAT, _STEP = range(9)
+_PLACES = 9
+# What happened, as bits.
+_TURNED, _DARKENED, _SEEING, _SET_BACK, _DUE = 1, 2, 4, 8, 16
+_NEVER = (1 << 63) - 1
+
+
+@jit
+def _turns(
+    time_ns: int,
+    v: float,
+    limit: float,
+    dead_band: float,
+    on_ns: int,
+    off_ns: int,
+    memory: IntArray,
+) -> bool:
+    """Judge one value; tell whether the condition turned."""
+    if memory[_ACTIVE] == 0:
+        beyond = v > limit
+        delay = on_ns
+    else:
+        beyond = v < limit * (1.0 - dead_band)
+        delay = off_ns
+    if not beyond:
+        memory[_COUNTING] = 0
+        return False
+    if memory[_COUNTING] == 0:
+        memory[_COUNTING] = 1
+        memory[_SINCE] = time_ns
+    if time_ns - memory[_SINCE] < delay:
+        return False
+    memory[_ACTIVE] = 1 - memory[_ACTIVE]
+    memory[_COUNTING] = 0
+    return True
+
+
+@jit
+def _sight(
+    judged: bool, turned: bool, watched_ns: int, dark_ns: int, back_ns: int, memory: IntArray
+) -> int:
+    """Follow how long the alarm has been blind, or could see again; return what that brings.
+
+    Time that nobody watched does not count, so that a silence alone suppresses nothing.
+    """
+    if not judged:
+        memory[_SIGHT] = 0
+        memory[_BLIND] += watched_ns
+        if memory[_DARK] == 0 and memory[_BLIND] >= dark_ns:
+            memory[_DARK] = 1
+            return _DARKENED
+        return 0
+    memory[_BLIND] = 0
+    if memory[_DARK] == 0:
+        return 0
+    memory[_SIGHT] += watched_ns
+    if memory[_SIGHT] >= back_ns or turned:
+        memory[_DARK] = memory[_SIGHT] = 0
+        return _SEEING
+    return 0
 
 
 @jit
@@ -74,80 +91,84 @@ def _watch(
     on_ns: int,
     off_ns: int,
     gap_ns: int,
+    dark_ns: int,
+    back_ns: int,
+    due_ns: int,
     memory: IntArray,
 ) -> int:
-    """Run until the condition turns; return the row after the turn, or 0.
+    """Run until something happens; return the row after it, or 0.
 
-    NaN leaves everything as it is: bad data neither raise nor clear. A delay
+    NaN leaves the condition as it is: bad data neither raise nor clear. A delay
     does not run through a gap in time, where nobody was watching.
     """
     for t in range(value.size):
         step_ns = time_ns[t] - memory[_LAST_NS]
         memory[_LAST_NS] = time_ns[t]
-        if step_ns > gap_ns or step_ns <= 0:
+        watched = 0 < step_ns <= gap_ns
+        if not watched:
             memory[_COUNTING] = 0
         v = abs(value[t])
-        if math.isnan(v):
+        judged = not math.isnan(v)
+        turned = False
+        if judged:
+            turned = _turns(time_ns[t], v, limit, dead_band, on_ns, off_ns, memory)
+        else:
             # Delays stand still while there is nothing to judge.
             memory[_SINCE] += step_ns
-            continue
-        if memory[_ACTIVE] == 0:
-            beyond = v > limit
-            delay = on_ns
-        else:
-            beyond = v < limit * (1.0 - dead_band)
-            delay = off_ns
-        if not beyond:
-            memory[_COUNTING] = 0
-            continue
-        if memory[_COUNTING] == 0:
-            memory[_COUNTING] = 1
-            memory[_SINCE] = time_ns[t]
-        if time_ns[t] - memory[_SINCE] >= delay:
-            memory[_ACTIVE] = 1 - memory[_ACTIVE]
-            memory[_COUNTING] = 0
+        what = _sight(judged, turned, step_ns if watched else 0, dark_ns, back_ns, memory)
+        if turned:
+            what += _TURNED
+        if step_ns <= 0:
+            what += _SET_BACK
+        if time_ns[t] >= due_ns:
+            what += _DUE
+        if what:
+            memory[_WHAT], memory[_STEP] = what, step_ns
             return t + 1
     return 0
 
 
-class ResidualAlarm:
+class ResidualAlarm(VoicedAlarm):
     """Judge the evidence that the plant has left the curve: beyond 1 or -1 it has.
+
+    Where the evidence cannot be judged for long, the alarm is suppressed; it comes back when a
+    whole block of the residual was judged, since evidence before that is of old data.
 
     Parameters
     ----------
     settings : Settings
-        Delays, dead band, latch.
+        Delays, dead band, latch, time on the shelf, flood limit.
+
+    Attributes
+    ----------
+    judged : Judged
+        What the next change speaks of.
     """
 
     NAME = 'residual'
 
     def __init__(self, settings: Settings) -> None:
-        self._memory = np.zeros(4, dtype=np.int64)
-        self._occurrence = 0
-        self._raised_ns = 0
-        self.state = AlarmState.NORMAL
-        self.configure(settings)
+        self._memory = np.zeros(_PLACES, dtype=np.int64)
+        self.judged = Judged(0, math.nan, math.nan)
+        super().__init__(settings)
 
     def configure(self, settings: Settings) -> None:
-        """Take new delays, dead band and latch; states and counters stay."""
+        """Take new settings; states and counters stay."""
+        super().configure(settings)
         self._dead_band = settings.real('alarm_dead_band')
         self._on_ns = round(settings.real('alarm_on_delay') * NS_PER_S)
         self._off_ns = round(settings.real('alarm_off_delay') * NS_PER_S)
-        self._latch = settings.flag('alarm_latch')
         self._gap_ns = round(1.5 * settings.real('sample_period') * NS_PER_S)
-
-    @property
-    def active(self) -> bool:
-        """Tell whether the condition holds now."""
-        return bool(self._memory[_ACTIVE])
-
-    @property
-    def standing(self) -> bool:
-        """Tell whether the alarm is anything but normal."""
-        return self.state != AlarmState.NORMAL
+        self._dark_ns = round(settings.real('alarm_suppress_time') * NS_PER_S)
+        self._back_ns = round(settings.real('alarm_block') * NS_PER_S)
 
     def feed(
-        self, time_ns: IntArray, evidence: FloatArray, shift_mw: FloatArray, model_id: str
+        self,
+        time_ns: IntArray,
+        evidence: FloatArray,
+        shift_mw: FloatArray,
+        model_id: str,
+        beside: Sequence[VoicedAlarm] = (),
     ) -> list[tuple[int, AlarmChange]]:
         """Judge rows; return changes, each with the number of rows up to it.
 
@@ -159,58 +180,77 @@ class ResidualAlarm:
         shift_mw : float64 (n,)
             The shift it speaks of, for the sentence.
         model_id : str
+        beside : sequence of VoicedAlarm
+            Others, for which the time passes row by row as well.
         """
         changes: list[tuple[int, AlarmChange]] = []
+        everyone = [self, *beside]
         done = 0
         while done < len(time_ns):
-            turned = _watch(
+            due = [alarm.due_ns for alarm in everyone]
+            taken = _watch(
                 time_ns[done:], evidence[done:], _LIMIT, self._dead_band,
-                self._on_ns, self._off_ns, self._gap_ns, self._memory,
+                self._on_ns, self._off_ns, self._gap_ns, self._dark_ns, self._back_ns,
+                min((d for d in due if d is not None), default=_NEVER), self._memory,
             )  # fmt: skip
-            if not turned:
+            if not taken:
                 break
-            done += turned
-            judged = Judged(
-                int(time_ns[done - 1]), float(evidence[done - 1]), float(shift_mw[done - 1])
-            )
-            changes.append((done, self._turn(judged, model_id)))
+            done += taken
+            now_ns = int(time_ns[done - 1])
+            self.judged = Judged(now_ns, float(evidence[done - 1]), float(shift_mw[done - 1]))
+            self._happened(now_ns, everyone)
+            changes += [(done, c) for a in everyone for c in a.pass_time(now_ns, model_id)]
         return changes
 
-    def acknowledge(self, judged: Judged, model_id: str) -> AlarmChange | None:
-        """Acknowledge; None when there is nothing to acknowledge."""
-        if self.state == AlarmState.UNACKNOWLEDGED:
-            return self._enter(AlarmState.ACKNOWLEDGED, judged, model_id)
-        if self.state == AlarmState.RETURNED_UNACKNOWLEDGED:
-            return self._enter(AlarmState.NORMAL, judged, model_id)
-        return None
+    def _happened(self, now_ns: int, everyone: Sequence[VoicedAlarm]) -> None:
+        """Let lives go on by what happened at a row."""
+        what = int(self._memory[_WHAT])
+        if what & _SET_BACK:
+            for alarm in everyone:
+                alarm.shift_time(int(self._memory[_STEP]))
+        if what & _DARKENED:
+            self._life.suppress()
+        if what & _SEEING:
+            self._life.resume()
+        if what & _TURNED and self._memory[_ACTIVE]:
+            self._life.begin(now_ns)
+        elif what & _TURNED:
+            self._life.end(self._latch)
 
-    def _turn(self, judged: Judged, model_id: str) -> AlarmChange:
-        """Change state because the condition has begun or ended."""
-        if self.active:
-            self._occurrence += 1
-            self._raised_ns = judged.time_ns
-            return self._enter(AlarmState.UNACKNOWLEDGED, judged, model_id)
-        latched = self._latch and self.state == AlarmState.UNACKNOWLEDGED
-        after = AlarmState.RETURNED_UNACKNOWLEDGED if latched else AlarmState.NORMAL
-        return self._enter(after, judged, model_id)
+    def _content(self, state: AlarmState) -> Content:
+        value, shift_mw = self.judged.evidence, self.judged.shift_mw
+        return Content(value, _LIMIT, '', _sentence(state, shift_mw))
 
-    def _enter(self, state: AlarmState, judged: Judged, model_id: str) -> AlarmChange:
-        previous, self.state = self.state, state
-        return AlarmChange(
-            judged.time_ns, self.NAME, state, previous, Priority.MEDIUM, judged.evidence, _LIMIT,
-            '', _sentence(state, judged.shift_mw), self._occurrence, self._raised_ns, model_id,
-        )  # fmt: skip
+    def _blind(self) -> str:
+        minutes = self._dark_ns / (60.0 * NS_PER_S)
+        return (
+            f'The residual could not be judged for {minutes:g} min: inputs are bad, or the valve '
+            'is outside the curve.'
+        )
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        return {**super().snapshot(), 'memory': self._memory.copy(), 'judged': list(self.judged)}
+
+    def restore(self, saved: State) -> None:
+        """Go on from a snapshot; raises `DataError` if it does not fit."""
+        put_back({'memory': self._memory}, saved)
+        super().restore(saved)
+        self.judged = Judged(*saved['judged'])
 
 
 def _sentence(state: AlarmState, shift_mw: float) -> str:
     """Say what happened in words an operator can act on."""
     side = 'more' if shift_mw > 0.0 else 'less'
+    known = abs(shift_mw) > 0.0
+    if state == AlarmState.UNACKNOWLEDGED and not known:
+        return 'The unit has left its valve curve; there is no residual to tell by how much.'
     if state == AlarmState.UNACKNOWLEDGED:
         return (
             f'The unit gives {abs(shift_mw):.1f} MW {side} than the valve curve says, and it '
             'lasts: check what changed, or re-identify.'
         )
-    if state == AlarmState.ACKNOWLEDGED and not abs(shift_mw) > 0.0:
+    if state == AlarmState.ACKNOWLEDGED and not known:
         return 'Acknowledged; there is no residual to tell yet.'
     if state == AlarmState.ACKNOWLEDGED:
         return f'Acknowledged; the unit still gives {abs(shift_mw):.1f} MW {side} than expected.'

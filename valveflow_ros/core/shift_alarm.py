@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.alarms import AlarmChange, AlarmState, Priority
+from valveflow_ros.core.alarm_records import AlarmChange, AlarmState
+from valveflow_ros.core.alarm_voice import Content, VoicedAlarm
 from valveflow_ros.core.shift import PieceShift, Shift
+from valveflow_ros.core.state import State
 
 # A shift that was seen is over only when it is ten times less sure than it had to be.
 _DOUBT = 10.0
@@ -15,33 +17,31 @@ _DOUBT = 10.0
 _COVERED = 0.8
 
 
-class ShiftAlarm:
+class ShiftAlarm(VoicedAlarm):
     """Follow the judgements of adopted curves against the reference.
 
     Notes
     -----
-    ISA-18.2 states as in `valveflow_ros.core.alarms.ResidualAlarm`, but without delays:
-    a curve stands on days of data. A piece that moved and left the window with its load is
-    not known to be back: the alarm stands until its u are judged again, or until there is a
-    new reference.
+    ISA-18.2 states as of the residual alarm, but without delays: a curve stands on days of data,
+    and for the same reason it is suppressed by a curve that cannot be judged, not by minutes of
+    bad data. A piece that moved and left the window with its load is not known to be back: the
+    alarm stands until its u are judged again, or until there is a new reference.
+
+    Parameters
+    ----------
+    settings : Settings, optional
+        Those given with a judgement are taken from then on.
     """
 
     NAME = 'curve_shift'
 
-    def __init__(self) -> None:
-        self._occurrence = 0
-        self._raised_ns = 0
+    def __init__(self, settings: Settings | None = None) -> None:
         self._value = 0.0
         self._limit = 0.0
         self._sentence = ''
+        self._problem = ''
         self._ranges: list[tuple[float, float]] = []
-        self.active = False
-        self.state = AlarmState.NORMAL
-
-    @property
-    def standing(self) -> bool:
-        """Tell whether the alarm is anything but normal."""
-        return self.state != AlarmState.NORMAL
+        super().__init__(settings or Settings())
 
     @property
     def ranges(self) -> tuple[tuple[float, float], ...]:
@@ -50,41 +50,43 @@ class ShiftAlarm:
 
     def judge(self, shift: Shift, time_ns: int, settings: Settings) -> list[AlarmChange]:
         """Take a judgement; return the change it makes, if any."""
+        self.configure(settings)
+        self._life.resume()
         worst = shift.largest
         if worst is not None:
             self._value, self._limit = worst.shift_mw, worst.smallest_mw
             self._sentence = shift.sentence
         self._remember(shift, settings)
         if not self.active and worst is not None:
-            self.active = True
-            self._occurrence += 1
-            self._raised_ns = time_ns
-            return [self._enter(AlarmState.UNACKNOWLEDGED, time_ns, shift.model_id)]
+            self._life.begin(time_ns)
         doubt = any(_stands(p, settings) for p in shift.pieces)
         if self.active and not doubt and not self._ranges:
-            return self.end(shift.sentence, time_ns, shift.model_id, settings)
-        return []
+            self._end(shift.sentence)
+        return self._tell(time_ns, shift.model_id)
+
+    def unjudged(
+        self, problem: str, time_ns: int, model_id: str, settings: Settings
+    ) -> list[AlarmChange]:
+        """Be suppressed, since a curve could not be judged, until the next one is."""
+        self.configure(settings)
+        self._problem = problem
+        self._life.suppress()
+        return self._tell(time_ns, model_id)
 
     def end(
         self, sentence: str, time_ns: int, model_id: str, settings: Settings
     ) -> list[AlarmChange]:
         """Let the condition be over, as with a new reference."""
-        if not self.active:
-            return []
-        self.active = False
+        self.configure(settings)
+        self._life.resume()
+        if self.active:
+            self._end(sentence)
+        return self._tell(time_ns, model_id)
+
+    def _end(self, sentence: str) -> None:
         self._ranges = []
         self._sentence, self._value = sentence, 0.0
-        waits = settings.flag('alarm_latch') and self.state == AlarmState.UNACKNOWLEDGED
-        after = AlarmState.RETURNED_UNACKNOWLEDGED if waits else AlarmState.NORMAL
-        return [self._enter(after, time_ns, model_id)]
-
-    def acknowledge(self, time_ns: int, model_id: str) -> list[AlarmChange]:
-        """Acknowledge; empty when there is nothing to acknowledge."""
-        if self.state == AlarmState.UNACKNOWLEDGED:
-            return [self._enter(AlarmState.ACKNOWLEDGED, time_ns, model_id)]
-        if self.state == AlarmState.RETURNED_UNACKNOWLEDGED:
-            return [self._enter(AlarmState.NORMAL, time_ns, model_id)]
-        return []
+        self._life.end(self._latch)
 
     def _remember(self, shift: Shift, settings: Settings) -> None:
         """Remember the ranges that moved; forget older ones that are judged anew."""
@@ -95,17 +97,34 @@ class ShiftAlarm:
         self._ranges = [r for r in self._ranges if not _covered(r, settled)]
         self._ranges += [(p.u_from, p.u_to) for p in shift.pieces if p.moved]
 
-    def _enter(self, state: AlarmState, time_ns: int, model_id: str) -> AlarmChange:
-        previous, self.state = self.state, state
-        sentence = self._sentence
+    def _content(self, state: AlarmState) -> Content:
+        sentence = self._sentence or 'No piece of the curve is known to have moved.'
         if state == AlarmState.ACKNOWLEDGED:
             sentence = f'Acknowledged. {sentence}'
         elif state == AlarmState.RETURNED_UNACKNOWLEDGED:
             sentence = f'{sentence} Acknowledge to clear the alarm.'
-        return AlarmChange(
-            time_ns, self.NAME, state, previous, Priority.MEDIUM, self._value, self._limit, 'MW',
-            sentence, self._occurrence, self._raised_ns, model_id,
-        )  # fmt: skip
+        return Content(self._value, self._limit, 'MW', sentence)
+
+    def _blind(self) -> str:
+        return f'The curve could not be judged against its reference: {self._problem}'
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        return {
+            **super().snapshot(),
+            'value': self._value,
+            'limit': self._limit,
+            'sentence': self._sentence,
+            'problem': self._problem,
+            'ranges': [list(r) for r in self._ranges],
+        }
+
+    def restore(self, saved: State) -> None:
+        """Go on from a snapshot."""
+        super().restore(saved)
+        self._value, self._limit = saved['value'], saved['limit']
+        self._sentence, self._problem = saved['sentence'], saved['problem']
+        self._ranges = [(r[0], r[1]) for r in saved['ranges']]
 
 
 def _covered(span: tuple[float, float], pieces: list[PieceShift]) -> bool:

@@ -73,6 +73,7 @@ def alarm(change: AlarmChange, tag: str) -> Alarm:
         occurrence=change.occurrence,
         raised=to_time(change.raised_ns),
         model_id=change.model_id,
+        first_out=change.first_out,
     )
 
 

@@ -22,6 +22,8 @@ _STATES = {
     Alarm.UNACKNOWLEDGED: 'ALARM',
     Alarm.ACKNOWLEDGED: 'acknowledged',
     Alarm.RETURNED_UNACKNOWLEDGED: 'the alarm has gone by itself',
+    Alarm.SHELVED: 'put aside',
+    Alarm.SUPPRESSED: 'cannot be judged',
 }
 
 _VERDICTS = {

@@ -76,6 +76,8 @@ class MonitorNode(LifecycleNode):
             for name, work in (
                 ('refit', self._refit),
                 ('acknowledge_alarms', self._acknowledge),
+                ('shelve_alarms', self._shelve),
+                ('unshelve_alarms', self._unshelve),
                 ('set_reference', self._set_reference),
                 ('diagnose', self._diagnose),
             )
@@ -235,6 +237,18 @@ class MonitorNode(LifecycleNode):
     def _acknowledge(self, session: Session) -> str:
         session.tell(session.engine.acknowledge())
         return 'The alarm is acknowledged.'
+
+    def _shelve(self, session: Session) -> str:
+        session.tell(session.engine.shelve())
+        hours = self.settings.real('alarm_shelve_time') / 3600.0
+        return (
+            f'The standing alarms are put aside for {hours:g} h; then they come back by '
+            'themselves if their cause is still there. New alarms are not hidden.'
+        )
+
+    def _unshelve(self, session: Session) -> str:
+        session.tell(session.engine.unshelve())
+        return 'The alarms are no longer put aside.'
 
     def _set_reference(self, session: Session) -> str:
         session.tell(session.engine.set_reference())

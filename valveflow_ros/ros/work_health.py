@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+from valveflow_ros.core.alarm_records import AlarmState
+from valveflow_ros.core.alarm_voice import VoicedAlarm
 from valveflow_ros.core.curve_status import CurveStatus
 from valveflow_ros.core.identifiability import weaknesses
 from valveflow_ros.core.monitor import Monitor
@@ -11,6 +13,9 @@ from valveflow_ros.logs import RecorderState
 from valveflow_ros.ros.diagnostics import Item, Level
 from valveflow_ros.ros.recording import Recording
 from valveflow_ros.ros.worker import FitWorker
+
+# Somebody knows of it, or nothing can be known of it.
+_ASIDE = (AlarmState.SHELVED, AlarmState.SUPPRESSED)
 
 
 def fit_item(monitor: Monitor, worker: FitWorker, last_fit_s: float | None) -> Item:
@@ -69,19 +74,39 @@ def _age_s(monitor: Monitor) -> float:
 
 
 def alarm_item(monitor: Monitor) -> Item:
-    """Return how the residual alarm stands."""
+    """Return how the residual alarm stands, whether or not that was announced."""
     alarm = monitor.alarm
-    words = alarm.state.name.lower().replace('_', ' ')
+    words = _words(alarm)
     values: dict[str, object] = {
         'State': words,
         'Evidence (1 is an alarm)': monitor.judged.evidence,
         'Shift (MW)': monitor.judged.shift_mw,
+        **_count_values(alarm),
     }
     if alarm.active:
-        return Item('alarm', Level.ERROR, f'The unit does not follow its curve ({words}).', values)
+        aside = alarm.state in _ASIDE
+        level = Level.WARN if aside else Level.ERROR
+        return Item('alarm', level, f'The unit does not follow its curve ({words}).', values)
+    if alarm.state == AlarmState.SUPPRESSED:
+        sentence = 'The residual cannot be judged, so no alarm can come (suppressed).'
+        return Item('alarm', Level.WARN, sentence, values)
     if alarm.standing:
         return Item('alarm', Level.WARN, f'The alarm waits to be cleared ({words}).', values)
     return Item('alarm', Level.OK, 'No alarm.', values)
+
+
+def _words(alarm: VoicedAlarm) -> str:
+    return alarm.state.name.lower().replace('_', ' ')
+
+
+def _count_values(alarm: VoicedAlarm) -> dict[str, object]:
+    """Return what an announcement may not have told yet."""
+    until_ns = alarm.shelved_until_ns
+    return {
+        'Occurrences': alarm.occurrence,
+        'Announcements held back': alarm.held,
+        'Shelved until (s since 1970)': None if until_ns is None else until_ns // 10**9,
+    }
 
 
 def reference_item(monitor: Monitor) -> Item:
@@ -90,8 +115,11 @@ def reference_item(monitor: Monitor) -> Item:
     if keeper.curve is None:
         return Item('reference', Level.OK, 'No reference was set (~/set_reference).')
     shift = keeper.shift
-    words = keeper.alarm.state.name.lower().replace('_', ' ')
-    values: dict[str, object] = {'Reference': keeper.curve.model_id, 'Alarm': words}
+    values: dict[str, object] = {
+        'Reference': keeper.curve.model_id,
+        'Alarm': _words(keeper.alarm),
+        **_count_values(keeper.alarm),
+    }
     if shift is not None:
         sizes = [p.shift_mw for p in shift.pieces]
         values['Shift by piece (MW)'] = ', '.join(f'{size:+.2f}' for size in sizes)
@@ -100,9 +128,9 @@ def reference_item(monitor: Monitor) -> Item:
         return Item('reference', Level.WARN, keeper.problem, values)
     if shift is None:
         return Item('reference', Level.OK, 'The next curve is judged against it.', values)
-    level = Level.ERROR if keeper.alarm.active else Level.OK
-    if keeper.alarm.standing and not keeper.alarm.active:
-        level = Level.WARN
+    level = Level.WARN if keeper.alarm.standing else Level.OK
+    if keeper.alarm.active and keeper.alarm.state not in _ASIDE:
+        level = Level.ERROR
     sentence = shift.sentence
     if keeper.alarm.active and not shift.moved:
         spans = ' and '.join(f'u {a:.0f} to {b:.0f}' for a, b in keeper.alarm.ranges)

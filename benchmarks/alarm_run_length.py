@@ -1,0 +1,183 @@
+"""Days between false residual alarms, and minutes to a true one, under correlated noise.
+
+Run: ``python -m benchmarks.alarm_run_length --records 40``. This asks the chart and the alarm
+alone, row by row at 1 Hz, without a plant: AR(1) noise of the coefficients given, scaled so that a
+mean over one block has an sd of ``--block-sd``. The chart designs itself from ten days of it, as
+it does on the days a curve was fitted to, and then watches others (``--days``), during which the
+curve is wrong by an error that the load, drifting by the hour and by the day, leads along the
+curve. The error is drawn from the standard error that the design was told of; the ten days do not
+show it. Then lasting shifts of one and of three sd of a block mean set in at some moments.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from scipy.signal import lfilter
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.alarms import AlarmState, ResidualAlarm
+from valveflow_ros.core.chart import ChartDesign, ResidualChart
+from valveflow_ros.core.run_length import design_chart
+from valveflow_ros.records import NS_PER_S, FloatArray
+
+RESULTS = Path(__file__).parent / 'results'
+PHI = (0.0, 0.5, 0.9, 0.98, 0.995)
+_DAY = 86400
+_DESIGN_DAYS = 10
+_KNOTS = 5
+_SETTINGS = Settings()
+_BLOCK = round(_SETTINGS.real('alarm_block'))
+_RUN_DAYS = _SETTINGS.real('alarm_run_length')
+_HOURS = 4
+_DRAWS = 2000
+
+
+def block_sd(phi: float) -> float:
+    """Return the sd of a mean over one block of AR(1) noise of sd 1."""
+    lags = np.arange(1, _BLOCK)
+    return math.sqrt((1.0 + 2.0 * float(((1.0 - lags / _BLOCK) * phi**lags).sum())) / _BLOCK)
+
+
+def noise(rng: np.random.Generator, rows: int, phi: float, sd: float) -> FloatArray:
+    """Return AR(1) noise."""
+    white = rng.standard_normal(rows)
+    white[1:] *= math.sqrt(1.0 - phi * phi)
+    return np.asarray(lfilter([sd], [1.0, -phi], white))
+
+
+def curve_error(rng: np.random.Generator, rows: int, error_mw: float) -> FloatArray:
+    """Return how wrong a curve is where a drifting load leads, row by row."""
+    minutes = rows // 60
+    slow = noise(rng, minutes, math.exp(-1.0 / 120.0), 0.15)
+    daily = 0.3 * np.sin(2.0 * np.pi * (np.arange(minutes) / 1440.0 + rng.random()))
+    at_knots = rng.normal(0.0, error_mw, _KNOTS)
+    error = np.interp(0.5 + daily + slow, np.linspace(0.0, 1.0, _KNOTS), at_knots)
+    return np.repeat(error, 60)
+
+
+def minutes_to_find(
+    design: ChartDesign, residual: FloatArray, shift: float, moments: int
+) -> list[float]:
+    """Return the minutes until a shift is found; inf where it was not in eight hours."""
+    found = []
+    ahead = _HOURS * 3600
+    for start in np.linspace(ahead, len(residual) - 3 * ahead, moments).astype(int).tolist():
+        part = residual[start - ahead : start + 2 * ahead].copy()
+        part[ahead:] += shift
+        time_ns = (start + np.arange(len(part), dtype=np.int64)) * NS_PER_S
+        evidence, _ = ResidualChart(design, 1.0).feed(time_ns, part)
+        late = np.flatnonzero(np.abs(evidence[ahead:]) > 1.0)
+        found.append(float(late[0]) / 60.0 if len(late) else math.inf)
+    return found
+
+
+def chattering(times_ns: list[int]) -> int:
+    """Count announcements that were the third within a minute."""
+    return sum(c - a < 60 * NS_PER_S for a, c in zip(times_ns, times_ns[2:], strict=False))
+
+
+def record(seed: int, phi: float, args: argparse.Namespace) -> dict[str, object]:
+    """Design a chart on ten days and watch the others with the alarm's own delays."""
+    rng = np.random.default_rng((seed, round(1000 * phi)))
+    sd = args.block_sd / block_sd(phi)
+    known = noise(rng, _DESIGN_DAYS * _DAY, phi, sd)
+    design = design_chart(
+        known, np.ones(len(known), np.uint8), 1.0, block_s=float(_BLOCK),
+        run_length_days=_RUN_DAYS, floor_mw=_SETTINGS.real('alarm_floor'),
+        curve_error_mw=args.curve_error,
+    )  # fmt: skip
+    rows = args.days * _DAY
+    residual = noise(rng, rows, phi, sd) + curve_error(rng, rows, args.curve_error)
+    chart, alarm = ResidualChart(design, 1.0), ResidualAlarm(_SETTINGS)
+    raised_ns: list[int] = []
+    for day in range(args.days):
+        part = slice(day * _DAY, (day + 1) * _DAY)
+        time_ns = np.arange(part.start, part.stop, dtype=np.int64) * NS_PER_S
+        evidence, shift = chart.feed(time_ns, residual[part])
+        for _, change in alarm.feed(time_ns, evidence, shift, 'm'):
+            if change.state == AlarmState.UNACKNOWLEDGED:
+                raised_ns.append(change.time_ns)
+    return {
+        'alarms': alarm.occurrence,
+        'announced': len(raised_ns),
+        'chattering': chattering(raised_ns),
+        'correlation': design.correlation,
+        'limit': list(design.limit),
+        'minutes_1_sd': minutes_to_find(design, residual, args.block_sd, args.moments),
+        'minutes_3_sd': minutes_to_find(design, residual, 3.0 * args.block_sd, args.moments),
+    }
+
+
+def days_per_alarm(alarms: FloatArray, days: int) -> tuple[float, float]:
+    """Return the mean time between alarms and its lower 95 % bound, by drawing records anew.
+
+    An alarm more is counted in each drawing, so that records without any prove no more than
+    they can.
+    """
+    total = float(days * len(alarms))
+    drawn = np.random.default_rng(1).choice(alarms, (_DRAWS, len(alarms))).sum(axis=1)
+    return total / max(float(alarms.sum()), 1.0), float(np.quantile(total / (drawn + 1.0), 0.05))
+
+
+def summary(phi: float, found: list[dict[str, object]], days: int) -> dict[str, object]:
+    """Return the figures of one coefficient."""
+    alarms = np.array([r['alarms'] for r in found], dtype=np.float64)
+    mean, low = days_per_alarm(alarms, days)
+    rho = float(np.median([r['correlation'] for r in found]))  # type: ignore[arg-type]
+    out: dict[str, object] = {
+        'phi': phi, 'records': len(found), 'days': days * len(found), 'alarms': int(alarms.sum()),
+        'days_per_alarm': round(mean, 1), 'days_per_alarm_low_95': round(low, 1),
+        'alarms_per_30_days': round(30.0 / mean, 2),
+        'most_alarms_in_a_record': int(alarms.max()),
+        'chattering': sum(int(r['chattering']) for r in found),  # type: ignore[call-overload]
+        'block_correlation': round(rho, 3),
+    }  # fmt: skip
+    for size in (1, 3):
+        m = np.array([v for r in found for v in r[f'minutes_{size}_sd']])  # type: ignore[attr-defined]
+        out[f'median_minutes_{size}_sd'] = round(float(np.median(m)), 1)
+        p90 = float(np.quantile(m, 0.9, method='higher'))
+        out[f'p90_minutes_{size}_sd'] = round(p90, 1) if math.isfinite(p90) else None
+        out[f'missed_{size}_sd'] = int(np.isinf(m).sum())
+        out[f'tried_{size}_sd'] = len(m)
+        # Lorden (Ann. Math. Stat. 42, 1971): no chart is asymptotically quicker than this for
+        # its time between false alarms; information per whitened block of a mean shift.
+        information = 0.5 * size**2 * (1.0 - rho) / (1.0 + rho)
+        least = math.log(_RUN_DAYS * _DAY / _BLOCK) / information * _BLOCK / 60.0
+        out[f'lorden_minutes_{size}_sd'] = round(least, 1)
+    return out
+
+
+def main() -> None:
+    """Run, print a line a coefficient, and write the figures beside the other results."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--records', type=int, default=40)
+    parser.add_argument('--days', type=int, default=60)
+    parser.add_argument('--first', type=int, default=5000)
+    parser.add_argument('--moments', type=int, default=5)
+    parser.add_argument('--block-sd', type=float, default=5.0)
+    parser.add_argument('--curve-error', type=float, default=0.2)
+    args = parser.parse_args()
+    begun = time.monotonic()
+    rows = []
+    for phi in PHI:
+        found = [record(args.first + k, phi, args) for k in range(args.records)]
+        rows.append(summary(phi, found, args.days))
+        print(json.dumps(rows[-1]), flush=True)
+    RESULTS.mkdir(exist_ok=True)
+    name = f'alarm_run_length_{args.first}_{args.first + args.records - 1}.json'
+    command = ' '.join(['python -m benchmarks.alarm_run_length', *sys.argv[1:]])
+    text = json.dumps(
+        {'command': command, 'took_s': round(time.monotonic() - begun), 'noise': rows}, indent=1
+    )
+    (RESULTS / name).write_text(text + '\n', encoding='utf-8')
+
+
+if __name__ == '__main__':
+    main()
