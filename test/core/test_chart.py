@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -211,3 +212,31 @@ def test_whatever_the_noise_a_large_shift_is_found_within_an_hour(
     record = r[:240] + np.where(np.arange(240) >= 120, shift, 0.0)
     evidence, _ = ResidualChart(design, 60.0).feed(time_ns, record)
     assert np.nanmax(sign * evidence[120:180]) > 1.0
+
+
+@examples(30)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 2400))
+def test_a_chart_that_follows_another_of_its_design_is_the_same_chart(seed, cut):
+    time_ns, residual = rows(seed, 0.002)
+    whole = ResidualChart(DESIGN, 1.0).feed(time_ns, residual)
+    first, second = ResidualChart(DESIGN, 1.0), ResidualChart(DESIGN, 1.0)
+    head = first.feed(time_ns[:cut], residual[:cut])
+    second.follow(first)
+    tail = second.feed(time_ns[cut:], residual[cut:])
+    for k in range(2):
+        joined = np.concatenate([head[k], tail[k]])
+        assert np.array_equal(joined, whole[k], equal_nan=True)
+
+
+def test_a_chart_that_follows_one_of_other_limits_keeps_the_shares():
+    time_ns, residual = rows(3, 0.0)
+    first = ResidualChart(DESIGN, 1.0)
+    evidence, _ = first.feed(time_ns, residual + 1.0)
+    other = replace(DESIGN, limit=(30.0, 20.0))
+    second = ResidualChart(other, 1.0)
+    second.follow(first)
+    later, _ = second.feed(time_ns[-1:] + NS_PER_S, residual[-1:])
+    assert later[0] == pytest.approx(evidence[-1])
+    slow = ResidualChart(replace(DESIGN, block_s=120.0), 1.0)
+    slow.follow(first)
+    assert np.isnan(slow.feed(time_ns[-1:] + NS_PER_S, residual[-1:])[0]).all()

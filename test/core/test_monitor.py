@@ -176,7 +176,8 @@ def test_shifting_time_shifts_the_stamps_and_nothing_else(seed, harms, seconds):
 def test_the_engine_has_no_second_of_its_own(factor, harms):
     """With every time scaled, the same values give the same story: 0.1 s data, 10 s data."""
     times = ('block', 'time_constant', 'delay', 'steady_min', 'slope_min', 'longest_segment',
-             'refit_period', 'alarm_average', 'alarm_on_delay', 'alarm_off_delay')  # fmt: skip
+             'refit_period', 'alarm_average', 'alarm_on_delay', 'alarm_off_delay',
+             'alarm_block', 'alarm_suppress_time')  # fmt: skip
     base = SETTINGS.changed({'longest_segment': 600.0, 'window_days': 0.02})
     scaled = {name: base.real(name) * factor for name in times}
     scaled |= {'sample_period': factor, 'window_days': 0.02 * max(1.0, factor)}

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_diagnosis_parts import TYPICAL
 
+from valveflow_ros.core.state_bytes import from_bytes, to_bytes
 from valveflow_ros.core.units import integrated_input
 from valveflow_ros.diagnosis.catalogue import catalogue
 from valveflow_ros.diagnosis.cause import Active
@@ -20,6 +21,7 @@ from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.extended_model import ExtendedModel
 from valveflow_ros.diagnosis.grid import make_scene
+from valveflow_ros.errors import DataError
 from valveflow_ros.records import NS_PER_S, Quality, SampleTable, Signal
 
 pytestmark = pytest.mark.skipif(
@@ -149,6 +151,20 @@ def test_rows_one_by_one_are_rows_at_once(scene, rows, name):
     single = [corrector.correct(part.part(k, k + 1)) for k in range(len(part))]
     assert same(SampleTable.concatenate(single), corrected(model, part))
     assert len(corrector.correct(part.part(3, 3))) == 0
+
+
+@pytest.mark.parametrize('names', [*((n,) for n in NAMES), SEVERAL], ids=lambda n: '+'.join(n))
+def test_taken_up_where_it_was_left_it_gives_the_same_bits(scene, rows, names):
+    model, cut = model_of(scene, *names), 16 * 700
+    expected = corrected(model, rows)
+    first = corrector_of(model, STEP_S)
+    before = first.correct(rows.part(0, cut))
+    second = corrector_of(model, STEP_S)
+    second.restore(from_bytes(to_bytes(first.snapshot())))
+    after = second.correct(rows.part(cut, len(rows)))
+    assert same(SampleTable.concatenate([before, after]), expected)
+    with pytest.raises(DataError, match='another model_file'):
+        corrector_of(model_of(scene), STEP_S).restore(first.snapshot())
 
 
 def test_pressure_temperature_and_command_stay(scene, rows):

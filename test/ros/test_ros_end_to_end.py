@@ -135,7 +135,7 @@ def test_a_run_from_the_plant_to_the_disk(
     assert monitor.wait(10.0) == 0, processes.output(monitor)
     assert 'Traceback' not in processes.output(monitor)
 
-    (folder,) = (tmp_path / 'recordings').iterdir()
+    (folder,) = (tmp_path / 'recordings').glob('valveflow_*')
     assert 'unit-1' in folder.name
     log = open_log(folder)
     assert log.warnings == ()
@@ -340,7 +340,7 @@ def test_ending_during_a_refit_finishes_the_file_at_once(
     assert monitor.wait(10.0) == 0, processes.output(monitor)
     assert time.monotonic() - begun < 2.0
     assert not worker.is_running() or worker.status() == psutil.STATUS_ZOMBIE
-    (folder,) = (tmp_path / 'recordings').iterdir()
+    (folder,) = (tmp_path / 'recordings').glob('valveflow_*')
     assert not list(folder.glob('*.part'))
     assert (folder / 'metadata.yaml').exists()
     log = open_log(folder)

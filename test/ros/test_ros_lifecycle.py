@@ -86,7 +86,7 @@ def test_the_whole_life(context: Any, tmp_path: Path) -> None:
             assert monitor.trigger_deactivate() == DONE
             assert monitor.trigger_cleanup() == DONE
             assert monitor.session is None
-        folders = sorted(tmp_path.iterdir())
+        folders = sorted(tmp_path.glob('valveflow_*'))
         assert len(folders) == 2
         for folder in folders:
             assert folder.name.endswith(('_HV-101-2', '_HV-101-2_2'))

@@ -92,7 +92,7 @@ def test_the_node_takes_causes_out_and_its_recording_repeats(
     said = processes.output(monitor)
     assert 'Traceback' not in said
     assert 'by model_file: backlash, gain_drift, clock.' in said
-    (folder,) = (tmp_path / 'recordings').iterdir()
+    (folder,) = (tmp_path / 'recordings').glob('valveflow_*')
     model.unlink()  # the recording has its own
     result = verifying.verify(folder)
     assert result.identical, result.difference

@@ -262,7 +262,7 @@ def test_the_node_judges_curves_and_its_recording_repeats(
     monitor.terminate()
     assert monitor.wait(10.0) == 0, processes.output(monitor)
     assert 'Traceback' not in processes.output(monitor)
-    (folder,) = (tmp_path / 'recordings').iterdir()
+    (folder,) = (tmp_path / 'recordings').glob('valveflow_*')
     result = verify(folder)
     assert result.identical, result.difference
     assert result.compared['journal'] >= 5

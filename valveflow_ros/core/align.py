@@ -14,8 +14,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.align_kernel import (
@@ -27,6 +29,7 @@ from valveflow_ros.core.align_kernel import (
     State,
     align,
 )
+from valveflow_ros.core.state import ArrayMemory
 from valveflow_ros.records import (
     N_SIGNALS,
     NS_PER_S,
@@ -55,7 +58,7 @@ class Aligned:
     resets: IntArray
 
 
-class Aligner:
+class Aligner(ArrayMemory):
     """Turn readings into rows, in one pass and bounded memory.
 
     Parameters
@@ -114,6 +117,9 @@ class Aligner:
             info.topic: {reason: int(counts[info.signal, k]) for k, reason in enumerate(REASONS)}
             for info in SIGNALS
         }
+
+    def _memory(self) -> dict[str, NDArray[Any]]:
+        return self._state._asdict()
 
     def _run(self, readings: Readings, final: bool) -> Aligned:
         tables: list[SampleTable] = []

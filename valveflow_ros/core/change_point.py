@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import ndtri, stdtr
 
 from valveflow_ros.records import FloatArray, IntArray
 
@@ -104,9 +104,10 @@ def _widening(rest: FloatArray) -> float:
 
 def _as_normal(t: float, freedom: int) -> float:
     """Return the normal deviate as rare as ``t`` of Student's distribution."""
-    tail = float(stats.t.logsf(t, freedom))
+    chance = float(stdtr(freedom, -t))
+    tail = math.log(chance) if chance > 0.0 else -math.inf
     # Far out the tail of the normal is log-quadratic; its inverse there is not in the tables.
-    return float(stats.norm.isf(math.exp(tail))) if tail > -600.0 else math.sqrt(-2.0 * tail)
+    return float(-ndtri(math.exp(tail))) if tail > -600.0 else math.sqrt(-2.0 * tail)
 
 
 def _chance(b: float, low: float, high: float) -> float:

@@ -12,10 +12,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from valveflow_ros.core.jit import jit
+from valveflow_ros.core.state import ArrayMemory
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
 
 # One wild block cannot raise the alarm alone.
@@ -132,7 +135,7 @@ def _run(
         shift[t] = state[_SHIFT]
 
 
-class ResidualChart:
+class ResidualChart(ArrayMemory):
     """Watch the residual of one curve, in constant time a row.
 
     Parameters
@@ -151,6 +154,21 @@ class ResidualChart:
         self._place = np.array([-1, 0], dtype=np.int64)
         self._state = np.array([0.0, math.nan, math.nan, math.nan])
         self._sums = np.zeros((4, 3))
+
+    def _memory(self) -> dict[str, NDArray[Any]]:
+        return {'place': self._place, 'state': self._state, 'sums': self._sums}
+
+    def follow(self, other: ResidualChart) -> None:
+        """Go on where the chart of an earlier curve was: a new curve undoes no evidence.
+
+        The sums keep their shares of the limits. With another length of blocks it starts afresh.
+        """
+        if other._block_ns != self._block_ns:
+            return
+        np.copyto(self._place, other._place)
+        np.copyto(self._state, other._state)
+        np.copyto(self._sums, other._sums)
+        self._sums[:, _C] *= np.repeat(self._limit / other._limit, 2)
 
     def feed(self, time_ns: IntArray, residual_mw: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the evidence and the shift it speaks of after each row, shapes (n,).

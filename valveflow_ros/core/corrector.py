@@ -11,6 +11,8 @@ from typing import Protocol
 import numpy as np
 
 from valveflow_ros.core.characteristic import HeldCause
+from valveflow_ros.core.state import State
+from valveflow_ros.errors import DataError
 from valveflow_ros.records import SampleTable
 
 
@@ -36,6 +38,14 @@ class Corrector(Protocol):
 
     def restart(self) -> None:
         """Forget all rows: the next one begins a new series."""
+        ...
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        ...
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state; raises `DataError` if it does not fit."""
         ...
 
 
@@ -84,6 +94,22 @@ class Correction:
         parts.append(self._corrector.correct(table.part(done, len(table))))
         self._ahead = SampleTable.concatenate(parts) if done else parts[-1]
         return self._ahead
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        ahead = self._ahead
+        return {
+            'corrector': None if self._corrector is None else self._corrector.snapshot(),
+            'ahead': None if ahead is None else [ahead.time_ns, ahead.values, ahead.quality],
+        }
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state; raises `DataError` if it does not fit."""
+        if (self._corrector is None) != (saved['corrector'] is None):
+            raise DataError('The saved state was made with another model_file.')
+        if self._corrector is not None:
+            self._corrector.restore(saved['corrector'])
+        self._ahead = saved['ahead'] and SampleTable(*saved['ahead'])
 
     def restart(self) -> None:
         """Forget all rows after the clock went back."""

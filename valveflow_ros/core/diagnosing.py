@@ -15,6 +15,7 @@ import numpy as np
 from valveflow_ros.config import Settings
 from valveflow_ros.core.alarms import ResidualAlarm
 from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.characteristic_json import from_json, to_json
 from valveflow_ros.core.diagnosis_task import DiagnosisTask
 from valveflow_ros.core.events import (
     Diagnosed,
@@ -26,7 +27,8 @@ from valveflow_ros.core.events import (
 from valveflow_ros.core.mismatch import NOTHING, Misfit, Mismatch
 from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.prediction import PredictionBlock
-from valveflow_ros.core.window import RollingWindow
+from valveflow_ros.core.state import State
+from valveflow_ros.core.window import NO_ROWS, RollingWindow
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
 
@@ -169,10 +171,47 @@ class Diagnosing:
         kind, model_id = JournalKind.DIAGNOSIS_FAILED, task.curve.model_id
         return [self.last, self._journal(kind, request_ns, model_id, reason)]
 
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`. Of a task no rows are."""
+        last, pending = self.last, self._pending
+        return {
+            'mismatch': self._mismatch.snapshot(),
+            'misfit': [self.misfit.score, self.misfit.name, self.misfit.hint],
+            'sentence': self.sentence,
+            'last': None if last is None else [_plain(last.task), last.content, last.reason],
+            'hour': self._hour,
+            'night': self._night,
+            'asked_ns': self._asked_ns,
+            'named_ns': self._named_ns,
+            'wanted': self._wanted,
+            'raised': self._raised,
+            'pending': None if pending is None else _plain(pending),
+        }
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state; raises `DataError` if it does not fit."""
+        self._mismatch.restore(saved['mismatch'])
+        self.misfit, self.sentence = Misfit(*saved['misfit']), saved['sentence']
+        last, pending = saved['last'], saved['pending']
+        self.last = last and Diagnosed(self._task(last[0]), last[1], last[2])
+        self._pending = pending and self._task(pending)
+        self._hour, self._night = saved['hour'], saved['night']
+        self._asked_ns, self._named_ns = saved['asked_ns'], saved['named_ns']
+        self._wanted, self._raised = saved['wanted'], saved['raised']
+
+    def _task(self, plain: State) -> DiagnosisTask:
+        return DiagnosisTask(
+            plain['request_ns'], NO_ROWS, self.settings, from_json(plain['curve']),
+            plain['window_end_ns'],
+        )  # fmt: skip
+
+    def give_up(self, reason: str) -> list[Event]:
+        """Wait no longer for the diagnosis that was asked for."""
+        return [] if self._pending is None else self.refuse(self._pending.request_ns, reason)
+
     def restart(self, reason: str) -> list[Event]:
         """Forget the rows after the clock went back; names go on."""
-        pending = self._pending
-        events = [] if pending is None else self.refuse(pending.request_ns, reason)
+        events = self.give_up(reason)
         self._mismatch = Mismatch(self.settings.real('sample_period'))
         self.misfit, self.sentence, self._wanted = NOTHING, '', ''
         self._hour = self._night = self._asked_ns = None
@@ -247,3 +286,12 @@ def _sentence(misfit: Misfit, limit: float) -> str:
         f'The model no longer fits: {misfit.hint} (statistic: {misfit.name}, '
         f'{size:g} standard errors, limit {limit:g}).'
     )
+
+
+def _plain(task: DiagnosisTask) -> State:
+    """Return a task without its rows as plain values."""
+    return {
+        'request_ns': task.request_ns,
+        'curve': to_json(task.curve),
+        'window_end_ns': task.window_end_ns,
+    }

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from valveflow_ros.config import Settings
 from valveflow_ros.core.characteristic import Characteristic
-from valveflow_ros.core.window import WindowContents
+from valveflow_ros.core.window import NO_ROWS, WindowContents
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +33,7 @@ class DiagnosisTask:
 
     def without_data(self) -> DiagnosisTask:
         """Return a copy that keeps no rows, for whoever only wants to know what was asked."""
-        empty = np.empty(0)
-        none = WindowContents(
-            np.empty(0, dtype=np.int64), empty, empty, empty, np.empty((0, 3), dtype=np.int64)
-        )
-        return replace(self, contents=none)
+        return replace(self, contents=NO_ROWS)
 
 
 @dataclass(frozen=True, slots=True)

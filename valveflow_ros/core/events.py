@@ -28,6 +28,9 @@ class JournalKind(enum.IntEnum):
     DIAGNOSED = 9
     DIAGNOSIS_FAILED = 10
     MISMATCH = 11
+    SHELVE = 12
+    UNSHELVE = 13
+    RESUMED = 14
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from scipy.signal import lfilter
 
 from valveflow_ros.core.characteristic import (
     Characteristic,
@@ -45,6 +44,9 @@ def residual_statistics(
     curve_error_mw : float
         Standard error of the prediction.
     """
+    # It takes a second to load, and a process that only predicts never comes here.
+    from scipy.signal import lfilter
+
     settings = task.settings
     average_s = settings.real('alarm_average')
     rest = residual[weight > 0]

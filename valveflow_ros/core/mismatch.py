@@ -20,7 +20,8 @@ import numpy as np
 from valveflow_ros.core import mismatch_kernel as k
 from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.prediction import PredictionBlock
-from valveflow_ros.records import NS_PER_S, FloatArray
+from valveflow_ros.core.state import State, copies, put_back
+from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
 
 # What is below this share of the residual's sd is not worth a word, however sure it is.
 FLOOR = 0.05
@@ -93,6 +94,25 @@ class Mismatch:
             block.residual_mw, self._minute_ns, self._least, model.knots, model.left, model.right,
             self._place, self._minute, self._state, self._block, self._kept, self._z,
         )  # fmt: skip
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        return {**copies(self._memory()), 'ends': list(self._ends)}
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state; raises `DataError` if it does not fit."""
+        put_back(self._memory(), saved)
+        self._ends = saved['ends'][0], saved['ends'][1]
+
+    def _memory(self) -> dict[str, FloatArray | IntArray]:
+        return {
+            'place': self._place,
+            'minute': self._minute,
+            'z': self._z,
+            'state': self._state,
+            'block': self._block,
+            'kept': self._kept,
+        }
 
     def scores(self) -> FloatArray:
         """Return the statistics as normal deviates, shape (len(NAMES),); 0 where not judged."""

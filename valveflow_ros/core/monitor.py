@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import math
 
-import numpy as np
-
 from valveflow_ros.config import Settings
+from valveflow_ros.core.alarm_desk import Act, AlarmDesk
 from valveflow_ros.core.alarms import Judged, ResidualAlarm
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.characteristic_json import to_json
 from valveflow_ros.core.corrector import Correction, Corrector
+from valveflow_ros.core.curve_in_force import CurveInForce
 from valveflow_ros.core.curve_status import CurveStatus
 from valveflow_ros.core.diagnosing import Diagnosing
 from valveflow_ros.core.events import (
@@ -25,10 +25,11 @@ from valveflow_ros.core.events import (
 )
 from valveflow_ros.core.feeding import Fed, Rows
 from valveflow_ros.core.fit_task import FitTask
-from valveflow_ros.core.prediction import PredictionBlock, Predictor, no_prediction
+from valveflow_ros.core.prediction import PredictionBlock
 from valveflow_ros.core.reference import ReferenceKeeper
 from valveflow_ros.core.refits import Refits
 from valveflow_ros.core.segmenter import NoiseLevel, Segmented, Segmenter
+from valveflow_ros.core.state import Continuing, State
 from valveflow_ros.core.window import RollingWindow
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import SampleTable
@@ -47,10 +48,11 @@ class Monitor:
 
     Notes
     -----
-    The state changes by rows and by the calls `adopt`, `refuse`, `acknowledge`, `request_fit`,
-    `set_reference`, `request_diagnosis`, `restart` and `reconfigure`, and those of `diagnosing`,
-    nothing else, and each such call leaves a `JournalEntry` with the number of rows before it.
-    Rows and journal together give the same events again, bit for bit.
+    The state changes by rows and by the calls `adopt`, `refuse`, `acknowledge`, `shelve`,
+    `unshelve`, `request_fit`, `set_reference`, `request_diagnosis`, `restart` and
+    `reconfigure`, and those of `diagnosing`, nothing else, and each such call leaves a
+    `JournalEntry` with the number of rows before it. Rows and journal together give the same
+    events again, bit for bit.
     """
 
     def __init__(self, settings: Settings, corrector: Corrector | None = None) -> None:
@@ -59,15 +61,14 @@ class Monitor:
         self._segmenter = Segmenter(settings)
         self._window = RollingWindow.of(settings)
         self.alarm = ResidualAlarm(settings)
-        self._predictor: Predictor | None = None
+        self._force = CurveInForce(settings)
         self._rows = 0
         self._last_ns = 0
         self.judged = Judged(0, math.nan, math.nan)
         self._refits = Refits()
         self.reference = ReferenceKeeper(settings)
+        self._desk = AlarmDesk(self.alarm, self.reference.alarm)
         self.diagnosing = Diagnosing(settings, self.alarm, self._journal)
-        self.status = CurveStatus.UNKNOWN
-        self.cause = 'No curve yet: not enough special segments.'
 
     @property
     def rows(self) -> int:
@@ -82,7 +83,17 @@ class Monitor:
     @property
     def characteristic(self) -> Characteristic | None:
         """Return the running curve."""
-        return None if self._predictor is None else self._predictor.characteristic
+        return self._force.characteristic
+
+    @property
+    def status(self) -> CurveStatus:
+        """Return what the running curve is worth."""
+        return self._force.status
+
+    @property
+    def cause(self) -> str:
+        """Return why there is no curve, or only a stale one; empty if it is fresh."""
+        return self._force.cause
 
     @property
     def fit_pending(self) -> bool:
@@ -115,9 +126,8 @@ class Monitor:
         if not changed:
             return []
         self.settings = self.diagnosing.settings = settings
-        self.alarm.configure(settings)
-        if self._predictor is not None:
-            self._predictor.limit_mw = settings.real('alarm_limit')
+        self._desk.configure(settings)
+        self._force.configure(settings)
         text = json.dumps(changed, sort_keys=True)
         return [self._journal(JournalKind.SETTINGS, 0, '', text)]
 
@@ -147,10 +157,7 @@ class Monitor:
         """
         if not self._refits.settle(request_ns):
             return []
-        self._predictor = Predictor.of(characteristic, self.settings)
-        self._predictor.warm_up(*self._window.tail(self._predictor.warm_up_rows))
-        self.status = CurveStatus.FRESH
-        self.cause = ''
+        self._force.adopt(characteristic, self._window)
         shift, changes = self.reference.judge(characteristic, self._last_ns, self.settings)
         entry = self._journal(JournalKind.FIT_ADOPTED, request_ns, characteristic.model_id, '')
         return [CurveAdopted(characteristic, shift), entry, *changes]
@@ -159,8 +166,7 @@ class Monitor:
         """Note that a fit gave no curve; the old one stays, as stale."""
         if not self._refits.settle(request_ns):
             return []
-        self.status = CurveStatus.REFUSED if self._predictor is None else CurveStatus.STALE
-        self.cause = reason
+        self._force.refuse(reason)
         return [self._journal(JournalKind.FIT_REFUSED, request_ns, '', reason)]
 
     def request_fit(self) -> list[Event]:
@@ -189,13 +195,20 @@ class Monitor:
         DataError
             There is nothing to acknowledge.
         """
-        model_id = '' if self.characteristic is None else self.characteristic.model_id
-        residual = self.alarm.acknowledge(self.judged, model_id)
-        changes: list[Event] = [] if residual is None else [residual]
-        changes += self.reference.alarm.acknowledge(self._last_ns, model_id)
-        if not changes:
-            raise DataError('There is no alarm to acknowledge.')
-        return [*changes, self._journal(JournalKind.ACKNOWLEDGE, 0, model_id, '')]
+        return self._by_hand(self._desk.acknowledge, JournalKind.ACKNOWLEDGE)
+
+    def shelve(self) -> list[Event]:
+        """Put the alarms that stand aside for a time; raises `DataError` if there is none."""
+        return self._by_hand(self._desk.shelve, JournalKind.SHELVE)
+
+    def unshelve(self) -> list[Event]:
+        """Take the alarms from the shelf; raises `DataError` if none is there."""
+        return self._by_hand(self._desk.unshelve, JournalKind.UNSHELVE)
+
+    def _by_hand(self, act: Act, kind: JournalKind) -> list[Event]:
+        model_id = self._model_id()
+        changes = act(self.judged, model_id)
+        return [*changes, self._journal(kind, 0, model_id, '')]
 
     def set_reference(self, given: Characteristic | None = None) -> list[Event]:
         """Let the running curve, or one that is given, be what later ones are judged against.
@@ -225,11 +238,47 @@ class Monitor:
         events += self.diagnosing.restart(reason)
         self._refits.restart()
         self.reference.restart()
-        if self._predictor is not None:
-            self._predictor = Predictor.of(self._predictor.characteristic, self.settings)
-            self.status = CurveStatus.STALE
-            self.cause = reason
+        self._force.restart(reason)
         return [*events, self._journal(JournalKind.RESET, 0, '', reason)]
+
+    def resume(self, reason: str) -> list[Event]:
+        """Give up what was being computed when the monitor ended, and say that it goes on."""
+        pending = self._refits.pending_ns
+        events: list[Event] = [] if pending is None else self.refuse(pending, reason)
+        events += self.diagnosing.give_up(reason)
+        return [*events, self._journal(JournalKind.RESUMED, 0, self._model_id(), reason)]
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        own = {'rows': self._rows, 'last_ns': self._last_ns, 'judged': list(self.judged)}
+        return {**{name: part.snapshot() for name, part in self._parts().items()}, **own}
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state that was made with the same settings.
+
+        What was being computed then is awaited still.
+
+        Raises
+        ------
+        DataError
+            It does not fit; the monitor is not to be used then.
+        """
+        for name, part in self._parts().items():
+            part.restore(saved[name])
+        self._rows, self._last_ns = saved['rows'], saved['last_ns']
+        self.judged = Judged(*saved['judged'])
+
+    def _parts(self) -> dict[str, Continuing]:
+        return {
+            'correction': self._correction,
+            'segmenter': self._segmenter,
+            'window': self._window,
+            'alarm': self.alarm,
+            'force': self._force,
+            'refits': self._refits,
+            'reference': self.reference,
+            'diagnosing': self.diagnosing,
+        }
 
     def _take(self, rows: Rows, events: list[Event]) -> tuple[int, bool]:
         """Run rows up to the next segment's close through everything.
@@ -245,7 +294,7 @@ class Monitor:
             rows.time_ns, rows.u, rows.power_mw, rows.temperature_degc, rows.opening_percent,
             rows.command_percent,
         )  # fmt: skip
-        block = self._predict(rows, segmented)
+        block = self._force.predict(rows, segmented.kinds)
         self.diagnosing.watch(block, rows.temperature_degc, self.characteristic)
         self._rows += n
         self._last_ns = int(rows.time_ns[-1])
@@ -253,19 +302,11 @@ class Monitor:
         self._say(block, segmented, events)
         return n, bool(segmented.found)
 
-    def _predict(self, rows: Rows, segmented: Segmented) -> PredictionBlock:
-        columns = rows.time_ns, rows.u, rows.power_mw, segmented.kinds
-        if self._predictor is None:
-            return rows.shown(no_prediction(*columns))
-        return rows.shown(self._predictor.predict(*columns))
-
     def _say(self, block: PredictionBlock, segmented: Segmented, events: list[Event]) -> None:
         """Append what the rows brought; a segment can only have closed at the last of them."""
         events.append(block)
-        if self._predictor is not None:
-            judged = np.where(np.isfinite(block.residual_mw), block.evidence, math.nan)
-            changes = self.alarm.feed(block.time_ns, judged, block.shift_mw, block.model_id)
-            events += [change for _, change in changes]
+        if self.characteristic is not None:
+            events += self._desk.feed(block)
         self._close(segmented, events)
 
     def _close(self, segmented: Segmented, events: list[Event]) -> None:
@@ -292,6 +333,9 @@ class Monitor:
         )  # fmt: skip
         entry = self._journal(JournalKind.FIT_REQUESTED, request_ns, '', text)
         return [entry, FitRequested(task)]
+
+    def _model_id(self) -> str:
+        return '' if self.characteristic is None else self.characteristic.model_id
 
     def _journal(
         self, kind: JournalKind, request_ns: int, model_id: str, text: str

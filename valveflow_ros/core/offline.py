@@ -23,6 +23,12 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.records import Readings, SampleTable
 
 Progress = Callable[[float, str], None]
+# What an operator did to the alarms.
+_AT_DESK = {
+    JournalKind.ACKNOWLEDGE: Monitor.acknowledge,
+    JournalKind.SHELVE: Monitor.shelve,
+    JournalKind.UNSHELVE: Monitor.unshelve,
+}
 CLOCK_BACK = 'The clock went back; rows before that were let go.'
 
 
@@ -147,10 +153,12 @@ class JournalReplayer:
         if entry.kind == JournalKind.FIT_REFUSED:
             self._tasks.pop(entry.request_ns, None)
             return monitor.refuse(entry.request_ns, entry.text)
-        if entry.kind == JournalKind.ACKNOWLEDGE:
-            return monitor.acknowledge()
+        if entry.kind in _AT_DESK:
+            return _AT_DESK[entry.kind](monitor)
         if entry.kind == JournalKind.RESET:
             return monitor.restart(entry.text)
+        if entry.kind == JournalKind.RESUMED:
+            return monitor.resume(entry.text)
         if entry.kind == JournalKind.SETTINGS:
             return monitor.reconfigure(monitor.settings.changed(_held(entry, 'parameters')))
         if entry.kind == JournalKind.SET_REFERENCE:

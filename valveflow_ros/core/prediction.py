@@ -23,6 +23,7 @@ from valveflow_ros.core.regional_kernel import (
     region_of,
 )
 from valveflow_ros.core.segmenter_kernel import NO_DATA, SETTLED_SLOPE, SETTLED_STEADY
+from valveflow_ros.core.state import State, copies, put_back
 from valveflow_ros.records import NS_PER_S, ByteArray, FloatArray, IntArray
 
 _LONGEST_DELAY_S = 600.0
@@ -233,6 +234,11 @@ class Predictor:
         """Return how many rows bring the filter into its stride."""
         return 2 * self._filter.settle + 1
 
+    def follow(self, other: Predictor) -> None:
+        """Take over the evidence that an earlier curve's chart had gathered."""
+        if self._chart is not None and other._chart is not None:
+            self._chart.follow(other._chart)
+
     def warm_up(self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray) -> None:
         """Run over rows of the past; the residual's mean starts afresh afterwards."""
         kinds = np.full(len(u), SETTLED_STEADY, dtype=np.uint8)
@@ -254,6 +260,21 @@ class Predictor:
             shift, out.state, self.characteristic.residuals.width_mw,
             self.characteristic.model_id,
         )  # fmt: skip
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        chart = None if self._chart is None else self._chart.snapshot()
+        return {**copies(self._memory()), 'chart': chart}
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state of the same curve; raises `DataError` if it does not fit."""
+        put_back(self._memory(), saved)
+        if self._chart is not None:
+            self._chart.restore(saved['chart'])
+
+    def _memory(self) -> dict[str, FloatArray | IntArray]:
+        f = self._filter
+        return {'place': f.place, 'memory': f.memory, 'past': f.past}
 
     def _rows(
         self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray, kinds: ByteArray

@@ -7,8 +7,11 @@ from collections import deque
 from valveflow_ros.config import Settings
 from valveflow_ros.core.alarms import AlarmChange
 from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.characteristic_json import from_json, to_json
+from valveflow_ros.core.segment_state import segment_of, segment_values
 from valveflow_ros.core.shift import Shift, ShiftLimits, judge_shift
 from valveflow_ros.core.shift_alarm import ShiftAlarm
+from valveflow_ros.core.state import State
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import NS_PER_S, SpecialSegment
 
@@ -40,6 +43,22 @@ class ReferenceKeeper:
         self._segments.append(segment)
         while self._segments and self._segments[0].start_ns <= segment.end_ns - self._window_ns:
             self._segments.popleft()
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`. The last judgement is not."""
+        return {
+            'segments': [segment_values(segment) for segment in self._segments],
+            'curve': None if self.curve is None else to_json(self.curve),
+            'problem': self.problem,
+            'alarm': self.alarm.snapshot(),
+        }
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state; raises `DataError` if it does not fit."""
+        self._segments = deque(segment_of(values) for values in saved['segments'])
+        self.curve = None if saved['curve'] is None else from_json(saved['curve'])
+        self.problem = saved['problem']
+        self.alarm.restore(saved['alarm'])
 
     def restart(self) -> None:
         """Forget the segments after the clock went back; reference and alarm stay."""
@@ -75,5 +94,7 @@ class ReferenceKeeper:
             self.shift = judge_shift(self.curve, current, self.segments, limits)
         except DataError as error:
             self.problem = str(error)
-            return None, []
+            return None, self.alarm.unjudged(
+                self.problem, time_ns, current.model_id, settings
+            )  # fmt: skip
         return self.shift, self.alarm.judge(self.shift, time_ns, settings)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from valveflow_ros.config import Settings
+from valveflow_ros.core.state import State
 from valveflow_ros.records import NS_PER_S, IntArray
 
 
@@ -66,6 +67,23 @@ class Refits:
             return False
         self.pending_ns = None
         return True
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        return {
+            'pending_ns': self.pending_ns,
+            'last_ns': self._last_ns,
+            'last_name_ns': self._last_name_ns,
+            'segments_at_request': self._segments_at_request,
+            'segments_seen': self.segments_seen,
+        }
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state."""
+        self.pending_ns, self._last_ns = saved['pending_ns'], saved['last_ns']
+        self._last_name_ns = saved['last_name_ns']
+        self._segments_at_request = saved['segments_at_request']
+        self.segments_seen = saved['segments_seen']
 
     def restart(self) -> None:
         """Begin to count anew; names go on."""

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core import segmenter_kernel as kernel
 from valveflow_ros.core.line import LINE_SIZE
 from valveflow_ros.core.noise import BINS, WARM_UP
+from valveflow_ros.core.state import State, copies, put_back
 from valveflow_ros.records import (
     NS_PER_S,
     ByteArray,
@@ -169,6 +172,24 @@ class Segmenter:
                 if most is not None and len(found) >= most:
                     break
         return Segmented(kinds[:done], found)
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        return {**copies(self._memory()), 'number': self._number}
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state; raises `DataError` if it does not fit."""
+        put_back(self._memory(), saved)
+        self._number = int(saved['number'])
+
+    def _memory(self) -> dict[str, NDArray[Any]]:
+        return {
+            'state': self._state,
+            'sums': self._sums,
+            'lines': self._lines,
+            'blocks': self._blocks,
+            'histograms': self._histograms,
+        }
 
     def _describe(self) -> FoundSegment:
         """Turn the kernel's numbers into a record."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy.special import ndtr, ndtri
 
 from valveflow_ros.core.change_point import LEAST_SIDE, Scan, moment_of, scan
 from valveflow_ros.core.characteristic import Characteristic, Piece
@@ -252,7 +252,7 @@ def _judged(
     if not tests * p_segments < chance:
         now_mw = now_error = math.nan
     size = now_mw if math.isfinite(now_mw) else middle_mw
-    smallest = float(stats.norm.isf(0.5 * chance / tests)) * error
+    smallest = float(-ndtri(0.5 * chance / tests)) * error
     return PieceShift(
         *common, middle_mw, float(difference.min()), float(difference.max()), error,
         now_mw, now_error, float(reference.model.static(middle)[0]), p,
@@ -283,7 +283,7 @@ def _two_sided(value: float, error: float) -> float:
     """Return the chance of a normal deviate as large as ``value``; 1 where it is not known."""
     if not (math.isfinite(value) and error > 0.0):
         return 1.0
-    return float(2.0 * stats.norm.sf(abs(value) / error))
+    return float(2.0 * ndtr(-abs(value) / error))
 
 
 def _since(

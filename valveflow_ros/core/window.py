@@ -8,7 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from valveflow_ros.config import Settings
+from valveflow_ros.core.segment_state import found_of, found_values
 from valveflow_ros.core.segmenter import FoundSegment
+from valveflow_ros.core.state import State
+from valveflow_ros.errors import DataError
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SegmentKind
 
 _FIRST_ROOM = 16384
@@ -48,6 +51,15 @@ class WindowContents:
     def count(self, kind: SegmentKind) -> int:
         """Return the number of segments of a kind."""
         return int((self.spans[:, 2] == kind).sum())
+
+
+NO_ROWS = WindowContents(
+    np.empty(0, dtype=np.int64),
+    np.empty(0),
+    np.empty(0),
+    np.empty(0),
+    np.empty((0, 3), dtype=np.int64),
+)
 
 
 class RollingWindow:
@@ -139,11 +151,8 @@ class RollingWindow:
     def contents(self) -> WindowContents:
         """Return a copy of the rows inside the window and their segments."""
         if self._end == 0:
-            empty = np.empty(0)
-            none = np.empty((0, 3), dtype=np.int64)
-            return WindowContents(np.empty(0, dtype=np.int64), empty, empty, empty, none)
-        oldest = self._time_ns[self._end - 1] - self._window_ns
-        first = int(np.searchsorted(self._time_ns[: self._end], oldest, side='right'))
+            return NO_ROWS
+        first = self._first()
         offset = self._base + first
         spans = [
             (s.first_row - offset, s.end_row - offset, int(s.segment.kind))
@@ -161,6 +170,35 @@ class RollingWindow:
             # Most units do not log it, and a snapshot goes to another process.
             command.copy() if np.isfinite(command).any() else np.empty(0),
         )
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`. Rows that have left the window are not."""
+        first = self._first()
+        rows = slice(first, self._end)
+        command = self._data[4, rows]
+        return {
+            'time_ns': self._time_ns[rows].copy(),
+            'rows': self._data[:4, rows].copy(),
+            'command': command.copy() if np.isfinite(command).any() else np.empty(0),
+            'base': self._base + first,
+            'segments': [found_values(s) for s in self._segments],
+        }
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state; raises `DataError` if it does not fit."""
+        time_ns, rows, command = saved['time_ns'], saved['rows'], saved['command']
+        if rows.shape != (4, len(time_ns)) or len(command) not in (0, len(time_ns)):
+            raise DataError('The saved state has rows of different lengths.')
+        self._end, self._base = 0, int(saved['base'])
+        self.append(time_ns, rows[0], rows[1], rows[2], rows[3], command if len(command) else None)
+        self._segments = deque(found_of(values) for values in saved['segments'])
+
+    def _first(self) -> int:
+        """Return the place of the oldest row inside the window."""
+        if self._end == 0:
+            return 0
+        oldest = self._time_ns[self._end - 1] - self._window_ns
+        return int(np.searchsorted(self._time_ns[: self._end], oldest, side='right'))
 
     def _make_room(self) -> None:
         """Grow until the window fits, then drop the oldest rows a fifth at a time."""
@@ -181,6 +219,8 @@ class RollingWindow:
 
     def _forget(self) -> None:
         """Let go of segments that began before the window or whose rows are gone."""
+        if not self._end:
+            return
         oldest = int(self._time_ns[self._end - 1]) - self._window_ns
         while self._segments and (
             self._segments[0].segment.start_ns <= oldest

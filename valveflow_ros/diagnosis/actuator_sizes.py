@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import log_ndtr
 
 from valveflow_ros.records import BoolArray, FloatArray, IntArray
 
@@ -164,7 +164,7 @@ def _probit(pull: FloatArray, slips: IntArray, rests: IntArray, off: float) -> t
     best = np.full(len(centres), -np.inf)
     for width in off * np.geomspace(0.003, 0.1, 9):
         side = (pull - centres[:, None]) / width
-        best = np.maximum(best, norm.logcdf(side) @ slips + norm.logcdf(-side) @ rests)
+        best = np.maximum(best, log_ndtr(side) @ slips + log_ndtr(-side) @ rests)
     k = int(np.argmax(best))
     inside = centres[best > best[k] - 0.5 * _CHI95]
     return float(centres[k]), float(max(inside[-1] - centres[k], centres[k] - inside[0], _ROUNDED))

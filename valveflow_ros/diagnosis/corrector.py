@@ -16,10 +16,14 @@ product of its change and the size of the cause.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from valveflow_ros.core.characteristic import HeldCause
 from valveflow_ros.core.corrector import Corrector
+from valveflow_ros.core.state import Continuing, State, copies, put_back
 from valveflow_ros.core.units import integrated_input
 from valveflow_ros.diagnosis import kernels as flows
 from valveflow_ros.diagnosis import streaming_kernels as kernels
@@ -36,6 +40,7 @@ from valveflow_ros.diagnosis.streaming import (
     check_streams,
     valves,
 )
+from valveflow_ros.errors import DataError
 from valveflow_ros.records import (
     NS_PER_S,
     ByteArray,
@@ -83,6 +88,15 @@ class ChainCorrector:
         """Forget all rows."""
         self._first.restart()
         self._second.restart()
+
+    def snapshot(self) -> State:
+        """Return what both remember."""
+        return {'first': self._first.snapshot(), 'second': self._second.snapshot()}
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state; raises `DataError` if it does not fit."""
+        self._first.restore(saved['first'])
+        self._second.restore(saved['second'])
 
 
 class ModelCorrector:
@@ -137,6 +151,29 @@ class ModelCorrector:
         self._clock = LateClock(sum(late), step) if late else None
         self._temperature = np.array([reference.temperature_degc])
         self._follows = np.array([np.iinfo(np.int64).min // 2, kernels.NO_DATA], dtype=np.int64)
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        return {
+            **copies(self._memory()),
+            'parts': [part.snapshot() for part in self._parts()],
+            'names': [a.name for a in self._model.active],
+        }
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state; raises `DataError` if it does not fit."""
+        if saved['names'] != [a.name for a in self._model.active]:
+            raise DataError('The saved state was made with another model_file.')
+        put_back(self._memory(), saved)
+        for part, given in zip(self._parts(), saved['parts'], strict=True):
+            part.restore(given)
+
+    def _memory(self) -> dict[str, NDArray[Any]]:
+        return {'temperature': self._temperature, 'follows': self._follows}
+
+    def _parts(self) -> list[Continuing]:
+        clock = [] if self._clock is None else [self._clock]
+        return [*self._valves, self._plain, self._extended, *self._refills.values(), *clock]
 
     def correct(self, table: SampleTable) -> SampleTable:
         """Return the rows without the causes."""

@@ -7,12 +7,14 @@ the same formulas as in the catalogue, with their own small classes.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.regional_kernel import make_taps
+from valveflow_ros.core.state import ArrayMemory, State, put_back
 from valveflow_ros.diagnosis import streaming_kernels as kernels
 from valveflow_ros.diagnosis.cause import Active, Stage
 from valveflow_ros.diagnosis.scene import Reference
@@ -31,8 +33,16 @@ class Valve(Protocol):
         """Return the opening in % behind it, shape (n,); NaN is passed."""
         ...
 
+    def snapshot(self) -> State:
+        """Return what is remembered."""
+        ...
 
-class Stop:
+    def restore(self, saved: State) -> None:
+        """Go on from a state."""
+        ...
+
+
+class Stop(ArrayMemory):
     """A saturation, or any cause of the opening without a memory."""
 
     def __init__(self, active: Active, reference: Reference) -> None:
@@ -45,7 +55,7 @@ class Stop:
         return np.asarray(self._active.cause.act(v, self._active.values, None), dtype=np.float64)
 
 
-class Slack:
+class Slack(ArrayMemory):
     """A backlash: the plug stays where it is until a flank reaches it."""
 
     def __init__(self, active: Active, reference: Reference) -> None:
@@ -60,8 +70,11 @@ class Slack:
         kernels.play(v, self._half, self._state, out)
         return out
 
+    def _memory(self) -> dict[str, NDArray[Any]]:
+        return {'place': self._state}
 
-class SlowServo:
+
+class SlowServo(ArrayMemory):
     """A rate limit, by the time between rows."""
 
     def __init__(self, active: Active, reference: Reference) -> None:
@@ -74,6 +87,9 @@ class SlowServo:
         out = np.empty(len(v))
         kernels.rate_limit(v, time_ns, self._rate, self._state, self._last_ns, out)
         return out
+
+    def _memory(self) -> dict[str, NDArray[Any]]:
+        return {'place': self._state, 'last_ns': self._last_ns}
 
 
 class Sticking:
@@ -100,8 +116,17 @@ class Sticking:
         kernels.stick_slip(v, noise, self._band, self._jump, self._state, out)
         return out
 
+    def snapshot(self) -> State:
+        """Return what is remembered, the generator's place among it."""
+        return {'places': self._state.copy(), 'chance': self._chance.bit_generator.state}
 
-class Response:
+    def restore(self, saved: State) -> None:
+        """Go on from a state; raises `DataError` if it does not fit."""
+        put_back({'places': self._state}, saved)
+        self._chance.bit_generator.state = saved['chance']
+
+
+class Response(ArrayMemory):
     """Regional dynamics, run on a flow as it comes."""
 
     def __init__(self, model: RegionalModel, step_s: float) -> None:
@@ -117,8 +142,11 @@ class Response:
         )
         return out
 
+    def _memory(self) -> dict[str, NDArray[Any]]:
+        return {'place': self._place, 'answer': self._answer, 'past': self._past}
 
-class Refill:
+
+class Refill(ArrayMemory):
     """A reheater behind part of the turbine."""
 
     def __init__(self, active: Active, step_s: float) -> None:
@@ -132,8 +160,11 @@ class Refill:
         kernels.lag(y, begin, self._taps, self._state, late)
         return np.asarray(self._share * y + (1.0 - self._share) * late)
 
+    def _memory(self) -> dict[str, NDArray[Any]]:
+        return {'state': self._state}
 
-class LateClock:
+
+class LateClock(ArrayMemory):
     """A series as it was some time ago."""
 
     def __init__(self, delay_s: float, step_s: float) -> None:
@@ -147,6 +178,9 @@ class LateClock:
         out = np.empty(len(y))
         kernels.delay(y, jumps, self._whole, self._part, self._place, self._past, out)
         return out
+
+    def _memory(self) -> dict[str, NDArray[Any]]:
+        return {'place': self._place, 'past': self._past}
 
 
 _VALVES: dict[str, Callable[[Active, Reference], Valve]] = {

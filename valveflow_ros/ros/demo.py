@@ -114,6 +114,8 @@ class Demo:
             {
                 'unit_tag': 'demo',
                 'record_directory': self.folder / 'recordings',
+                # Shown anew each time.
+                'keep_state': False,
                 'refit_period': 14400.0,
                 'refit_segments': 0,
                 # Here a night is over before a diagnosis is.
@@ -180,7 +182,8 @@ class Demo:
             raise ValveflowError(f'The monitor ended with status {status}: {monitor.last_line()}')
 
     def _conclude(self, watch: Watch) -> int:
-        recording = max((self.folder / 'recordings').iterdir(), key=lambda p: p.stat().st_mtime)
+        found = (self.folder / 'recordings').glob('valveflow_*')
+        recording = max(found, key=lambda p: p.stat().st_mtime)
         result = self.folder / 'result'
         ok = self._run('replay --verify', 'ros.replay_main', str(recording), '--verify')
         for verb in ('identify', 'diagnose'):

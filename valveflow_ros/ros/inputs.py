@@ -90,6 +90,16 @@ class Decoder:
         """
         return self._read[name](data, time_ns)
 
+    def recorded(self, name: str, data: bytes, publish_time_ns: int) -> list[Row]:
+        """Return the readings in a recorded message as the live run took them."""
+        time_ns = self.time_ns(name, data, publish_time_ns)
+        if time_ns <= 0:
+            return []
+        try:
+            return self.rows(name, data, time_ns)
+        except ValueError:
+            return []
+
 
 def _float_reader(signal: Signal, unit: Unit) -> Callable[[bytes, int], list[Row]]:
     scale, offset = unit.scale, unit.offset

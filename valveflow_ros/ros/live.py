@@ -12,6 +12,7 @@ from valveflow_ros.core.diagnosis_task import DiagnosisContent
 from valveflow_ros.core.events import DiagnosisRequested, Event, FitRequested
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.offline import CLOCK_BACK
+from valveflow_ros.core.state import State
 from valveflow_ros.records import Readings, SampleTable
 from valveflow_ros.ros.inputs import Row
 from valveflow_ros.ros.outcome import Outcome
@@ -102,6 +103,14 @@ class LiveEngine:
         """Acknowledge the alarms; raises `DataError` if there is none."""
         return self.monitor.acknowledge()
 
+    def shelve(self) -> list[Event]:
+        """Put the alarms that stand aside for a time; raises `DataError` if there is none."""
+        return self.monitor.shelve()
+
+    def unshelve(self) -> list[Event]:
+        """Take the alarms from the shelf; raises `DataError` if none is there."""
+        return self.monitor.unshelve()
+
     def set_reference(self, given: Characteristic | None = None) -> list[Event]:
         """Judge later curves against the running one, or one given; raises `DataError`."""
         return self.monitor.set_reference(given)
@@ -109,6 +118,15 @@ class LiveEngine:
     def reconfigure(self, settings: Settings) -> list[Event]:
         """Take settings of which only live ones differ."""
         return self.monitor.reconfigure(settings)
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        return {'aligner': self.aligner.snapshot(), 'monitor': self.monitor.snapshot()}
+
+    def restore(self, saved: State) -> None:
+        """Go on from a snapshot; raises `DataError` if it does not fit."""
+        self.aligner.restore(saved['aligner'])
+        self.monitor.restore(saved['monitor'])
 
     def _feed_rows(self, table: SampleTable) -> list[Event]:
         events: list[Event] = []

@@ -25,6 +25,7 @@ from valveflow_ros.core.alarms import AlarmChange
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.curve_status import CurveStatus
 from valveflow_ros.core.events import JournalKind
+from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.prediction import PredictionBlock
 from valveflow_ros.core.shift import Shift
 from valveflow_ros.ros import conversions, diagnosis_message
@@ -86,12 +87,11 @@ class Outputs:
         self.cause = NO_CURVE_YET
         self.reference_id = ''
         self.shift: Shift | None = None
+        self._diagnosed: engine.Diagnosed | None = None
 
     def first(self) -> Iterator[Output]:
-        """Yield what stands there before anything has happened."""
-        yield from self._curve_messages()
-        message = diagnosis_message.unknown(diagnosis_message.NOT_YET, self._tag)
-        yield _output('diagnosis', message, 0)
+        """Return what stands there before anything has happened."""
+        return self.latched()
 
     def of(self, events: Sequence[engine.Event]) -> Iterator[Output]:
         """Yield the messages of the events of one call of the engine.
@@ -136,12 +136,36 @@ class Outputs:
             self.reference_id, self.shift = event.characteristic.model_id, None
             yield from self._curve_messages()
         elif isinstance(event, engine.Diagnosed):
-            message = diagnosis_message.of(event, tag)
-            yield _output('diagnosis', message, event.task.window_end_ns)
+            self._diagnosed = event
+            yield self._diagnosis(event)
         elif isinstance(event, engine.JournalEntry):
             yield _output('journal', conversions.journal(event, tag), event.time_ns)
-            if self._note(event):
+            if event.kind == JournalKind.RESUMED:
+                # Who listens to a process that was started again finds everything there.
+                self.shift = None
+                yield from self.latched()
+            elif self._note(event):
                 yield from self._curve_messages()
+
+    def take_up(self, monitor: Monitor) -> None:
+        """Go on with what a monitor knows that was taken up where it was left."""
+        reference = monitor.reference.curve
+        self.curve, self.status, self.cause = monitor.characteristic, monitor.status, monitor.cause
+        self.reference_id = '' if reference is None else reference.model_id
+        self.shift, self._diagnosed = None, monitor.diagnosing.last
+
+    def latched(self) -> Iterator[Output]:
+        """Yield the messages that stand on the latched topics."""
+        yield from self._curve_messages()
+        if self._diagnosed is None:
+            message = diagnosis_message.unknown(diagnosis_message.NOT_YET, self._tag)
+            yield _output('diagnosis', message, 0)
+        else:
+            yield self._diagnosis(self._diagnosed)
+
+    def _diagnosis(self, event: engine.Diagnosed) -> Output:
+        message = diagnosis_message.of(event, self._tag)
+        return _output('diagnosis', message, event.task.window_end_ns)
 
     def _note(self, entry: engine.JournalEntry) -> bool:
         """Take what an entry says about the curve; tell whether it says anything."""

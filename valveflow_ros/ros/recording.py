@@ -5,19 +5,39 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from valveflow_ros.config import Settings
 from valveflow_ros.errors import RecordingError, ValveflowError
 from valveflow_ros.logs import Qos, Recorder, RecorderSettings, RecorderState, RecorderStatus
+from valveflow_ros.logs.part_file import make_folder
 
 DEFAULT_FOLDER = 'valveflow_recordings'
 PARAMETERS = 'parameters.json'
 TOPICS = 'topics.json'
 _CLOSE_S = 1.2
 _MOST_NAMES = 1000
+
+
+def tag_of(settings: Settings) -> str:
+    """Return the unit's tag as a part of a folder's name."""
+    return re.sub(r'[^A-Za-z0-9_-]+', '-', settings.text('unit_tag'))[:60] or 'unit'
+
+
+def at_home(name: str) -> Path:
+    """Return a folder a parameter names, ``~`` replaced.
+
+    Raises
+    ------
+    RecordingError
+        There is no such user.
+    """
+    try:
+        return Path(name).expanduser()
+    except RuntimeError:
+        raise RecordingError(name, 'names the home of a user that is not there') from None
 
 
 def new_folder(settings: Settings, at_s: float) -> Path:
@@ -28,11 +48,10 @@ def new_folder(settings: Settings, at_s: float) -> Path:
     RecordingError
         It cannot be made.
     """
-    parent = Path(settings.text('record_directory') or DEFAULT_FOLDER).expanduser()
-    tag = re.sub(r'[^A-Za-z0-9_-]+', '-', settings.text('unit_tag'))[:60] or 'unit'
-    stem = time.strftime('valveflow_%Y%m%dT%H%M%SZ', time.gmtime(at_s)) + f'_{tag}'
+    parent = at_home(settings.text('record_directory') or DEFAULT_FOLDER)
+    stem = time.strftime('valveflow_%Y%m%dT%H%M%SZ', time.gmtime(at_s)) + f'_{tag_of(settings)}'
     try:
-        parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        make_folder(parent)
         for k in range(1, _MOST_NAMES):
             folder = parent / (stem if k == 1 else f'{stem}_{k}')
             try:
@@ -59,6 +78,15 @@ class Recording:
         Time of the start, seconds since the epoch.
     more : mapping, optional
         Other attachments by name.
+    folder : Path, optional
+        A recording to go on with; a new one is begun without it.
+    began : mapping, optional
+        The parameters that one began with, from which its journal leads to those of now.
+
+    Attributes
+    ----------
+    began : dict
+        The parameters that the recording began with.
     """
 
     def __init__(
@@ -67,11 +95,14 @@ class Recording:
         topics: Mapping[str, Any],
         at_s: float,
         more: Mapping[str, bytes] | None = None,
+        folder: Path | None = None,
+        began: Mapping[str, Any] | None = None,
     ) -> None:
         self.problem = ''
         self.folder: Path | None = None
         self._recorder: Recorder | None = None
         self._offered: dict[str, tuple[str, Qos, bool]] = {}
+        self.began = dict(settings if began is None else began)
         if not settings.flag('record'):
             self.problem = 'Recording is switched off (parameter record).'
             return
@@ -82,12 +113,12 @@ class Recording:
             keep_files=settings.whole('record_keep') or None,
         )
         attachments = {
-            PARAMETERS: _json(dict(settings)),
+            PARAMETERS: _json(self.began),
             TOPICS: _json(topics),
             **(more or {}),
         }
         try:
-            self.folder = new_folder(settings, at_s)
+            self.folder = folder or new_folder(settings, at_s)
             self._recorder = Recorder(self.folder, limits, attachments=attachments)
         except ValveflowError as error:
             self.problem = str(error)
@@ -121,6 +152,19 @@ class Recording:
     def status(self) -> RecorderStatus | None:
         """Return the recorder's account, None without one."""
         return None if self._recorder is None else self._recorder.status()
+
+    def settled(self) -> Callable[[], bool]:
+        """Return what tells whether all messages handed in up to now are on disk or lost."""
+        recorder = self._recorder
+        if recorder is None:
+            return lambda: True
+        received = recorder.status().received
+
+        def ready() -> bool:
+            status = recorder.status()
+            return status.received - status.queued >= received
+
+        return ready
 
     def close(self) -> RecorderStatus | None:
         """Finish the file; return the account."""

@@ -16,6 +16,7 @@ from valveflow_ros.core.events import Event
 from valveflow_ros.logs import RecorderStatus
 from valveflow_ros.ros import diagnosis_health, graph, model_file, work_health
 from valveflow_ros.ros.chronicle import line_of
+from valveflow_ros.ros.continuity import Continuity
 from valveflow_ros.ros.diagnostics import Item, Level
 from valveflow_ros.ros.input_health import InputHealth
 from valveflow_ros.ros.inputs import INPUTS, Decoder
@@ -57,18 +58,16 @@ class Session:
         self._node = node
         self._log = log
         self._settings = settings
-        self._log_clock = LogClock()
         self._reference = reference_of(settings)
         self._extended = model_file.extended_of(settings)
         self.inputs = {topic.name: node.resolve_topic_name(topic.name) for topic in INPUTS}
         self.outputs = {name: node.resolve_topic_name(f'~/{name}') for name in OUTPUTS}
+        self._continuity = Continuity(settings, self.inputs, self.outputs, log)
         self.worker = FitWorker(settings.real('refit_timeout'))
         self.worker.start()
         self.diagnosis_worker = DiagnosisWorker(settings.real('diagnosis_timeout'))
+        self._outputs = Outputs(settings.text('unit_tag'))
         try:
-            self.warm_up_s = warm_up(settings, self.worker, stop)
-            corrector = model_file.ready(self._extended, settings)
-            self.engine = LiveEngine(settings, self.worker, self.diagnosis_worker, corrector)
             # Each event costs the executor time at every look, and nobody listens to these.
             silent = PublisherEventCallbacks(use_default_callbacks=False)
             self._publishers = {
@@ -77,17 +76,34 @@ class Session:
                 )
                 for name, topic in OUTPUTS.items()
             }
+            self.engine = self._made_engine()
+            self.warm_up_s = warm_up(settings, self.worker, stop)
+            self._log_clock = LogClock(self._continuity.log_ns)
             self.recording = self._open_recording()
         except BaseException:
             self.worker.close()
+            self._continuity.close()
             raise
-        self._outputs = Outputs(settings.text('unit_tag'))
         self._takers: list[Taker] = []
         self._intake: Intake | None = None
         self._health = InputHealth(settings, self.inputs)
         self._seen: dict[str, graph.Publishers] = {}
         self._looked_s = self._listening_since_s = 0.0
         self._begun = False
+
+    def _made_engine(self) -> LiveEngine:
+        """Return the engine; where it goes on from an earlier run its curve is there at once."""
+
+        def make(settings: Settings) -> LiveEngine:
+            corrector = model_file.ready(self._extended, settings)
+            return LiveEngine(settings, self.worker, self.diagnosis_worker, corrector)
+
+        engine = self._continuity.engine(make)
+        if self._continuity.goes_on:
+            self._outputs.take_up(engine.monitor)
+            for output in self._outputs.latched():
+                self._publishers[output.name].publish(output.data)
+        return engine
 
     @property
     def listening(self) -> bool:
@@ -119,12 +135,19 @@ class Session:
         self._listening_since_s = time.monotonic()
         if not self._begun:
             self._begun = True
-            self._say(self._outputs.first())
-            if self._extended is not None:
-                names = ', '.join(h.name for h in self._extended.held) or 'nothing'
-                self._log(Level.OK, f'Taken out of the rows, by model_file: {names}.')
-            if self._reference is not None:
-                self.tell(self.engine.set_reference(self._reference))
+            self._begin()
+
+    def _begin(self) -> None:
+        """Say what stands there at the start, or go on where an earlier run ended."""
+        self._say(self._continuity.begin(self.engine, self._outputs))
+        self._continuity.look_after(self.recording)
+        if self._extended is not None:
+            names = ', '.join(h.name for h in self._extended.held) or 'nothing'
+            self._log(Level.OK, f'Taken out of the rows, by model_file: {names}.')
+        kept = self.engine.monitor.reference.curve
+        given = self._reference
+        if given is not None and (kept is None or kept.model_id != given.model_id):
+            self.tell(self.engine.set_reference(given))
 
     def hush(self) -> None:
         """Unsubscribe, after taking what is there."""
@@ -139,6 +162,7 @@ class Session:
     def step(self, last: bool = False) -> int:
         """Take, record and feed what has arrived; return how many messages that was."""
         self.tell(self.engine.poll())
+        self._continuity.step(self._settings, self.engine, self._log_clock.last_ns, self.recording)
         if self._intake is None:
             return 0
         arrivals = self._intake.collect(time.monotonic(), time.time_ns(), last)
@@ -155,6 +179,7 @@ class Session:
             line = line_of(event)
             if line is not None:
                 self._log(*line)
+        self._continuity.note(events)
         self._say(self._outputs.of(events))
 
     def reconfigure(self, settings: Settings) -> None:
@@ -187,6 +212,7 @@ class Session:
             )
         )
         items.append(work_health.recorder_item(self.recording))
+        items.append(self._continuity.item())
         return items
 
     def record(self, topic: str, data: bytes, time_ns: int) -> None:
@@ -198,7 +224,13 @@ class Session:
         self.hush()
         self.worker.close()
         self.diagnosis_worker.close()
+        # Where nothing is recorded, nothing else tells what happened since it was saved last.
+        if not self.recording.on:
+            self._continuity.save(
+                self._settings, self.engine, self._log_clock.last_ns, self.recording
+            )
         status = self.recording.close()
+        self._continuity.close()
         for publisher in self._publishers.values():
             self._node.destroy_publisher(publisher)
         return status
@@ -212,7 +244,10 @@ class Session:
     def _open_recording(self) -> Recording:
         topics: dict[str, Any] = {'inputs': self.inputs, 'outputs': self.outputs}
         model = model_file.attached(self._extended)
-        recording = Recording(self._settings, topics, time.time(), model)
+        recording = Recording(
+            self._settings, topics, time.time(), model, self._continuity.folder,
+            self._continuity.began,
+        )  # fmt: skip
         reliable = self._settings.text('input_reliability') == 'reliable'
         for topic in INPUTS:
             recording.offer(

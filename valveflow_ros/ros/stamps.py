@@ -12,15 +12,20 @@ class LogClock:
 
     Should the machine's clock be set back, times go on by a nanosecond a message
     until it has caught up.
+
+    Parameters
+    ----------
+    after_ns : int
+        The first time is later than this.
     """
 
-    def __init__(self) -> None:
-        self._last_ns = 0
+    def __init__(self, after_ns: int = 0) -> None:
+        self.last_ns = after_ns
 
     def stamp(self, received_ns: int) -> int:
         """Return the log time of a message."""
-        self._last_ns = max(received_ns, self._last_ns + 1)
-        return self._last_ns
+        self.last_ns = max(received_ns, self.last_ns + 1)
+        return self.last_ns
 
 
 class ClockTrack:

@@ -17,7 +17,7 @@ from valveflow_ros.config import Settings
 from valveflow_ros.core.align import Aligner
 from valveflow_ros.core.corrector import Corrector
 from valveflow_ros.core.diagnosis_task import DiagnosisContent, DiagnosisTask
-from valveflow_ros.core.events import Event, JournalEntry
+from valveflow_ros.core.events import Event, JournalEntry, JournalKind
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.offline import JournalReplayer
 from valveflow_ros.diagnosis import model_json
@@ -130,12 +130,19 @@ def _replayed(
     kept = set(outputs.values())
     yield from (output for output in speaker.first() if output.name in kept)
     monitor = Monitor(settings, _corrector(log, settings))
-    replayer = JournalReplayer(monitor, list(_journal(log, outputs)), diagnosed_elsewhere)
+    journal = list(_journal(log, outputs))
+    if journal and journal[0].kind == JournalKind.RESUMED:
+        problem = 'goes on from an earlier recording and cannot be verified without it'
+        raise RecordingError(log.path, problem)
+    replayer = JournalReplayer(monitor, journal, diagnosed_elsewhere)
     aligner, decoder = Aligner(settings), Decoder(settings)
     messages = _messages(log, inputs)
     while block := list(islice(messages, _BLOCK)):
         result.inputs += len(block)
-        rows = [row for message in block for row in _rows(decoder, inputs, message)]
+        rows = [
+            row for m in block
+            for row in decoder.recorded(inputs[m.topic], m.data, m.publish_time_ns)
+        ]  # fmt: skip
         # Restarts of the clock stand in the journal, so the rows alone are enough here.
         said = speaker.of(_fed(replayer, aligner, rows))
         yield from (output for output in said if output.name in kept)
@@ -200,18 +207,6 @@ def _journal(log: LogContents, outputs: dict[str, str]) -> Iterator[JournalEntry
             # rclpy raises whatever the middleware's C++ gave it.
             problem = f'holds a line of the journal that cannot be read ({error})'
             raise RecordingError(log.path, problem) from error
-
-
-def _rows(decoder: Decoder, inputs: dict[str, str], message: LoggedMessage) -> list[Row]:
-    """Return the readings in a message as the live run took them."""
-    name = inputs[message.topic]
-    time_ns = decoder.time_ns(name, message.data, message.publish_time_ns)
-    if time_ns <= 0:
-        return []
-    try:
-        return decoder.rows(name, message.data, time_ns)
-    except ValueError:
-        return []
 
 
 def _fed(replayer: JournalReplayer, aligner: Aligner, rows: list[Row]) -> list[Event]:

@@ -1,0 +1,93 @@
+"""A monitor that is taken up where it was left goes on bit for bit as if it had not been."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from streams import (
+    QUICK_MONITOR,
+    examples,
+    first_difference,
+    plant_table,
+    story,
+    table_harms,
+)
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.align import Aligner
+from valveflow_ros.core.monitor import Monitor
+from valveflow_ros.core.offline import feed_rows
+from valveflow_ros.core.state_bytes import from_bytes, to_bytes
+from valveflow_ros.errors import DataError
+from valveflow_ros.records import Readings, table_to_readings
+
+SETTINGS = Settings(QUICK_MONITOR)
+N = 700
+seeds = st.integers(0, 2**32 - 1)
+
+
+def again(made, fresh):
+    """Return a fresh object that goes on where ``made`` is, by way of bytes."""
+    fresh.restore(from_bytes(to_bytes(made.snapshot())))
+    return fresh
+
+
+@examples(25)
+@given(seeds, table_harms(N), st.integers(0, N))
+def test_a_monitor_taken_up_again_says_the_same(seed, harms, cut):
+    table = plant_table(seed, N, harms)
+    n = len(table)
+    cut = min(cut, n)
+    whole = Monitor(SETTINGS)
+    expected = feed_rows(whole, table)
+    first = Monitor(SETTINGS)
+    events = feed_rows(first, table.part(0, cut))
+    second = again(first, Monitor(SETTINGS))
+    events += feed_rows(second, table.part(cut, n))
+    assert first_difference(story(expected), story(events)) == ''
+    assert to_bytes(second.snapshot()) == to_bytes(whole.snapshot())
+
+
+@examples(15)
+@given(seeds, table_harms(N), st.integers(0, 5 * N))
+def test_an_aligner_taken_up_again_closes_the_same_rows(seed, harms, cut):
+    readings = table_to_readings(plant_table(seed, N, harms))
+    cut = min(cut, len(readings))
+    expected = Aligner(SETTINGS).feed(readings)
+    first = Aligner(SETTINGS)
+    before = first.feed(readings.part(0, cut))
+    after = again(first, Aligner(SETTINGS)).feed(readings.part(cut, len(readings)))
+    times = np.concatenate([before.table.time_ns, after.table.time_ns])
+    values = np.concatenate([before.table.values, after.table.values])
+    np.testing.assert_array_equal(times, expected.table.time_ns)
+    np.testing.assert_array_equal(values, expected.table.values)
+
+
+def test_taking_a_snapshot_changes_nothing_and_it_does_not_change_any_more():
+    table = plant_table(5, N)
+    monitor = Monitor(SETTINGS)
+    feed_rows(monitor, table.part(0, 400))
+    taken = monitor.snapshot()
+    before = to_bytes(taken)
+    assert to_bytes(monitor.snapshot()) == before
+    feed_rows(monitor, table.part(400, N))
+    assert to_bytes(taken) == before
+
+
+def test_a_state_of_other_settings_is_refused():
+    monitor = Monitor(SETTINGS)
+    feed_rows(monitor, plant_table(1, N))
+    other = Monitor(Settings({**QUICK_MONITOR, 'block': 2.0 * SETTINGS.real('block')}))
+    with pytest.raises(DataError, match='saved state'):
+        other.restore(monitor.snapshot())
+
+
+def test_an_empty_aligner_and_monitor_have_a_state_too():
+    assert len(again(Aligner(SETTINGS), Aligner(SETTINGS)).feed(Readings.of([])).table) == 0
+    monitor = again(Monitor(SETTINGS), Monitor(SETTINGS))
+    assert monitor.rows == 0
+    assert story(feed_rows(monitor, plant_table(2, 50))) == story(
+        feed_rows(Monitor(SETTINGS), plant_table(2, 50))
+    )

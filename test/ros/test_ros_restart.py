@@ -1,0 +1,158 @@
+"""A monitor that is killed goes on where it was: same curve, same alarms, one recording."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from ros_helpers import Processes, wait_until
+from std_srvs.srv import Trigger
+from valveflow_msgs.msg import Alarm, FlowCharacteristic, JournalEntry
+
+from valveflow_ros.core.events import JournalKind
+from valveflow_ros.logs import open_log
+from valveflow_ros.plant.simulator import simulate
+from valveflow_ros.ros.demo_processes import ros_arguments
+from valveflow_ros.ros.inputs import PLANT_SAMPLE
+from valveflow_ros.ros.playing import Player
+from valveflow_ros.ros.simulator_steps import effects_of, stamped_steps
+from valveflow_ros.ros.verify import verify
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+MONITOR = '/valveflow_monitor'
+LATCHED = QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+LOG = simulate(0.3, 7, effects=effects_of(['gain_step:g=-0.12,t0_days=0.2'])).table
+
+
+class Plant:
+    """Publishes rows of a log and hears what the monitor says."""
+
+    def __init__(self, context: Any) -> None:
+        self.node = Node('plant', context=context)
+        self.executor = SingleThreadedExecutor(context=context)
+        self.executor.add_node(self.node)
+        self.alarms: list[Alarm] = []
+        self.curves: list[FlowCharacteristic] = []
+        self.journal: list[JournalEntry] = []
+        subscribe = self.node.create_subscription
+        subscribe(Alarm, f'{MONITOR}/alarms', self.alarms.append, LATCHED)
+        subscribe(FlowCharacteristic, f'{MONITOR}/characteristic', self.curves.append, LATCHED)
+        subscribe(JournalEntry, f'{MONITOR}/journal', self.journal.append, 1000)
+        self._player = Player(self.node, [PLANT_SAMPLE], 0.0, False, lambda: False)
+
+    def play(self, start: int, end: int) -> None:
+        assert not self._player.wait_for_listeners(240.0)
+        self._player.play(stamped_steps([LOG.part(start, end)], False, 'unit'))
+
+    def until(self, condition: Any, what: str, patience_s: float = 120.0) -> Any:
+        def look() -> Any:
+            self.executor.spin_once(timeout_sec=0.02)
+            return condition()
+
+        return wait_until(look, what, patience_s)
+
+    def quiet(self, seconds: float) -> None:
+        """Listen for a while."""
+        until_s = time.monotonic() + seconds
+        self.until(lambda: time.monotonic() > until_s, 'the end of a while')
+
+    def trigger(self, name: str) -> Trigger.Response:
+        client = self.node.create_client(Trigger, f'{MONITOR}/{name}')
+        self.until(client.service_is_ready, name)
+        future = client.call_async(Trigger.Request())
+        return self.until(lambda: future.done() and future.result(), name)
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+
+
+@pytest.fixture
+def plant(context: Any) -> Iterator[Plant]:
+    made = Plant(context)
+    yield made
+    made.close()
+
+
+def start(processes: Processes, folder: Path, **more: object) -> Any:
+    given = {
+        'record_directory': folder, 'input_reliability': 'reliable', 'refit_period': 3600.0,
+        'refit_segments': 0, **more,
+    }  # fmt: skip
+    return processes.start('valveflow_ros.ros.monitor_main', *ros_arguments(given))
+
+
+def test_killed_and_started_again_it_goes_on_with_curve_alarm_and_recording(
+    processes: Processes, plant: Plant, tmp_path: Path
+) -> None:
+    first = start(processes, tmp_path)
+    plant.play(0, 21000)
+    plant.until(
+        lambda: plant.curves and plant.curves[-1].model_id
+        and plant.alarms and plant.alarms[-1].state == Alarm.UNACKNOWLEDGED,
+        'curve and alarm',
+    )  # fmt: skip
+    # What is still being computed or on its way is heard too.
+    plant.quiet(4.0)
+    raised, curve = plant.alarms[-1], plant.curves[-1]
+    first.kill()
+    first.wait()
+    before = len(plant.alarms)
+
+    plant.curves.clear()
+    second = start(processes, tmp_path)
+    begun = time.monotonic()
+    found = plant.until(lambda: plant.curves and plant.curves[-1], 'the curve')
+    print(f'curve again after {time.monotonic() - begun:.1f} s')
+    assert found.model_id == curve.model_id
+    plant.until(
+        lambda: any(e.kind == JournalKind.RESUMED for e in plant.journal), 'the journal', 240.0
+    )
+    # An operator is not told twice, and can still acknowledge what was raised before.
+    assert len(plant.alarms) == before
+    answer = plant.trigger('acknowledge_alarms')
+    assert answer.success, answer.message
+    plant.until(lambda: plant.alarms[-1].state == Alarm.ACKNOWLEDGED, 'the acknowledgement')
+    assert plant.alarms[-1].occurrence == raised.occurrence
+    plant.play(21000, len(LOG))
+    time.sleep(1.0)
+    second.send_signal(signal.SIGTERM)
+    assert second.wait(10.0) == 0, processes.output(second)
+    assert 'Traceback' not in processes.output(second)
+
+    (folder,) = tmp_path.glob('valveflow_*')
+    assert not list(folder.glob('*.part'))
+    log = open_log(folder)
+    assert log.warnings == ()
+    assert log.topics['/plant_sample'].count >= len(LOG) - 600
+    result = verify(folder)
+    assert result.difference == '', result.difference
+    assert result.compared['alarms'] >= 2
+
+
+def test_a_second_monitor_on_the_same_state_is_refused_and_the_first_goes_on(
+    processes: Processes, plant: Plant, tmp_path: Path
+) -> None:
+    first = start(processes, tmp_path)
+    plant.until(lambda: plant.curves, 'the first monitor', 240.0)
+    second = start(processes, tmp_path)
+    assert second.wait(120.0) == 1
+    said = processes.output(second)
+    assert f'another monitor (process {first.pid}) keeps its state there' in said
+    assert 'Traceback' not in said
+    assert first.poll() is None
+    os.kill(first.pid, signal.SIGKILL)
+    first.wait()
+    third = start(processes, tmp_path)
+    plant.curves.clear()
+    plant.until(lambda: plant.curves, 'the third monitor', 240.0)
+    third.send_signal(signal.SIGTERM)
+    assert third.wait(10.0) == 0

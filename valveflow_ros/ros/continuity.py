@@ -1,0 +1,146 @@
+"""Ties a run of the monitor to the one before it and to the one after it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from valveflow_ros.config import Settings
+from valveflow_ros.core.events import Event
+from valveflow_ros.errors import ValveflowError
+from valveflow_ros.ros.diagnostics import Item, Level
+from valveflow_ros.ros.keeper import Keeper
+from valveflow_ros.ros.leftovers import Leftovers
+from valveflow_ros.ros.live import LiveEngine
+from valveflow_ros.ros.outputs import Output, Outputs
+from valveflow_ros.ros.recording import Recording
+from valveflow_ros.ros.resuming import REASON, Earlier, earlier_run, retrace
+
+Log = Callable[[Level, str], None]
+
+
+class Continuity:
+    """Finds what an earlier run left, and leaves the like for a later one.
+
+    Parameters
+    ----------
+    settings : Settings
+    inputs, outputs : mapping of str to str
+        Full names of the topics.
+    log : callable
+        Takes how grave something is and a sentence.
+
+    Raises
+    ------
+    InUseError
+        Another monitor keeps its state in the same folder.
+    """
+
+    def __init__(
+        self, settings: Settings, inputs: Mapping[str, str], outputs: Mapping[str, str], log: Log
+    ) -> None:
+        self._settings = settings
+        self._inputs = {topic: name for name, topic in inputs.items()}
+        self._outputs = {topic: name for name, topic in outputs.items()}
+        self._topics = {**inputs, **outputs}
+        self._log = log
+        self._earlier: Earlier | None = None
+        self._leftovers: Leftovers | None = None
+        self._keeper = Keeper(settings)
+
+    @property
+    def goes_on(self) -> bool:
+        """Tell whether an earlier run is gone on with."""
+        return self._earlier is not None
+
+    @property
+    def log_ns(self) -> int:
+        """Return the newest log time of the earlier run, 0 without one."""
+        return 0 if self._earlier is None else self._earlier.log_ns
+
+    @property
+    def folder(self) -> Path | None:
+        """Return the recording that is gone on with, None if a new one is to be begun."""
+        return None if self._earlier is None else self._earlier.folder
+
+    @property
+    def began(self) -> Mapping[str, Any] | None:
+        """Return the parameters that recording began with."""
+        saved = self._keeper.saved
+        return None if self.folder is None or saved is None else saved['began']
+
+    def engine(self, make: Callable[[Settings], LiveEngine]) -> LiveEngine:
+        """Return the engine, where it was left if there is a state that can be used."""
+        saved = self._keeper.saved
+        if saved is not None:
+            try:
+                earlier = earlier_run(saved, self._settings, self._topics)
+                engine = make(earlier.settings)
+                engine.restore(saved['engine'])
+            except (ValveflowError, LookupError, TypeError, ValueError, AttributeError) as error:
+                self._keeper.drop(str(error) if isinstance(error, ValveflowError) else '')
+            else:
+                self._earlier = earlier
+                return engine
+        return make(self._settings)
+
+    def begin(self, engine: LiveEngine, speaker: Outputs) -> Iterator[Output]:
+        """Yield what stands at the beginning: nothing yet, or where the earlier run ended."""
+        for sentence in filter(None, (self._keeper.problem, self._keeper.sentence)):
+            self._log(Level.WARN, sentence)
+        earlier = self._earlier
+        if earlier is None:
+            yield from speaker.first()
+            return
+        if earlier.sentence:
+            self._log(Level.WARN, earlier.sentence)
+        try:
+            yield from retrace(engine, speaker, earlier, self._inputs, self._outputs)
+        except ValveflowError as error:
+            self._log(Level.WARN, f'Not all of the earlier recording could be followed: {error}')
+        yield from speaker.of(engine.monitor.resume(REASON))
+        yield from speaker.of(engine.reconfigure(self._settings))
+        earlier.tail.clear()
+        self._log(Level.OK, f'Going on after {engine.monitor.rows} rows of an earlier run.')
+
+    def look_after(self, recording: Recording) -> None:
+        """Finish in the background what other runs left unfinished beside this recording."""
+        if recording.folder is not None:
+            self._leftovers = Leftovers(recording.folder)
+
+    def note(self, events: Sequence[Event]) -> None:
+        """Look for what must survive the end of the process."""
+        self._keeper.note(events)
+
+    def step(
+        self, settings: Settings, engine: LiveEngine, log_ns: int, recording: Recording
+    ) -> None:
+        """Save the state if that is due; ``log_ns`` is of the newest message that went into it."""
+        for level, sentence in self._leftovers.news() if self._leftovers else ():
+            self._log(level, sentence)
+        if self._keeper.due:
+            self.save(settings, engine, log_ns, recording)
+
+    def save(
+        self, settings: Settings, engine: LiveEngine, log_ns: int, recording: Recording
+    ) -> None:
+        """Save the state now."""
+        if self._keeper.on:
+            self._keeper.write(settings, engine.snapshot(), log_ns, recording, self._topics)
+
+    def item(self) -> Item:
+        """Return how saving goes."""
+        keeper = self._keeper
+        age_s = keeper.age_s
+        values = {'Seconds since it was saved': '' if age_s is None else f'{age_s:.0f}'}
+        if keeper.problem:
+            return Item('state', Level.ERROR, keeper.problem, values)
+        if not keeper.on:
+            nothing = 'Nothing is kept (parameters keep_state, state_directory).'
+            return Item('state', Level.OK, nothing)
+        return Item('state', Level.OK, 'The state is saved in its time.', values)
+
+    def close(self) -> None:
+        """Let the next run in, once what is being saved is in place."""
+        self._keeper.close()

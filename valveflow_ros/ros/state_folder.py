@@ -1,0 +1,170 @@
+"""Where a monitor keeps its state: one file, one owner."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from valveflow_ros.core.state import State
+from valveflow_ros.core.state_bytes import to_bytes
+from valveflow_ros.errors import RecordingError
+from valveflow_ros.logs.part_file import FILE_MODE, make_folder, write_whole
+
+STATE = 'monitor.state'
+LOCK = 'lock'
+_MOST_BYTES = 4 << 30
+# The file is put in place when the recording has everything that went into it, or after this.
+_PATIENCE_S = 2.0
+_LOOK_S = 0.02
+
+
+class InUseError(RecordingError):
+    """Another monitor keeps its state there."""
+
+
+class StateFolder:
+    """A folder that only one monitor works in, as long as it lives.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if absent.
+
+    Raises
+    ------
+    InUseError
+        Another monitor is at work there.
+    RecordingError
+        It cannot be made or used.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.path = folder / STATE
+        try:
+            make_folder(folder)
+            self._lock = _locked(folder / LOCK)
+            for stale in folder.glob(f'.{STATE}.*.tmp'):
+                stale.unlink()
+        except BlockingIOError:
+            raise InUseError(folder, _in_use(folder / LOCK)) from None
+        except (OSError, ValueError) as error:
+            raise RecordingError(folder, f'cannot be used ({_reason(error)})') from None
+
+    def read(self) -> bytes | None:
+        """Return what was saved last, None if nothing was.
+
+        Raises
+        ------
+        RecordingError
+            It is there and cannot be read.
+        """
+        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        try:
+            with os.fdopen(os.open(self.path, flags), 'rb') as file:
+                if os.fstat(file.fileno()).st_size > _MOST_BYTES:
+                    raise RecordingError(self.path, 'is too large to be a saved state')
+                return file.read()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise RecordingError(self.path, f'cannot be read ({_reason(error)})') from None
+
+    def write(self, data: bytes) -> None:
+        """Put a state in place of the last one: it is the old or the new one, never half."""
+        write_whole(self.path, data)
+
+    def close(self) -> None:
+        """Let another monitor in."""
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1
+
+
+class StateWriter:
+    """Writes states from a thread, one at a time; the monitor never waits for it.
+
+    Parameters
+    ----------
+    folder : StateFolder
+
+    Attributes
+    ----------
+    problem : str
+        Why the last one could not be written; empty if it was.
+    saved_s : float or None
+        When the last one was put in place, by a clock that never goes back.
+    """
+
+    def __init__(self, folder: StateFolder) -> None:
+        self._folder = folder
+        self._thread: threading.Thread | None = None
+        self.problem = ''
+        self.saved_s: float | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Tell whether one is being written."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def write(self, state: State, ready: Callable[[], bool]) -> None:
+        """Write a state once ``ready`` says so, or after a while; call it only when not busy."""
+        self._thread = threading.Thread(
+            target=self._write, args=(state, ready), name='state writer', daemon=True
+        )
+        self._thread.start()
+
+    def finish(self, timeout_s: float) -> None:
+        """Wait for the one being written."""
+        if self._thread is not None:
+            self._thread.join(timeout_s)
+
+    def _write(self, state: State, ready: Callable[[], bool]) -> None:
+        try:
+            data = to_bytes(state)
+            until_s = time.monotonic() + _PATIENCE_S
+            while not ready() and time.monotonic() < until_s:
+                time.sleep(_LOOK_S)
+            self._folder.write(data)
+        except OSError as error:
+            self.problem = f'{self._folder.path}: the state cannot be saved ({_reason(error)}).'
+        except Exception as error:  # noqa: BLE001 - a dead thread must not go unnoticed
+            self.problem = f'The state cannot be saved ({type(error).__name__}: {error}).'
+        else:
+            self.problem = ''
+            self.saved_s = time.monotonic()
+
+
+def _locked(path: Path) -> int:
+    """Return a descriptor that holds the lock; the kernel lets go when the process ends."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+    descriptor = os.open(path, flags, FILE_MODE)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.fchmod(descriptor, FILE_MODE)
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, f'{os.getpid()}\n'.encode())
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def _in_use(lock: Path) -> str:
+    """Say who holds it."""
+    owner = ''
+    with contextlib.suppress(OSError, ValueError):
+        owner = f' (process {int(lock.read_text()[:20])})'
+    return (
+        f'another monitor{owner} keeps its state there; stop it, or give this one a '
+        'state_directory or unit_tag of its own'
+    )
+
+
+def _reason(error: OSError | ValueError) -> str:
+    return (getattr(error, 'strerror', None) or str(error)).lower()
