@@ -9,20 +9,28 @@ from dataclasses import replace
 from pathlib import Path
 
 import hurt_jobs
+import numpy as np
 import psutil
 import pytest
 from ros_helpers import wait_until
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.diagnosis_task import DiagnosisTask
 from valveflow_ros.core.fit import fit
+from valveflow_ros.core.fit_task import FitTask
+from valveflow_ros.core.state import State
+from valveflow_ros.core.window import NO_ROWS
+from valveflow_ros.errors import DataError
 from valveflow_ros.ros.frames import FrameReader, send
+from valveflow_ros.ros.letters import result_letter, result_of, task_letter, task_of
 from valveflow_ros.ros.outcome import Outcome
-from valveflow_ros.ros.warmup import made_up_task
+from valveflow_ros.ros.warmup import made_up_curve, made_up_task
 from valveflow_ros.ros.worker import FIT_JOB, FitWorker
 
 pytestmark = pytest.mark.usefixtures('jobs_on_path')
 TASK = made_up_task(Settings())
+DIAGNOSIS = DiagnosisTask(5, TASK.contents, Settings(), made_up_curve(Settings()).with_id(), 6)
 
 
 @contextmanager
@@ -69,8 +77,8 @@ def told_worker() -> Iterator[FitWorker]:
         ('refuses', 'There is no curve in these data.'),
         ('greedy', 'more memory than there is'),
         ('nothing', 'gave no curve'),
-        ('nan', 'not finite'),
-        ('backwards', 'do not increase'),
+        ('nan', 'a curve that cannot be'),
+        ('backwards', 'a curve that cannot be'),
         ('of_other_data', 'other data'),
         ('renamed', 'its own name'),
     ],
@@ -213,10 +221,11 @@ def test_the_process_ends_with_its_parent() -> None:
 
 def test_frames_survive_any_cutting() -> None:
     reader, writer = os.pipe()
-    items = [('a', 1.5), {'large': TASK}, None, b'x' * 100_000]
+    large = np.random.default_rng(1).standard_normal((3, 100_000))
+    items = [{'a': [1.5, 'b', None]}, {'large': large, 'of': {'more': large[0]}}, {}]
     os.set_blocking(reader, False)
     frames = FrameReader(reader)
-    found: list[object] = []
+    found: list[State] = []
     pid = os.fork()
     if pid == 0:  # pragma: no cover - another process
         for item in items:
@@ -227,8 +236,33 @@ def test_frames_survive_any_cutting() -> None:
     os.waitpid(pid, 0)
     os.close(reader)
     assert len(found) == len(items)
-    assert found[0] == items[0]
-    assert found[3] == items[3]
-    sent, got = TASK.contents, found[1]['large'].contents  # type: ignore[index]
-    assert (sent.u == got.u).all()
-    assert (sent.spans == got.spans).all()
+    assert (found[0], found[2]) == (items[0], items[2])
+    assert found[1]['large'].tobytes() == large.tobytes()
+    assert found[1]['of']['more'].tobytes() == large[0].tobytes()
+
+
+@pytest.mark.parametrize('raw', [b'x' * 100, b'\x05' + 7 * b'\x00' + b'abcde', b'\xff' * 8])
+def test_what_is_no_message_is_refused(raw: bytes) -> None:
+    reader, writer = os.pipe()
+    os.set_blocking(reader, False)
+    os.write(writer, raw)
+    with pytest.raises(DataError):
+        FrameReader(reader).ready()
+    os.close(writer)
+    os.close(reader)
+
+
+def test_tasks_and_results_arrive_as_they_were_sent() -> None:
+    number, task = task_of(task_letter(7, TASK))
+    assert number == 7
+    assert isinstance(task, FitTask)
+    assert dict(task.settings) == dict(TASK.settings)
+    bare = {'contents': NO_ROWS, 'settings': TASK.settings}
+    assert repr(replace(task, **bare)) == repr(replace(TASK, **bare))
+    for name in ('time_ns', 'u', 'power_mw', 'temperature_degc', 'spans'):
+        assert getattr(task.contents, name).tobytes() == getattr(TASK.contents, name).tobytes()
+    for result in (hurt_jobs.good(TASK), hurt_jobs.diagnosed(DIAGNOSIS), 'A sentence.', None):
+        assert repr(result_of(result_letter(3, result))) == repr((3, result))
+    _, again = task_of(task_letter(9, DIAGNOSIS))
+    assert isinstance(again, DiagnosisTask)
+    assert repr(replace(again, **bare)) == repr(replace(DIAGNOSIS, **bare))

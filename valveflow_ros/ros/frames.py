@@ -1,29 +1,29 @@
-"""Objects over a pipe between a process and its own child, with large arrays uncopied.
+"""Messages over a pipe between a process and its own child.
 
-Each frame is a count, that many lengths, and the parts: a pickle and the
-buffers it refers to. Both ends are the same program started by itself and the
-pipe has no name, so nobody else can put anything in.
+Each frame is a length and that many bytes. They are states (`valveflow_ros.core.state_bytes`):
+plain values and arrays with a checksum, so that nothing that a hurt process writes can be
+mistaken for a result, or be executed.
 """
 
 from __future__ import annotations
 
 import os
-import pickle
 import struct
-from typing import Any
+
+from valveflow_ros.core.state import State
+from valveflow_ros.core.state_bytes import from_bytes, to_bytes
+from valveflow_ros.errors import DataError
 
 _LENGTH = struct.Struct('<Q')
-_MOST_PARTS = 4096
+# A window of twenty million rows takes less.
+_MOST_BYTES = 4 << 30
 _READ = 1 << 20
 
 
-def send(descriptor: int, item: object) -> None:
-    """Write one object; blocks while the pipe is full. Raises `OSError` if nobody reads."""
-    buffers: list[pickle.PickleBuffer] = []
-    body = pickle.dumps(item, protocol=5, buffer_callback=buffers.append)
-    parts = [memoryview(body), *(buffer.raw() for buffer in buffers)]
-    head = b''.join(_LENGTH.pack(n) for n in (len(parts), *(part.nbytes for part in parts)))
-    for part in (memoryview(head), *parts):
+def send(descriptor: int, item: State) -> None:
+    """Write one message; blocks while the pipe is full. Raises `OSError` if nobody reads."""
+    body = to_bytes(item)
+    for part in (memoryview(_LENGTH.pack(len(body))), memoryview(body)):
         done = 0
         while done < part.nbytes:
             # The interpreter is free for others while the pipe takes the bytes.
@@ -31,7 +31,7 @@ def send(descriptor: int, item: object) -> None:
 
 
 class FrameReader:
-    """Puts frames together from whatever a pipe gives.
+    """Puts messages together from whatever a pipe gives.
 
     Parameters
     ----------
@@ -44,8 +44,14 @@ class FrameReader:
         self._bytes = bytearray()
         self.ended = False
 
-    def ready(self) -> list[Any]:
-        """Return the objects that are there whole, without waiting."""
+    def ready(self) -> list[State]:
+        """Return the messages that are there whole, without waiting.
+
+        Raises
+        ------
+        DataError
+            What came is no message.
+        """
         while not self.ended:
             try:
                 found = os.read(self._descriptor, _READ)
@@ -55,39 +61,32 @@ class FrameReader:
                 found = b''
             self.ended = not found
             self._bytes += found
-        items: list[Any] = []
+        items: list[State] = []
         while (item := self._cut()) is not None:
-            items.append(item[0])
+            items.append(item)
         return items
 
-    def wait(self) -> Any:
-        """Return the next object; raises `EOFError` when the other end is gone."""
+    def wait(self) -> State:
+        """Return the next message; raises `EOFError` when the other end is gone."""
         while True:
             item = self._cut()
             if item is not None:
-                return item[0]
+                return item
             found = os.read(self._descriptor, _READ)
             if not found:
                 raise EOFError
             self._bytes += found
 
-    def _cut(self) -> tuple[Any] | None:
+    def _cut(self) -> State | None:
         """Cut the first frame off, if it is whole."""
-        size = _LENGTH.size
-        if len(self._bytes) < size:
-            return None
-        (count,) = _LENGTH.unpack_from(self._bytes)
-        if not 1 <= count <= _MOST_PARTS:
-            raise ValueError('no frame')
-        start = size * (1 + count)
+        start = _LENGTH.size
         if len(self._bytes) < start:
             return None
-        lengths = [_LENGTH.unpack_from(self._bytes, size * (1 + k))[0] for k in range(count)]
-        if len(self._bytes) < start + sum(lengths):
+        (length,) = _LENGTH.unpack_from(self._bytes)
+        if length > _MOST_BYTES:
+            raise DataError('What came through the pipe is no message.')
+        if len(self._bytes) < start + length:
             return None
-        parts: list[bytearray] = []
-        for length in lengths:
-            parts.append(self._bytes[start : start + length])
-            start += length
-        del self._bytes[:start]
-        return (pickle.loads(parts[0], buffers=parts[1:]),)
+        body = bytes(memoryview(self._bytes)[start : start + length])
+        del self._bytes[: start + length]
+        return from_bytes(body)

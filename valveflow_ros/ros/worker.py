@@ -21,7 +21,9 @@ from typing import Any
 
 from valveflow_ros.core.diagnosis_task import DiagnosisTask
 from valveflow_ros.core.fit_task import FitTask
+from valveflow_ros.errors import DataError
 from valveflow_ros.ros.frames import FrameReader, send
+from valveflow_ros.ros.letters import result_of, task_letter
 from valveflow_ros.ros.outcome import Outcome, content_objection, objection
 
 FIT_JOB = 'valveflow_ros.core.fit:fit'
@@ -189,8 +191,8 @@ class Worker:
     def _take_results(self, outcomes: list[Outcome]) -> None:
         assert self._reader is not None
         try:
-            results = self._reader.ready()
-        except Exception:  # noqa: BLE001 - unpickling what a hurt process wrote may raise anything
+            results = [result_of(letter) for letter in self._reader.ready()]
+        except DataError:
             self._end()
             self._failed(
                 f'The {self._trade.word} process gave an answer that cannot be read.', outcomes
@@ -233,7 +235,7 @@ class Worker:
             target=_send_quietly,
             # A descriptor of its own: the other may be closed, and its number be
             # somebody else's, while this thread still writes.
-            args=(os.dup(process.stdin.fileno()), (running.number, running.task)),
+            args=(os.dup(process.stdin.fileno()), running.number, running.task),
             name=f'{self._trade.word} sender',
             daemon=True,
         )
@@ -254,11 +256,11 @@ class Worker:
         return f'signal {signal.Signals(-code).name}' if code < 0 else f'exit status {code}'
 
 
-def _send_quietly(descriptor: int, item: object) -> None:
+def _send_quietly(descriptor: int, number: int, task: FitTask | DiagnosisTask) -> None:
     """Send; if the process is gone, the monitor learns it from the other pipe."""
     try:
         with contextlib.suppress(OSError):
-            send(descriptor, item)
+            send(descriptor, task_letter(number, task))
     finally:
         os.close(descriptor)
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from valveflow_ros.errors import DataError
 from valveflow_ros.ros.frames import FrameReader, send
+from valveflow_ros.ros.letters import result_letter, task_of
 from valveflow_ros.ros.sentences import one_line, with_place
 
 _PR_SET_PDEATHSIG = 1
@@ -62,10 +63,10 @@ def main(arguments: list[str]) -> int:
     tasks = FrameReader(0)
     while True:
         try:
-            number, task = tasks.wait()
+            number, task = task_of(tasks.wait())
         except EOFError:
             return 0
-        send(results, (number, answer(work, task, word)))
+        send(results, result_letter(number, answer(work, task, word)))
 
 
 if __name__ == '__main__':
