@@ -29,6 +29,8 @@ MONITOR = {
     'record': ('true', 'Whether to record inputs and outputs to MCAP (true, false).'),
     'record_directory': ('', 'Folder of the recordings; empty: valveflow_recordings here.'),
     'log_level': ('info', 'debug, info, warn, error or fatal.'),
+    # The environment that the monitor's launch file sets is the plant's too, which comes after it.
+    'loopback_only': ('false', 'Whether DDS of both nodes stays on 127.0.0.1 (true, false).'),
 }
 
 

@@ -3,7 +3,9 @@
 import json
 from tempfile import NamedTemporaryFile
 
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
+from launch.conditions import IfCondition
+from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
@@ -75,7 +77,9 @@ def monitor(context: LaunchContext) -> list[Node]:
 
 def generate_launch_description() -> LaunchDescription:
     """Describe the launch."""
-    defaults = PathJoinSubstitution([FindPackageShare('valveflow_ros'), 'config', 'monitor.yaml'])
+    share = FindPackageShare('valveflow_ros')
+    defaults = PathJoinSubstitution([share, 'config', 'monitor.yaml'])
+    loopback = PathJoinSubstitution([share, 'launch', 'loopback.launch.py'])
     return LaunchDescription(
         [
             argument('namespace', 'Namespace of the node and its relative topics.'),
@@ -85,9 +89,20 @@ def generate_launch_description() -> LaunchDescription:
             argument(
                 'use_respawn', 'Whether to start it again when it dies (true, false).', 'false'
             ),
+            # Not by default: a gateway on another machine would go unheard without a word.
+            argument(
+                'loopback_only',
+                'Whether DDS, of this node and of all started after it, stays on 127.0.0.1 '
+                '(true, false).',
+                'false',
+            ),
             *(
                 argument(name, f'{about} Empty: as in the parameter file.')
                 for name, (_, about) in OVERRIDES.items()
+            ),
+            IncludeLaunchDescription(
+                PythonLaunchDescriptionSource(loopback),
+                condition=IfCondition(LaunchConfiguration('loopback_only')),
             ),
             OpaqueFunction(function=monitor),
         ]

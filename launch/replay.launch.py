@@ -37,6 +37,7 @@ def replay(context: LaunchContext) -> list[Node]:
 def generate_launch_description() -> LaunchDescription:
     """Describe the launch."""
     share = FindPackageShare('valveflow_ros')
+    loopback = PathJoinSubstitution([share, 'launch', 'loopback.launch.py'])
     passed_on = ('namespace', 'params_file', 'log_level', 'record', 'record_directory')
     return LaunchDescription(
         [
@@ -68,6 +69,16 @@ def generate_launch_description() -> LaunchDescription:
             ),
             DeclareLaunchArgument(
                 'record_directory', default_value='', description='Folder of the recordings.'
+            ),
+            DeclareLaunchArgument(
+                'loopback_only',
+                default_value='false',
+                description='Whether DDS of both nodes stays on 127.0.0.1 (true, false).',
+            ),
+            # Also where no monitor is started that would do it.
+            IncludeLaunchDescription(
+                PythonLaunchDescriptionSource(loopback),
+                condition=IfCondition(LaunchConfiguration('loopback_only')),
             ),
             IncludeLaunchDescription(
                 PythonLaunchDescriptionSource(

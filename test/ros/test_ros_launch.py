@@ -54,4 +54,4 @@ def test_the_service_ends_the_monitor_in_order() -> None:
     service = unit['Service']
     assert service['KillSignal'] == 'SIGTERM'
     assert float(service['TimeoutStopSec']) > 2.0
-    assert 'ros2 run valveflow_ros monitor' in service['ExecStart']
+    assert '/lib/valveflow_ros/monitor ' in service['ExecStart']

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import yaml
-from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rcl_interfaces.srv import DescribeParameters, SetParameters, SetParametersAtomically
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
@@ -150,7 +150,16 @@ def test_misspelt_parameters_are_named(context: Any) -> None:
 
 
 def test_changes_leave_foreign_parameters_to_ros() -> None:
-    assert changed(Settings(), [ros('use_sim_time', True)]) == Settings()
+    assert changed(Settings(), [ros('start_type_description_service', True)]) == Settings()
+
+
+def test_the_clock_cannot_be_taken_over_while_it_runs(node: MonitorNode) -> None:
+    result = node.set_parameters_atomically([ros('use_sim_time', True)])
+    assert not result.successful
+    assert result.reason == (
+        "Parameter 'use_sim_time' cannot be changed while the monitor runs; set it at the start."
+    )
+    assert node.get_parameter('use_sim_time').value is False
 
 
 def test_the_description_holds_no_default_beyond_its_range() -> None:
@@ -187,6 +196,72 @@ def test_from_afar_bad_values_come_back_with_the_sentence(context: Any, node: Mo
     future = describe.call_async(DescribeParameters.Request(names=['alarm_off_delay']))
     wait_until(lambda: executor.spin_once(timeout_sec=0.05) or future.done(), 'the answer', 20.0)
     assert future.result().descriptors[0].floating_point_range[0].to_value == 86400.0
+    executor.shutdown()
+    asking.destroy_node()
+
+
+HUGE = [1e308, -1e308, 2**63 - 1, -(2**63), 5e-324]
+HOSTILE = [math.nan, math.inf, -math.inf, -1.0, -1, *HUGE, True, '', 'nan', 'a\nb', 'x' * 100_000,
+           [math.nan], [1], ['a'], [True], [b'\x00'], None]  # fmt: skip
+STRANGE_NAMES = [
+    'no_such_thing', '', ' ', 'Record', 'record_directory.', '../record', 'record\n', 'ä' * 2000,
+    'qos_overrides./valve_opening.subscription.depth',
+]  # fmt: skip
+
+
+def hostile_wishes() -> list[RosParameter]:
+    """Everything for every parameter of the table, apart from what a live one may be set to."""
+    wishes = [ros(name, value) for name in STRANGE_NAMES for value in (1.0, 'a', None)]
+    wishes += [ros('use_sim_time', value) for value in (True, 1, 'yes', None)]
+    for row in TABLE:
+        values = [*HOSTILE, *bad_values(row), *([] if row.live else [row.default])]
+        for value in values:
+            try:
+                row.check(value)
+            except ParameterError:
+                pass
+            else:
+                if row.live:
+                    continue
+            wishes.append(ros(row.name, value))
+    return wishes
+
+
+@pytest.mark.parametrize('kind', [SetParameters, SetParametersAtomically])
+def test_from_afar_nothing_hostile_gets_in(context: Any, node: MonitorNode, kind: Any) -> None:
+    asking = Node('asking', context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    executor.add_node(asking)
+    atomically = kind is SetParametersAtomically
+    service = '/valveflow_monitor/set_parameters' + ('_atomically' if atomically else '')
+    client = asking.create_client(kind, service)
+    wait_until(client.service_is_ready, 'the service', 20.0)
+    declared = {name: node.get_parameter(name).value for name in node._parameters}
+    wishes = hostile_wishes()
+    if atomically:
+        # One bad value among good ones spoils them all; enough to ask it once for each name.
+        wishes = list({wish.name: wish for wish in wishes}.values())
+    good = ros('alarm_off_delay', 7.0)
+    groups = [[good, wish] for wish in wishes] if atomically else [wishes]
+    for group in groups:
+        request = kind.Request(parameters=[wish.to_parameter_msg() for wish in group])
+        future = client.call_async(request)
+        wait_until(
+            lambda: executor.spin_once(timeout_sec=0.05) or future.done(),  # noqa: B023
+            'the answer', 60.0,
+        )  # fmt: skip
+        answer = future.result()
+        results = [answer.result] if atomically else answer.results
+        assert len(results) == (1 if atomically else len(group))
+        for wish, result in zip(group[-len(results) :], results, strict=True):
+            assert not result.successful, (wish.name, wish.value)
+            assert len(result.reason) > 10, (wish.name, wish.value)
+            if wish.name in declared:
+                assert wish.name in result.reason
+    assert len(wishes) >= (len(TABLE) if atomically else 20 * len(TABLE))
+    assert {name: node.get_parameter(name).value for name in node._parameters} == declared
+    assert node.settings == Settings()
     executor.shutdown()
     asking.destroy_node()
 

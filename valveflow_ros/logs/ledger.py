@@ -29,6 +29,16 @@ class Ledger:
         self._state, self._reason = RecorderState.RECORDING, ''
         self._file, self._files, self._bytes = '', 0, 0
         self._recovered: tuple[RecoveryReport, ...] = ()
+        self._at_work_since_s: float | None = None
+
+    def at_work(self) -> None:
+        """Note that the thread has come to its next step; called for every message."""
+        # One assignment, which needs no lock: a stuck thread must not be able to hold one either.
+        self._at_work_since_s = self._clock()
+
+    def at_rest(self) -> None:
+        """Note that the thread waits, or does what takes as long as it takes."""
+        self._at_work_since_s = None
 
     def admit(self, topic: str) -> bool:
         """Count a message in; False if it must be dropped."""
@@ -75,6 +85,7 @@ class Ledger:
 
     def stopped(self, reason: str = '') -> None:
         """Close the account: what waits now is lost."""
+        self.at_rest()
         with self._lock:
             self._open = False
             self._lost += self._queued
@@ -89,6 +100,8 @@ class Ledger:
 
     def status(self) -> RecorderStatus:
         """Return the account."""
+        since_s = self._at_work_since_s
+        stalled_s = 0.0 if since_s is None else max(0.0, self._clock() - since_s)
         with self._lock:
             return RecorderStatus(
                 self._state,
@@ -102,4 +115,5 @@ class Ledger:
                 self._files,
                 self._bytes,
                 self._recovered,
+                stalled_s,
             )

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from valveflow_ros.errors import RecordingError
+from valveflow_ros.logs.folder import is_split_of
 from valveflow_ros.logs.ledger import Ledger
 from valveflow_ros.logs.qos import Qos
 from valveflow_ros.logs.recorder_status import MIB, RecorderSettings
@@ -94,9 +95,13 @@ class RecorderLoop:
             while not stopping:
                 # Read before the cycle: what was put before `stop` is then in the queue.
                 stopping = self._stopping
+                begun = time.monotonic()
                 self._cycle(stopping)
                 if not stopping:
-                    self._wake.wait(self._settings.flush_period_s)
+                    self._ledger.at_rest()
+                    # What came while the disk was busy has waited long enough.
+                    left = begun + self._settings.flush_period_s - time.monotonic()
+                    self._wake.wait(max(0.0, left))
                     self._wake.clear()
             self._ledger.stopped(self._finish())
         except Exception as error:  # noqa: BLE001
@@ -109,13 +114,17 @@ class RecorderLoop:
             return
         try:
             writer = self._ready()
+            self._ledger.at_work()
             self._check_space(writer)
             self._drain(writer)
+            self._ledger.at_work()
             writer.flush()
             # Only what stands in a split already is a repetition in the next.
             self._latched.update(self._fresh)
             self._fresh = {}
+            self._ledger.at_work()
             self._keep_safe(writer, now)
+            self._ledger.at_work()
             self._rotate(writer, now)
         except RecordingError as error:
             self._ledger.ill(str(error))
@@ -129,6 +138,9 @@ class RecorderLoop:
 
     def _ready(self) -> RecordingWriter:
         if self._writer is None:
+            # A leftover takes as long as it is large; to be ended for that, again at each start,
+            # would mean never to get past it.
+            self._ledger.at_rest()
             self._ledger.recovered(recover_leftovers(self._folder))
             self._writer = self._make_writer(self.latched)
         return self._writer
@@ -148,6 +160,7 @@ class RecorderLoop:
 
     def _drain(self, writer: RecordingWriter) -> None:
         for _ in range(len(self._queue)):
+            self._ledger.at_work()
             item = self._queue.popleft()
             if isinstance(item, NewTopic):
                 self._add(writer, item)
@@ -187,7 +200,9 @@ class RecorderLoop:
         keep = self._settings.keep_files
         if keep is None:
             return
-        for split in writer.finished[: max(0, len(writer.finished) - keep)]:
+        # A recording of another name in the same folder is not ours to remove.
+        own = [split for split in writer.finished if is_split_of(split.name, writer.name)]
+        for split in own[: max(0, len(own) - keep)]:
             try:
                 (self._folder / split.name).unlink(missing_ok=True)
             except OSError as error:

@@ -79,6 +79,9 @@ class RecorderStatus:
         Bytes written since the start.
     recovered : tuple of RecoveryReport
         Leftovers of an earlier recorder that were finished at the start.
+    stalled_s : float
+        How long the thread has been at one and the same step; 0 while it waits for work. A disk
+        that refuses keeps it small, one that does not answer lets it grow.
     """
 
     state: RecorderState
@@ -92,3 +95,4 @@ class RecorderStatus:
     files_finished: int = 0
     bytes_written: int = 0
     recovered: tuple[RecoveryReport, ...] = ()
+    stalled_s: float = 0.0

@@ -12,8 +12,10 @@ from valveflow_ros.config import PARAMETERS, TABLE, Parameter, Settings, Value, 
 from valveflow_ros.errors import ParameterError
 
 # What ROS itself puts among the parameters of every node.
-_FOREIGN = ('use_sim_time', 'start_type_description_service')
+_SIM_TIME = 'use_sim_time'
+_FOREIGN = (_SIM_TIME, 'start_type_description_service')
 _FOREIGN_PREFIX = 'qos_overrides.'
+_AT_THE_START = 'cannot be changed while the monitor runs; set it at the start'
 
 
 def descriptor(row: Parameter) -> ParameterDescriptor:
@@ -89,13 +91,14 @@ def changed(settings: Settings, wanted: Iterable[RosParameter]) -> Settings:
     """
     values = {}
     for item in wanted:
+        if item.name == _SIM_TIME:
+            # Whoever may set it would take the node's clock over.
+            raise ParameterError(item.name, _AT_THE_START)
         if item.name in _FOREIGN:
             continue
         row = parameter(item.name)
         value = row.check(item.value)
         if not row.live:
-            raise ParameterError(
-                row.name, 'cannot be changed while the monitor runs; set it at the start'
-            )
+            raise ParameterError(row.name, _AT_THE_START)
         values[row.name] = value
     return settings.changed(values)

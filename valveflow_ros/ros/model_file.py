@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 
@@ -14,10 +13,10 @@ from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.extended_model import ExtendedModel
 from valveflow_ros.errors import DataError, ParameterError
 from valveflow_ros.records import NS_PER_S, SampleTable, Signal
+from valveflow_ros.ros.given_file import given_path, read_given
 
 PARAMETER = 'model_file'
 ATTACHMENT = 'extended_model.json'
-_MOST_BYTES = 10_000_000
 _FEW = 32
 
 
@@ -32,11 +31,10 @@ def extended_of(settings: Settings) -> ExtendedModel | None:
     name = settings.text(PARAMETER)
     if not name:
         return None
-    path = Path(name).expanduser()
+    path = name
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise ParameterError(PARAMETER, f"names '{path}', which is too large to be a model")
-        given = model_json.from_json(json.loads(path.read_text(encoding='utf-8')))
+        path = given_path(name)
+        given = model_json.from_json(json.loads(read_given(path, 'a model')))
         corrector_of(given, settings.real('sample_period'))
     except (OSError, ValueError, RecursionError, DataError) as error:
         reason = (error.strerror or '').lower() if isinstance(error, OSError) else str(error)

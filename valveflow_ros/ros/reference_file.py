@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.characteristic_json import from_json
 from valveflow_ros.errors import DataError, ParameterError
+from valveflow_ros.ros.given_file import given_path, read_given
 
 _PARAMETER = 'reference_file'
-_MOST_BYTES = 10_000_000
 
 
 def reference_of(settings: Settings) -> Characteristic | None:
@@ -25,11 +24,10 @@ def reference_of(settings: Settings) -> Characteristic | None:
     name = settings.text(_PARAMETER)
     if not name:
         return None
-    path = Path(name).expanduser()
+    path = name
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise ParameterError(_PARAMETER, f"names '{path}', which is too large to be a curve")
-        curve = from_json(json.loads(path.read_text(encoding='utf-8')))
+        path = given_path(name)
+        curve = from_json(json.loads(read_given(path, 'a curve')))
     except (OSError, ValueError, RecursionError, DataError) as error:
         reason = error.strerror.lower() if isinstance(error, OSError) else str(error)
         raise ParameterError(

@@ -15,6 +15,7 @@ from valveflow_ros.errors import ValveflowError
 from valveflow_ros.logs import open_log
 from valveflow_ros.ros.playing import Player
 from valveflow_ros.ros.replay_steps import steps_of
+from valveflow_ros.ros.secure_start import check_security
 from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.stops import StopFlag
 from valveflow_ros.ros.verify import verify
@@ -90,6 +91,7 @@ def _verify(path: str) -> int:
 
 def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     stop = StopFlag().install()
+    check_security(arguments)
     log = open_log(options.log)
     names, steps = steps_of(log)
     try:

@@ -19,6 +19,7 @@ from valveflow_ros.ros import simulator_steps as steps
 from valveflow_ros.ros.declare import declare, unknown_overrides
 from valveflow_ros.ros.inputs import PLANT_SAMPLE
 from valveflow_ros.ros.playing import Player, Step
+from valveflow_ros.ros.secure_start import check_security
 from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.stops import StopFlag
 
@@ -34,7 +35,10 @@ def main(args: Sequence[str] | None = None) -> int:
     """Simulate and publish; return the exit status."""
     stop = StopFlag().install()
     try:
+        check_security(args)
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except ValveflowError as error:
+        return _complain(str(error))
     except Exception as error:  # noqa: BLE001 - rclpy raises what its C++ gave it
         return _complain(f'ROS could not be started: {one_line(error)}')
     node = Node('plant_simulator')

@@ -1,0 +1,60 @@
+"""The monitor as a process, with places at which a test can hold it up.
+
+A file `hold` in the working folder names the place; `held` is written when it is reached, and
+it goes on when `hold` is gone.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from valveflow_ros.logs.part_file import PartFile
+from valveflow_ros.ros import monitor_main
+from valveflow_ros.ros.monitor_node import MonitorNode
+from valveflow_ros.ros.taking import Taker
+
+HOLD, HELD = Path('hold'), Path('held')
+# The interpreter's lock cannot be given back from outside, so this one ends by itself.
+LOCKED_S = 5
+
+
+def wanted(place: str) -> bool:
+    return HOLD.exists() and HOLD.read_text() == place
+
+
+def hold_up(place: str) -> None:
+    if not wanted(place):
+        return
+    HELD.write_text(place)
+    while wanted(place):
+        time.sleep(0.01)
+
+
+def held_at(place: str, work: Callable[..., Any]) -> Callable[..., Any]:
+    def run(*args: Any, **more: Any) -> Any:
+        hold_up(place)
+        return work(*args, **more)
+
+    return run
+
+
+def keep_the_lock() -> None:
+    """Take the interpreter for a while and let nobody else run, as bad compiled code does."""
+    while not wanted('interpreter'):
+        time.sleep(0.01)
+    HELD.write_text('interpreter')
+    ctypes.PyDLL(None).sleep(LOCKED_S)
+
+
+if __name__ == '__main__':
+    MonitorNode.step = held_at('loop', MonitorNode.step)  # type: ignore[method-assign]
+    Taker.take = held_at('poll', Taker.take)  # type: ignore[method-assign]
+    PartFile.write = held_at('writer', PartFile.write)  # type: ignore[method-assign]
+    threading.Thread(target=keep_the_lock, daemon=True).start()
+    sys.exit(monitor_main.main(sys.argv[1:]))

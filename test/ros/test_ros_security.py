@@ -1,0 +1,432 @@
+"""Nobody outside this host is listened to, nobody else may read, and no demand is overheard."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from own_sockets import bound, family, readable
+from rclpy.parameter import Parameter as RosParameter
+from ros_helpers import PATIENCE_S, Processes, wait_until
+
+from valveflow_ros.config import TABLE, Settings
+from valveflow_ros.errors import ParameterError, RecordingError, ValveflowError
+from valveflow_ros.logs import Recorder, RecorderSettings, open_log
+from valveflow_ros.ros import monitor_main, replay_main, secure_start, simulator_main
+from valveflow_ros.ros.model_file import extended_of
+from valveflow_ros.ros.monitor_node import MonitorNode
+from valveflow_ros.ros.recording import Recording, new_folder
+from valveflow_ros.ros.reference_file import reference_of
+from valveflow_ros.ros.secure_start import InsecureError, check_security
+from valveflow_ros.ros.state_folder import LOCK, STATE, StateFolder
+
+pytestmark = pytest.mark.ros
+ROOT = Path(__file__).resolve().parents[2]
+HERE = Path(__file__).resolve().parent
+PROFILE = ROOT / 'config' / 'fastdds_loopback.xml'
+LOOPBACK = '127.0.0.1'
+AT_NS = 1_700_000_000 * 10**9
+
+
+def profile_environment(discovery_range: str = 'SYSTEM_DEFAULT') -> dict[str, str]:
+    return {
+        'FASTRTPS_DEFAULT_PROFILES_FILE': str(PROFILE),
+        'FASTDDS_DEFAULT_PROFILES_FILE': str(PROFILE),
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': discovery_range,
+    }
+
+
+def rtps_ports(domain: int) -> range:
+    """Return the ports that DDS gives to a domain (OMG DDSI-RTPS 9.6.1)."""
+    return range(7400 + 250 * domain, 7400 + 250 * (domain + 1))
+
+
+# Network
+
+
+def test_addresses_are_read_as_the_kernel_means_them() -> None:
+    assert sys.byteorder == 'big' or readable('0100007F') == LOOPBACK
+    assert readable('00000000') == '0.0.0.0'
+    for kind, name, address in (
+        (socket.AF_INET, 'udp', LOOPBACK),
+        (socket.AF_INET, 'udp', '0.0.0.0'),
+        (socket.AF_INET6, 'udp6', '::1'),
+    ):
+        try:
+            opened = socket.socket(kind, socket.SOCK_DGRAM)
+            opened.bind((address, 0))
+        except OSError:  # no IPv6 here
+            continue
+        with opened:
+            assert (name, address, opened.getsockname()[1]) in bound('self')
+
+
+def sockets_of_a_node(environment: dict[str, str]) -> list[tuple[str, str, int]]:
+    done = subprocess.run(
+        [sys.executable, str(HERE / 'own_sockets.py')],
+        env=environment, capture_output=True, text=True, check=True, timeout=PATIENCE_S,
+    )  # fmt: skip
+    return [(protocol, address, port) for protocol, address, port in json.loads(done.stdout)]
+
+
+def test_without_the_profile_a_node_listens_to_everybody(ros_environment: dict[str, str]) -> None:
+    ports = rtps_ports(int(ros_environment['ROS_DOMAIN_ID']))
+    found = sockets_of_a_node(ros_environment)
+    assert any(address == '0.0.0.0' and port in ports for _, address, port in found)
+
+
+@pytest.mark.parametrize('discovery_range', ['SYSTEM_DEFAULT', 'LOCALHOST', 'SUBNET'])
+def test_with_the_profile_a_node_listens_to_this_host(
+    ros_environment: dict[str, str], discovery_range: str
+) -> None:
+    ports = rtps_ports(int(ros_environment['ROS_DOMAIN_ID']))
+    found = sockets_of_a_node({**ros_environment, **profile_environment(discovery_range)})
+    listening = [(address, port) for _, address, port in found if port in ports]
+    assert len(listening) >= 2
+    assert {address for address, _ in listening} == {LOOPBACK}
+    if discovery_range != 'LOCALHOST':
+        # LOCALHOST adds transports of its own: two sockets that only send, and shared memory.
+        assert {address for _, address, _ in found} == {LOOPBACK}
+
+
+def test_the_running_monitor_is_on_the_loopback_alone_and_its_files_are_its_owners(
+    processes: Processes, ros_environment: dict[str, str], tmp_path: Path
+) -> None:
+    home, logs = tmp_path / 'home', tmp_path / 'home' / 'logs' / 'ros'
+    home.mkdir()
+    records = home / 'deep' / 'below' / 'recordings'
+    more = {**profile_environment(), 'HOME': str(home), 'ROS_LOG_DIR': str(logs)}
+    before = os.umask(0)
+    try:
+        monitor = processes.start(
+            'valveflow_ros.ros.monitor_main', '--ros-args', '-p', f'record_directory:={records}',
+            '-p', 'input_reliability:=reliable', '-p', 'record_rotation:=1.0', **more,
+        )  # fmt: skip
+    finally:
+        os.umask(before)
+    # A publisher with the same profile reaches it, and hears its predictions.
+    plant = processes.start(
+        'valveflow_ros.ros.simulator_main', '--ros-args', '-p', 'days:=0.02', '-p', 'rate:=0.0',
+        '-p', 'stamped:=true', '-p', f'wait:={PATIENCE_S}', **profile_environment(),
+    )  # fmt: skip
+    wait_until(lambda: plant.poll() is not None or monitor.poll() is not None, 'the plant')
+    assert plant.returncode == 0, processes.output(plant) + processes.output(monitor)
+    assert 'Nobody listens' not in processes.output(plant)
+
+    ports = rtps_ports(int(ros_environment['ROS_DOMAIN_ID']))
+    found = [socket for pid in family(monitor.pid) for socket in bound(pid)]
+    assert len([port for _, _, port in found if port in ports]) >= 2
+    assert {address for _, address, _ in found} == {LOOPBACK}
+
+    monitor.send_signal(signal.SIGTERM)
+    assert monitor.wait(20.0) == 0, processes.output(monitor)
+    (folder,) = records.glob('valveflow_*')
+    log = open_log(folder)
+    assert log.topics['/plant_sample'].count == round(0.02 * 86400)
+
+    everything = [path for path in home.rglob('*') if '.numba' not in str(path)]
+    files = [path for path in everything if path.is_file()]
+    assert {'metadata.yaml', LOCK} <= {path.name for path in files}
+    assert any(path.suffix == '.log' for path in files)
+    assert len([path for path in files if path.suffix == '.mcap']) >= 1
+    modes = {str(path): stat.S_IMODE(path.lstat().st_mode) for path in everything}
+    assert {mode for path, mode in modes.items() if Path(path).is_file()} == {0o600}, modes
+    assert {mode for path, mode in modes.items() if Path(path).is_dir()} == {0o700}, modes
+
+
+def test_the_profile_is_installed_and_closed() -> None:
+    text = PROFILE.read_text()
+    assert '<useBuiltinTransports>false</useBuiltinTransports>' in text
+    assert 'is_default_profile="true"' in text
+    assert text.count('<address>') == text.count(f'<address>{LOOPBACK}</address>') == 3
+    assert "files('config/*')" in (ROOT / 'setup.py').read_text()
+
+
+# Demanded security
+
+KEYS = 'KEYS'
+DEMANDS = [
+    ({'ROS_SECURITY_ENABLE': 'true'}, 'ROS_SECURITY_STRATEGY is not set'),
+    (
+        {'ROS_SECURITY_ENABLE': 'true', 'ROS_SECURITY_STRATEGY': 'Permissive'},
+        "ROS_SECURITY_STRATEGY is 'Permissive'",
+    ),
+    (
+        {'ROS_SECURITY_ENABLE': 'true', 'ROS_SECURITY_STRATEGY': 'enforce'},
+        "ROS_SECURITY_STRATEGY is 'enforce'",
+    ),
+    ({'ROS_SECURITY_ENABLE': 'True', 'ROS_SECURITY_STRATEGY': 'Enforce'}, "not 'True'"),
+    ({'ROS_SECURITY_ENABLE': '1', 'ROS_SECURITY_STRATEGY': 'Enforce'}, "not '1'"),
+    (
+        {'ROS_SECURITY_ENABLE': 'true', 'ROS_SECURITY_STRATEGY': 'Enforce'},
+        'ROS_SECURITY_KEYSTORE',
+    ),
+    (
+        {
+            'ROS_SECURITY_ENABLE': 'true',
+            'ROS_SECURITY_STRATEGY': 'Enforce',
+            'ROS_SECURITY_KEYSTORE': KEYS,
+        },
+        # What a middleware that has it says of an empty keystore is its own.
+        '',
+    ),
+]
+MAINS: list[tuple[str, Callable[[list[str]], int], list[str]]] = [
+    ('monitor', monitor_main.main, []),
+    ('plant_simulator', simulator_main.main, []),
+    ('replay', replay_main.main, ['nothing.csv', '--wait', '0']),
+]
+
+
+@pytest.fixture
+def demanded(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ros_environment: dict[str, str]
+) -> Callable[[dict[str, str]], None]:
+    del ros_environment
+
+    def demand(environment: dict[str, str]) -> None:
+        (tmp_path / 'keys' / 'enclaves').mkdir(parents=True)
+        for name in ('ENABLE', 'STRATEGY', 'KEYSTORE', 'ENCLAVE_OVERRIDE'):
+            monkeypatch.delenv(f'ROS_SECURITY_{name}', raising=False)
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value.replace(KEYS, str(tmp_path / 'keys')))
+
+    return demand
+
+
+@pytest.mark.usefixtures('here')
+@pytest.mark.parametrize(('environment', 'words'), DEMANDS)
+@pytest.mark.parametrize(('name', 'main', 'arguments'), MAINS, ids=[main[0] for main in MAINS])
+def test_no_start_where_security_is_demanded_and_cannot_be_had(
+    demanded: Any,
+    capfd: pytest.CaptureFixture[str],
+    name: str,
+    main: Callable[[list[str]], int],
+    arguments: list[str],
+    environment: dict[str, str],
+    words: str,
+) -> None:
+    demanded(environment)
+    assert main(arguments) == 1
+    said = capfd.readouterr().err
+    start = f'valveflow {name}: Not started, because security is demanded (ROS_SECURITY_ENABLE): '
+    (line,) = [line for line in said.splitlines() if line.startswith('valveflow')]
+    assert line.startswith(start)
+    assert words in line
+    assert line.endswith('.')
+    assert 'Traceback' not in said
+
+
+def test_a_middleware_without_security_is_called_by_its_name(demanded: Any) -> None:
+    demanded(DEMANDS[-1][0])
+    with pytest.raises(InsecureError) as refusal:
+        check_security([])
+    library = b''.join(
+        path.read_bytes() for path in Path(sys.prefix, 'lib').glob('librmw_fastrtps_shared*.so')
+    )
+    if b"doesn't have the security libraries" in library:
+        assert 'built without DDS security' in str(refusal.value)
+    else:
+        assert 'no node can be made with it' in str(refusal.value)
+
+
+@pytest.mark.parametrize('value', ['', 'false', 'False', '0', 'no', 'off'])
+def test_who_demands_nothing_is_let_through(demanded: Any, value: str) -> None:
+    demanded({'ROS_SECURITY_ENABLE': value, 'ROS_SECURITY_STRATEGY': 'Permissive'})
+    check_security([])
+    check_security([], {})
+
+
+def test_a_node_that_can_be_made_is_let_through_and_leaves_nothing_behind(
+    demanded: Any, tmp_path: Path
+) -> None:
+    demanded({})
+    wish = {
+        name: value.replace(KEYS, str(tmp_path / 'keys')) for name, value in DEMANDS[-1][0].items()
+    }
+    # The stack itself sees no wish, so that its node stands for one that got what it wished for.
+    check_security(['--ros-args', '--enclave', '/a'], wish)
+    check_security(None, wish)
+
+
+def test_an_unknown_middleware_is_not_trusted_to_refuse(
+    demanded: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    demanded(DEMANDS[-1][0])
+    monkeypatch.setattr(secure_start, 'get_rmw_implementation_identifier', lambda: 'rmw_new_cpp')
+    with pytest.raises(InsecureError, match='of rmw_new_cpp it is not known'):
+        check_security([])
+
+
+# Paths
+
+READERS = [('reference_file', reference_of), ('model_file', extended_of)]
+
+
+@pytest.mark.parametrize(('name', 'read'), READERS)
+def test_a_file_that_is_none_is_refused_in_a_sentence_at_once(
+    name: str, read: Callable[[Settings], object], tmp_path: Path
+) -> None:
+    os.mkfifo(tmp_path / 'pipe')
+    (tmp_path / 'round').symlink_to(tmp_path / 'round')
+    (tmp_path / 'endless').symlink_to('/dev/zero')
+    (tmp_path / 'bytes').write_bytes(b'\xff\xfe\x00')
+    (tmp_path / 'empty').touch()
+    (tmp_path / 'deep').write_text('[' * 100_000)
+    with (tmp_path / 'large').open('wb') as file:
+        file.truncate(1 << 34)
+    given = [
+        '/dev/zero', '/dev/stdin', '/', f'{tmp_path}/pipe', f'{tmp_path}/round',
+        f'{tmp_path}/endless', f'{tmp_path}/bytes', f'{tmp_path}/empty', f'{tmp_path}/deep',
+        f'{tmp_path}/large', f'{tmp_path}/none', f'{tmp_path}/empty/below', 'x' * 300,
+        '../' * 100 + 'etc/passwd', '~nobody-of-that-name/file',
+    ]  # fmt: skip
+    for path in given:
+        with pytest.raises(ParameterError) as error:
+            within(20.0, lambda: read(Settings({name: path})))  # noqa: B023
+        sentence = str(error.value)
+        assert sentence.startswith(f"Parameter '{name}' names '"), path
+        assert sentence.endswith('.')
+        assert '\n' not in sentence
+
+
+def within(limit_s: float, work: Callable[[], object]) -> None:
+    """Do work that must not wait for anybody; raises what it raises."""
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            work()
+        except BaseException as error:  # noqa: BLE001
+            errors.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(limit_s)
+    assert not thread.is_alive(), 'it waits'
+    if errors:
+        raise errors[0]
+
+
+PATHS = [row.name for row in TABLE if row.name.endswith(('_directory', '_file', '_tag'))]
+
+
+@pytest.mark.parametrize('name', PATHS)
+@pytest.mark.parametrize('text', ['a\0b', 'a\nb', 'a\x1b[2Jb', 'x' * 501, 'a\u202eb'])
+def test_a_path_is_one_printable_line(context: Any, name: str, text: str) -> None:
+    with pytest.raises(ParameterError, match='must be one line of at most 500 printable'):
+        Settings({name: text})
+    overrides = [RosParameter(name, value=text)]
+    with pytest.raises(ParameterError) as error:
+        MonitorNode(context=context, parameter_overrides=overrides)
+    assert str(error.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    'given',
+    ['{}/file', '{}/file/below', '/proc/nowhere', '/dev/null', '{}/' + 'x' * 300, '{}/round'],
+)
+def test_a_folder_that_cannot_be_made_is_a_sentence_and_the_run_goes_on(
+    tmp_path: Path, given: str
+) -> None:
+    (tmp_path / 'file').touch()
+    (tmp_path / 'round').symlink_to(tmp_path / 'round')
+    settings = Settings({'record_directory': given.format(tmp_path)})
+    with pytest.raises(RecordingError) as error:
+        new_folder(settings, 1.7e9)
+    recording = Recording(settings, {}, 1.7e9)
+    assert not recording.on
+    assert recording.problem == str(error.value)
+    assert recording.problem.startswith(given.format(tmp_path))
+    assert recording.problem.endswith('.')
+    recording.write('/a', b'', AT_NS, AT_NS)
+    assert recording.close() is None
+
+
+@pytest.mark.parametrize(
+    'tag', ['../../x', '/etc', '..', '.', '~', 'a/b', 'x' * 500, '$(id)', '*', 'ä/ö', '-rf']
+)
+def test_a_tag_does_not_lead_out_of_the_folder(tmp_path: Path, tag: str) -> None:
+    home = tmp_path / 'home'
+    made = new_folder(Settings({'record_directory': str(home), 'unit_tag': tag}), 1.7e9)
+    assert made.parent == home
+    assert made.resolve() == made
+    assert list(tmp_path.iterdir()) == [home]
+    assert stat.S_IMODE(made.stat().st_mode) == 0o700
+
+
+def test_a_planted_link_is_not_followed(tmp_path: Path) -> None:
+    home, elsewhere = tmp_path / 'home', tmp_path / 'elsewhere'
+    settings = Settings({'record_directory': str(home)})
+    expected = new_folder(settings, 1.7e9)
+    expected.rmdir()
+    elsewhere.mkdir()
+    expected.symlink_to(elsewhere)
+    made = new_folder(settings, 1.7e9)
+    assert made == expected.with_name(expected.name + '_2')
+    # The same for the file and for what is put beside it.
+    (elsewhere / 'victim').write_text('untouched')
+    for name in (f'{made.name}_0.mcap.part', f'{made.name}_0.mcap', 'metadata.yaml'):
+        (made / name).symlink_to(elsewhere / 'victim')
+    limits = RecorderSettings(flush_period_s=0.01, free_floor_bytes=0, retry_s=0.01)
+    recorder = Recorder(made, limits)
+    recorder.add_topic('/a', 'std_msgs/msg/Float64', definition='float64 data')
+    recorder.record('/a', bytes(12), AT_NS, AT_NS)
+    recorder.close(10.0)
+    assert (elsewhere / 'victim').read_text() == 'untouched'
+    assert [path.name for path in elsewhere.iterdir()] == ['victim']
+
+
+def test_a_planted_state_is_not_followed(tmp_path: Path) -> None:
+    victim, folder = tmp_path / 'victim', tmp_path / 'state'
+    victim.write_text('untouched')
+    folder.mkdir()
+    (folder / LOCK).symlink_to(victim)
+    with pytest.raises(RecordingError, match='cannot be used'):
+        StateFolder(folder)
+    (folder / LOCK).unlink()
+    (folder / STATE).symlink_to(victim)
+    state = StateFolder(folder)
+    with pytest.raises(RecordingError, match='cannot be read'):
+        state.read()
+    state.write(b'mine')
+    assert state.read() == b'mine'
+    state.close()
+    assert victim.read_text() == 'untouched'
+    assert {stat.S_IMODE(path.lstat().st_mode) for path in folder.iterdir()} == {0o600}
+
+
+@pytest.mark.parametrize('umask', [0o000, 0o022, 0o077])
+def test_what_is_recorded_is_its_owners_whatever_the_umask(tmp_path: Path, umask: int) -> None:
+    before = os.umask(umask)
+    try:
+        limits = RecorderSettings(flush_period_s=0.01, rotate_s=0.05, free_floor_bytes=0)
+        recorder = Recorder(tmp_path / 'a' / 'b', limits)
+        recorder.add_topic('/a', 'std_msgs/msg/Float64', definition='float64 data')
+        recorder.record('/a', bytes(12), AT_NS, AT_NS)
+        wait_until(lambda: recorder.status().files_finished, 'a finished split', 20.0)
+        recorder.close(20.0)
+    finally:
+        os.umask(before)
+    found = list((tmp_path / 'a').rglob('*'))
+    files = {path.name: stat.S_IMODE(path.stat().st_mode) for path in found if path.is_file()}
+    assert yaml.safe_load((tmp_path / 'a' / 'b' / 'metadata.yaml').read_text())
+    assert set(files.values()) == {0o600}
+    for folder in (tmp_path / 'a', tmp_path / 'a' / 'b'):
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
+def test_a_refusal_is_one_of_ours() -> None:
+    assert issubclass(InsecureError, ValveflowError)
+    assert str(InsecureError('why')).endswith('(ROS_SECURITY_ENABLE): why.')

@@ -1,0 +1,396 @@
+"""What systemd is told: that the monitor is ready, alive, ending; and never while it is stuck."""
+
+from __future__ import annotations
+
+import configparser
+import contextlib
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import hurt_monitor
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from ros_helpers import Processes, wait_until
+
+from valveflow_ros.logs import Recorder, RecorderSettings, RecorderState, RecorderStatus
+from valveflow_ros.logs.ledger import Ledger
+from valveflow_ros.logs.part_file import PartFile
+from valveflow_ros.ros.watchdog import Watchdog, recorder_lives
+
+ROOT = Path(__file__).resolve().parents[2]
+HERE = Path(__file__).resolve().parent
+WELL = RecorderStatus(RecorderState.RECORDING)
+PERIOD_S = 0.2
+FLOAT64 = 'std_msgs/msg/Float64'
+
+
+class Supervisor:
+    """Listens as systemd does, and notes when it heard what."""
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind('\0' + address[1:] if address.startswith('@') else address)
+        self.heard: list[tuple[float, str]] = []
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
+
+    def _listen(self) -> None:
+        while data := self._socket.recv(65536):
+            self.heard.append((time.monotonic(), data.decode()))
+
+    def texts(self) -> list[str]:
+        return [text for _, text in self.heard]
+
+    def pings(self, since_s: float = 0.0) -> list[float]:
+        return [at_s for at_s, text in self.heard if 'WATCHDOG=1' in text and at_s >= since_s]
+
+    def environment(self, usec: int = 0) -> dict[str, str]:
+        return {'NOTIFY_SOCKET': self.address, **({'WATCHDOG_USEC': str(usec)} if usec else {})}
+
+    def close(self) -> None:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as last:
+            last.sendto(b'', self._socket.getsockname())
+        self._thread.join(5.0)
+        self._socket.close()
+
+
+@contextlib.contextmanager
+def listening(abstract: bool = False) -> Iterator[Supervisor]:
+    # A socket's path may be 107 bytes long, which pytest's folders are not made for.
+    folder = tempfile.mkdtemp(prefix='vf')
+    made = Supervisor(f'@{folder}/s' if abstract else f'{folder}/s')
+    try:
+        yield made
+    finally:
+        made.close()
+        shutil.rmtree(folder)
+
+
+@pytest.fixture(params=[False, True], ids=['path', 'abstract'])
+def supervisor(request: pytest.FixtureRequest) -> Iterator[Supervisor]:
+    with listening(request.param) as made:
+        yield made
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def last(supervisor: Supervisor, count: int) -> list[str]:
+    wait_until(lambda: len(supervisor.heard) >= count, f'{count} datagrams', 10.0)
+    return supervisor.texts()
+
+
+def test_ready_status_and_end_reach_the_manager(supervisor: Supervisor) -> None:
+    watchdog = Watchdog(supervisor.environment(usec=10_000_000))
+    watchdog.status('Loading.')
+    watchdog.ready('Listening.')
+    watchdog.stopping('Ending.')
+    assert last(supervisor, 3) == [
+        'STATUS=Loading.',
+        'READY=1\nSTATUS=Listening.\nWATCHDOG=1',
+        'STOPPING=1\nSTATUS=Ending.',
+    ]
+
+
+def test_pings_come_at_twice_the_rate_asked_for_and_no_faster(supervisor: Supervisor) -> None:
+    clock = Clock()
+    watchdog = Watchdog(supervisor.environment(usec=10_000_000), clock)
+    assert watchdog.period_s == 5.0
+    for _ in range(200):
+        watchdog.completed(lambda: WELL)
+        clock.now_s += 0.1
+    # 20 s, one each 5 s.
+    assert last(supervisor, 4) == ['WATCHDOG=1'] * 4
+
+
+@pytest.mark.parametrize(
+    'environment',
+    [
+        {},
+        {'WATCHDOG_USEC': '0'},
+        {'WATCHDOG_USEC': '-5'},
+        {'WATCHDOG_USEC': 'soon'},
+        {'WATCHDOG_USEC': '9' * 5000},
+        {'WATCHDOG_USEC': '1000000', 'WATCHDOG_PID': '1'},
+    ],
+)
+def test_no_ping_where_none_is_asked_of_this_process(
+    supervisor: Supervisor, environment: dict[str, str]
+) -> None:
+    watchdog = Watchdog({**supervisor.environment(), **environment})
+    watchdog.completed(lambda: pytest.fail('the recorder was asked for nothing'))
+    with watchdog.patient(600.0):
+        pass
+    watchdog.status('Here.')
+    assert last(supervisor, 1) == ['STATUS=Here.']
+
+
+@pytest.mark.parametrize('address', ['', 'relative/socket', '@', '/nowhere/socket', 'vsock:2:1'])
+def test_silent_and_unharmed_where_nobody_listens(address: str) -> None:
+    watchdog = Watchdog({'NOTIFY_SOCKET': address, 'WATCHDOG_USEC': '1000000'})
+    watchdog.ready('Listening.')
+    watchdog.completed(lambda: WELL)
+    watchdog.stopping('Ending.')
+    assert Watchdog({'WATCHDOG_USEC': '1000000'}).period_s == 0.0
+
+
+def test_a_manager_that_does_not_read_holds_nobody_up_and_gets_the_ping_later() -> None:
+    folder = tempfile.mkdtemp(prefix='vf')
+    clock = Clock()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as deaf:
+        deaf.bind(f'{folder}/s')
+        environment = {'NOTIFY_SOCKET': f'{folder}/s', 'WATCHDOG_USEC': '2000000'}
+        watchdog = Watchdog(environment, clock)
+        begun_s = time.monotonic()
+        for _ in range(5000):
+            watchdog.status('x' * 1000)
+        assert time.monotonic() - begun_s < 10.0
+        watchdog.completed(lambda: WELL)
+        deaf.setblocking(False)
+        waiting = 0
+        while True:
+            try:
+                assert 'WATCHDOG' not in deaf.recv(65536).decode()
+            except BlockingIOError:
+                break
+            waiting += 1
+        assert 0 < waiting < 5000
+        # Not a period later, but after the next cycle.
+        watchdog.completed(lambda: WELL)
+        assert deaf.recv(65536) == b'WATCHDOG=1'
+    shutil.rmtree(folder)
+
+
+@given(st.text())
+def test_no_text_becomes_another_assignment(text: str) -> None:
+    sent: list[str] = []
+    watchdog = Watchdog({'NOTIFY_SOCKET': '@nobody'})
+    watchdog._send = lambda said: sent.append(said) or True  # type: ignore[assignment, func-returns-value]
+    watchdog.ready(text)
+    first, second, third = sent[0].splitlines()
+    assert (first, third) == ('READY=1', 'WATCHDOG=1')
+    assert second.startswith('STATUS=')
+    assert second[7:].split() == text.split()
+
+
+def test_long_work_gets_its_time_and_then_the_old_limit_holds(supervisor: Supervisor) -> None:
+    watchdog = Watchdog(supervisor.environment(usec=10_000_000))
+    with pytest.raises(ZeroDivisionError), watchdog.patient(600.0):
+        raise ZeroDivisionError
+    assert last(supervisor, 2) == [
+        'WATCHDOG_USEC=600000000\nWATCHDOG=1',
+        'WATCHDOG_USEC=10000000\nWATCHDOG=1',
+    ]
+
+
+@pytest.mark.parametrize(
+    ('status', 'lives'),
+    [
+        (None, True),
+        (WELL, True),
+        (RecorderStatus(RecorderState.RECORDING, stalled_s=0.9), True),
+        (RecorderStatus(RecorderState.RECORDING, stalled_s=1.1), False),
+        (RecorderStatus(RecorderState.DEGRADED, 'no space left', stalled_s=0.0), True),
+        (RecorderStatus(RecorderState.DEGRADED, 'no space left', stalled_s=9.0), False),
+        (RecorderStatus(RecorderState.STOPPED, 'the recorder failed'), False),
+    ],
+)
+def test_who_counts_as_alive(
+    status: RecorderStatus | None, lives: bool, supervisor: Supervisor
+) -> None:
+    assert recorder_lives(status, 1.0) is lives
+    watchdog = Watchdog(supervisor.environment(usec=10_000_000))
+    watchdog.completed(lambda: status)
+    watchdog.status('After.')
+    said = last(supervisor, 1 + lives)
+    assert said == ['WATCHDOG=1'] * lives + ['STATUS=After.']
+
+
+def test_the_account_tells_how_long_a_step_takes() -> None:
+    clock = Clock()
+    ledger = Ledger(10, clock)
+    assert ledger.status().stalled_s == 0.0
+    ledger.at_work()
+    clock.now_s += 3.0
+    assert ledger.status().stalled_s == 3.0
+    ledger.at_work()
+    assert ledger.status().stalled_s == 0.0
+    clock.now_s += 3.0
+    ledger.at_rest()
+    assert ledger.status().stalled_s == 0.0
+
+
+@pytest.mark.parametrize('place', ['write', 'sync', 'publish'])
+def test_a_disk_that_does_not_answer_is_seen_and_one_that_refuses_is_not_a_stuck_recorder(
+    tmp_path: Path, place: str
+) -> None:
+    answers = threading.Event()
+    reached = threading.Event()
+
+    class Slow(PartFile):
+        pass
+
+    def late(self: Slow, *args: Any) -> Any:
+        reached.set()
+        answers.wait(60.0)
+        return getattr(PartFile, place)(self, *args)
+
+    setattr(Slow, place, late)
+    settings = RecorderSettings(flush_period_s=0.01, sync_period_s=0.01, free_floor_bytes=0)
+    recorder = Recorder(tmp_path, settings, open_file=Slow)
+    recorder.add_topic('/a', FLOAT64, definition='float64 data')
+    recorder.record('/a', bytes(12), 1, 1)
+    if place == 'publish':
+        recorder.rotate()
+        time.sleep(0.05)
+        recorder.rotate()
+    assert reached.wait(20.0)
+    assert wait_until(lambda: not recorder_lives(recorder.status(), 0.2), 'the stall', 10.0)
+    answers.set()
+    wait_until(lambda: recorder_lives(recorder.status(), 0.2), 'the way on', 20.0)
+    assert recorder.close(20.0).written == 1
+
+
+def test_a_full_disk_is_not_a_stuck_recorder(tmp_path: Path) -> None:
+    class Full(PartFile):
+        def write(self, data: bytes) -> int:
+            raise OSError(28, 'No space left on device')
+
+    settings = RecorderSettings(
+        flush_period_s=0.01, free_floor_bytes=0, retry_s=0.01, retry_max_s=0.05
+    )
+    recorder = Recorder(tmp_path, settings, open_file=Full)
+    recorder.add_topic('/a', FLOAT64, definition='float64 data')
+    recorder.record('/a', bytes(12), 1, 1)
+    wait_until(lambda: recorder.status().state == RecorderState.DEGRADED, 'the trouble', 20.0)
+    end_s = time.monotonic() + 0.5
+    while time.monotonic() < end_s:
+        status = recorder.status()
+        assert status.state == RecorderState.DEGRADED
+        assert recorder_lives(status, 1.0)
+    recorder.close(20.0)
+
+
+@pytest.mark.ros
+def test_a_monitor_that_is_held_up_anywhere_pings_no_more(
+    processes: Processes, tmp_path: Path
+) -> None:
+    with listening() as supervisor:
+        held_up_everywhere(processes, supervisor, tmp_path)
+
+
+def held_up_everywhere(processes: Processes, supervisor: Supervisor, tmp_path: Path) -> None:
+    monitor = processes.start(
+        'hurt_monitor', '--ros-args', '-p', f'record_directory:={tmp_path / "rec"}',
+        '-p', 'diagnostics_period:=0.1', '-p', 'record_flush:=0.05',
+        **supervisor.environment(usec=round(2e6 * PERIOD_S)),
+        PYTHONPATH=f'{HERE}{os.pathsep}{os.environ.get("PYTHONPATH", "")}',
+    )  # fmt: skip
+
+    def ready() -> bool:
+        assert monitor.poll() is None, processes.output(monitor)
+        return any('READY=1' in text for text in supervisor.texts())
+
+    wait_until(ready, 'READY=1')
+    assert any('WATCHDOG_USEC=600000000' in text for text in supervisor.texts())
+    assert any('WATCHDOG_USEC=400000\n' in text for text in supervisor.texts())
+    for place in ('loop', 'poll', 'writer', 'interpreter'):
+        goes_on(supervisor)
+        hold, held = tmp_path / hurt_monitor.HOLD, tmp_path / hurt_monitor.HELD
+        hold.write_text(place)
+        wait_until(lambda: held.exists() and held.read_text() == place, place, 30.0)  # noqa: B023
+        # A ping may be on its way, and a recorder about to come back; after a second, none is.
+        time.sleep(1.0)
+        before = len(supervisor.pings())
+        time.sleep(1.2)
+        assert monitor.poll() is None
+        assert len(supervisor.pings()) == before, place
+        hold.unlink()
+        held.unlink()
+    goes_on(supervisor)
+    monitor.send_signal(signal.SIGTERM)
+    assert monitor.wait(20.0) == 0, processes.output(monitor)
+    assert any(text.startswith('STOPPING=1') for text in supervisor.texts())
+
+
+def goes_on(supervisor: Supervisor) -> None:
+    """Require several pings from now on."""
+    since_s = time.monotonic()
+    wait_until(lambda: len(supervisor.pings(since_s)) >= 4, 'four pings', 60.0)
+
+
+# The unit
+
+
+@pytest.fixture(scope='module')
+def unit() -> dict[str, list[str]]:
+    """Every assignment of the unit, in order."""
+    found: dict[str, list[str]] = {}
+    lines = (ROOT / 'config' / 'valveflow.service').read_text().replace('\\\n', ' ').splitlines()
+    for line in lines:
+        name, sign, value = line.partition('=')
+        if sign and not line.startswith('#'):
+            found.setdefault(name, []).append(value)
+    return found
+
+
+def test_the_unit_believes_and_pings_the_process_that_watches(unit: dict[str, list[str]]) -> None:
+    assert unit['Type'] == ['notify']
+    assert unit['NotifyAccess'] == ['main']
+    (start,) = unit['ExecStart']
+    # Whatever is started as a child of the main process is not believed.
+    assert 'exec /opt/' in start
+    assert '/lib/valveflow_ros/monitor ' in start
+    assert 'ros2 run' not in start
+    assert 5.0 <= float(unit['WatchdogSec'][0]) <= 60.0
+    assert unit['Restart'] == ['on-failure']
+    assert float(unit['TimeoutStartSec'][0]) >= 600.0
+    scripts = configparser.ConfigParser()
+    scripts.read(ROOT / 'setup.cfg')
+    assert scripts['install']['install_scripts'].endswith('/lib/valveflow_ros')
+
+
+def test_the_unit_takes_the_loopback_profile_or_does_not_start(unit: dict[str, list[str]]) -> None:
+    (path,) = unit['AssertPathExists']
+    assert path.endswith('/share/valveflow_ros/config/fastdds_loopback.xml')
+    assert f'FASTRTPS_DEFAULT_PROFILES_FILE={path}' in unit['Environment']
+    assert f'FASTDDS_DEFAULT_PROFILES_FILE={path}' in unit['Environment']
+    assert 'ROS_AUTOMATIC_DISCOVERY_RANGE=SYSTEM_DEFAULT' in unit['Environment']
+    assert unit['IPAddressDeny'] == ['any']
+    assert unit['IPAddressAllow'] == ['localhost']
+
+
+def test_the_unit_is_as_closed_as_its_work_allows(unit: dict[str, list[str]]) -> None:
+    for name in ('StateDirectoryMode', 'CacheDirectoryMode', 'LogsDirectoryMode'):
+        assert unit[name] == ['0700']
+    assert unit['UMask'] == ['0077']
+    assert unit['DynamicUser'] == ['yes']
+    assert 'MemoryDenyWriteExecute' not in unit
+    tool = shutil.which('systemd-analyze')
+    if tool is None:
+        pytest.skip('no systemd-analyze here')
+    # 30 tenths, of which 0 is best.
+    done = subprocess.run(
+        [tool, 'security', '--offline=true', '--threshold=30', 'config/valveflow.service'],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if 'unrecognized option' in done.stderr:
+        pytest.skip('systemd-analyze is too old to look at a file')
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert 'Overall exposure level' in done.stdout
