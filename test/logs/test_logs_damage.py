@@ -4,11 +4,14 @@ import random
 import struct
 
 import pytest
+from damage import against_chunks, chunk_ends, record_heads, records
 from log_files import START_NS, Reading, read_back, write_chunks
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import open_log, recover
-from valveflow_ros.logs.layout import MAGIC, RECORD_HEAD, Op
+from valveflow_ros.logs.layout import RECORD_HEAD, Op
+from valveflow_ros.logs.scan import Scanner
+from valveflow_ros.logs.source import Source
 
 PER_CHUNK = 20
 SEED = 20240117
@@ -22,26 +25,6 @@ def small(tmp_path_factory):
     return path.read_bytes(), wanted
 
 
-def chunk_ends(raw):
-    """Return where each chunk ends, by a walk over an intact file."""
-    position, ends = len(MAGIC), []
-    while position < len(raw) - len(MAGIC):
-        op, length = RECORD_HEAD.unpack_from(raw, position)
-        position += RECORD_HEAD.size + length
-        if op == Op.CHUNK:
-            ends.append(position)
-    return ends
-
-
-def record_heads(raw):
-    """Return every byte that belongs to the kind or the length of a record."""
-    position, places = len(MAGIC), []
-    while position < len(raw) - len(MAGIC):
-        places += range(position, position + RECORD_HEAD.size)
-        position += RECORD_HEAD.size + RECORD_HEAD.unpack_from(raw, position)[1]
-    return places
-
-
 def readings_of(path):
     try:
         return read_back(open_log(path))
@@ -51,14 +34,8 @@ def readings_of(path):
 
 def lost_chunks(found, wanted):
     """Return how many whole chunks are missing; fails if anything else is."""
-    chunks = [wanted[k : k + PER_CHUNK] for k in range(0, len(wanted), PER_CHUNK)]
-    missing = 0
-    for chunk in chunks:
-        if found[:PER_CHUNK] == chunk:
-            found = found[PER_CHUNK:]
-        else:
-            missing += 1
-    assert found == []
+    missing, wrong = against_chunks(found, wanted, PER_CHUNK)
+    assert wrong == []
     return missing
 
 
@@ -81,6 +58,23 @@ def test_a_cut_file_says_so_in_one_sentence(tmp_path, small):
     assert warning.startswith('The file was not finished and ends at byte ')
     path.write_bytes(raw[: chunk_ends(raw)[7]])
     assert open_log(path).warnings == ('The file was not finished; all of its chunks were read.',)
+
+
+def test_what_stands_before_a_cut_chunk_is_kept(tmp_path, small):
+    raw, _ = small
+    begin = next(begin for op, begin, _ in records(raw) if op == Op.CHUNK)
+    end = chunk_ends(raw)[0]
+    path = tmp_path / 'cut.mcap'
+    for size in range(end, end + 400):
+        path.write_bytes(raw[:size])
+        assert open_log(path).attachments == {'parameters.yaml': b'a: 1\n'}
+    for size in range(begin, end, 7):
+        path.write_bytes(raw[:size])
+        with Source.open(path) as source:
+            scanner = Scanner(source)
+            assert list(scanner.chunks()) == []
+        assert scanner.findings.attachments.keys() == {'parameters.yaml'}, size
+        assert scanner.findings.cut_off_at in (begin, None if size == begin else begin)
 
 
 def test_flipped_bits_cost_at_most_a_chunk_and_never_change_a_value(tmp_path, small):

@@ -3,12 +3,14 @@
 import lz4.frame
 import pytest
 import zstandard
-from log_files import FLOAT64, START_NS, STOCK, float64, write_chunks
+from damage import records
+from log_files import FLOAT64, START_NS, STOCK, float64, read_back, write_chunks
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import Decoder, RecordingWriter, open_log, recover
+from valveflow_ros.logs.chunk_builder import ChunkBuilder
 from valveflow_ros.logs.compression import Unpacker
-from valveflow_ros.logs.layout import Channel, LayoutError, Op, Schema
+from valveflow_ros.logs.layout import MAGIC, Channel, LayoutError, Op, Schema, pack_header
 from valveflow_ros.logs.limits import Limits
 from valveflow_ros.logs.part_file import PartFile
 from valveflow_ros.logs.topic_book import REPEAT_CHUNKS, TableSchedule
@@ -118,3 +120,55 @@ def test_bytes_that_are_no_cdr_and_types_that_are_not_read():
     with pytest.raises(RecordingError, match='wstring'):
         Decoder('a/msg/A', 'wstring text').decode(b'\0\1\0\0' + bytes(8))
     assert Decoder('a/msg/A', '').decode(b'\0\1\0\0\0') == {}
+
+
+@pytest.mark.parametrize('schema_id', [0, 7])
+def test_a_channel_without_a_schema_is_left_out_and_ends(tmp_path, schema_id):
+    """Reading it again and again for its schema would never end."""
+    schema = Schema(1, FLOAT64, 'ros2msg', STOCK.text(FLOAT64).encode())
+    lone = Channel(2, schema_id, '/generated_power', 'cdr', {})
+    good = Channel(1, 1, '/valve_opening', 'cdr', {})
+    builder = ChunkBuilder()
+    for channel in (1, 2):
+        builder.add(channel, 1, START_NS, START_NS, float64(channel))
+    path = tmp_path / 'lone.mcap'
+    table = b''.join(record.pack() for record in (schema, good, lone))
+    path.write_bytes(MAGIC + pack_header('x') + builder.build(table).record)
+    contents = open_log(path)
+    assert contents.readings.value.tolist() == [1.0]
+    assert [m.data for m in contents.iter_messages(['/valve_opening'])] == [float64(1)]
+
+
+def test_chunks_before_the_first_table_that_is_left_are_read(tmp_path):
+    path, wanted, _ = write_chunks(tmp_path / 'log', chunks=3 * REPEAT_CHUNKS, close=False)
+    raw = bytearray(path.read_bytes())
+    chunks = [(begin, end) for op, begin, end in records(bytes(raw) + bytes(8)) if op == Op.CHUNK]
+    # Two tables stand at the beginning, the next one REPEAT_CHUNKS later.
+    for begin, end in chunks[:2]:
+        raw[begin + 20 : end] = bytes(end - begin - 20)
+    path.write_bytes(raw)
+    assert read_back(open_log(path)) == wanted[2 * 20 :]
+
+
+def test_more_of_one_time_than_can_wait_is_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr('valveflow_ros.logs.journal.MAX_WAITING_BYTES', 1 << 20)
+    with RecordingWriter(tmp_path / 'log', definitions=STOCK) as writer:
+        writer.add_topic('/valve_opening', FLOAT64)
+        writer.add_topic('/note', 'std_msgs/msg/String')
+        for number in range(5):
+            for step in (0, 5 - number):
+                time_ns = START_NS + step
+                writer.write('/valve_opening', float64(number), time_ns, time_ns)
+                writer.write('/note', bytes(1 << 20), time_ns, time_ns)
+            writer.flush()
+    contents = open_log(tmp_path / 'log')
+    assert len(contents.readings) == 10
+    with pytest.raises(RecordingError, match='side by side'):
+        list(contents.iter_messages())
+
+
+def test_a_line_break_in_a_name_does_not_end_the_sentence(tmp_path):
+    with pytest.raises(RecordingError) as caught:
+        open_log(tmp_path / 'line\nbreak.mcap')
+    assert '\n' not in str(caught.value)
+    assert 'line?break.mcap' in str(caught.value)

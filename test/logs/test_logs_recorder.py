@@ -1,10 +1,13 @@
 """The recorder's account against what is found on the disk, whatever the disk does."""
 
 import errno
+import sys
 import threading
 import time
 
 import pytest
+import yaml
+from fault_points import Faults
 from log_files import FLOAT64, START_NS, STOCK, float64, write_chunks
 
 from valveflow_ros.errors import InputError, RecordingError
@@ -16,7 +19,7 @@ from valveflow_ros.logs import (
     open_log,
 )
 from valveflow_ros.logs.ledger import DROPS_SHOWN_S, Ledger
-from valveflow_ros.logs.part_file import PartFile
+from valveflow_ros.logs.part_file import PartFile, is_held
 
 QUICK = RecorderSettings(
     flush_period_s=0.002, sync_period_s=0.01, retry_s=0.002, retry_max_s=0.01, free_floor_bytes=0
@@ -199,6 +202,34 @@ def test_a_file_begins_anew_when_space_returns(tmp_path):
     assert values_on_disk(tmp_path / 'log') == list(range(80))
 
 
+@pytest.mark.parametrize('call', range(1, 61))
+def test_whatever_call_fails_every_whole_file_is_listed(tmp_path, call):
+    """A file that has its name is named in metadata.yaml, and a lock is never kept."""
+    folder = tmp_path / 'log'
+    faults = Faults('recorder', call, errno.EIO)
+    with faults.active():
+        recorder = recorder_of(folder)
+        for part in range(6):
+            record(recorder, 5 * part, 5)
+            recorder.rotate()
+
+            def settled(part=part):
+                done = recorder.status().written == 5 * part + 5
+                return done and not recorder.is_rotating
+
+            wait_for(lambda settled=settled: faults.failed_at_s is not None or settled())
+            if faults.failed_at_s is not None:
+                faults.heal()
+            wait_for(settled)
+        status = recorder.close()
+    assert (status.state, status.reason, status.written) == (RecorderState.STOPPED, '', 30)
+    listed = yaml.safe_load((folder / 'metadata.yaml').read_text())
+    names = listed['rosbag2_bagfile_information']['relative_file_paths']
+    assert sorted(names) == sorted(p.name for p in folder.glob('*.mcap'))
+    assert not any(is_held(part) for part in folder.glob('*.part'))
+    assert values_on_disk(folder) == list(range(30))
+
+
 def test_writes_of_a_few_bytes_are_put_together(tmp_path):
     disk = Disk()
     recorder = recorder_of(tmp_path / 'log', open_file=lambda p: ShortFile(disk, PartFile(p)))
@@ -308,7 +339,11 @@ def test_latched_messages_head_every_later_split(tmp_path):
 def test_the_oldest_files_go_when_told_so(tmp_path):
     folder = tmp_path / 'log'
     settings = RecorderSettings(flush_period_s=0.002, free_floor_bytes=0, keep_files=2)
-    (tmp_path / 'bystander.mcap').write_bytes(b'not ours')
+    folder.mkdir()
+    whole, _, _ = write_chunks(tmp_path / 'other', chunks=1)
+    for name in ('other.mcap', 'other_0.mcap', 'log_x.mcap', 'xlog_0.mcap'):
+        (folder / name).write_bytes(whole.read_bytes())
+    bystanders = {p.name for p in folder.iterdir()}
     recorder = recorder_of(folder, settings)
     for part in range(5):
         record(recorder, part, 1)
@@ -316,10 +351,12 @@ def test_the_oldest_files_go_when_told_so(tmp_path):
         recorder.rotate()
         wait_for(lambda part=part: recorder.status().files_finished == part + 1)
     recorder.close()
-    assert sorted(p.name for p in folder.glob('*.mcap')) == ['log_3.mcap', 'log_4.mcap']
-    assert open_log(folder).warnings == ()
-    assert values_on_disk(folder) == [3.0, 4.0]
-    assert (tmp_path / 'bystander.mcap').exists()
+    left = {p.name for p in folder.glob('*.mcap')}
+    assert left - bystanders == {'log_4.mcap', 'log_5.mcap'}
+    assert left >= bystanders
+    found = open_log(folder, columns={'valve_opening': '/valve_opening'})
+    assert found.warnings == ()
+    assert found.readings.value[found.readings.signal == 0].tolist()[-2:] == [3.0, 4.0]
 
 
 def test_it_stops_before_the_disk_is_full_and_goes_on_afterwards(tmp_path):
@@ -354,6 +391,27 @@ def test_leftovers_are_finished_at_the_start(tmp_path):
     names = sorted(p.name for p in (tmp_path / 'log').iterdir())
     assert names == ['log_0.mcap', 'log_1.mcap', 'metadata.yaml']
     assert len(open_log(tmp_path / 'log').readings) == len(wanted) + 3
+
+
+@pytest.mark.parametrize('problem', [PermissionError(13, 'no'), OSError(errno.EIO, 'bad sector')])
+def test_a_leftover_that_cannot_be_read_holds_up_nothing(tmp_path, monkeypatch, problem):
+    """It may be another user's, or lie on a bad sector."""
+    folder = tmp_path / 'log'
+    folder.mkdir()
+    part = folder / 'log_3.mcap.part'
+    part.write_bytes(b'whatever')
+
+    def fail(path):
+        raise problem
+
+    # The package's function of that name hides the module.
+    monkeypatch.setattr(sys.modules['valveflow_ros.logs.recover'], 'is_held', fail)
+    recorder = recorder_of(folder)
+    record(recorder, 0, 3)
+    status = recorder.close()
+    assert (status.written, status.lost) == (3, 0)
+    assert part.exists()
+    assert (folder / 'log_4.mcap').exists()
 
 
 def test_closing_takes_a_bounded_time_and_later_messages_are_counted(tmp_path):

@@ -4,12 +4,14 @@ import sys
 
 import pytest
 import yaml
+from damage import records
 from log_files import FLOAT64, START_NS, STOCK, float64, read_back, write_chunks
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import RecordingWriter, open_log, recover, recover_leftovers
+from valveflow_ros.logs.layout import Op
 from valveflow_ros.logs.part_file import is_held
 
 DIE_WRITING = """
@@ -152,3 +154,20 @@ def test_what_cannot_be_recovered_stays_and_does_not_stop_a_recorder(tmp_path):
         writer.write('/valve_opening', float64(1.0), START_NS, START_NS)
     assert (folder / 'log_1.mcap').exists()
     assert part.read_bytes() == raw
+
+
+def test_a_part_whose_only_chunk_was_begun_goes(tmp_path):
+    """What was never whole was never counted as written; a damaged chunk stays for its owner."""
+    folder = tmp_path / 'log'
+    part = died_writing(folder)
+    raw = part.read_bytes()
+    first = next(begin for op, begin, _ in records(raw + bytes(8)) if op == Op.CHUNK)
+    for size in (9, 40, first, first + 5, first + 60, first + 300):
+        part.write_bytes(raw[:size])
+        assert recover_leftovers(folder) == ()
+        assert not part.exists(), size
+    damaged = bytearray(raw[: first + 300])
+    damaged[first + 2] ^= 1
+    part.write_bytes(damaged)
+    assert recover_leftovers(folder) == ()
+    assert part.exists()

@@ -71,6 +71,15 @@ def test_what_is_written_reads_back_to_the_same_bits(tmp_path_factory, suffix):
 
 
 @pytest.mark.parametrize('suffix', ['.csv', '.parquet'])
+def test_a_negative_zero_among_whole_numbers_keeps_its_sign(tmp_path, suffix):
+    values = {signal: np.array([0.0, -0.0, 7.0]) for signal in Signal}
+    table = SampleTable.from_columns(START_NS + np.arange(3), values)
+    write_table(table, tmp_path / f'table{suffix}')
+    found = table_of(read_table(tmp_path / f'table{suffix}')).values
+    assert np.array_equal(np.signbit(found), np.signbit(table.values))
+
+
+@pytest.mark.parametrize('suffix', ['.csv', '.parquet'])
 def test_a_table_opens_as_readings(tmp_path, suffix):
     table = wander(200, seed=3, command=True)
     path = tmp_path / f'table{suffix}'

@@ -5,6 +5,7 @@ import os
 import shutil
 import stat
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -250,3 +251,30 @@ def test_both_ways_of_reading_agree(samples):
     found = read_back(open_log(folder))
     assert [r.time_ns for r in found] == [t for t, _ in rows for _ in range(5)]
     assert [r.value for r in found] == [v for _, values in rows for v in values]
+
+
+LOADS_NOTHING = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from log_files import FLOAT64, START_NS, STOCK, float64
+from valveflow_ros.logs import RecordingWriter
+writer = RecordingWriter(Path(sys.argv[2]), definitions=STOCK)
+writer.add_topic('/valve_opening', FLOAT64)
+writer.write('/valve_opening', float64(1.0), START_NS, START_NS)
+before = set(sys.modules)
+writer.flush()
+writer.sync()
+print(sorted(set(sys.modules) - before))
+"""
+
+
+def test_writing_begins_without_loading_anything(tmp_path):
+    """Modules that load at the first chunk would hold up a recorder just when it begins."""
+    here = Path(__file__).parent
+    paths = os.pathsep.join([str(here.parents[1]), *sys.path])
+    done = subprocess.run(
+        [sys.executable, '-c', LOADS_NOTHING, str(here), str(tmp_path / 'log')],
+        check=True, capture_output=True, text=True, env={**os.environ, 'PYTHONPATH': paths},
+    )  # fmt: skip
+    assert done.stdout.strip() == '[]'

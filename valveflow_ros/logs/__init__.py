@@ -9,6 +9,7 @@ from valveflow_ros.logs.reader import open_log
 from valveflow_ros.logs.recorder import Recorder
 from valveflow_ros.logs.recorder_status import RecorderSettings, RecorderState, RecorderStatus
 from valveflow_ros.logs.recover import RecoveryReport, recover, recover_leftovers
+from valveflow_ros.logs.since import messages_since
 from valveflow_ros.logs.table_write import write_table
 from valveflow_ros.logs.tables import RawTable, read_table
 from valveflow_ros.logs.writer import Message, RecordingWriter
@@ -30,6 +31,7 @@ __all__ = [
     'RecoveryReport',
     'TopicInfo',
     'WrittenLog',
+    'messages_since',
     'open_log',
     'read_table',
     'recover',

@@ -97,7 +97,9 @@ class ChunkFile:
         indexes: list[bytes] = []
         places: list[bytes] = []
         index_at = self.position
-        for channel in np.unique(chunk.channel).tolist():
+        # Not np.unique: its first call loads a part of numpy for half a second, in which a
+        # recorder would write nothing.
+        for channel in np.flatnonzero(np.bincount(chunk.channel)).tolist():
             mine = rows[chunk.channel == channel].tobytes()
             self.counts[channel] = self.counts.get(channel, 0) + len(mine) // _INDEX_ROW.itemsize
             places.append(struct.pack('<HQ', channel, index_at))

@@ -103,6 +103,12 @@ def split_number(path: Path) -> int:
     return -1 if match is None else int(match.group(2))
 
 
+def is_split_of(name: str, recording: str) -> bool:
+    """Tell whether a file is called as the splits of a recording are."""
+    match = _NUMBERED.match(name)
+    return match is not None and match.group(1) == recording
+
+
 def in_order(paths: Iterable[Path]) -> list[Path]:
     """Return files in the order of their numbers, then of their names."""
     return sorted(paths, key=lambda path: (split_number(path), path.name))
@@ -116,6 +122,56 @@ def finished_files(folder: Path) -> list[Path]:
 def write_metadata(folder: Path, splits: list[Split]) -> None:
     """Write `metadata.yaml` for these splits; raises `OSError`."""
     write_whole(folder / METADATA_NAME, metadata_text(splits).encode())
+
+
+class Listing:
+    """The finished splits of a folder, and the `metadata.yaml` that names them.
+
+    Parameters
+    ----------
+    folder : Path
+        The recording's folder.
+
+    Attributes
+    ----------
+    splits : list of Split
+        In their order.
+    due : bool
+        `metadata.yaml` could not be written as it should be.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be read.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.due = False
+        self.splits: list[Split] = []
+        self._look()
+
+    def add(self, split: Split) -> None:
+        """Take note of a split that was just finished, without reading it again."""
+        self.splits.append(split)
+
+    def forget(self, name: str) -> None:
+        """Take note that a split was removed."""
+        self.splits = [split for split in self.splits if split.name != name]
+
+    def write(self) -> None:
+        """Write `metadata.yaml` for what is whole on the disk; raises `OSError`."""
+        self.due = True
+        # A file may have got its name although finishing it failed after that.
+        self._look()
+        write_metadata(self._folder, self.splits)
+        self.due = False
+
+    def _look(self) -> None:
+        known = {split.name: split for split in self.splits}
+        paths = finished_files(self._folder)
+        found = [known.get(path.name) or Split.read(path) for path in paths]
+        self.splits = [split for split in found if split is not None]
 
 
 def metadata_text(splits: list[Split]) -> str:

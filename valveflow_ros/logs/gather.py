@@ -44,10 +44,10 @@ def gather(
     while True:
         collector = _Collector(source, choice, seed, Scanner(source, limits, unchecked))
         contents = collector.run()
-        lost = {channel for channel in contents.counts if channel not in collector.known}
-        if not lost & set(contents.table.channels):
+        if not collector.unnamed & collector.known:
             break
-        # The chunk that first named a topic is lost, but a later one repeats the name.
+        # The chunk that first named a topic is lost, but a later one repeats the name. From the
+        # next pass on it is known from the beginning, so there is at most one for each topic.
         seed = contents.table
     contents.announced = None if summary is None else summary.messages
     return contents
@@ -59,6 +59,7 @@ class _Collector:
     ) -> None:
         self.contents = FileContents(source.path, TopicTable(seed.limits), scanner.findings)
         self.known: set[int] = set()
+        self.unnamed: set[int] = set()
         self._choice = choice
         self._scanner = scanner
         self._floats = np.zeros(1 << 16, dtype=np.bool_)
@@ -97,6 +98,8 @@ class _Collector:
         present, counts = np.unique(table.channel, return_counts=True)
         for channel, count in zip(present.tolist(), counts.tolist(), strict=True):
             self.contents.counts[channel] = self.contents.counts.get(channel, 0) + count
+            if channel not in self.known:
+                self.unnamed.add(channel)
         self.contents.groups.append(
             Group(
                 tuple(chunk.offset for chunk in chunks),

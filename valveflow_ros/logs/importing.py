@@ -26,11 +26,11 @@ from valveflow_ros.logs.folder import (
     information_text,
     write_metadata,
 )
-from valveflow_ros.logs.layout import RECORD_HEAD, Attachment, Op
+from valveflow_ros.logs.layout import RECORD_HEAD, Attachment, Op, media_type
 from valveflow_ros.logs.names import FLOAT64
 from valveflow_ros.logs.part_file import PartFile, make_folder
 from valveflow_ros.logs.topic_book import TableSchedule, TopicBook
-from valveflow_ros.logs.writer import Metadata, media_type
+from valveflow_ros.logs.writer import Metadata
 from valveflow_ros.records import SIGNALS, IntArray, SampleTable, table_to_readings
 
 _RECORD = np.dtype(

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.contents import LoggedMessage
@@ -18,6 +19,9 @@ from valveflow_ros.logs.walk import HEAD_SIZE, MessageTable, walk
 from valveflow_ros.records import IntArray
 
 _END = np.iinfo(np.int64).max
+_BLOCK = 1 << 14
+# Chunks of a recorder overlap by a moment; only a file made to hurt has more than this waiting.
+MAX_WAITING_BYTES = 96 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +33,19 @@ class _Batch:
     content: bytes
     table: MessageTable
     rows: IntArray
+
+
+def _columns(batch: _Batch) -> tuple[NDArray[np.generic], ...]:
+    table, rows = batch.table, batch.rows
+    starts = table.offset[rows] + HEAD_SIZE
+    return (
+        table.log_time[rows],
+        table.publish_time[rows],
+        table.channel[rows],
+        table.sequence[rows],
+        starts,
+        starts + table.size[rows],
+    )
 
 
 class Journal:
@@ -74,45 +91,37 @@ class Journal:
     ) -> Iterator[LoggedMessage]:
         """Yield what comes before ``until`` and keep the rest waiting."""
         waiting.sort(key=lambda batch: (batch.file, batch.place))
-        times = [batch.table.log_time[batch.rows] for batch in waiting]
-        due = [part < until for part in times]
-        # A stable sort keeps messages of one time in the order of files and places.
-        due_times = [part[mask] for part, mask in zip(times, due, strict=True)]
-        order = np.argsort(np.concatenate(due_times), kind='stable')
-        lines = [
-            line
-            for batch, part in zip(waiting, due, strict=True)
-            for line in self._lines(batch, batch.rows[part])
-        ]
+        due = [batch.table.log_time[batch.rows] < until for batch in waiting]
+        out = [replace(b, rows=b.rows[part]) for b, part in zip(waiting, due, strict=True)]
         waiting[:] = [
             replace(batch, rows=batch.rows[~part])
             for batch, part in zip(waiting, due, strict=True)
             if not part.all()
         ]
+        if sum(len(batch.content) for batch in waiting) > MAX_WAITING_BYTES:
+            problem = 'holds too much of the same time side by side to be put in order'
+            raise RecordingError(self._files[out[0].file].path, problem)
         single = len(self._files) == 1
-        for index in order.tolist():
-            line = lines[index]
-            if single or not repeats.seen(*line):
-                yield line[2]
+        for file, sequence, message in self._in_order(out):
+            if single or not repeats.seen(file, sequence, message):
+                yield message
 
-    def _lines(self, batch: _Batch, rows: IntArray) -> Iterator[tuple[int, int, LoggedMessage]]:
-        names = _channels(self._files[batch.file], None)
-        table, content = batch.table, batch.content
-        starts = table.offset[rows] + HEAD_SIZE
-        columns = (
-            table.channel[rows],
-            table.sequence[rows],
-            table.log_time[rows],
-            table.publish_time[rows],
-            starts,
-            starts + table.size[rows],
-        )
-        for channel, sequence, log_ns, publish_ns, start, end in zip(
-            *(column.tolist() for column in columns), strict=True
-        ):
-            topic, kind = names[channel]
-            message = LoggedMessage(topic, kind, log_ns, publish_ns, content[start:end])
-            yield batch.file, sequence, message
+    def _in_order(self, out: list[_Batch]) -> Iterator[tuple[int, int, LoggedMessage]]:
+        """Yield file, sequence number and message; payloads are cut out one at a time."""
+        names = [_channels(self._files[batch.file], None) for batch in out]
+        columns = [np.concatenate(parts) for parts in zip(*map(_columns, out), strict=True)]
+        sizes = [len(batch.rows) for batch in out]
+        columns.append(np.repeat(np.arange(len(out)), sizes))
+        # A stable sort keeps messages of one time in the order of files and places.
+        order = np.argsort(columns[0], kind='stable')
+        for begin in range(0, len(order), _BLOCK):
+            picked = order[begin : begin + _BLOCK]
+            lists = [column[picked].tolist() for column in columns]
+            for log_ns, publish_ns, channel, sequence, start, end, k in zip(*lists, strict=True):
+                topic, kind = names[k][channel]
+                data = out[k].content[start:end]
+                message = LoggedMessage(topic, kind, log_ns, publish_ns, data)
+                yield out[k].file, sequence, message
 
     def _content(self, file: FileContents, group: Group) -> bytes:
         try:

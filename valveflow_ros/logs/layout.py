@@ -11,6 +11,7 @@ import struct
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import PurePath
 
 MAGIC = b'\x89MCAP0\r\n'
 PROFILE = 'ros2'
@@ -217,3 +218,9 @@ def pack_footer(summary_start: int, offsets_start: int, summary_crc: int) -> byt
     )
     crc = zlib.crc32(crc_input[:-4], summary_crc)
     return record(Op.FOOTER, FOOTER.pack(summary_start, offsets_start, crc)) + MAGIC
+
+
+def media_type(name: str) -> str:
+    """Return the media type of an attachment by its suffix."""
+    kinds = {'.json': 'application/json', '.yaml': 'application/yaml'}
+    return kinds.get(PurePath(name).suffix, 'application/octet-stream')

@@ -18,12 +18,12 @@ class Limits:
     """
 
     record_bytes: int = 64 * MIB
-    chunk_bytes: int = 64 * MIB
+    chunk_bytes: int = 32 * MIB
     channels: int = 1024
     definition_bytes: int = 4 * MIB
     attachment_bytes: int = 64 * MIB
-    work_floor_bytes: int = 96 * MIB
-    work_per_byte: int = 128
+    work_floor_bytes: int = 32 * MIB
+    work_per_byte: int = 64
     failed_floor_bytes: int = 128 * MIB
     failed_per_byte: int = 2
 

@@ -84,9 +84,11 @@ class PartFile:
 
     def close(self) -> None:
         """Let go of the file and its lock."""
-        if self._descriptor >= 0:
-            os.close(self._descriptor)
-            self._descriptor = -1
+        descriptor, self._descriptor = self._descriptor, -1
+        if descriptor >= 0:
+            # It is gone whatever the system answers, and `sync` has told of errors before.
+            with suppress(OSError):
+                os.close(descriptor)
 
     def discard(self) -> None:
         """Let go of the file and remove it."""

@@ -23,6 +23,7 @@ from valveflow_ros.logs.folder import (
 from valveflow_ros.logs.layout import CHUNK_HEAD, RECORD_HEAD, Cursor, LayoutError
 from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, is_held, make_folder
 from valveflow_ros.logs.scan import Chunk, Scanner
+from valveflow_ros.logs.seek import SHAPE_SIZE, candidates
 from valveflow_ros.logs.source import Source
 from valveflow_ros.logs.summary import read_summary
 from valveflow_ros.logs.topic_table import TopicTable
@@ -89,9 +90,9 @@ def recover(
 def recover_leftovers(folder: str | Path) -> tuple[RecoveryReport, ...]:
     """Finish every ``.part`` in a folder that no living recorder holds.
 
-    The ``.part`` is removed when its finished file is in place, or if no chunk
-    was begun in it; one that holds damaged chunks only is left. The folder's
-    `metadata.yaml` is brought up to date.
+    The ``.part`` is removed when its finished file is in place, or if not one chunk
+    was finished in it; one that cannot be read, or that holds damaged chunks only
+    is left. The folder's `metadata.yaml` is brought up to date.
 
     Raises
     ------
@@ -112,6 +113,14 @@ def recover_leftovers(folder: str | Path) -> tuple[RecoveryReport, ...]:
 
 
 def _leftover(part: Path) -> RecoveryReport | None:
+    """Finish one; what cannot be read or finished now stays, and nobody has to wait for it."""
+    try:
+        return _finished(part)
+    except (OSError, RecordingError):
+        return None
+
+
+def _finished(part: Path) -> RecoveryReport | None:
     if part.is_symlink() or not part.is_file() or is_held(part):
         return None
     if part.stat().st_size == 0:
@@ -133,12 +142,17 @@ def _leftover(part: Path) -> RecoveryReport | None:
 
 
 def _holds_nothing(part: Path) -> bool:
-    """Tell whether no chunk even begins in a file."""
+    """Tell whether there is nothing in a file but the beginning of its first chunk, or less."""
     with Source.open(part) as source:
         scanner = Scanner(source)
         chunks = sum(1 for _ in scanner.chunks())
-    findings = scanner.findings
-    return not chunks and not findings.damaged and findings.cut_off_at is None
+        cut_at = scanner.findings.cut_off_at
+        if chunks or scanner.findings.damaged:
+            return False
+        if cut_at is None or source.size - cut_at < SHAPE_SIZE:
+            return True
+        # A head whose fields agree was not damaged: the rest of its chunk was never written.
+        return next(candidates(source, cut_at, cut_at + 1), None) is not None
 
 
 def _recover(path: Path, target: Path, name: str, progress: Progress | None) -> RecoveryReport:
@@ -180,6 +194,8 @@ def _taken(
     scanner: Scanner, table: TopicTable, progress: Progress | None, size: int
 ) -> Iterator[PackedChunk]:
     for chunk in scanner.chunks():
+        if not chunk.content:
+            continue
         try:
             packed = _described(chunk, table)
         except LayoutError as error:

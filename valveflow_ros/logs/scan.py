@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from valveflow_ros.logs.compression import Unpacker
 from valveflow_ros.logs.layout import (
     CHUNK_HEAD,
-    FOOTER_RECORD_SIZE,
     MAGIC,
     RECORD_HEAD,
     Attachment,
@@ -26,7 +25,7 @@ from valveflow_ros.logs.layout import (
     Op,
 )
 from valveflow_ros.logs.limits import DEFAULT_LIMITS, Budget, Limits, OverBudgetError
-from valveflow_ros.logs.seek import candidates
+from valveflow_ros.logs.seek import SHAPE_SIZE, candidates, ends_well
 from valveflow_ros.logs.source import Source
 
 _INDEX_HEAD = struct.Struct('<BQHI')
@@ -283,15 +282,11 @@ class Scanner:
         size = self._source.size
         if position == size or self._is_end(position):
             return True
+        if not self.findings.finished and 0 <= size - position < SHAPE_SIZE:
+            # Too little of a last record to be judged.
+            return True
         op, length = self._head(position)
-        return op in _KINDS and position + RECORD_HEAD.size + length <= size
-
-
-def ends_well(source: Source) -> bool:
-    """Tell whether a file was finished: it ends in a footer and the magic."""
-    start = source.size - len(MAGIC) - FOOTER_RECORD_SIZE
-    if start < len(MAGIC):
-        return False
-    raw = source.read(start, FOOTER_RECORD_SIZE + len(MAGIC))
-    op, length = RECORD_HEAD.unpack_from(raw)
-    return op == Op.FOOTER and length == 20 and raw.endswith(MAGIC)
+        if op not in _KINDS or position + RECORD_HEAD.size + length <= size:
+            return op in _KINDS
+        # The last chunk of an unfinished file may be cut off, with a head that agrees.
+        return next(candidates(self._source, position, position + 1), None) is not None

@@ -1,11 +1,11 @@
-"""Finds places in a file that look like the head of a chunk."""
+"""Finds places in a file that look like the head of a chunk, and the end of a finished one."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
 
-from valveflow_ros.logs.layout import RECORD_HEAD
+from valveflow_ros.logs.layout import FOOTER_RECORD_SIZE, MAGIC, RECORD_HEAD, Op
 from valveflow_ros.logs.source import Source
 
 # A chunk's record: kind 6, a length below 64 GiB, four fixed fields, then the
@@ -13,7 +13,8 @@ from valveflow_ros.logs.source import Source
 _SHAPE = re.compile(
     rb'\x06.{4}[\x00-\x0f]\x00{3}.{28}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd)', re.DOTALL
 )
-_SHAPE_SIZE = 64
+# More than the head of a chunk takes.
+SHAPE_SIZE = 64
 _WINDOW = 1 << 22
 
 
@@ -21,7 +22,7 @@ def candidates(source: Source, start: int, end: int) -> Iterator[int]:
     """Yield places in ``[start, end)`` where the fields of a chunk's head agree."""
     while start < end:
         limit = min(_WINDOW, end - start)
-        window = source.read(start, limit + _SHAPE_SIZE)
+        window = source.read(start, limit + SHAPE_SIZE)
         match = _SHAPE.search(window)
         while match is not None and match.start() < limit:
             if _fields_agree(window, match.start(), match.end()):
@@ -38,3 +39,13 @@ def _fields_agree(window: bytes, position: int, names_end: int) -> bool:
         return False
     packed = int.from_bytes(window[names_end:packed_at], 'little')
     return bool(packed_at - position - RECORD_HEAD.size + packed == length)
+
+
+def ends_well(source: Source) -> bool:
+    """Tell whether a file was finished: it ends in a footer and the magic."""
+    start = source.size - len(MAGIC) - FOOTER_RECORD_SIZE
+    if start < len(MAGIC):
+        return False
+    raw = source.read(start, FOOTER_RECORD_SIZE + len(MAGIC))
+    op, length = RECORD_HEAD.unpack_from(raw)
+    return op == Op.FOOTER and length == 20 and raw.endswith(MAGIC)

@@ -20,6 +20,11 @@ def os_problem(error: OSError) -> str:
     return f'cannot be opened ({reason})'
 
 
+def printable(name: str) -> str:
+    """Return a file's name as it may stand in a sentence: a line break would end that."""
+    return ''.join(letter if letter.isprintable() else '?' for letter in name)
+
+
 @dataclass(slots=True)
 class Source:
     """A regular file and the size it had when it was opened."""
@@ -42,9 +47,9 @@ class Source:
         try:
             descriptor = os.open(name, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError as error:
-            raise RecordingError(name, os_problem(error)) from None
+            raise RecordingError(printable(name), os_problem(error)) from None
         except ValueError:
-            raise RecordingError(name.replace('\0', '?'), 'is not a name of a file') from None
+            raise RecordingError(printable(name), 'is not a name of a file') from None
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode) or status.st_size == 0:
             os.close(descriptor)

@@ -15,7 +15,7 @@ from valveflow_ros.logs.layout import (
     Op,
 )
 from valveflow_ros.logs.limits import DEFAULT_LIMITS
-from valveflow_ros.logs.scan import ends_well
+from valveflow_ros.logs.seek import ends_well
 from valveflow_ros.logs.source import Source
 from valveflow_ros.logs.topic_table import TopicTable
 

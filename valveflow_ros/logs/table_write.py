@@ -78,10 +78,30 @@ def _columns(table: SampleTable, time: IntArray | list[str]) -> pa.Table:
 def _write_csv(columns: pa.Table, path: Path) -> None:
     from pyarrow import csv
 
+    for number, name in enumerate(columns.column_names):
+        if _has_negative_zero(columns[name]):
+            columns = columns.set_column(number, name, _as_text(columns[name]))
     with path.open('wb') as stream:
         stream.write((','.join(columns.column_names) + '\n').encode())
         options = csv.WriteOptions(include_header=False, quoting_style='none')
         csv.write_csv(columns, stream, options)
+
+
+def _has_negative_zero(column: pa.ChunkedArray) -> bool:
+    import pyarrow as pa
+
+    if column.type != pa.float64():
+        return False
+    values = column.to_numpy()
+    return bool((np.signbit(values) & (values == 0.0)).any())
+
+
+def _as_text(column: pa.ChunkedArray) -> pa.Array:
+    """Return numbers with their point: among whole numbers a reader takes ``-0`` for 0."""
+    import pyarrow as pa
+
+    cells = [None if cell is None else repr(cell) for cell in column.to_pylist()]
+    return pa.array(cells, pa.string())
 
 
 def _write_parquet(columns: pa.Table, path: Path) -> None:

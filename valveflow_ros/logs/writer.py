@@ -13,13 +13,13 @@ from valveflow_ros.logs.chunk_file import ChunkFile
 from valveflow_ros.logs.definitions import Definitions
 from valveflow_ros.logs.folder import (
     LIBRARY,
+    Listing,
     Split,
     finished_files,
     information_text,
     split_number,
-    write_metadata,
 )
-from valveflow_ros.logs.layout import Attachment
+from valveflow_ros.logs.layout import Attachment, media_type
 from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, Writable, make_folder
 from valveflow_ros.logs.qos import Qos
 from valveflow_ros.logs.topic_book import TableSchedule, TopicBook
@@ -99,11 +99,14 @@ class RecordingWriter:
         self._sequences: dict[int, int] = {}
         try:
             make_folder(self.folder)
-            self._splits = [
-                split for path in finished_files(self.folder) if (split := Split.read(path))
-            ]
+            self._listing = Listing(self.folder)
         except OSError as error:
             raise self._failed(error) from None
+        # Numbers go on in a folder that is continued: by them a repetition is known.
+        self._before: dict[str, int] = {}
+        for split in self._listing.splits:
+            for topic, count in split.counts.items():
+                self._before[topic] = self._before.get(topic, 0) + count
 
     def add_topic(
         self,
@@ -128,7 +131,7 @@ class RecordingWriter:
             If the topic was not added.
         """
         channel = self._topics.ids[topic]
-        sequence = self._sequences.get(channel, 0) + 1
+        sequence = self._sequences.get(channel, self._before.get(topic, 0)) + 1
         self._sequences[channel] = sequence
         self._builder.add(channel, sequence, log_time_ns, publish_time_ns, data)
         if self._builder.size >= CHUNK_BYTES:
@@ -142,7 +145,7 @@ class RecordingWriter:
     @property
     def finished(self) -> list[Split]:
         """The finished splits of the folder."""
-        return list(self._splits)
+        return list(self._listing.splits)
 
     @property
     def file_bytes(self) -> int:
@@ -197,11 +200,8 @@ class RecordingWriter:
 
     def forget(self, name: str) -> None:
         """Strike a split that was deleted from `metadata.yaml`."""
-        self._splits = [split for split in self._splits if split.name != name]
-        try:
-            write_metadata(self.folder, self._splits)
-        except OSError as error:
-            raise self._failed(error) from None
+        self._listing.forget(name)
+        self._list()
 
     def __enter__(self) -> RecordingWriter:
         """Return itself."""
@@ -269,8 +269,16 @@ class RecordingWriter:
         parts = self.folder.glob(f'*.mcap{PART_SUFFIX}')
         return max(map(split_number, [*finished_files(self.folder), *parts]), default=-1) + 1
 
+    def _list(self) -> None:
+        try:
+            self._listing.write()
+        except OSError as error:
+            raise self._failed(error) from None
+
     def _finish(self) -> None:
         if self._file is None or self.path is None:
+            if self._listing.due:
+                self._list()
             return
         split = Split.of_file(self.path.name, self._file, self._topics.table)
         try:
@@ -278,19 +286,14 @@ class RecordingWriter:
             self._file.finish(self._topics.table)
             self.bytes_finished += self._file.position
             self.files_finished += 1
-            self._splits.append(split)
+            self._listing.add(split)
             self._file = self.path = None
-            write_metadata(self.folder, self._splits)
         except OSError as error:
+            self._listing.due = True
             self.abandon()
             raise self._failed(error) from None
+        self._list()
 
     def _failed(self, error: OSError) -> RecordingError:
         reason = (error.strerror or str(error)).lower()
         return RecordingError(self.path or self.folder, f'cannot be written ({reason})')
-
-
-def media_type(name: str) -> str:
-    """Return the media type of an attachment by its suffix."""
-    kinds = {'.json': 'application/json', '.yaml': 'application/yaml'}
-    return kinds.get(Path(name).suffix, 'application/octet-stream')
