@@ -1,8 +1,10 @@
 # make setup   .venv and install/, from pinned wheels; quick when nothing changed
 # make demo    set-up, then a simulated plant, the monitor, an alarm and a recording
 # make test    set-up, then every test              (PYTEST_ARGS='-k partition' for some)
+# make test-slow   set-up, then the tests marked slow, also those that make test leaves out
 # make lint    set-up, then ruff and mypy           (make format rewrites the layout)
 # make bench   set-up, then what is fast, measured
+# make torture   set-up, then kills, faults, flips, fuzz, signals and a year of soak, counted (hours)
 # make study   how good curve, choice, segments, shifts, alarm and baselines are (hours)
 # make study-diagnosis   how often the diagnosis names the right cause, and none where there is none (hours)
 # make certify-partition   the exact partition of 305,633 samples against every break (minutes)
@@ -13,7 +15,7 @@
 
 SHELL := bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint format bench study study-diagnosis certify-partition lock clean
+.PHONY: help setup demo test test-slow lint format bench torture study study-diagnosis certify-partition lock clean
 
 export PYTHON
 ENV := source ./env.sh &&
@@ -38,6 +40,9 @@ demo: setup
 test: setup
 	@$(ENV) VALVEFLOW_REQUIRE_ROS=1 python -m pytest $(PYTEST_ARGS)
 
+test-slow: setup
+	@$(ENV) VALVEFLOW_REQUIRE_ROS=1 VALVEFLOW_SLOW=1 python -m pytest -m slow $(PYTEST_ARGS)
+
 lint: setup
 	@$(ENV) ruff check .
 	@$(ENV) ruff format --check .
@@ -49,6 +54,9 @@ format: setup
 
 bench: setup
 	@$(ENV) for name in $(BENCHMARKS); do python -m benchmarks.$$name || exit 1; done
+
+torture: setup
+	@$(ENV) python -m benchmarks.torture
 
 study: setup
 	@$(ENV) for name in $(STUDIES); do python -m benchmarks.$$name || exit 1; done
