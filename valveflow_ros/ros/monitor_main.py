@@ -78,6 +78,7 @@ def _main(args: Sequence[str] | None) -> int:
     except Exception as error:  # noqa: BLE001 - a person is owed a sentence, not a trace
         return _complain(f'The monitor failed unexpectedly: {with_place(error)}')
     finally:
+        stop.last()
         rclpy.try_shutdown()
 
 

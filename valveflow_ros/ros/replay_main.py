@@ -118,6 +118,7 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
         say.info(f'{end} after {count} instants, {total} messages.')
         return 0
     finally:
+        stop.last()
         node.destroy_node()
         rclpy.try_shutdown()
 

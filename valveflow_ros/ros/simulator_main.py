@@ -49,6 +49,7 @@ def main(args: Sequence[str] | None = None) -> int:
     except Exception as error:  # noqa: BLE001 - a person is owed a sentence, not a trace
         return _complain(f'failed unexpectedly: {with_place(error)}')
     finally:
+        stop.last()
         node.destroy_node()
         rclpy.try_shutdown()
 

@@ -20,6 +20,11 @@ class StopFlag:
             signal.signal(number, self._note)
         return self
 
+    def last(self) -> None:
+        """Hear nothing more: the process ends already, and its last steps are not to be cut."""
+        for number in _ASKED_TO_STOP:
+            signal.signal(number, signal.SIG_IGN)
+
     def __bool__(self) -> bool:
         """Tell whether to stop."""
         return self._by is not None
