@@ -74,7 +74,9 @@ class RollingWindow:
     def __init__(self, window_s: float, period_s: float) -> None:
         self._window_ns = round(window_s * NS_PER_S)
         self._rows = max(16, int(np.ceil(window_s / period_s)) + 1)
-        self._room = min(_FIRST_ROOM, self._rows * 5 // 4 + 16)
+        # Rows are dropped a sixteenth of the window at a time.
+        self._most_room = self._rows * 17 // 16 + 16
+        self._room = min(_FIRST_ROOM, self._most_room)
         self._time_ns = np.empty(self._room, dtype=np.int64)
         self._data = np.empty((5, self._room))
         self._end = 0
@@ -201,8 +203,8 @@ class RollingWindow:
         return int(np.searchsorted(self._time_ns[: self._end], oldest, side='right'))
 
     def _make_room(self) -> None:
-        """Grow until the window fits, then drop the oldest rows a fifth at a time."""
-        limit = self._rows * 5 // 4 + 16
+        """Grow until the window fits, then drop the oldest rows many at a time."""
+        limit = self._most_room
         if self._room < limit:
             self._room = min(limit, 2 * self._room)
             time_ns = np.empty(self._room, dtype=np.int64)
@@ -212,8 +214,9 @@ class RollingWindow:
             self._time_ns, self._data = time_ns, data
             return
         drop = self._end - self._rows
-        self._time_ns[: self._rows] = self._time_ns[drop : self._end].copy()
-        self._data[:, : self._rows] = self._data[:, drop : self._end].copy()
+        # One column at a time: a copy of all would be as large as the window itself.
+        for column in (self._time_ns, *self._data):
+            column[: self._rows] = column[drop : self._end].copy()
         self._base += drop
         self._end = self._rows
 
