@@ -217,6 +217,7 @@ def main() -> None:
     command = (
         f'python -m benchmarks.diagnosis_study --kind {args.kind} --seeds {args.seeds} '
         f'--first {args.first} --days {args.days:g} --low {args.low:g} --high {args.high:g}'
+        + ''.join(f' --effect {name}' for name in args.effect or [])
     )
     rows: list[dict[str, Any]] = []
     for case in cases(args):

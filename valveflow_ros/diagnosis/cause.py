@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from valveflow_ros.diagnosis.bench import Bench
 
 Values = tuple[float, ...]
+# So near to the end of what a plant can have the data ask for something else.
+_END = 0.95
 
 
 class Stage(enum.IntEnum):
@@ -155,6 +157,8 @@ class Cause:
     # A simpler cause it becomes at some values, and those values near given ones.
     contains: str = ''
     simpler: Callable[[Values], list[Values]] | None = None
+    # Families that cannot be judged beside it, since what it leaves open looks like them.
+    conceals: tuple[str, ...] = ()
 
     def clipped(self, values: Values) -> Values:
         """Return values within the bounds."""
@@ -184,6 +188,16 @@ class Active:
     def named(self) -> dict[str, float]:
         """Return the values by name."""
         return {u.name: v for u, v in zip(self.cause.unknowns, self.values, strict=True)}
+
+    @property
+    def beyond(self) -> str:
+        """Return which value had to go to the end of what a plant can have; empty if none."""
+        for unknown, value in zip(self.cause.unknowns, self.values, strict=True):
+            if value >= _END * unknown.high > 0.0:
+                return (
+                    f'its {unknown.name} would have to be {unknown.high:g} {unknown.unit} or more'
+                ).replace('  ', ' ')
+        return ''
 
     def sentence(self, start_ns: int, estimates: Mapping[str, Estimate] | None = None) -> str:
         """Return what is wrong, for an operator.

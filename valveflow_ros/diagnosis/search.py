@@ -95,7 +95,17 @@ def search(task: Task, start: Extended, progress: Progress, rough: Scene | None 
         if not _add(found, barred):
             break
         _drop_weak(found, barred)
+        _conceal(found, barred)
     return found
+
+
+def _conceal(found: Found, barred: set[str]) -> None:
+    """Put away what cannot be judged beside the causes taken."""
+    for a in found.model.active:
+        for name, cause in catalogue().items():
+            if cause.family in a.cause.conceals and name not in (*barred, *found.model.names):
+                found.reasons.setdefault(name, f'cannot be judged beside {a.name}')
+                barred.add(name)
 
 
 def _add(found: Found, barred: set[str]) -> bool:
@@ -107,6 +117,9 @@ def _add(found: Found, barred: set[str]) -> bool:
     for rival in rivals:
         if rival.score - best > NOT_TOLD_APART:
             break
+        if beyond := rival.added.beyond:
+            found.reasons[rival.added.name] = beyond
+            continue
         without = found.model
         evidence = weigh(found.task, without, rival.model, rival.added.size)
         if not evidence.enough:

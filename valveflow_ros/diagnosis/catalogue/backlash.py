@@ -18,7 +18,7 @@ from valveflow_ros.diagnosis.cause import Cause, Kind, Stage, Start, Unknown, Va
 from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.records import FloatArray
 
-_TRIED = (0.1, 0.2, 0.35, 0.6, 1.0, 1.6)
+_TRIED = (0.1, 0.2, 0.35, 0.6, 1.0, 1.6, 2.7, 4.5)
 
 
 def act(v: FloatArray, values: Values, scene: Scene) -> FloatArray:

@@ -63,7 +63,8 @@ CAUSE = Cause(
     (
         # The same delayed area (1 - alpha) T looks nearly the same: no ellipse holds them.
         Unknown('alpha', '', 0.03, 0.0, 1.0, Kind.ROUGH),
-        Unknown('time_s', 's', 1.0, 0.5, 1800.0, Kind.ROUGH),
+        # One fills within seconds to a minute; a memory of hours is another thing.
+        Unknown('time_s', 's', 1.0, 0.5, 300.0, Kind.ROUGH),
     ),
     act, starts, sentence, ('clock', 'region_lag', 'rate_limit'),
     'Steps of the opening at constant pressure, power logged every second: two slopes in the '
