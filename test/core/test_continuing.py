@@ -19,6 +19,8 @@ from valveflow_ros.config import Settings
 from valveflow_ros.core.align import Aligner
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.offline import feed_rows
+from valveflow_ros.core.refits import Refits
+from valveflow_ros.core.shift_alarm import ShiftAlarm
 from valveflow_ros.core.state_bytes import from_bytes, to_bytes
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import Readings, table_to_readings
@@ -91,3 +93,28 @@ def test_an_empty_aligner_and_monitor_have_a_state_too():
     assert story(feed_rows(monitor, plant_table(2, 50))) == story(
         feed_rows(Monitor(SETTINGS), plant_table(2, 50))
     )
+
+
+def test_what_was_being_computed_is_asked_for_again_although_no_segment_is_new():
+    settings = Settings({**QUICK_MONITOR, 'refit_segments': 0})
+    refits = Refits()
+    refits.segments_seen = 5
+    refits.ask(10)
+    assert not refits.due(20, False, True, settings)
+    saved = from_bytes(to_bytes(refits.snapshot()))
+    again_there = Refits()
+    again_there.restore(saved)
+    again_there.ask_again()
+    assert again_there.pending_ns is None
+    assert again_there.due(20, False, True, settings)
+    assert again_there.ask(15) > refits.pending_ns
+
+
+def test_a_restored_alarm_keeps_to_the_settings_of_the_monitor():
+    nervous = Settings({**QUICK_MONITOR, 'alarm_latch': False, 'alarm_shelve_time': 60.0})
+    monitor = again(Monitor(nervous), Monitor(nervous))
+    fresh, default = ShiftAlarm(nervous), ShiftAlarm(Settings())
+    for name, value in vars(fresh).items():
+        if isinstance(value, bool | int | float):
+            assert vars(monitor.reference.alarm)[name] == value
+    assert vars(fresh) != vars(default)

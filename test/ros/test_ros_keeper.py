@@ -7,17 +7,24 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from valveflow_ros.config import Settings
+from valveflow_ros.core.events import CurveAdopted
 from valveflow_ros.core.state_bytes import from_bytes, to_bytes
 from valveflow_ros.errors import DataError, RecordingError
+from valveflow_ros.ros.continuity import Continuity
 from valveflow_ros.ros.keeper import Keeper, folder_of
+from valveflow_ros.ros.live import LiveEngine
+from valveflow_ros.ros.outcome import Outcome
+from valveflow_ros.ros.outputs import Outputs
 from valveflow_ros.ros.recording import Recording
 from valveflow_ros.ros.state_folder import STATE, StateFolder, StateWriter
+from valveflow_ros.ros.warmup import made_up_curve
 
 ENGINE = {'numbers': np.arange(3.0)}
 
@@ -31,7 +38,7 @@ def written(folder: Path, **more: object) -> None:
     keeper = Keeper(given)
     nothing = Recording(given.changed({'record': False}), {}, 0.0)
     keeper.write(given, ENGINE, 5, nothing, {})
-    keeper.close(10.0)
+    keeper.close()
 
 
 def test_what_is_written_is_found_again_with_the_rights_of_its_owner(tmp_path: Path) -> None:
@@ -142,7 +149,7 @@ def test_a_state_waits_for_the_recording_and_a_full_disk_is_told(tmp_path: Path)
         return len(asked) > 3
 
     writer.write(ENGINE, ready)
-    writer.finish(10.0)
+    writer.finish()
     assert len(asked) == 4
     assert from_bytes(folder.read() or b'')['numbers'].tolist() == [0.0, 1.0, 2.0]
     assert writer.problem == ''
@@ -150,7 +157,7 @@ def test_a_state_waits_for_the_recording_and_a_full_disk_is_told(tmp_path: Path)
     folder.path.unlink()
     folder.path.mkdir()
     writer.write(ENGINE, lambda: True)
-    writer.finish(10.0)
+    writer.finish()
     assert 'the state cannot be saved (is a directory)' in writer.problem
     folder.close()
 
@@ -186,3 +193,57 @@ def test_killed_at_any_moment_it_is_the_old_or_the_new_state(tmp_path: Path) -> 
         assert state['number'] in (told[-1], told[-1] + 1)
         assert (state['rows'] == state['number']).all()
         assert not list(tmp_path.glob('.*.tmp'))
+
+
+def test_a_state_written_while_another_is_being_written_waits_for_it(tmp_path: Path) -> None:
+    given = settings(tmp_path)
+    keeper = Keeper(given)
+    nothing = Recording(given.changed({'record': False}), {}, 0.0)
+    for k in range(5):
+        keeper.write(given, {'numbers': np.full(300_000, float(k))}, k, nothing, {})
+    keeper.close()
+    found = Keeper(given)
+    assert found.saved is not None
+    assert found.saved['log_ns'] == 4
+    assert (found.saved['engine']['numbers'] == 4.0).all()
+    assert not list((tmp_path / 'state_unit').glob('.*'))
+    found.close()
+
+
+def test_a_curve_is_kept_at_once_and_only_the_last_ones_stay(tmp_path: Path) -> None:
+    curve = made_up_curve(Settings())
+    curves = [replace(curve, notes=(f'number {k}',)).with_id() for k in range(8)]
+    keeper = Keeper(settings(tmp_path))
+    for one in curves:
+        keeper.note([CurveAdopted(one)])
+        assert repr(keeper.curve(one.model_id)) == repr(one)
+    assert len(list((tmp_path / 'state_unit').glob('curve_*'))) == 5
+    with pytest.raises(DataError, match='was not saved'):
+        keeper.curve(curves[0].model_id)
+    (tmp_path / 'state_unit' / f'curve_{curves[7].model_id}.json').write_text('{"format": 1}')
+    with pytest.raises(DataError, match='was not saved'):
+        keeper.curve(curves[7].model_id)
+    keeper.close()
+
+
+def test_nothing_is_saved_before_the_earlier_run_is_gone_on_with(tmp_path: Path) -> None:
+    given = settings(tmp_path, state_period=1.0)
+    nothing = Recording(given.changed({'record': False}), {}, 0.0)
+    ours = Continuity(given, {}, {}, lambda level, sentence: None)
+    engine = ours.engine(lambda found: LiveEngine(found, NoWorker()))
+    path = tmp_path / 'state_unit' / STATE
+    ours.save(given, engine, 1, nothing)
+    ours.step(given, engine, 1, nothing)
+    assert not path.exists()
+    list(ours.begin(given, engine, Outputs('unit')))
+    ours.save(given, engine, 1, nothing)
+    ours.close()
+    assert path.exists()
+
+
+class NoWorker:
+    def submit(self, task: object) -> None:
+        raise AssertionError('nothing is to be fitted')
+
+    def poll(self) -> list[Outcome]:
+        return []

@@ -103,7 +103,8 @@ class VoicedAlarm(ABC):
     def due_ns(self) -> int | None:
         """Return when something happens without a cause from outside; None if never."""
         if self._waits:
-            return self._flood.free_ns
+            # None: the limit was raised meanwhile, and it may go out at once.
+            return self._flood.free_ns or 0
         return self._life.shelved_until_ns
 
     def stand_beside(self, alarms: Sequence[VoicedAlarm]) -> None:

@@ -205,6 +205,11 @@ class Diagnosing:
             plain['window_end_ns'],
         )  # fmt: skip
 
+    def ask_again(self, reason: str) -> None:
+        """Wait no longer for the diagnosis that was asked for, and ask at the next look."""
+        if self._pending is not None:
+            self._pending, self._asked_ns, self._wanted = None, None, reason
+
     def give_up(self, reason: str) -> list[Event]:
         """Wait no longer for the diagnosis that was asked for."""
         return [] if self._pending is None else self.refuse(self._pending.request_ns, reason)

@@ -242,11 +242,10 @@ class Monitor:
         return [*events, self._journal(JournalKind.RESET, 0, '', reason)]
 
     def resume(self, reason: str) -> list[Event]:
-        """Give up what was being computed when the monitor ended, and say that it goes on."""
-        pending = self._refits.pending_ns
-        events: list[Event] = [] if pending is None else self.refuse(pending, reason)
-        events += self.diagnosing.give_up(reason)
-        return [*events, self._journal(JournalKind.RESUMED, 0, self._model_id(), reason)]
+        """Ask again in its time for what was being computed when the monitor ended."""
+        self._refits.ask_again()
+        self.diagnosing.ask_again(reason)
+        return [self._journal(JournalKind.RESUMED, 0, self._model_id(), reason)]
 
     def snapshot(self) -> State:
         """Return what is remembered; see `core.state`."""

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 
 from valveflow_ros.core.align import Aligned, Aligner
+from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.characteristic_json import from_json
 from valveflow_ros.core.diagnosing import ASKED
 from valveflow_ros.core.diagnosis_task import DiagnosisTask
@@ -88,6 +89,10 @@ class JournalReplayer:
     diagnose : callable, optional
         Computes a diagnosis and returns its content; without it none that the journal holds can
         be repeated.
+    curves : callable, optional
+        Returns the curve of a name, where there is a quicker way than to compute it again.
+    left : list of str, optional
+        Takes why an entry cannot be repeated; without it the first such entry is an error.
     """
 
     def __init__(
@@ -95,8 +100,12 @@ class JournalReplayer:
         monitor: Monitor,
         journal: Sequence[JournalEntry],
         diagnose: Callable[[DiagnosisTask], str] | None = None,
+        curves: Callable[[str], Characteristic] | None = None,
+        left: list[str] | None = None,
     ) -> None:
         self._monitor = monitor
+        self._curves = curves
+        self._left = left
         self._due = [entry for entry in journal if _from_outside(entry)]
         self._tasks: dict[int, FitTask] = {}
         self._diagnose = diagnose
@@ -131,8 +140,18 @@ class JournalReplayer:
     def _repeat_due(self) -> list[Event]:
         events: list[Event] = []
         while self._due and self._due[0].rows <= self._monitor.rows:
-            events += self._repeat(self._due.pop(0))
+            try:
+                events += self._repeat(self._due.pop(0))
+            except DataError as error:
+                if self._left is None:
+                    raise
+                self._left.append(str(error))
         return events
+
+    @property
+    def due(self) -> int:
+        """Return how many entries of the journal wait for rows that did not come yet."""
+        return len(self._due)
 
     def _repeat(self, entry: JournalEntry) -> list[Event]:
         monitor = self._monitor
@@ -168,6 +187,8 @@ class JournalReplayer:
 
     def _adopt(self, entry: JournalEntry) -> list[Event]:
         """Compute the fit that was adopted; it must be the one that was."""
+        if self._curves is not None:
+            return self._monitor.adopt(entry.request_ns, self._curves(entry.model_id))
         task = self._tasks.pop(entry.request_ns, None)
         if task is None:
             raise DataError(

@@ -31,7 +31,7 @@ class ReferenceKeeper:
         self.curve: Characteristic | None = None
         self.shift: Shift | None = None
         self.problem = ''
-        self.alarm = ShiftAlarm()
+        self.alarm = ShiftAlarm(settings)
 
     @property
     def segments(self) -> tuple[SpecialSegment, ...]:

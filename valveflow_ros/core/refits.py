@@ -68,6 +68,12 @@ class Refits:
         self.pending_ns = None
         return True
 
+    def ask_again(self) -> None:
+        """Wait no longer for the outcome that was asked for; its segments count as new."""
+        if self.pending_ns is not None:
+            self.pending_ns = None
+            self._segments_at_request = min(self._segments_at_request, self.segments_seen - 1)
+
     def snapshot(self) -> State:
         """Return what is remembered; see `core.state`."""
         return {

@@ -157,16 +157,22 @@ class ModelCorrector:
         return {
             **copies(self._memory()),
             'parts': [part.snapshot() for part in self._parts()],
-            'names': [a.name for a in self._model.active],
+            'causes': self._causes(),
         }
 
     def restore(self, saved: State) -> None:
         """Go on from a state; raises `DataError` if it does not fit."""
-        if saved['names'] != [a.name for a in self._model.active]:
+        if saved['causes'] != self._causes():
             raise DataError('The saved state was made with another model_file.')
         put_back(self._memory(), saved)
         for part, given in zip(self._parts(), saved['parts'], strict=True):
             part.restore(given)
+
+    def _causes(self) -> list[Any]:
+        """Return what is taken out: another model of the same causes is another one."""
+        base = self._model.base
+        curve = [base.knots.tolist(), base.left.tolist(), base.right.tolist()]
+        return [curve, *([a.name, list(a.values), list(a.extra)] for a in self._model.active)]
 
     def _memory(self) -> dict[str, NDArray[Any]]:
         return {'temperature': self._temperature, 'follows': self._follows}

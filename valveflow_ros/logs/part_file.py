@@ -7,15 +7,19 @@ its writer died.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
-from contextlib import suppress
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Protocol
 
 PART_SUFFIX = '.part'
 FILE_MODE = 0o600
 FOLDER_MODE = 0o700
+_TRIES = 20
 
 
 class Writable(Protocol):
@@ -58,15 +62,7 @@ class PartFile:
         self.part = path.with_name(path.name + PART_SUFFIX)
         if replace and self.part.exists() and not is_held(self.part):
             self.part.unlink()
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
-        self._descriptor = os.open(self.part, flags, FILE_MODE)
-        try:
-            # The umask may have taken rights away; nothing may have added any.
-            os.fchmod(self._descriptor, FILE_MODE)
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            self.close()
-            raise
+        self._descriptor = _made(self.part)
 
     def write(self, data: bytes) -> int:
         """Append bytes and return how many were taken."""
@@ -97,6 +93,28 @@ class PartFile:
             self.part.unlink()
 
 
+def _made(part: Path) -> int:
+    """Return a descriptor of a new file that is locked.
+
+    Between making and locking somebody may look whether it is a leftover, and even take it for an
+    empty one and remove it: then it is made again.
+    """
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
+    for left in reversed(range(_TRIES)):
+        descriptor = os.open(part, flags, FILE_MODE)
+        try:
+            # The umask may have taken rights away; nothing may have added any.
+            os.fchmod(descriptor, FILE_MODE)
+            fcntl.flock(descriptor, fcntl.LOCK_EX if left else fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.fstat(descriptor).st_nlink:
+                return descriptor
+        except OSError:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)
+    raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(part))
+
+
 def sync_folder(folder: Path) -> None:
     """Bring a folder's names to the disk."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -115,19 +133,31 @@ def make_folder(folder: Path) -> None:
 
 def is_held(part: Path) -> bool:
     """Tell whether a living writer holds a ``.part``."""
+    with taken(part) as free:
+        return not free
+
+
+@contextmanager
+def taken(part: Path) -> Iterator[bool]:
+    """Hold a ``.part`` that no living writer holds, so that nobody else takes it up meanwhile.
+
+    Gives False if one does, or if the file is gone by now.
+    """
     descriptor = os.open(part, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            free = os.fstat(descriptor).st_nlink > 0
+        except BlockingIOError:
+            free = False
+        yield free
     finally:
         os.close(descriptor)
-    return False
 
 
 def write_whole(path: Path, data: bytes) -> None:
     """Put a small file in place at once: it is the old one or the new one, never half."""
-    temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
+    temporary = path.with_name(f'.{path.name}.{os.getpid()}.{threading.get_ident()}.tmp')
     flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW
     descriptor = os.open(temporary, flags, FILE_MODE)
     try:

@@ -21,7 +21,7 @@ from valveflow_ros.logs.folder import (
     write_metadata,
 )
 from valveflow_ros.logs.layout import CHUNK_HEAD, RECORD_HEAD, Cursor, LayoutError
-from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, is_held, make_folder
+from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, make_folder, taken
 from valveflow_ros.logs.scan import Chunk, Scanner
 from valveflow_ros.logs.seek import SHAPE_SIZE, candidates
 from valveflow_ros.logs.source import Source
@@ -121,8 +121,14 @@ def _leftover(part: Path) -> RecoveryReport | None:
 
 
 def _finished(part: Path) -> RecoveryReport | None:
-    if part.is_symlink() or not part.is_file() or is_held(part):
+    if part.is_symlink() or not part.is_file():
         return None
+    with taken(part) as free:
+        return _made_whole(part) if free else None
+
+
+def _made_whole(part: Path) -> RecoveryReport | None:
+    """Finish one that is held, so that no other recovery works on it at the same time."""
     if part.stat().st_size == 0:
         part.unlink()
         return None

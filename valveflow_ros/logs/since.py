@@ -5,11 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs.contents import LoggedMessage
+from valveflow_ros.logs.contents import LogContents, LoggedMessage
 from valveflow_ros.logs.folder import Split, in_order
 from valveflow_ros.logs.mcap_log import read_recording
 from valveflow_ros.logs.part_file import PART_SUFFIX
+from valveflow_ros.records import Readings
+
+_TRIES = 3
 
 
 def messages_since(folder: str | Path, after_ns: int) -> Iterator[LoggedMessage]:
@@ -26,7 +31,26 @@ def messages_since(folder: str | Path, after_ns: int) -> Iterator[LoggedMessage]
     RecordingError
         The files cannot be read; a folder without any gives nothing.
     """
-    home = Path(folder)
+    for message in _read(Path(folder), after_ns).iter_messages():
+        if message.log_time_ns > after_ns:
+            yield message
+
+
+def _read(home: Path, after_ns: int) -> LogContents:
+    """Return what the last files hold; one that is made whole meanwhile has another name then."""
+    for left in reversed(range(_TRIES)):
+        wanted = _wanted(home, after_ns)
+        if not wanted:
+            break
+        try:
+            return read_recording(wanted, str(home), {})
+        except RecordingError:
+            if not left or all(path.exists() for path in wanted):
+                raise
+    return LogContents(str(home), Readings.of([]), np.empty(0, dtype=np.int64))
+
+
+def _wanted(home: Path, after_ns: int) -> list[Path]:
     wanted: list[Path] = []
     for path in reversed(in_order(_files(home))):
         wanted.insert(0, path)
@@ -34,12 +58,7 @@ def messages_since(folder: str | Path, after_ns: int) -> Iterator[LoggedMessage]
         # Splits follow each other in time; one that begins before the moment is the first needed.
         if split is not None and split.messages and split.start_ns <= after_ns:
             break
-    if not wanted:
-        return
-    log = read_recording(wanted, str(folder), {})
-    for message in log.iter_messages():
-        if message.log_time_ns > after_ns:
-            yield message
+    return wanted
 
 
 def _files(home: Path) -> list[Path]:

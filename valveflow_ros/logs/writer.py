@@ -24,6 +24,8 @@ from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, Writable, make_f
 from valveflow_ros.logs.qos import Qos
 from valveflow_ros.logs.topic_book import TableSchedule, TopicBook
 
+_SPLITS_APART, _NUMBERS_APART = 64, 1 << 26
+
 OpenFile = Callable[[Path], Writable]
 Metadata = Mapping[str, Mapping[str, str]]
 
@@ -102,11 +104,9 @@ class RecordingWriter:
             self._listing = Listing(self.folder)
         except OSError as error:
             raise self._failed(error) from None
-        # Numbers go on in a folder that is continued: by them a repetition is known.
-        self._before: dict[str, int] = {}
-        for split in self._listing.splits:
-            for topic, count in split.counts.items():
-                self._before[topic] = self._before.get(topic, 0) + count
+        # Numbers in a folder that is continued are others than before: by them a repetition is
+        # known. No split holds so many messages that they could meet.
+        self._before = (self._next_number() % _SPLITS_APART) * _NUMBERS_APART
 
     def add_topic(
         self,
@@ -131,7 +131,7 @@ class RecordingWriter:
             If the topic was not added.
         """
         channel = self._topics.ids[topic]
-        sequence = self._sequences.get(channel, self._before.get(topic, 0)) + 1
+        sequence = self._sequences.get(channel, self._before) + 1
         self._sequences[channel] = sequence
         self._builder.add(channel, sequence, log_time_ns, publish_time_ns, data)
         if self._builder.size >= CHUNK_BYTES:

@@ -14,7 +14,7 @@ from valveflow_ros.ros.keeper import Keeper
 from valveflow_ros.ros.leftovers import Leftovers
 from valveflow_ros.ros.live import LiveEngine
 from valveflow_ros.ros.outputs import Output, Outputs
-from valveflow_ros.ros.recording import Recording
+from valveflow_ros.ros.recording import Recording, tag_of
 from valveflow_ros.ros.resuming import REASON, Earlier, earlier_run, retrace
 
 Log = Callable[[Level, str], None]
@@ -46,6 +46,8 @@ class Continuity:
         self._topics = {**inputs, **outputs}
         self._log = log
         self._earlier: Earlier | None = None
+        # Before the tail of an earlier run is fed, a state would leave it out for good.
+        self._begun = False
         self._leftovers: Leftovers | None = None
         self._keeper = Keeper(settings)
 
@@ -75,7 +77,7 @@ class Continuity:
         saved = self._keeper.saved
         if saved is not None:
             try:
-                earlier = earlier_run(saved, self._settings, self._topics)
+                earlier = earlier_run(saved, self._settings, self._topics, self._keeper.curve)
                 engine = make(earlier.settings)
                 engine.restore(saved['engine'])
             except (ValveflowError, LookupError, TypeError, ValueError, AttributeError) as error:
@@ -85,29 +87,37 @@ class Continuity:
                 return engine
         return make(self._settings)
 
-    def begin(self, engine: LiveEngine, speaker: Outputs) -> Iterator[Output]:
+    def begin(self, settings: Settings, engine: LiveEngine, speaker: Outputs) -> Iterator[Output]:
         """Yield what stands at the beginning: nothing yet, or where the earlier run ended."""
         for sentence in filter(None, (self._keeper.problem, self._keeper.sentence)):
             self._log(Level.WARN, sentence)
         earlier = self._earlier
         if earlier is None:
             yield from speaker.first()
+            self._begun = True
             return
         if earlier.sentence:
             self._log(Level.WARN, earlier.sentence)
+        left: list[str] = []
         try:
-            yield from retrace(engine, speaker, earlier, self._inputs, self._outputs)
+            yield from retrace(
+                engine, speaker, earlier, self._inputs, self._outputs, self._keeper.curve, left
+            )
         except ValveflowError as error:
-            self._log(Level.WARN, f'Not all of the earlier recording could be followed: {error}')
+            left.append(str(error))
+        if left:
+            what = ' '.join(dict.fromkeys(left))
+            self._log(Level.WARN, f'Not all of the earlier recording could be followed: {what}')
         yield from speaker.of(engine.monitor.resume(REASON))
-        yield from speaker.of(engine.reconfigure(self._settings))
+        yield from speaker.of(engine.reconfigure(settings))
+        self._begun = True
         earlier.tail.clear()
         self._log(Level.OK, f'Going on after {engine.monitor.rows} rows of an earlier run.')
 
     def look_after(self, recording: Recording) -> None:
         """Finish in the background what other runs left unfinished beside this recording."""
         if recording.folder is not None:
-            self._leftovers = Leftovers(recording.folder)
+            self._leftovers = Leftovers(recording.folder, tag_of(self._settings))
 
     def note(self, events: Sequence[Event]) -> None:
         """Look for what must survive the end of the process."""
@@ -126,7 +136,7 @@ class Continuity:
         self, settings: Settings, engine: LiveEngine, log_ns: int, recording: Recording
     ) -> None:
         """Save the state now."""
-        if self._keeper.on:
+        if self._keeper.on and self._begun:
             self._keeper.write(settings, engine.snapshot(), log_ns, recording, self._topics)
 
     def item(self) -> Item:

@@ -18,6 +18,7 @@ _LENGTH = struct.Struct('<Q')
 # A window of twenty million rows takes less.
 _MOST_BYTES = 4 << 30
 _READ = 1 << 20
+_READS = 8  # at most in one look: whoever looks has samples to take
 
 
 def send(descriptor: int, item: State) -> None:
@@ -37,10 +38,13 @@ class FrameReader:
     ----------
     descriptor : int
         Of the pipe; set it non-blocking for `ready`.
+    most : int
+        Bytes that a message may have.
     """
 
-    def __init__(self, descriptor: int) -> None:
+    def __init__(self, descriptor: int, most: int = _MOST_BYTES) -> None:
         self._descriptor = descriptor
+        self._most = most
         self._bytes = bytearray()
         self.ended = False
 
@@ -52,7 +56,9 @@ class FrameReader:
         DataError
             What came is no message.
         """
-        while not self.ended:
+        for _ in range(_READS):
+            if self.ended:
+                break
             try:
                 found = os.read(self._descriptor, _READ)
             except BlockingIOError:
@@ -83,7 +89,7 @@ class FrameReader:
         if len(self._bytes) < start:
             return None
         (length,) = _LENGTH.unpack_from(self._bytes)
-        if length > _MOST_BYTES:
+        if length > self._most:
             raise DataError('What came through the pipe is no message.')
         if len(self._bytes) < start + length:
             return None

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from valveflow_ros.config import Settings, parameter
 from valveflow_ros.core.alarms import AlarmChange
+from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.events import (
     CurveAdopted,
     Diagnosed,
@@ -18,12 +19,13 @@ from valveflow_ros.core.events import (
 )
 from valveflow_ros.core.state import State
 from valveflow_ros.core.state_bytes import from_bytes
-from valveflow_ros.errors import ValveflowError
+from valveflow_ros.errors import DataError, ValveflowError
 from valveflow_ros.ros.recording import DEFAULT_FOLDER, Recording, at_home, tag_of
 from valveflow_ros.ros.state_folder import InUseError, StateFolder, StateWriter
 
 # A window of ten days takes 40 MB.
 _LEAST_S = 1.0
+_RETRY_S = 10.0
 _WORTH = (AlarmChange, CurveAdopted, Diagnosed, ReferenceSet)
 _ENTRIES = (JournalKind.SETTINGS, JournalKind.RESET, JournalKind.RESUMED)
 
@@ -93,8 +95,17 @@ class Keeper:
         self.saved = None
         self.sentence = f'The state saved by an earlier run is not used. {reason}'
 
+    def curve(self, model_id: str) -> Characteristic:
+        """Return a curve that was adopted lately; raises `DataError` if it is not there."""
+        if self._folder is None:
+            raise DataError(f'Curve {model_id} was not saved.')
+        return self._folder.curve(model_id)
+
     def note(self, events: Sequence[Event]) -> None:
-        """Look for what must survive the end of the process."""
+        """Look for what must survive the end of the process; a curve is saved at once."""
+        for event in events:
+            if isinstance(event, CurveAdopted) and self._folder is not None:
+                self._folder.keep_curve(event.characteristic)
         self._due = self._due or any(
             isinstance(e, _WORTH) or (isinstance(e, JournalEntry) and e.kind in _ENTRIES)
             for e in events
@@ -106,6 +117,8 @@ class Keeper:
         if not self.on or self._writer.busy:
             return False
         waited_s = time.monotonic() - self._written_s
+        if self._writer.problem:
+            return waited_s >= min(_RETRY_S, self._period_s)
         return waited_s >= (min(_LEAST_S, self._period_s) if self._due else self._period_s)
 
     def write(
@@ -131,6 +144,7 @@ class Keeper:
         topics : mapping of str to str
             Full names of inputs and outputs.
         """
+        self._writer.finish()
         self._due, self._written_s = False, time.monotonic()
         folder = recording.folder if recording.on else None
         state = {
@@ -143,10 +157,10 @@ class Keeper:
         }
         self._writer.write(state, recording.settled())
 
-    def close(self, timeout_s: float = 1.0) -> None:
+    def close(self) -> None:
         """End; what is being written is finished first."""
         if self._folder is not None:
-            self._writer.finish(timeout_s)
+            self._writer.finish()
             self._folder.close()
             self._folder = None
 
@@ -163,7 +177,11 @@ class Keeper:
             self._refused = f'The state cannot be saved. {error}'
             return
         self._folder, self._writer = folder, StateWriter(folder)
-        self._look(folder, settings)
+        try:
+            self._look(folder, settings)
+        except BaseException:
+            folder.close()
+            raise
 
     def _look(self, folder: StateFolder, settings: Settings) -> None:
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import re
 import threading
 from pathlib import Path
 
@@ -13,16 +14,19 @@ from valveflow_ros.ros.diagnostics import Level
 
 
 class Leftovers:
-    """Looks once through the folders beside a recording; a living recorder's files stay.
+    """Looks once through this unit's other recordings; a living recorder's files stay.
 
     Parameters
     ----------
     own : Path
         The recording at hand, which is seen to by its own recorder.
+    tag : str
+        The unit's part of the folders' names; those of other units are theirs.
     """
 
-    def __init__(self, own: Path) -> None:
+    def __init__(self, own: Path, tag: str) -> None:
         self._own = own
+        self._mine = re.compile(rf'valveflow_\d{{8}}T\d{{6}}Z_{re.escape(tag)}(_\d+)?')
         self._news: queue.SimpleQueue[tuple[Level, str]] = queue.SimpleQueue()
         threading.Thread(target=self._run, name='leftovers', daemon=True).start()
 
@@ -37,10 +41,10 @@ class Leftovers:
         own = self._own.resolve()
         try:
             parts = own.parent.glob(f'valveflow_*/*.mcap{PART_SUFFIX}')
-            folders = sorted({part.parent for part in parts} - {own})
+            found = {part.parent for part in parts} - {own}
         except OSError:
             return
-        for folder in folders:
+        for folder in sorted(f for f in found if self._mine.fullmatch(f.name)):
             try:
                 reports = recover_leftovers(folder)
             except ValveflowError as error:

@@ -128,6 +128,14 @@ class Recording:
         """Tell whether there is a recorder at work."""
         return self._recorder is not None
 
+    @property
+    def whole(self) -> bool:
+        """Tell whether everything handed in is on disk or on its way there."""
+        status = self.status()
+        if status is None or status.state != RecorderState.RECORDING:
+            return False
+        return not (status.lost or any(status.dropped.values()))
+
     def offer(self, topic: str, type_name: str, *, reliable: bool, latched: bool) -> None:
         """Describe a topic; it stands in the file from its first message on."""
         qos = Qos(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from rclpy.serialization import deserialize_message
 from valveflow_msgs.msg import JournalEntry as JournalMessage
 
 from valveflow_ros.config import Settings, parameter
+from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.events import JournalEntry, JournalKind
 from valveflow_ros.core.offline import JournalReplayer
 from valveflow_ros.core.state import State
@@ -24,7 +25,7 @@ from valveflow_ros.ros.outputs import Output, Outputs
 
 REASON = 'The monitor was started again; it goes on from its saved state.'
 _BLOCK = 500
-_COMPUTED = (JournalKind.FIT_ADOPTED, JournalKind.DIAGNOSED)
+Curves = Callable[[str], Characteristic]
 
 
 @dataclass(slots=True)
@@ -58,7 +59,9 @@ def engine_settings(saved: State, now: Settings) -> Settings:
     return now.changed({n: then[n] for n in now if parameter(n).live and n in then})
 
 
-def earlier_run(saved: State, settings: Settings, topics: Mapping[str, str]) -> Earlier:
+def earlier_run(
+    saved: State, settings: Settings, topics: Mapping[str, str], curves: Curves
+) -> Earlier:
     """Return what the earlier run left besides its state.
 
     Parameters
@@ -69,6 +72,8 @@ def earlier_run(saved: State, settings: Settings, topics: Mapping[str, str]) -> 
         Of this run.
     topics : mapping of str to str
         Full names of inputs and outputs in this run.
+    curves : callable
+        Returns an adopted curve by its name.
     """
     made = Earlier(engine_settings(saved, settings), int(saved['log_ns']), None, [])
     name = saved['recording']
@@ -79,9 +84,9 @@ def earlier_run(saved: State, settings: Settings, topics: Mapping[str, str]) -> 
         recover_leftovers(folder)
         made.tail = list(messages_since(folder, made.log_ns))
         # With the same names on the topics it is one recording, and a replay finds all of it.
-        goes_on = saved['topics'] == dict(topics) and not _computed(made.tail, topics)
+        goes_on = saved['topics'] == dict(topics) and not _lost(made.tail, topics, curves)
         made.folder = folder if goes_on else None
-    except RecordingError as error:
+    except (RecordingError, DataError) as error:
         made.sentence = f'What was recorded after the state was saved is not there: {error}'
     if made.tail:
         made.log_ns = max(made.log_ns, made.tail[-1].log_time_ns)
@@ -94,6 +99,8 @@ def retrace(
     earlier: Earlier,
     inputs: Mapping[str, str],
     outputs: Mapping[str, str],
+    curves: Curves,
+    left: list[str],
 ) -> Iterator[Output]:
     """Feed what was recorded after the state was saved; yield what it had not recorded itself.
 
@@ -105,17 +112,24 @@ def retrace(
     earlier : Earlier
     inputs, outputs : mapping of str to str
         Names by topics.
+    curves : callable
+        Returns an adopted curve by its name.
+    left : list of str
+        Takes what could not be followed.
 
     Raises
     ------
     DataError
-        The recording does not go on from the state.
+        The journal cannot be read.
     """
     told = Counter(
         (outputs[m.topic], m.publish_time_ns) for m in earlier.tail if m.topic in outputs
     )
-    journal = [e for e in _journal(earlier.tail, outputs) if e.kind not in _COMPUTED]
-    replayer = JournalReplayer(engine.monitor, journal)
+    # A diagnosis takes a minute, and is asked for again.
+    journal = [
+        e for e in _journal(earlier.tail, outputs) if e.kind != JournalKind.DIAGNOSED
+    ]  # fmt: skip
+    replayer = JournalReplayer(engine.monitor, journal, curves=curves, left=left)
     decoder = Decoder(earlier.settings)
     messages = [m for m in earlier.tail if m.topic in inputs]
     for k in range(0, len(messages) + 1, _BLOCK):
@@ -130,12 +144,21 @@ def retrace(
                 told[output.name, output.time_ns] -= 1
             else:
                 yield output
+    if replayer.due:
+        left.append(f'{replayer.due} of its decisions stand after rows that are not there.')
 
 
-def _computed(tail: list[LoggedMessage], topics: Mapping[str, str]) -> bool:
-    """Tell whether a result came that was not saved any more; it is computed again in time."""
-    journal = {topics['journal']: 'journal'}
-    return any(entry.kind in _COMPUTED for entry in _journal(tail, journal))
+def _lost(tail: list[LoggedMessage], topics: Mapping[str, str], curves: Curves) -> bool:
+    """Tell whether a result came that was not saved any more: then the recording ends there."""
+    for entry in _journal(tail, {topics['journal']: 'journal'}):
+        if entry.kind == JournalKind.DIAGNOSED:
+            return True
+        if entry.kind == JournalKind.FIT_ADOPTED:
+            try:
+                curves(entry.model_id)
+            except DataError:
+                return True
+    return False
 
 
 def _journal(tail: list[LoggedMessage], outputs: Mapping[str, str]) -> Iterator[JournalEntry]:

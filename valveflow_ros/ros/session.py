@@ -128,18 +128,19 @@ class Session:
         clock = None
         if node.get_parameter('use_sim_time').value:
             clock = taker(Clock, '/clock')
-        self._intake = Intake(
+        intake = Intake(
             sources, Decoder(settings), self._log_clock, settings.text('stamp_source'), clock,
             self._health.note,
         )  # fmt: skip
-        self._listening_since_s = time.monotonic()
         if not self._begun:
-            self._begun = True
             self._begin()
+            self._begun = True
+        self._intake = intake
+        self._listening_since_s = time.monotonic()
 
     def _begin(self) -> None:
         """Say what stands there at the start, or go on where an earlier run ended."""
-        self._say(self._continuity.begin(self.engine, self._outputs))
+        self._say(self._continuity.begin(self._settings, self.engine, self._outputs))
         self._continuity.look_after(self.recording)
         if self._extended is not None:
             names = ', '.join(h.name for h in self._extended.held) or 'nothing'
@@ -224,8 +225,8 @@ class Session:
         self.hush()
         self.worker.close()
         self.diagnosis_worker.close()
-        # Where nothing is recorded, nothing else tells what happened since it was saved last.
-        if not self.recording.on:
+        # Where not all is recorded, nothing else tells what happened since it was saved last.
+        if not self.recording.whole:
             self._continuity.save(
                 self._settings, self.engine, self._log_clock.last_ns, self.recording
             )

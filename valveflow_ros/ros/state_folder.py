@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import json
 import os
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.characteristic_json import from_json, to_json
 from valveflow_ros.core.state import State
 from valveflow_ros.core.state_bytes import to_bytes
-from valveflow_ros.errors import RecordingError
+from valveflow_ros.errors import DataError, RecordingError
 from valveflow_ros.logs.part_file import FILE_MODE, make_folder, write_whole
 
 STATE = 'monitor.state'
 LOCK = 'lock'
+_CURVE, _CURVES = 'curve_', 5
 _MOST_BYTES = 4 << 30
 # The file is put in place when the recording has everything that went into it, or after this.
-_PATIENCE_S = 2.0
+_PATIENCE_S = 1.0
 _LOOK_S = 0.02
+_LONGEST_S = 30.0
 
 
 class InUseError(RecordingError):
@@ -49,12 +54,14 @@ class StateFolder:
         try:
             make_folder(folder)
             self._lock = _locked(folder / LOCK)
-            for stale in folder.glob(f'.{STATE}.*.tmp'):
-                stale.unlink()
         except BlockingIOError:
             raise InUseError(folder, _in_use(folder / LOCK)) from None
         except (OSError, ValueError) as error:
             raise RecordingError(folder, f'cannot be used ({_reason(error)})') from None
+        # What a killed process left half written; if it cannot be removed, it does no harm.
+        with contextlib.suppress(OSError):
+            for stale in folder.glob('.*.tmp'):
+                stale.unlink()
 
     def read(self) -> bytes | None:
         """Return what was saved last, None if nothing was.
@@ -78,6 +85,33 @@ class StateFolder:
     def write(self, data: bytes) -> None:
         """Put a state in place of the last one: it is the old or the new one, never half."""
         write_whole(self.path, data)
+
+    def keep_curve(self, curve: Characteristic) -> None:
+        """Put a curve beside the state, which is written a moment later; the older ones go.
+
+        It is small and must only outlive the process: nothing waits for the disk. If it cannot be
+        written, the state that follows has it.
+        """
+        with contextlib.suppress(OSError):
+            place = self.folder / f'{_CURVE}{curve.model_id}.json'
+            draft = self.folder / f'.{place.name}.tmp'
+            with open(draft, 'w', encoding='utf-8', opener=_private) as file:
+                json.dump(to_json(curve), file)
+            draft.replace(place)
+            kept = sorted(self.folder.glob(f'{_CURVE}*.json'), key=lambda p: p.stat().st_mtime_ns)
+            for old in kept[:-_CURVES]:
+                old.unlink()
+
+    def curve(self, model_id: str) -> Characteristic:
+        """Return a curve that was kept; raises `DataError` if it is not there whole."""
+        place = self.folder / f'{_CURVE}{model_id}.json'
+        try:
+            found = from_json(json.loads(place.read_text(encoding='utf-8')))
+        except (OSError, ValueError, RecursionError, DataError):
+            raise DataError(f'Curve {model_id} was not saved.') from None
+        if found.model_id != model_id:
+            raise DataError(f'Curve {model_id} was not saved.')
+        return found
 
     def close(self) -> None:
         """Let another monitor in."""
@@ -119,10 +153,10 @@ class StateWriter:
         )
         self._thread.start()
 
-    def finish(self, timeout_s: float) -> None:
-        """Wait for the one being written."""
+    def finish(self) -> None:
+        """Wait for the one being written; that is bounded, unless a disk hangs."""
         if self._thread is not None:
-            self._thread.join(timeout_s)
+            self._thread.join(_LONGEST_S)
 
     def _write(self, state: State, ready: Callable[[], bool]) -> None:
         try:
@@ -138,6 +172,10 @@ class StateWriter:
         else:
             self.problem = ''
             self.saved_s = time.monotonic()
+
+
+def _private(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, FILE_MODE)
 
 
 def _locked(path: Path) -> int:

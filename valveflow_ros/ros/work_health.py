@@ -126,13 +126,12 @@ def reference_item(monitor: Monitor) -> Item:
         values['Shift since (s since 1970)'] = shift.since_ns // 10**9 or None
     if keeper.problem:
         return Item('reference', Level.WARN, keeper.problem, values)
-    if shift is None:
-        return Item('reference', Level.OK, 'The next curve is judged against it.', values)
     level = Level.WARN if keeper.alarm.standing else Level.OK
     if keeper.alarm.active and keeper.alarm.state not in _ASIDE:
         level = Level.ERROR
-    sentence = shift.sentence
-    if keeper.alarm.active and not shift.moved:
+    # After a restart no curve was judged yet, and the alarm stands all the same.
+    sentence = 'The next curve is judged against it.' if shift is None else shift.sentence
+    if keeper.alarm.active and (shift is None or not shift.moved):
         spans = ' and '.join(f'u {a:.0f} to {b:.0f}' for a, b in keeper.alarm.ranges)
         moved = f'what moved, {spans}, is not judged unmoved yet' if spans else 'doubt is left'
         sentence = f'The alarm stands: {moved}. {sentence}'

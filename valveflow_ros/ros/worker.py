@@ -30,6 +30,7 @@ FIT_JOB = 'valveflow_ros.core.fit:fit'
 DIAGNOSIS_JOB = 'valveflow_ros.diagnosis.from_window:diagnose_window'
 _FIRST_PAUSE_S = 0.5
 _LONGEST_PAUSE_S = 60.0
+_MOST_ANSWER = 16 << 20  # bytes; a curve takes some ten thousand
 # One core is what the machine can spare, and one thread adds up in one order only.
 _ONE_THREAD = dict.fromkeys(
     ('NUMBA_NUM_THREADS', 'OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1'
@@ -138,7 +139,7 @@ class Worker:
         self.starts += 1
         assert self._process.stdout is not None
         os.set_blocking(self._process.stdout.fileno(), False)
-        self._reader = FrameReader(self._process.stdout.fileno())
+        self._reader = FrameReader(self._process.stdout.fileno(), _MOST_ANSWER)
 
     def submit(self, task: FitTask | DiagnosisTask) -> None:
         """Take a task; one that is still running is given up."""
