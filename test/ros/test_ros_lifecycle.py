@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,9 @@ from ros_helpers import wait_until
 from std_msgs.msg import Float32
 from std_srvs.srv import Trigger
 
+from valveflow_ros.config import TABLE
 from valveflow_ros.logs import open_log
+from valveflow_ros.ros import simulator_steps
 from valveflow_ros.ros.monitor_node import MonitorNode
 
 pytestmark = pytest.mark.ros
@@ -134,3 +138,19 @@ def test_a_recording_that_cannot_be_made_keeps_nobody_from_monitoring(
         assert not session.recording.on
     finally:
         stage.close()
+
+
+@pytest.mark.parametrize('name', ['monitor_main', 'simulator_main', 'replay_main'])
+def test_help_is_a_page_and_starts_nothing(name: str, tmp_path: Path) -> None:
+    module = f'valveflow_ros.ros.{name}'
+    asked = subprocess.run(
+        [sys.executable, '-m', module, '--help'], cwd=tmp_path, capture_output=True, text=True,
+        timeout=240.0, check=False,
+    )  # fmt: skip
+    assert asked.returncode == 0, asked.stderr
+    assert asked.stdout.startswith('usage: ')
+    table = {'monitor_main': TABLE, 'simulator_main': simulator_steps.TABLE}.get(name, ())
+    for row in table:
+        assert row.name in asked.stdout
+        assert row.sentence in asked.stdout
+    assert list(tmp_path.iterdir()) == []

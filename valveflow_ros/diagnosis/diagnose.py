@@ -259,7 +259,9 @@ def _sentence(d: Diagnosis) -> str:
             f'{d.disturbance.time_scale_s / 3600.0:.2g} h, which has no cause in these signals.'
         )
     if d.verdict == NOTHING:
-        return 'The model explains the unit down to its noise.' + wander
+        blind = sum('cannot be judged' in reason for _, reason in d.rejected)
+        but = f' {blind} causes could not be judged in this record.' if blind > 1 else ''
+        return f'The model explains the unit down to its noise.{but}{wander}'
     near = f'; nearest: {", ".join(d.not_told_apart)}' if d.not_told_apart else ''
     besides = ''.join(f' Found besides: {c.sentence}' for c in d.causes)
     return (

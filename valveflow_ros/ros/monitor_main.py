@@ -13,12 +13,14 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 
+from valveflow_ros.config import TABLE
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.logs import RecorderStatus
 from valveflow_ros.ros.monitor_node import MonitorNode
 from valveflow_ros.ros.secure_start import check_security
 from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.stops import StopFlag
+from valveflow_ros.ros.usage import usage, wants_help
 from valveflow_ros.ros.watchdog import Watchdog
 
 # A look costs the same for one message as for ten, and a plant is in no hurry. Where much
@@ -30,6 +32,15 @@ _SPIN_EVERY_S = 0.1
 # The compiler works when a configuration runs for the first time, and an activation may go
 # through what an earlier run recorded.
 _LONGEST_START_S = 600.0
+
+
+_ABOUT = """usage: monitor [--ros-args ...]
+
+Watches valve opening, main steam pressure and temperature and generated power, and keeps the
+flow characteristic of the main steam valve. It runs until it is asked to end (Ctrl-C)."""
+_EXAMPLE = (
+    'ros2 run valveflow_ros monitor --ros-args -p unit_tag:=U1 -p main_steam_pressure_unit:=bar'
+)
 
 
 class _Supervised(MonitorNode):
@@ -54,6 +65,9 @@ class _Supervised(MonitorNode):
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the monitor until it is asked to stop; return the exit status."""
+    if wants_help(args):
+        print(usage(_ABOUT, _EXAMPLE, TABLE))
+        return 0
     # Recordings, logs and compiled code are nobody else's business, whatever the shell allowed.
     before = os.umask(0o077)
     try:

@@ -22,6 +22,7 @@ from valveflow_ros.ros.playing import Player, Step
 from valveflow_ros.ros.secure_start import check_security
 from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.stops import StopFlag
+from valveflow_ros.ros.usage import usage, wants_help
 
 _EFFECTS = ParameterDescriptor(
     description='What is wrong with the plant: texts of the form name or name:key=value,... as '
@@ -31,8 +32,22 @@ _EFFECTS = ParameterDescriptor(
 )
 
 
+_ABOUT = """usage: plant_simulator [--ros-args ...]
+
+Publishes the paper's unit, simulated, as a gateway would; any effect of the catalogue can be
+hidden in it."""
+_EXAMPLE = (
+    'ros2 run valveflow_ros plant_simulator --ros-args -p stamped:=true -p rate:=100.0 '
+    '-p "effects:=[gain_step:t0_days=0.5]"'
+)
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Simulate and publish; return the exit status."""
+    if wants_help(args):
+        print(usage(_ABOUT, _EXAMPLE, steps.TABLE))
+        print(f'  {"effects":28} []\n  {"":28} {_EFFECTS.description}')
+        return 0
     stop = StopFlag().install()
     try:
         check_security(args)

@@ -1,0 +1,27 @@
+"""What the executables answer to ``--help``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Sequence
+
+from valveflow_ros.config import Parameter
+
+_WIDTH = 28
+
+
+def wants_help(args: Sequence[str] | None) -> bool:
+    """Tell whether somebody asked what there is to give."""
+    given = sys.argv[1:] if args is None else args
+    return any(word in ('-h', '--help') for word in given)
+
+
+def usage(about: str, example: str, rows: Iterable[Parameter]) -> str:
+    """Return a page: what it does, an example, and every parameter with unit and default."""
+    lines = [about, '', 'Parameters are given as for any ROS 2 node:', f'  {example}', '']
+    for row in rows:
+        default = repr(row.default) if isinstance(row.default, str) else str(row.default).lower()
+        unit = f' {row.unit}' if row.unit else ''
+        lines.append(f'  {row.name:{_WIDTH}} {default}{unit}')
+        lines.append(f'  {"":{_WIDTH}} {row.sentence}')
+    return '\n'.join(lines)
