@@ -25,6 +25,7 @@ from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.prediction import PredictionBlock
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import NS_PER_S, SampleTable
+from valveflow_ros.ros.memory import give_back
 
 DAYS = 365
 PERIOD_DAYS = 30
@@ -77,6 +78,11 @@ class _Walk:
             fed = self.monitor.feed(table.part(done, len(table)))
             done += fed.rows
             self._take(fed.events)
+            asked = any(isinstance(event, FitRequested) for event in fed.events)
+            del fed
+            if asked:
+                # As the node does when a task has its outcome.
+                give_back()
 
     def close(self) -> None:
         """End the other process."""

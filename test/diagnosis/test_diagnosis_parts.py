@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from valveflow_ros.diagnosis import kernels, quality
 from valveflow_ros.diagnosis.catalogue import catalogue
-from valveflow_ros.diagnosis.cause import Active, Stage
+from valveflow_ros.diagnosis.cause import Active, Stage, Told
 from valveflow_ros.diagnosis.diagnosis_json import model_from_json, model_json
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import Task, base_mask, base_tangents, cause_tangents
@@ -58,7 +58,7 @@ def test_the_catalogue_holds_what_it_promises():
         assert set(cause.confusers) <= NAMES - {name}
         assert cause.experiment.endswith('.')
         keys = [u.name for u in cause.unknowns]
-        said = cause.sentence(dict(zip(keys, TYPICAL[name], strict=True)))
+        said = cause.sentence(Told(zip(keys, TYPICAL[name], strict=True)))
         assert said.endswith('.')
         assert said[0].isupper()
 

@@ -405,7 +405,7 @@ def test_a_leftover_that_cannot_be_read_holds_up_nothing(tmp_path, monkeypatch, 
         raise problem
 
     # The package's function of that name hides the module.
-    monkeypatch.setattr(sys.modules['valveflow_ros.logs.recover'], 'is_held', fail)
+    monkeypatch.setattr(sys.modules['valveflow_ros.logs.recover'], 'taken', fail)
     recorder = recorder_of(folder)
     record(recorder, 0, 3)
     status = recorder.close()

@@ -57,6 +57,11 @@ def test_diagnostics_tell_of_shelf_and_suppression() -> None:
     assert after([0.0]).level == Level.OK
 
 
+def states(listener: Listener) -> list[int]:
+    """Return how the alarm on a shift went."""
+    return [a.state for a in listener.alarms if a.name == 'curve_shift']
+
+
 @pytest.mark.ros
 @pytest.mark.slow
 def test_an_alarm_is_put_aside_and_taken_back_and_the_recording_repeats(
@@ -84,14 +89,17 @@ def test_an_alarm_is_put_aside_and_taken_back_and_the_recording_repeats(
         *ros_arguments({'seed': 7, 'rate': 0.0, 'wait': PATIENCE_S, 'days': 0.1,
                         'use_clock': True}),
     )  # fmt: skip
-    listener.until(lambda: plant.poll() is not None and listener.alarms, 'the alarm')
-    assert listener.alarms[-1].first_out == 'curve_shift'
+    listener.until(lambda: plant.poll() is not None and states(listener), 'the alarm')
+    (raised,) = (a for a in listener.alarms if a.name == 'curve_shift')
+    assert raised.first_out == 'curve_shift'
     answer = listener.trigger('shelve_alarms')
     assert (answer.success, 'put aside for 8 h' in answer.message) == (True, True)
-    listener.until(lambda: listener.alarms[-1].state == Alarm.SHELVED, 'the shelf')
+    listener.until(lambda: Alarm.SHELVED in states(listener), 'the shelf')
     assert not listener.trigger('acknowledge_alarms').success
     assert listener.trigger('unshelve_alarms').success
-    listener.until(lambda: listener.alarms[-1].state == Alarm.UNACKNOWLEDGED, 'its return')
+    listener.until(
+        lambda: states(listener)[-2:] == [Alarm.SHELVED, Alarm.UNACKNOWLEDGED], 'its return'
+    )
     again = listener.trigger('unshelve_alarms')
     assert (again.success, again.message) == (False, 'There is no shelved alarm.')
     monitor.terminate()
@@ -99,4 +107,6 @@ def test_an_alarm_is_put_aside_and_taken_back_and_the_recording_repeats(
     (folder,) = (tmp_path / 'recordings').glob('valveflow_*')
     result = verify(folder)
     assert result.identical, result.difference
-    assert result.compared['alarms'] == len(listener.alarms) == 3
+    # Where the load leaves the young curve the residual cannot be judged: that is told as well.
+    assert states(listener) == [Alarm.UNACKNOWLEDGED, Alarm.SHELVED, Alarm.UNACKNOWLEDGED]
+    assert result.compared['alarms'] == len(listener.alarms)

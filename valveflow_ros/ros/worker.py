@@ -24,6 +24,7 @@ from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.errors import DataError
 from valveflow_ros.ros.frames import FrameReader, send
 from valveflow_ros.ros.letters import result_of, task_letter
+from valveflow_ros.ros.memory import give_back
 from valveflow_ros.ros.outcome import Outcome, content_objection, objection
 
 FIT_JOB = 'valveflow_ros.core.fit:fit'
@@ -216,6 +217,8 @@ class Worker:
         self._running = None
         seconds = self._clock() - running.begun_s
         outcomes.append(Outcome(running.task.request_ns, result, seconds))
+        del running
+        give_back()
 
     def _failed(self, sentence: str, outcomes: list[Outcome]) -> None:
         self.failures_in_a_row += 1
