@@ -81,7 +81,8 @@ class Continuity:
                 engine = make(earlier.settings)
                 engine.restore(saved['engine'])
             except (ValveflowError, LookupError, TypeError, ValueError, AttributeError) as error:
-                self._keeper.drop(str(error) if isinstance(error, ValveflowError) else '')
+                known = isinstance(error, ValveflowError)
+                self._keeper.drop(str(error) if known else 'It does not fit this program.')
             else:
                 self._earlier = earlier
                 return engine

@@ -55,9 +55,6 @@ class Keeper:
     sentence : str
         Why there is none although there was something; empty otherwise.
 
-    problem : str
-        Why nothing is saved although it should be; empty if all goes well.
-
     Raises
     ------
     InUseError
