@@ -120,7 +120,10 @@ def start_plant(processes: Processes, **parameters: object) -> Any:
 def test_a_run_from_the_plant_to_the_disk(
     processes: Processes, listener: Listener, tmp_path: Path
 ) -> None:
-    monitor = start_monitor(processes, tmp_path / 'recordings', use_sim_time=True)
+    # Never suppressed: however late the operator of this test is, the alarm still stands then.
+    monitor = start_monitor(
+        processes, tmp_path / 'recordings', use_sim_time=True, alarm_suppress_time=86400.0
+    )
     plant = start_plant(processes, days=DAYS, use_clock=True, command=True, effects=f'"{FAULT}"')
     live_parameter_and_acknowledgement(listener, monitor)
     listener.until(lambda: plant.poll() is not None, 'the end of the plant')
