@@ -77,15 +77,28 @@ def made_up_curve(settings: Settings) -> Characteristic:
     )
 
 
-def warm_up(settings: Settings, worker: FitWorker, stop: Callable[[], bool]) -> float:
+def warm_up(settings: Settings, worker: FitWorker, stop: Callable[[], bool], wait: bool) -> float:
     """Compile, or load what was compiled before; return how many seconds it took.
 
     The worker does its share meanwhile. If it fails, that shows at the first
     real fit, with a sentence; nothing is lost by going on.
+
+    Parameters
+    ----------
+    settings : Settings
+    worker : FitWorker
+    stop : callable
+        Tells whether to give up waiting.
+    wait : bool
+        Wait for the worker too: without a curve nothing can be said before its first fit. Who
+        has a curve goes on at once.
     """
     begun = time.monotonic()
     task = made_up_task(settings)
-    worker.submit(task)
+    if wait:
+        worker.submit(task)
+    else:
+        worker.rehearse(task)
     c = task.contents
     table = SampleTable.from_columns(
         c.time_ns[:_FEW] + NS_PER_S,
@@ -98,10 +111,10 @@ def warm_up(settings: Settings, worker: FitWorker, stop: Callable[[], bool]) -> 
     )
     aligner = Aligner(settings)
     Monitor(settings).feed(aligner.feed(table_to_readings(table)).table)
-    outcomes = worker.poll()
-    while not outcomes and not stop() and time.monotonic() - begun < _LONGEST_S:
+    done = not wait
+    while not done and not stop() and time.monotonic() - begun < _LONGEST_S:
         time.sleep(0.02)
-        outcomes = worker.poll()
+        done = bool(worker.poll())
     _predict(settings, made_up_curve(settings), c)
     return time.monotonic() - begun
 

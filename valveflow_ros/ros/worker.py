@@ -25,46 +25,17 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.ros.frames import FrameReader, send
 from valveflow_ros.ros.letters import result_of, task_letter
 from valveflow_ros.ros.memory import give_back
-from valveflow_ros.ros.outcome import Outcome, content_objection, objection
+from valveflow_ros.ros.outcome import Outcome
+from valveflow_ros.ros.trades import DIAGNOSIS, DIAGNOSIS_JOB, FIT, FIT_JOB, Trade
 
-FIT_JOB = 'valveflow_ros.core.fit:fit'
-DIAGNOSIS_JOB = 'valveflow_ros.diagnosis.from_window:diagnose_window'
 _FIRST_PAUSE_S = 0.5
 _LONGEST_PAUSE_S = 60.0
 _MOST_ANSWER = 16 << 20  # bytes; a curve takes some ten thousand
+_REHEARSAL = 0  # the number of a task that nobody waits for
 # One core is what the machine can spare, and one thread adds up in one order only.
 _ONE_THREAD = dict.fromkeys(
     ('NUMBA_NUM_THREADS', 'OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1'
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Trade:
-    """What a worker does.
-
-    Attributes
-    ----------
-    word : str
-        What one piece of work is called.
-    parameter : str
-        Which parameter limits its time.
-    objection : callable
-        Says why a result is not to be believed, or nothing.
-    nice : int
-        How far the process stands back.
-    stays : bool
-        The process waits for the next task; otherwise it is started for each.
-    """
-
-    word: str
-    parameter: str
-    objection: Callable[[Any, object], str]
-    nice: int
-    stays: bool
-
-
-FIT = Trade('fit', 'refit_timeout', objection, 10, True)
-DIAGNOSIS = Trade('diagnosis', 'diagnosis_timeout', content_objection, 19, False)
 
 
 @dataclass(slots=True)
@@ -99,7 +70,8 @@ class Worker:
         self._process: subprocess.Popen[bytes] | None = None
         self._reader: FrameReader | None = None
         self._running: _Running | None = None
-        self._number = 0
+        self._number = _REHEARSAL
+        self._sending = threading.Lock()
         self._pause_s = _FIRST_PAUSE_S
         self._start_at_s = 0.0
         self.starts = 0
@@ -138,6 +110,8 @@ class Worker:
             self._failed(sentence, [] if outcomes is None else outcomes)
             return
         self.starts += 1
+        # What was being sent to an earlier process ends by itself.
+        self._sending = threading.Lock()
         assert self._process.stdout is not None
         os.set_blocking(self._process.stdout.fileno(), False)
         self._reader = FrameReader(self._process.stdout.fileno(), _MOST_ANSWER)
@@ -149,6 +123,14 @@ class Worker:
         self._number += 1
         self._running = _Running(self._number, task, self._clock())
         self._send()
+
+    def rehearse(self, task: FitTask | DiagnosisTask) -> None:
+        """Let the process compile or load what a task needs; no outcome comes of it.
+
+        A task that is submitted meanwhile is begun afterwards, in the same process.
+        """
+        if self._process is not None:
+            self._post(self._process, _REHEARSAL, task)
 
     def poll(self) -> list[Outcome]:
         """Return the outcomes there are, and see to the process; never waits."""
@@ -202,6 +184,9 @@ class Worker:
             return
         for number, result in results:
             running = self._running
+            if running is not None and number == _REHEARSAL:
+                # The time it waited for the rehearsal to end is not the task's.
+                running.begun_s = self._clock()
             if running is None or running.number != number:
                 continue
             self._conclude(self._believed(running.task, result), outcomes)
@@ -227,19 +212,25 @@ class Worker:
         self._conclude(sentence, outcomes)
 
     def _send(self) -> None:
-        """Send the task at hand from a thread: a snapshot of days takes the pipe a while."""
+        """Send the task at hand."""
         running, process = self._running, self._process
         if running is None or running.sent or process is None:
             return
         running.sent = True
         # The time it waited for a process to be there is not the fit's.
         running.begun_s = self._clock()
+        self._post(process, running.number, running.task)
+
+    def _post(
+        self, process: subprocess.Popen[bytes], number: int, task: FitTask | DiagnosisTask
+    ) -> None:
+        """Send a task from a thread: a snapshot of days takes the pipe a while."""
         assert process.stdin is not None
         thread = threading.Thread(
             target=_send_quietly,
             # A descriptor of its own: the other may be closed, and its number be
             # somebody else's, while this thread still writes.
-            args=(os.dup(process.stdin.fileno()), running.number, running.task),
+            args=(self._sending, os.dup(process.stdin.fileno()), number, task),
             name=f'{self._trade.word} sender',
             daemon=True,
         )
@@ -260,10 +251,12 @@ class Worker:
         return f'signal {signal.Signals(-code).name}' if code < 0 else f'exit status {code}'
 
 
-def _send_quietly(descriptor: int, number: int, task: FitTask | DiagnosisTask) -> None:
-    """Send; if the process is gone, the monitor learns it from the other pipe."""
+def _send_quietly(
+    turn: threading.Lock, descriptor: int, number: int, task: FitTask | DiagnosisTask
+) -> None:
+    """Send, one after the other; the monitor learns from the other pipe if nobody is there."""
     try:
-        with contextlib.suppress(OSError):
+        with turn, contextlib.suppress(OSError):
             send(descriptor, task_letter(number, task))
     finally:
         os.close(descriptor)
