@@ -35,6 +35,7 @@ TRIALS = {
     'fuzz': ('fuzz', 7200),
     'signals': ('signals', 3600),
     'restart': ('restart', 5400),
+    'rehearing': ('rehearing', 3600),
     'soak': ('soak', 7200),
 }
 

@@ -20,6 +20,7 @@ from valveflow_ros.ros.monitor_node import MonitorNode
 from valveflow_ros.ros.secure_start import check_security
 from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.stops import StopFlag
+from valveflow_ros.ros.transport import choose_transport
 from valveflow_ros.ros.usage import usage, wants_help
 from valveflow_ros.ros.watchdog import Watchdog
 
@@ -79,6 +80,7 @@ def main(args: Sequence[str] | None = None) -> int:
 def _main(args: Sequence[str] | None) -> int:
     stop = StopFlag().install()
     try:
+        choose_transport()
         check_security(args)
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except ValveflowError as error:

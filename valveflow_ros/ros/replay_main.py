@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 
@@ -13,11 +14,13 @@ from rclpy.utilities import remove_ros_args
 
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.logs import open_log
+from valveflow_ros.report.terminal_progress import Progress
 from valveflow_ros.ros.playing import Player
 from valveflow_ros.ros.replay_steps import steps_of
 from valveflow_ros.ros.secure_start import check_security
 from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.stops import StopFlag
+from valveflow_ros.ros.transport import choose_transport
 from valveflow_ros.ros.verify import verify
 
 
@@ -79,7 +82,12 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _verify(path: str) -> int:
-    result = verify(path)
+    progress = Progress(sys.stderr, sys.stderr.isatty() and os.environ.get('TERM') != 'dumb')
+    progress.at(0.0, 'reading the recording')
+    try:
+        result = verify(path, lambda share: progress.at(share, 'feeding the recording again'))
+    finally:
+        progress.end()
     for warning in result.warnings:
         print(warning, file=sys.stderr)
     print(f'{result.inputs} input messages, {result.rows} samples')
@@ -91,6 +99,7 @@ def _verify(path: str) -> int:
 
 def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     stop = StopFlag().install()
+    choose_transport()
     check_security(arguments)
     log = open_log(options.log)
     names, steps = steps_of(log)

@@ -22,6 +22,7 @@ from valveflow_ros.ros.playing import Player, Step
 from valveflow_ros.ros.secure_start import check_security
 from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.stops import StopFlag
+from valveflow_ros.ros.transport import choose_transport
 from valveflow_ros.ros.usage import usage, wants_help
 
 _EFFECTS = ParameterDescriptor(
@@ -50,6 +51,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return 0
     stop = StopFlag().install()
     try:
+        choose_transport()
         check_security(args)
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except ValveflowError as error:
