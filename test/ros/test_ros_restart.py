@@ -18,6 +18,7 @@ from std_srvs.srv import Trigger
 from valveflow_msgs.msg import Alarm, FlowCharacteristic, JournalEntry
 
 from valveflow_ros.core.events import JournalKind
+from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import open_log
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.ros.demo_processes import ros_arguments
@@ -116,8 +117,14 @@ def test_killed_and_started_again_it_goes_on_with_curve_alarm_and_recording(
     plant.until(
         lambda: any(e.kind == JournalKind.RESUMED for e in plant.journal), 'the journal', 240.0
     )
-    # An operator is not told twice, and can still acknowledge what was raised before.
-    assert len(plant.alarms) == before
+    # Who listens from now on finds what stands, as it was told before: nothing in it is new.
+    plant.until(lambda: len(plant.alarms) > before, 'the standing alarm')
+    plant.quiet(0.5)
+    assert plant.alarms[before:] == [raised]
+    late: list[Alarm] = []
+    plant.node.create_subscription(Alarm, f'{MONITOR}/alarms', late.append, LATCHED)
+    plant.until(lambda: late, 'the standing alarm for who comes late')
+    assert late == [raised]
     answer = plant.trigger('acknowledge_alarms')
     assert answer.success, answer.message
     plant.until(lambda: plant.alarms[-1].state == Alarm.ACKNOWLEDGED, 'the acknowledgement')
@@ -149,10 +156,22 @@ def test_a_second_monitor_on_the_same_state_is_refused_and_the_first_goes_on(
     assert f'another monitor (process {first.pid}) keeps its state there' in said
     assert 'Traceback' not in said
     assert first.poll() is None
+    # However young it is, another one goes on from there.
+    plant.play(0, 600)
+    plant.quiet(2.5)
     os.kill(first.pid, signal.SIGKILL)
     first.wait()
     third = start(processes, tmp_path)
-    plant.curves.clear()
-    plant.until(lambda: plant.curves, 'the third monitor', 240.0)
+    plant.until(
+        lambda: any(e.kind == JournalKind.RESUMED for e in plant.journal), 'the journal', 240.0
+    )
+    plant.play(600, 700)
+    plant.quiet(1.0)
     third.send_signal(signal.SIGTERM)
-    assert third.wait(10.0) == 0
+    assert third.wait(10.0) == 0, processes.output(third)
+    (folder,) = tmp_path.glob('valveflow_*')
+    result = verify(folder)
+    assert (result.difference, result.rows) == ('', 700)
+    last = max(folder.glob('*.mcap'))
+    with pytest.raises(RecordingError, match='goes on from an earlier recording'):
+        verify(last)

@@ -66,7 +66,8 @@ class Keeper:
         self.sentence = ''
         self._period_s = settings.real('state_period')
         self._written_s = time.monotonic()
-        self._due = False
+        # At the start too: with any state, however empty, the recording after it is fed again.
+        self._due = True
         self._folder: StateFolder | None = None
         self._refused = ''
         self._open(settings)

@@ -128,12 +128,12 @@ def _replayed(
     speaker = Outputs(settings.text('unit_tag'))
     # A recording of an earlier version has no topics that came later.
     kept = set(outputs.values())
-    yield from (output for output in speaker.first() if output.name in kept)
-    monitor = Monitor(settings, _corrector(log, settings))
     journal = list(_journal(log, outputs))
-    if journal and journal[0].kind == JournalKind.RESUMED:
+    if journal and _began_elsewhere(log, journal[0], inputs, outputs):
         problem = 'goes on from an earlier recording and cannot be verified without it'
         raise RecordingError(log.path, problem)
+    yield from (output for output in speaker.first() if output.name in kept)
+    monitor = Monitor(settings, _corrector(log, settings))
     replayer = JournalReplayer(monitor, journal, diagnosed_elsewhere)
     aligner, decoder = Aligner(settings), Decoder(settings)
     messages = _messages(log, inputs)
@@ -207,6 +207,18 @@ def _journal(log: LogContents, outputs: dict[str, str]) -> Iterator[JournalEntry
             # rclpy raises whatever the middleware's C++ gave it.
             problem = f'holds a line of the journal that cannot be read ({error})'
             raise RecordingError(log.path, problem) from error
+
+
+def _began_elsewhere(
+    log: LogContents, first: JournalEntry, inputs: dict[str, str], outputs: dict[str, str]
+) -> bool:
+    """Tell whether the rows before the first decision, which is to go on, are not here."""
+    if first.kind != JournalKind.RESUMED or first.rows == 0:
+        return False
+    lines = _messages(log, [topic for topic, name in outputs.items() if name == 'journal'])
+    decided_ns = next(lines).log_time_ns
+    rows = next(_messages(log, inputs), None)
+    return rows is None or rows.log_time_ns > decided_ns
 
 
 def _fed(replayer: JournalReplayer, aligner: Aligner, rows: list[Row]) -> list[Event]:
