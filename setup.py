@@ -12,12 +12,16 @@ PACKAGE = 'valveflow_ros'
 # must be relative to it.
 MANIFEST = ElementTree.parse(Path(__file__).with_name('package.xml')).getroot()
 MAINTAINER = MANIFEST.find('maintainer')
+# colcon runs a link to this file from a folder that has no README.
+README = Path(__file__).resolve().with_name('README.md')
+URLS = {url.get('type'): url.text for url in MANIFEST.findall('url')}
 
 COMMAND = ['valveflow = valveflow_ros.cli.main:main']
 NODES = [
     'monitor = valveflow_ros.ros.monitor_main:main',
     'plant_simulator = valveflow_ros.ros.simulator_main:main',
     'replay = valveflow_ros.ros.replay_main:main',
+    'watch = valveflow_ros.ros.watch_main:main',
 ]
 # pip would put the nodes beside the command, under names as plain as `monitor`, also
 # where there is no ROS. ros2 looks for them in lib/valveflow_ros, where colcon puts them.
@@ -33,6 +37,30 @@ setup(
     name=PACKAGE,
     version=MANIFEST.findtext('version'),
     description=MANIFEST.findtext('description'),
+    long_description=README.read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
+    url=URLS['website'],
+    project_urls={
+        'Source': URLS['repository'],
+        'Issues': URLS['bugtracker'],
+        'Changes': f'{URLS["repository"]}/blob/main/CHANGELOG.rst',
+        'Handbook': f'{URLS["repository"]}/blob/main/docs/index.md',
+    },
+    classifiers=[
+        'Development Status :: 4 - Beta',
+        'Environment :: Console',
+        'Intended Audience :: Manufacturing',
+        'Intended Audience :: Science/Research',
+        'License :: OSI Approved :: Apache Software License',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: Python :: 3',
+        'Programming Language :: Python :: 3.10',
+        'Programming Language :: Python :: 3.11',
+        'Programming Language :: Python :: 3.12',
+        'Topic :: Scientific/Engineering',
+        'Topic :: System :: Monitoring',
+    ],
+    keywords=['ROS', 'steam turbine', 'valve', 'flow characteristic', 'system identification'],
     maintainer=MAINTAINER.text,
     maintainer_email=MAINTAINER.get('email'),
     license=MANIFEST.findtext('license'),

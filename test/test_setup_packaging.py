@@ -84,11 +84,11 @@ def test_executables_are_those_of_the_contract(arguments):
     scripts = dict(
         re.split(r'\s*=\s*', line) for line in arguments['entry_points']['console_scripts']
     )
-    assert set(scripts) == {'monitor', 'plant_simulator', 'replay', 'valveflow'}
+    assert set(scripts) == {'monitor', 'plant_simulator', 'replay', 'watch', 'valveflow'}
     assert all(re.fullmatch(r'valveflow_ros(\.\w+)+:main', target) for target in scripts.values())
 
 
-@pytest.mark.parametrize('name', ['monitor', 'plant_simulator', 'replay', 'valveflow'])
+@pytest.mark.parametrize('name', ['monitor', 'plant_simulator', 'replay', 'watch', 'valveflow'])
 def test_every_executable_has_its_module(arguments, name):
     line = next(x for x in arguments['entry_points']['console_scripts'] if x.startswith(name))
     module = line.split('=')[1].strip().split(':')[0]
@@ -193,7 +193,7 @@ def test_the_wheel_of_the_pure_part(tmp_path):
         if (ROOT / name).is_dir():
             ignore = shutil.ignore_patterns('__pycache__')
             shutil.copytree(ROOT / name, tree / name, ignore=ignore)
-    for name in ('setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml', 'LICENSE'):
+    for name in ('setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml', 'README.md', 'LICENSE'):
         shutil.copy(ROOT / name, tree)
     command = [
         sys.executable,

@@ -1,0 +1,160 @@
+"""The terminal view over ROS: it finds the monitor and shows what it says."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+
+import pytest
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from ros_helpers import wait_until
+from std_msgs.msg import Header
+from valveflow_msgs.msg import Alarm, Diagnosis, DiagnosisCause, FlowCharacteristic, Prediction
+
+from valveflow_ros.report.terminal_draw import screen
+from valveflow_ros.ros import watch_main
+from valveflow_ros.ros.diagnostics import Item, Level, array
+from valveflow_ros.ros.watch_node import WatchNode, fields_of
+
+pytestmark = pytest.mark.ros
+
+AT_S = 1_700_000_000
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class Speaker(Node):
+    """Says what a monitor says, once for each that asks."""
+
+    def __init__(self, context, name: str = 'valveflow_monitor') -> None:
+        super().__init__(name, context=context)
+        self.head = Header(stamp=Time(sec=AT_S), frame_id='U1')
+        self.health = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self.predictions = self.create_publisher(Prediction, '~/prediction', 10)
+        self._latched = [
+            self._say('characteristic', FlowCharacteristic(
+                header=self.head, status=1, model_id='abc', pieces=1, breakpoints=[1000.0, 2000.0],
+                values=[150.0, 290.0], samples=99, window_end=Time(sec=AT_S - 3600),
+            )),
+            self._say('alarms', Alarm(
+                header=self.head, name='residual', state=Alarm.UNACKNOWLEDGED, sentence='Less.'
+            )),
+            self._say('diagnosis', Diagnosis(
+                header=self.head, verdict=Diagnosis.NAMED, sentence='It sticks.',
+                causes=[DiagnosisCause(name='stiction')],
+            )),
+        ]  # fmt: skip
+
+    def _say(self, name, message):
+        publisher = self.create_publisher(type(message), f'~/{name}', LATCHED)
+        publisher.publish(message)
+        return publisher
+
+    def go_on(self) -> None:
+        """Say what comes again and again."""
+        self.health.publish(array(
+            [Item('input valve_opening', Level.STALE, 'silent for 9 s.'),
+             Item('recorder', Level.OK, 'Recording.')], 'U1', AT_S * 10**9,
+        ))  # fmt: skip
+        self.predictions.publish(
+            Prediction(
+                header=self.head, state=2, integrated_input=1500.0, measured_mw=220.0,
+                residual_mw=1.5, limit_low_mw=216.0, limit_high_mw=221.0,
+            )
+        )  # fmt: skip
+
+
+@pytest.fixture
+def speaker(context) -> Iterator[Speaker]:
+    node = Speaker(context)
+    yield node
+    node.destroy_node()
+
+
+@pytest.fixture
+def watch(context, monkeypatch) -> Iterator[WatchNode]:
+    usual = Node.__init__
+
+    def here(self, name, **more):
+        usual(self, name, context=context, **more)
+
+    monkeypatch.setattr(Node, '__init__', here)
+    node = WatchNode()
+    monkeypatch.undo()
+    yield node
+    node.destroy_node()
+
+
+def test_what_the_monitor_says_is_shown(context, speaker, watch):
+    assert watch.frame().note.startswith('Waiting for a monitor.')
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(watch)
+
+    def complete():
+        watch.look()
+        speaker.go_on()
+        executor.spin_once(timeout_sec=0.05)
+        frame = watch.frame()
+        return frame if len(watch.heard) == 5 and frame.samples else None
+
+    frame = wait_until(complete, 'a whole frame')
+    assert watch.monitor == '/valveflow_monitor'
+    assert frame.unit == 'U1'
+    assert frame.now_ns == AT_S * 10**9
+    assert frame.curve is not None
+    assert frame.curve.values == (150.0, 290.0)
+    assert (frame.last.low_mw, frame.last.high_mw) == (-2.5, 2.5)
+    assert [(a.name, a.state) for a in frame.alarms] == [('residual', 1)]
+    assert frame.diagnosis.causes == ('stiction',)
+    assert [(i.name, i.level, i.sentence) for i in frame.inputs] == [
+        ('valve_opening', 3, 'silent for 9 s.')
+    ]
+    assert frame.recorder.sentence == 'Recording.'
+    text = '\n'.join(screen(frame, 80, 24))
+    assert 'opening: silent for 9 s.' in text
+    executor.shutdown()
+
+
+def test_with_two_monitors_one_has_to_choose(context, speaker, watch):
+    other = Speaker(context, 'other')
+
+    def several():
+        watch.look()
+        return watch.several
+
+    assert wait_until(several, 'both monitors') == ('/other', '/valveflow_monitor')
+    assert '/other, /valveflow_monitor. Choose with --node NAME.' in watch.frame().note
+    other.destroy_node()
+
+
+def test_one_picture_of_a_real_process(speaker, processes):
+    process = processes.start('valveflow_ros.ros.watch_main', '--once', '--json')
+
+    def done():
+        speaker.go_on()
+        return process.poll() is not None
+
+    wait_until(done, 'the picture')
+    assert process.returncode == 0, processes.output(process)
+    frame = json.loads(processes.output(process))
+    assert frame['curve']['breakpoints'] == [1000.0, 2000.0]
+    assert frame['recorder']['sentence'] == 'Recording.'
+
+
+def test_messages_within_messages_become_mappings():
+    message = Diagnosis(causes=[DiagnosisCause(name='a', parameter_names=['x'])])
+    found = fields_of(message)
+    assert found['causes'][0]['name'] == 'a'
+    assert found['causes'][0]['parameter_names'] == ['x']
+    assert found['header']['stamp'] == {'sec': 0, 'nanosec': 0}
+
+
+def test_help_needs_no_ros_to_run(capsys):
+    with pytest.raises(SystemExit) as ended:
+        watch_main.main(['--help'])
+    assert ended.value.code == 0
+    page = capsys.readouterr().out
+    assert 'example:\n  ros2 run valveflow_ros watch' in page

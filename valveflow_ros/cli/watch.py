@@ -1,0 +1,64 @@
+"""``valveflow watch``: look on while a monitor works."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from pathlib import Path
+
+from valveflow_ros.cli.console import Console, Outcome
+
+_DESCRIPTION = """\
+Show how a monitor is doing, drawn anew once a second: the curve with today's operating point,
+its age, the last residuals with their limits, alarms, inputs, recorder and diagnosis. With a
+LOG it follows the recording of a monitor while it grows, also into further files; without one
+it listens to a running monitor over ROS 2. Ctrl-C ends it.
+
+example:
+  valveflow watch valveflow_recordings
+
+and over ROS 2, in a shell that has it:
+  valveflow watch
+
+Where the output is no terminal, each change is a line instead."""
+
+
+def _seconds(words: str) -> float:
+    try:
+        value = float(words)
+    except ValueError:
+        raise ArgumentTypeError(f"must be a number of seconds, not '{words}'") from None
+    if not 0.1 <= value <= 3600.0:
+        raise ArgumentTypeError(f'must be from 0.1 to 3600 s, not {words}')
+    return value
+
+
+def arguments(parser: ArgumentParser) -> None:
+    """Add description, example and options."""
+    parser.description = _DESCRIPTION
+    parser.usage = 'valveflow watch [LOG] [options]'
+    parser.add_argument(
+        'log', metavar='LOG', type=Path, nargs='?',
+        help='an .mcap or .mcap.part file, the folder of a recording, or a folder of recordings',
+    )  # fmt: skip
+    parser.add_argument('--once', action='store_true', help='print one picture, then stop')
+    parser.add_argument(
+        '--interval', metavar='S', type=_seconds, default=1.0,
+        help='seconds between two pictures (default 1)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--node', metavar='NAME',
+        help='which monitor to listen to over ROS 2, such as /unit1/valveflow_monitor; '
+        'found by itself where there is one',
+    )  # fmt: skip
+
+
+def run(options: Namespace, console: Console) -> Outcome:
+    """Watch until there is nothing more to see."""
+    from valveflow_ros.cli.usage import UsageError
+    from valveflow_ros.cli.watch_run import watch_log, watch_ros
+
+    if options.log is None:
+        return watch_ros(options)
+    if options.node is not None:
+        raise UsageError('--node chooses a running monitor and does not go with a LOG.')
+    return watch_log(options, console)

@@ -1,0 +1,166 @@
+"""Shows how far long work has come: a bar on a terminal, a line now and then anywhere else."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from typing import TextIO
+
+_BAR = 20
+_REDRAW_S = 0.1
+_TICK_S = 0.5
+# An estimate from less than this says nothing.
+_LEAST_S, _LEAST_SHARE = 2.0, 0.03
+# Where there is no terminal: when the first line comes, and how much longer each pause is.
+_FIRST_LINE_S, _LONGER, _LONGEST_PAUSE_S = 15.0, 2.0, 120.0
+
+
+class Progress:
+    """Keeps a bar, or lines, up to date; goes on telling the time between two calls.
+
+    Parameters
+    ----------
+    err : text stream
+    bar : bool
+        Draw a bar; else write lines, few of them.
+    pace : callable, optional
+        Turns the share that is told, and what is done, into a share of the time.
+    clock : callable
+        Time in s that never goes back.
+    """
+
+    def __init__(
+        self,
+        err: TextIO,
+        bar: bool,
+        pace: Callable[[float, str], float] = lambda share, _what: share,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._err, self._bar, self._pace, self._clock = err, bar, pace, clock
+        wide = (getattr(err, 'encoding', None) or 'utf-8').lower().startswith('utf')
+        self._letters = '█░' if wide else '#.'
+        self._lock = threading.RLock()
+        self._begun_s: float | None = None
+        self._share, self._what = 0.0, ''
+        self._ends_s = math.inf
+        self._drawn_s = -math.inf
+        self._next_line_s = math.inf
+        self._pause_s = _FIRST_LINE_S
+        self._shown = False
+        self._done = threading.Event()
+        self._ticker: threading.Thread | None = None
+
+    def at(self, share: float, what: str) -> None:
+        """Take note of how far it has come, as a share of 1, and what is done now."""
+        with self._lock:
+            now = self._clock()
+            if self._begun_s is None:
+                self._begun_s = now
+                self._next_line_s = now + self._pause_s
+                self._start()
+            new = what != self._what
+            # What is behind us does not come back.
+            self._share = max(self._share, min(max(self._pace(share, what), 0.0), 1.0))
+            self._what = what
+            self._estimate(now)
+            if new or now - self._drawn_s >= _REDRAW_S:
+                self._tell(now)
+
+    def tick(self) -> None:
+        """Show the time that has gone by."""
+        with self._lock:
+            now = self._clock()
+            if self._begun_s is not None and now - self._drawn_s >= _TICK_S:
+                self._tell(now)
+
+    def clear(self) -> None:
+        """Take the bar away; it comes again with the next call or tick."""
+        with self._lock:
+            if self._shown:
+                self._err.write('\r\x1b[K')
+                self._err.flush()
+                self._shown = False
+
+    def write(self, line: str) -> None:
+        """Write a line where the bar is; the bar comes back below it."""
+        with self._lock:
+            self.clear()
+            self._err.write(line + '\n')
+            self._err.flush()
+            self._drawn_s = self._clock()
+
+    def end(self) -> None:
+        """Take the bar away for good."""
+        self._done.set()
+        with self._lock:
+            self._begun_s = None
+            self.clear()
+
+    def left_s(self) -> float:
+        """Return how many seconds are left, infinity if that cannot be told."""
+        return max(0.0, self._ends_s - self._clock())
+
+    def _estimate(self, now: float) -> None:
+        assert self._begun_s is not None
+        gone = now - self._begun_s
+        if gone >= _LEAST_S and self._share >= _LEAST_SHARE:
+            self._ends_s = now + gone * (1.0 - self._share) / self._share
+
+    def _tell(self, now: float) -> None:
+        if self._bar:
+            self._draw(now)
+        elif now >= self._next_line_s:
+            when = self._gone(now) + self._left(now)
+            self._err.write(f'{100.0 * self._share:.0f} %  {when}{self._what}\n')
+            self._err.flush()
+            self._pause_s = min(_LONGER * self._pause_s, _LONGEST_PAUSE_S)
+            self._next_line_s = now + self._pause_s
+
+    def _draw(self, now: float) -> None:
+        full = round(_BAR * self._share)
+        bar = self._letters[0] * full + self._letters[1] * (_BAR - full)
+        when = self._left(now) or self._gone(now)
+        text = f'{bar} {100.0 * self._share:3.0f} %  {when}{self._what}'
+        # A line that is broken could not be taken back.
+        width = shutil.get_terminal_size().columns - 1
+        self._err.write(f'\r\x1b[K{text[: max(width, 1)]}')
+        self._err.flush()
+        self._drawn_s = now
+        self._shown = True
+
+    def _gone(self, now: float) -> str:
+        """Return how long it took so far, once that is worth a word."""
+        assert self._begun_s is not None
+        gone = now - self._begun_s
+        return f'{in_words(gone)} so far  ' if gone >= _LEAST_S else ''
+
+    def _left(self, now: float) -> str:
+        """Return how long it will take, empty where that cannot be told."""
+        left = self._ends_s - now
+        return f'about {in_words(left)} left  ' if math.isfinite(left) and left >= 0.5 else ''
+
+    def _start(self) -> None:
+        self._ticker = threading.Thread(target=self._run, name='progress', daemon=True)
+        self._ticker.start()
+
+    def _run(self) -> None:
+        while not self._done.wait(_TICK_S):
+            try:
+                self.tick()
+            except (OSError, ValueError):  # the stream is gone, and so is its reader
+                return
+
+
+def in_words(seconds: float) -> str:
+    """Return '8 s', '2 min 10 s', '1 h 5 min', no finer than is worth saying."""
+    whole = round(seconds) if seconds < 60.0 else round(seconds / 5.0) * 5
+    if whole < 60:
+        return f'{whole} s'
+    minutes, rest = divmod(whole, 60)
+    if minutes < 60:
+        return f'{minutes} min {rest} s' if rest else f'{minutes} min'
+    hours, minutes = divmod(minutes, 60)
+    return f'{hours} h {minutes} min' if minutes else f'{hours} h'

@@ -1,0 +1,81 @@
+"""Lines of a terminal view: pieces of text with a tone, and what a terminal is sent for them."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Iterator
+
+# A piece of a line: the text, and one of the tones below or '' for plain.
+Span = tuple[str, str]
+Line = tuple[Span, ...]
+
+# Colour-blind safe: bad differs from good in weight and brightness too, and in the words.
+_SGR = {'strong': '1', 'dim': '2', 'curve': '36', 'good': '32', 'warn': '33', 'bad': '1;31'}
+# One letter for one, so that a line stays as long as it was.
+_PLAIN = str.maketrans('…·●┄─−\u202f±│°', '~|@--- ~| ')
+_BLANKS = re.compile(r'[^\S\u202f]+')
+
+
+def clean(text: str) -> str:
+    """Return a text of others as it may stand on a terminal: no control characters, one line."""
+    text = _BLANKS.sub(' ', text).strip()
+    return ''.join(c if c.isprintable() or c == '\u202f' else '?' for c in text)
+
+
+def cells(text: str) -> int:
+    """Return how many places of a terminal a text takes."""
+    wide = sum(unicodedata.east_asian_width(c) in 'WF' for c in text)
+    return len(text) + wide - sum(bool(unicodedata.combining(c)) for c in text)
+
+
+def cut(text: str, width: int) -> str:
+    """Return a text, shortened to a width."""
+    if cells(text) <= width:
+        return text
+    while text and cells(text) > width - 1:
+        text = text[:-1]
+    return f'{text.rstrip()}…' if width > 0 else ''
+
+
+def wrapped(text: str, width: int, most: int) -> list[str]:
+    """Return a text in at most so many lines of a width; what is left out ends in an ellipsis."""
+    lines = ['']
+    for word in text.split(' '):
+        longer = f'{lines[-1]} {word}'.lstrip()
+        if cells(longer) <= width:
+            lines[-1] = longer
+        elif len(lines) == most:
+            lines[-1] = cut(f'{lines[-1]} {word}', width)
+            break
+        else:
+            lines.append(word)
+    return [cut(line, width) for line in lines]
+
+
+def labelled(label: str, text: str, tone: str, width: int, most: int) -> Iterator[Line]:
+    """Yield the lines of a text that hangs beside a label."""
+    space = len(label) + 2
+    for k, line in enumerate(wrapped(clean(text), max(1, width - space), most)):
+        head = f'{label}  ' if k == 0 else ' ' * space
+        yield ((head, 'strong'), (line, tone))
+
+
+def painted(line: Line, width: int, colour: bool, unicode: bool = True) -> str:
+    """Return what a terminal is sent for a line, never longer than ``width`` places."""
+    parts, left = [], width
+    for text, tone in line:
+        shown = cut(text, left)
+        left -= cells(shown)
+        if not unicode:
+            shown = _ascii(shown)
+        parts.append(f'\x1b[{_SGR[tone]}m{shown}\x1b[0m' if colour and tone else shown)
+        if left <= 0:
+            break
+    return ''.join(parts).rstrip(' ')
+
+
+def _ascii(text: str) -> str:
+    """Return a text for a terminal that knows no other letters, no longer than it was."""
+    bare = ''.join(c for c in text.translate(_PLAIN) if not unicodedata.combining(c))
+    return bare.encode('ascii', 'replace').decode()

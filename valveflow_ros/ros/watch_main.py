@@ -1,0 +1,153 @@
+"""The executable `watch`: how a running monitor is doing, on a terminal."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import math
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+from valveflow_ros.errors import ValveflowError
+from valveflow_ros.report.terminal_board import CURVE, HEALTH
+from valveflow_ros.report.terminal_screen import Screen
+from valveflow_ros.ros.secure_start import check_security
+from valveflow_ros.ros.sentences import one_line, with_place
+from valveflow_ros.ros.transport import choose_transport
+from valveflow_ros.ros.watch_node import WatchNode
+
+_LOOK_S = 0.5
+# For one picture: how long a monitor may take to be found, and then to say how it is.
+_FIND_S, _HEAR_S = 5.0, 3.0
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the description of the command line."""
+    made = argparse.ArgumentParser(
+        prog='watch',
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description='Show how a running monitor is doing, drawn anew once a second: the curve '
+        "with today's\noperating point, residuals, alarms, inputs, recorder, diagnosis. Ctrl-C "
+        'ends it.\n\nexample:\n  ros2 run valveflow_ros watch --node /unit1/valveflow_monitor',
+        epilog='The same as "valveflow watch"; ROS arguments follow --ros-args.',
+    )
+    made.add_argument(
+        '--node', metavar='NAME', default='', help='which monitor, if there are several'
+    )
+    made.add_argument('--once', action='store_true', help='print one picture, then stop')
+    made.add_argument(
+        '--interval', type=_seconds, default=1.0, metavar='S',
+        help='seconds between two pictures (default: 1)',
+    )  # fmt: skip
+    made.add_argument(
+        '--json', action='store_true', help='with --once: print the picture as JSON, for programs'
+    )
+    return made
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not 0.1 <= value <= 3600.0:
+        raise argparse.ArgumentTypeError(f'must be from 0.1 to 3600 s, not {text}')
+    return value
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Watch until it is asked to end; return the exit status."""
+    arguments = list(sys.argv if args is None else ['watch', *args])
+    made = parser()
+    options = made.parse_args(remove_ros_args(arguments)[1:])
+    if options.json and not options.once:
+        made.error('--json goes with --once: one picture is one object')
+    try:
+        choose_transport()
+        check_security(arguments)
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    except ValveflowError as error:
+        return _complain(str(error))
+    except KeyboardInterrupt:
+        return 0
+    except Exception as error:  # noqa: BLE001 - rclpy raises what its C++ gave it
+        return _complain(f'ROS could not be started: {one_line(error)}')
+    try:
+        return _run(options)
+    except KeyboardInterrupt:
+        # How one stops looking.
+        return 0
+    except BrokenPipeError:
+        # Whoever read the output has gone.
+        sys.stdout = None  # type: ignore[assignment]
+        return 0
+    except Exception as error:  # noqa: BLE001 - a person is owed a sentence, not a trace
+        return _complain(f'failed unexpectedly: {with_place(error)}')
+    finally:
+        rclpy.try_shutdown()
+
+
+def _run(options: argparse.Namespace) -> int:
+    node = WatchNode(options.node)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        if options.once:
+            return _once(node, executor, options.json)
+        with Screen(sys.stdout) as screen:
+            while True:
+                _listen(node, executor, options.interval)
+                screen.show(node.frame())
+    finally:
+        executor.shutdown(timeout_sec=0.5)
+        node.destroy_node()
+
+
+def _listen(node: WatchNode, executor: SingleThreadedExecutor, seconds: float) -> None:
+    """Take what comes for a while."""
+    end_s = time.monotonic() + seconds
+    node.look()
+    while (left_s := end_s - time.monotonic()) > 0.0:
+        executor.spin_once(timeout_sec=min(left_s, _LOOK_S))
+
+
+def _once(node: WatchNode, executor: SingleThreadedExecutor, as_json: bool) -> int:
+    begun_s = time.monotonic()
+    while not node.monitor and time.monotonic() - begun_s < _FIND_S:
+        _listen(node, executor, 0.1)
+    if not node.monitor:
+        return _complain(node.frame().note)
+    found_s = time.monotonic()
+    # The health comes once a second, and what is latched at once.
+    while not {CURVE, HEALTH} <= node.heard and time.monotonic() - found_s < _HEAR_S:
+        _listen(node, executor, 0.1)
+    frame = node.frame()
+    if as_json:
+        content = _finite(dataclasses.asdict(frame))
+        print(json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False))
+    else:
+        print(Screen(sys.stdout).text(frame), flush=True)
+    return 0
+
+
+def _finite(value: Any) -> Any:
+    """Replace what JSON does not know."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _complain(sentence: str) -> int:
+    print(f'valveflow watch: {sentence}', file=sys.stderr)
+    return 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())
