@@ -70,6 +70,14 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope='session')
+def identified(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the characteristic.json of the simulated log."""
+    folder = tmp_path_factory.mktemp('identified')
+    assert main(['identify', str(logs / 'plant.csv'), '-o', str(folder), '--quiet']) == 0
+    return folder / 'characteristic.json'
+
+
+@pytest.fixture(scope='session')
 def shared_data() -> Path:
     """Return the folder of measured data that are not part of the project."""
     place = os.environ.get('VALVEFLOW_SHARED_DATA')

@@ -86,7 +86,7 @@ def test_output_cut_off_by_a_reader_is_no_error():
 
 
 @pytest.fixture
-def breaks(run, monkeypatch):
+def breaks(run, monkeypatch, tmp_path):
     """Let a verb raise something; return what the command made of it."""
 
     def command(error):
@@ -94,7 +94,8 @@ def breaks(run, monkeypatch):
             raise error
 
         monkeypatch.setattr(info, 'run', fail)
-        return run('info', 'x.mcap')
+        (tmp_path / 'x.mcap').touch()
+        return run('info', tmp_path / 'x.mcap')
 
     return command
 
@@ -119,6 +120,40 @@ def test_errors_raised_on_purpose_and_by_the_system(breaks):
     full = OSError(28, 'No space left on device', 'x.mcap')
     assert breaks(full).refused() == 'valveflow: x.mcap: no space left on device.'
     assert 'memory' in breaks(MemoryError()).refused()
+
+
+def test_a_misspelt_option_is_told_before_anything_that_is_missing(run):
+    sentence = run('validate', '--modell', 'x.json').refused(2)
+    assert "There is no option '--modell'. Did you mean '--model'?" in sentence
+    assert 'There is no option' in run('info', 'x.mcap', '--xyz=1').refused(2)
+
+
+def test_a_file_that_is_not_there_is_told_before_anything_is_loaded(tmp_path):
+    words = [
+        ['identify', 'nothing.mcap', '-o', 'o'],
+        ['identify', 'log.mcap', '-o', 'log.mcap/o'],
+        ['identify', 'log.mcap', '-o', 'o', '--reference', 'nothing.json'],
+        ['validate', 'log.mcap', '-o', 'o', '--model', 'nothing.json'],
+        ['compare', 'log.mcap', '-o', 'o', '--test', 'nothing.mcap'],
+        ['simulate', '-o', 'x.mcap', '--truth', 'nowhere/truth.json'],
+    ]
+    (tmp_path / 'log.mcap').write_bytes(b'x')
+    code = (
+        'import sys\nfrom valveflow_ros.cli.main import main\n'
+        f'print([main(w) for w in {words!r}], file=sys.stderr)\n'
+        'print(*sys.modules, file=sys.stderr)'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    *said, statuses, modules = done.stderr.splitlines()
+    assert statuses == str([1] * len(words))
+    assert len(said) == len(words)
+    named = ['nothing.mcap', 'log.mcap', 'nothing.json', 'nothing.json', 'nothing.mcap', 'nowhere']
+    for line, name in zip(said, named, strict=True):
+        assert name in line
+    assert not HEAVY & set(modules.split())
+    assert [p.name for p in tmp_path.iterdir()] == ['log.mcap']
 
 
 def test_interrupt_is_status_130(breaks):

@@ -29,12 +29,12 @@ DONE = TransitionCallbackReturn.SUCCESS
 class Stage:
     """A monitor that does nothing by itself, and somebody who talks to it."""
 
-    def __init__(self, context: Any, folder: Path) -> None:
-        overrides = [
-            Parameter('record_directory', value=str(folder)),
-            Parameter('diagnostics_period', value=0.1),
-            Parameter('unit_tag', value='HV 101/2'),
-        ]
+    def __init__(self, context: Any, folder: Path, **more: object) -> None:
+        given = {
+            'record_directory': str(folder), 'diagnostics_period': 0.1, 'unit_tag': 'HV 101/2',
+            **more,
+        }  # fmt: skip
+        overrides = [Parameter(name, value=value) for name, value in given.items()]
         self.monitor = MonitorNode(context=context, parameter_overrides=overrides)
         self.other = Node('other', context=context)
         self.executor = SingleThreadedExecutor(context=context)
@@ -68,7 +68,8 @@ class Stage:
 
 
 def test_the_whole_life(context: Any, tmp_path: Path) -> None:
-    stage = Stage(context, tmp_path)
+    # Each life by itself: with a state the second would go on with the first one's recording.
+    stage = Stage(context, tmp_path, keep_state=False)
     monitor = stage.monitor
     try:
         assert stage.sentence('fit') == 'The monitor is not configured.'

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import math
 import os
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TextIO
 
-_BAR = 24
-_REDRAW_S = 0.1
+from valveflow_ros.cli.pace import pace_of
+from valveflow_ros.report.terminal_progress import Progress
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,19 +39,20 @@ class Console:
         Print the result as JSON.
     quiet : bool
         Say nothing but warnings and the result.
+    verb : str
+        Whose work it is.
     """
 
     def __init__(
-        self, out: TextIO, err: TextIO, *, as_json: bool = False, quiet: bool = False
-    ) -> None:
+        self, out: TextIO, err: TextIO, *, as_json: bool = False, quiet: bool = False,
+        verb: str = '',
+    ) -> None:  # fmt: skip
         self._out = out
         self._err = err
         self._as_json = as_json
         self._quiet = quiet
-        self._bar = not quiet and err.isatty() and os.environ.get('TERM') != 'dumb'
-        self._shown = False
-        self._last_s = -math.inf
-        self._last_what = ''
+        bar = err.isatty() and os.environ.get('TERM') != 'dumb'
+        self._progress = Progress(err, bar, pace_of(verb).share)
 
     def say(self, sentence: str) -> None:
         """Tell something that is good to know."""
@@ -65,30 +65,24 @@ class Console:
 
     def fail(self, sentence: str) -> None:
         """Tell why it could not be done."""
+        self._progress.end()
         self._write(f'valveflow: {sentence}')
 
     def progress(self, share: float, what: str) -> None:
-        """Show how far a long piece of work has come; only on a terminal."""
-        now = time.monotonic()
-        if not self._bar or (what == self._last_what and now - self._last_s < _REDRAW_S):
-            return
-        self._last_s, self._last_what = now, what
-        full = round(_BAR * min(max(share, 0.0), 1.0))
-        bar = '█' * full + '░' * (_BAR - full)
-        self._err.write(f'\r\x1b[K{bar} {100.0 * share:3.0f} %  {what}')
-        self._err.flush()
-        self._shown = True
+        """Show how far a long piece of work has come: what is done now, and the time it takes.
+
+        A bar on a terminal; anywhere else a line now and then, once it takes long.
+        """
+        if not self._quiet:
+            self._progress.at(share, what)
 
     def clear(self) -> None:
         """Take the progress bar away."""
-        if self._shown:
-            self._err.write('\r\x1b[K')
-            self._err.flush()
-            self._shown = False
+        self._progress.clear()
 
     def finish(self, outcome: Outcome) -> None:
         """Print the result."""
-        self.clear()
+        self._progress.end()
         if self._as_json:
             text = json.dumps(_finite(outcome.data), indent=2, allow_nan=False, ensure_ascii=False)
             self._out.write(text + '\n')
@@ -97,9 +91,7 @@ class Console:
         self._out.flush()
 
     def _write(self, line: str) -> None:
-        self.clear()
-        self._err.write(line + '\n')
-        self._err.flush()
+        self._progress.write(line)
 
 
 def _finite(value: Any) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -34,7 +34,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         draft.unlink(missing_ok=True)
 
 
-def write_texts(folder: Path, texts: dict[str, str]) -> dict[str, Path]:
+def write_texts(folder: Path, texts: Mapping[str, str | bytes]) -> dict[str, Path]:
     """Write files of a folder, made if absent: all of them, or none is replaced.
 
     Raises
@@ -49,7 +49,7 @@ def write_texts(folder: Path, texts: dict[str, str]) -> dict[str, Path]:
     drafts = {name: folder / f'.{name}.{os.getpid()}.draft' for name in texts}
     try:
         for name, text in texts.items():
-            drafts[name].write_text(text, encoding='utf-8')
+            drafts[name].write_bytes(text if isinstance(text, bytes) else text.encode())
         for name, draft in drafts.items():
             os.replace(draft, folder / name)
     except OSError as error:

@@ -9,11 +9,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from valveflow_ros.cli.console import Console
+from valveflow_ros.cli.early import check_paths
+from valveflow_ros.cli.stopping import Stop
 from valveflow_ros.cli.usage import Parser, UsageError, add_common
 from valveflow_ros.cli.verbs import load, overview
 from valveflow_ros.errors import ValveflowError
 
-DONE, NOT_DONE, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
+DONE, NOT_DONE, WRONG_USAGE = 0, 1, 2
+# As a shell tells of a process that a signal has ended: 130 after Ctrl-C.
+_SIGNALLED = 128
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -27,10 +31,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0 done, 1 could not be done, 2 wrong usage, 130 interrupted.
+        0 done, 1 could not be done, 2 wrong usage, 130 stopped by Ctrl-C, 143 by the system.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    console = Console(sys.stdout, sys.stderr, as_json='--json' in words, quiet='--quiet' in words)
+    console = Console(
+        sys.stdout, sys.stderr, as_json='--json' in words, quiet='--quiet' in words,
+        verb=words[0] if words else '',
+    )  # fmt: skip
+    with Stop().listening() as stop:
+        return _guarded(words, console, stop)
+
+
+def _guarded(words: list[str], console: Console, stop: Stop) -> int:
     try:
         return _command(words, console)
     except UsageError as error:
@@ -41,17 +53,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _show_traceback()
         console.fail(str(error))
     except KeyboardInterrupt:
-        console.fail('stopped; nothing was left half-written.')
-        return INTERRUPTED
+        return _stopped(console, stop)
     except BrokenPipeError:
         # Whoever read the output has gone; there is nobody to tell.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except MemoryError:
         console.fail('There is not enough memory for this log; use a shorter part of it.')
     except Exception as error:  # noqa: BLE001 - the last line: a person gets a sentence
+        if stop.number:
+            # Libraries that were interrupted while they load raise errors of their own.
+            return _stopped(console, stop)
         _show_traceback()
         console.fail(_sentence(error))
     return NOT_DONE
+
+
+def _stopped(console: Console, stop: Stop) -> int:
+    console.fail('stopped; nothing was left half-written.')
+    return _SIGNALLED + (stop.number or 2)
 
 
 def _command(words: list[str], console: Console) -> int:
@@ -73,6 +92,7 @@ def _command(words: list[str], console: Console) -> int:
         options = parser.parse_args(words[1:])
     except SystemExit as done:  # --help was asked for
         return int(done.code or DONE)
+    check_paths(words[0], parser, options)
     console.finish(verb.run(options, console))
     return DONE
 

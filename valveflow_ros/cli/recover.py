@@ -33,8 +33,11 @@ def run(options: Namespace, console: Console) -> Outcome:
     from valveflow_ros.report.numbers import count, counted
 
     check_output(options.output, ('.mcap',), source=options.broken)
-    console.progress(0.2, 'recovering')
-    report = recover(options.broken, options.output)
+    console.progress(0.0, 'recovering')
+    report = recover(
+        options.broken, options.output,
+        progress=lambda done, total: console.progress(done / max(total, 1), 'recovering'),
+    )  # fmt: skip
     for sentence in report.warnings:
         console.warn(sentence)
     lost = (

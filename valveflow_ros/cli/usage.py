@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 from argparse import ArgumentParser, RawDescriptionHelpFormatter
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from valveflow_ros.errors import InputError
 
@@ -18,8 +19,26 @@ class Parser(ArgumentParser):
     def __init__(self, prog: str) -> None:
         super().__init__(prog=prog, formatter_class=_Formatter, allow_abbrev=False)
 
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse; an option that does not exist is told before anything that is missing."""
+        for word in [] if args is None else list(args):
+            if word == '--':
+                break
+            name = word.partition('=')[0]
+            if name.startswith('--') and name not in self._option_string_actions:
+                known = [o for o in self._option_string_actions if o.startswith('--')]
+                near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+                hint = f" Did you mean '{near[0]}'?" if near else ''
+                raise UsageError(f"There is no option '{name}'.{hint}")
+        return super().parse_args(args, namespace)
+
     def error(self, message: str) -> NoReturn:
         """Refuse what argparse found wrong, as a sentence."""
+        missing = message.removeprefix('the following arguments are required: ')
+        if missing != message:
+            *most, last = missing.split(', ')
+            text = f'Something is missing: {", ".join(most)}{" and " if most else ""}{last}.'
+            raise UsageError(text)
         text = message[:1].upper() + message[1:]
         raise UsageError(text if text.endswith('.') else f'{text}.')
 

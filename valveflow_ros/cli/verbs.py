@@ -22,6 +22,9 @@ VERBS: tuple[tuple[str, str, str], ...] = (
     ('compensate', 'compensate', 'the inverse curve as a table for the turbine controller'),
     ('export', 'export', 'a log becomes a table'),
     ('recover', 'recover', 'repair a broken recording'),
+    ('config', 'config_verb', 'a parameter file for the monitor, fitted to a log'),
+    ('watch', 'watch', 'look on while a monitor works'),
+    ('completion', 'completion', 'let the shell finish what you type'),
 )
 
 OVERVIEW = """\
@@ -34,7 +37,7 @@ Try it:
   valveflow identify plant.mcap -o result
 and open result/report.html.
 
-A log is an .mcap file, a rosbag2 folder, a .csv or a .parquet table.
+A log is an .mcap file, a rosbag2 folder, or a table: .csv, .xlsx or .parquet.
 "valveflow VERB --help" tells more about a verb, "valveflow --version" which version this is.
 """
 
@@ -51,7 +54,7 @@ class Verb(Protocol):
 
 def overview() -> str:
     """Return what ``valveflow`` says without a verb."""
-    lines = [f'  valveflow {name:<10} {about}' for name, _, about in VERBS]
+    lines = [f'  valveflow {name:<11} {about}' for name, _, about in VERBS]
     return OVERVIEW.format(verbs='\n'.join(lines))
 
 

@@ -19,6 +19,7 @@ from valveflow_msgs.msg import Alarm, FlowCharacteristic
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.plant.simulator import DEFAULT_START_NS
 from valveflow_ros.plant.unit import UnitDescription
+from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.ros.conversions import from_time
 from valveflow_ros.ros.demo_processes import Process, ros_arguments
 from valveflow_ros.ros.demo_watch import Watch
@@ -104,7 +105,7 @@ class Demo:
             f'Hidden in it: from {_FAULT_FROM * o.days:.2g} days on one of the valves gives up to '
             f'{-_FAULT_MW:g} MW less. The monitor is not told.'
         )
-        tell('Starting the monitor; compiling for the first time takes a minute or two.')
+        tell(f'Starting the monitor. {SENTENCE}' if is_first_run() else 'Starting the monitor.')
 
     def _start(self) -> tuple[Process, Process]:
         o = self._options

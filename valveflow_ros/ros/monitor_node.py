@@ -15,9 +15,11 @@ from std_srvs.srv import Trigger
 
 from valveflow_ros.config import Settings
 from valveflow_ros.errors import ParameterError, ValveflowError
+from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.ros import declare
 from valveflow_ros.ros.diagnostics import Changes, Item, Level, array
 from valveflow_ros.ros.encoding import encode
+from valveflow_ros.ros.record_place import check_record_place
 from valveflow_ros.ros.sentences import with_place
 from valveflow_ros.ros.session import DIAGNOSTICS, Session
 
@@ -109,7 +111,13 @@ class MonitorNode(LifecycleNode):
         """Start the fit process, compile, open the recording."""
         del state
         log = self.get_logger()
-        log.info('Loading and compiling the engine; the first time this takes a minute.')
+        try:
+            check_record_place(self.settings)
+        except ValveflowError as error:
+            # Known before the long work, for whoever watches the start; the unit is watched all
+            # the same.
+            log.warning(str(error))
+        log.info(SENTENCE if is_first_run() else 'Loading the engine.')
         self.session = session = Session(self, self.settings, self._stop, self._log)
         log.info(f'Ready after {session.warm_up_s:.1f} s of loading and compiling.')
         if session.recording.problem:

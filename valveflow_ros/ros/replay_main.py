@@ -23,12 +23,20 @@ from valveflow_ros.ros.stops import StopFlag
 from valveflow_ros.ros.transport import choose_transport
 from valveflow_ros.ros.verify import verify
 
+# As a shell tells of a process that Ctrl-C has ended.
+_STOPPED = 130
+
 
 def parser() -> argparse.ArgumentParser:
     """Return the description of the command line."""
     made = argparse.ArgumentParser(
         prog='replay',
-        description='Publish a log on the input topics, with /clock, or verify a recording.',
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description='Publish a log on the input topics, with /clock, as a gateway would, or '
+        'verify that a\nrecording of the monitor gives the same again. Ctrl-C ends it.\n\n'
+        'example:\n  ros2 run valveflow_ros replay plant.mcap --rate 600\n\n'
+        'and for a recording of the monitor:\n'
+        '  ros2 run valveflow_ros replay valveflow_recordings/valveflow_... --verify',
         epilog='ROS arguments (remaps, namespace) follow --ros-args.',
     )
     made.add_argument('log', metavar='LOG', help='.mcap, rosbag2 folder, .csv or .parquet')
@@ -75,7 +83,8 @@ def main(args: Sequence[str] | None = None) -> int:
     except ValveflowError as error:
         print(f'valveflow replay: {error}', file=sys.stderr)
     except KeyboardInterrupt:
-        print('valveflow replay: interrupted.', file=sys.stderr)
+        print('valveflow replay: stopped.', file=sys.stderr)
+        return _STOPPED
     except Exception as error:  # noqa: BLE001 - a person is owed a sentence, not a trace
         print(f'valveflow replay: failed unexpectedly: {with_place(error)}', file=sys.stderr)
     return 1

@@ -33,7 +33,7 @@ from valveflow_ros.ros.worker import DiagnosisWorker
 # Small, so that what is said before a decision that cannot be repeated is compared first.
 _BLOCK = 500
 _LOOK_S = 0.05
-Progress = Callable[[int], None]
+Progress = Callable[[float], None]
 
 
 @dataclass(slots=True)
@@ -76,7 +76,7 @@ def verify(path: str | Path, progress: Progress = lambda _: None) -> Verificatio
     path : str or Path
         A recording of the monitor.
     progress : callable
-        Is told from time to time how many inputs were fed.
+        Is told from time to time which share of the inputs was fed.
 
     Raises
     ------
@@ -137,6 +137,7 @@ def _replayed(
     replayer = JournalReplayer(monitor, journal, diagnosed_elsewhere)
     aligner, decoder = Aligner(settings), Decoder(settings)
     messages = _messages(log, inputs)
+    total = sum(log.topics[topic].count for topic in inputs if topic in log.topics)
     while block := list(islice(messages, _BLOCK)):
         result.inputs += len(block)
         rows = [
@@ -147,7 +148,7 @@ def _replayed(
         said = speaker.of(_fed(replayer, aligner, rows))
         yield from (output for output in said if output.name in kept)
         result.rows = monitor.rows
-        progress(result.inputs)
+        progress(result.inputs / max(1, total))
 
 
 def _corrector(log: LogContents, settings: Settings) -> Corrector | None:

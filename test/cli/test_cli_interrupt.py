@@ -1,0 +1,135 @@
+"""Ctrl-C at any moment: one sentence, its exit status, nothing half-written."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from valveflow_ros.cli import console
+from valveflow_ros.cli.verbs import VERBS
+
+SAID = 'valveflow: stopped; nothing was left half-written.\n'
+# Verbs that are done before anybody could press a key.
+AT_ONCE = {'completion', 'config'}
+TRIED = ('simulate', 'import', 'info', 'export', 'recover', 'identify', 'validate', 'compare',
+         'diagnose', 'compensate', 'watch')  # fmt: skip
+
+
+@pytest.fixture
+def stopped_at(run, monkeypatch):
+    """Run a verb and press Ctrl-C when its nth part begins, if it has so many."""
+    # What a shell starts in the background ignores Ctrl-C, and so may this process.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def command(part, number, *words):
+        seen: list[str] = []
+
+        def progress(self, share, what):
+            if what not in seen:
+                seen.append(what)
+                if len(seen) == part:
+                    os.kill(os.getpid(), number)
+
+        monkeypatch.setattr(console.Console, 'progress', progress)
+        return run(*words)
+
+    yield command
+    signal.signal(signal.SIGINT, before)
+
+
+def everything(folder):
+    return {path: path.read_bytes() for path in folder.rglob('*') if path.is_file()}
+
+
+def words_of(verb, logs, model, out):
+    csv, mcap = logs / 'plant.csv', logs / 'plant.mcap'
+    return {
+        'simulate': [verb, '-o', out / 'x.mcap', '--days', '0.1'],
+        'import': [verb, csv, '-o', out / 'x.mcap'],
+        'info': [verb, mcap],
+        'export': [verb, mcap, '-o', out / 'x.csv'],
+        'recover': [verb, mcap, '-o', out / 'x.mcap'],
+        'identify': [verb, mcap, '-o', out / 'new'],
+        'validate': [verb, mcap, '-o', out / 'new', '--model', model],
+        'compare': [verb, mcap, '-o', out / 'new'],
+        'diagnose': [verb, mcap, '-o', out / 'new'],
+    }[verb]
+
+
+def test_every_verb_that_takes_time_is_tried():
+    assert {name for name, _, _ in VERBS} - AT_ONCE <= set(TRIED)
+
+
+@pytest.mark.parametrize('verb', ['simulate', 'import', 'info', 'export', 'recover', 'validate'])
+def test_ctrl_c_in_every_part_of_a_verb(stopped_at, logs, identified, tmp_path, verb):
+    for part in range(1, 30):
+        out = tmp_path / str(part)
+        out.mkdir()
+        ran = stopped_at(part, signal.SIGINT, *words_of(verb, logs, identified, out))
+        if ran.status == 0:
+            break
+        assert ran.status == 130, ran.err
+        assert ran.err.endswith(SAID)
+        assert 'Traceback' not in ran.err
+        assert everything(out) == {}
+    assert part > 1, 'the verb tells of no part of its work'
+    assert ran.status == 0
+
+
+@pytest.mark.parametrize(('verb', 'part'), [
+    ('identify', 1), ('identify', 3), ('identify', 4), ('diagnose', 3), ('compare', 2),
+])  # fmt: skip
+def test_ctrl_c_in_parts_of_long_verbs(stopped_at, logs, identified, tmp_path, verb, part):
+    ran = stopped_at(part, signal.SIGINT, *words_of(verb, logs, identified, tmp_path))
+    assert ran.status == 130, ran.err
+    assert ran.err.endswith(SAID)
+    assert everything(tmp_path) == {}
+
+
+def test_the_system_asks_to_end(stopped_at, logs, identified, tmp_path):
+    ran = stopped_at(2, signal.SIGTERM, *words_of('export', logs, identified, tmp_path))
+    assert ran.status == 143
+    assert ran.err.endswith(SAID)
+    assert everything(tmp_path) == {}
+
+
+def test_the_handlers_of_the_process_come_back(stopped_at, logs, identified, tmp_path):
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    stopped_at(1, signal.SIGINT, *words_of('info', logs, identified, tmp_path))
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_ctrl_c_at_any_moment_of_a_real_process(logs, identified, tmp_path, seed):
+    """From the first import to the last byte; pressed twice, as people do."""
+    words = [str(word) for word in words_of('identify', logs, identified, tmp_path)]
+    code = (
+        'import signal, sys\n'
+        # A shell that starts things in the background lets them ignore it.
+        'signal.signal(signal.SIGINT, signal.default_int_handler)\n'
+        'from valveflow_ros.cli import main\n'
+        'usual = main.load\n'
+        'main.load = lambda name: print("begun", flush=True) or usual(name)\n'
+        f'sys.exit(main.main({words!r}))'
+    )
+    done = subprocess.Popen(
+        [sys.executable, '-c', code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert done.stdout is not None
+    assert done.stdout.readline() == 'begun\n'
+    time.sleep(random.Random(seed).uniform(0.0, 1.5))
+    for _ in range(2):
+        done.send_signal(signal.SIGINT)
+    out, err = done.communicate(timeout=60)
+    assert 'Traceback' not in err
+    if done.returncode:
+        assert done.returncode == 130
+        assert err.endswith(SAID)
+        assert out == ''
+        assert everything(tmp_path) == {}

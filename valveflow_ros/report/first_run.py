@@ -1,0 +1,47 @@
+"""Tell whether the engine has to be compiled first, which takes a while, once."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+SENTENCE = 'The engine is compiled for this machine now, once; that takes about a minute.'
+_ENGINE = 'valveflow_ros.core.'
+
+
+def is_first_run() -> bool:
+    """Tell whether most of the engine is not in numba's cache for this machine and version.
+
+    False as well where nothing is compiled or nothing can be told.
+    """
+    from valveflow_ros.core import monitor  # noqa: F401 - what is asked about must be loaded
+
+    known = [cold for dispatcher in _compiled() if (cold := _is_cold(dispatcher)) is not None]
+    return bool(known) and 2 * sum(known) > len(known)
+
+
+def _compiled() -> Iterator[Any]:
+    """Yield the compiled functions of the engine's modules that are loaded."""
+    for name, module in list(sys.modules.items()):
+        if name.startswith(_ENGINE):
+            yield from (
+                found
+                for found in vars(module).values()
+                if hasattr(found, 'py_func') and getattr(found, '__module__', '') == name
+            )
+
+
+def _is_cold(dispatcher: Any) -> bool | None:
+    """Tell whether a function is not in the cache; None if that cannot be told."""
+    if dispatcher.signatures:
+        return False
+    # numba shows no more than the folder, in which there may be older or foreign code.
+    file = getattr(getattr(dispatcher, '_cache', None), '_cache_file', None)
+    index = getattr(file, '_load_index', None)
+    if index is None:
+        return None
+    try:
+        return not index()
+    except Exception:  # noqa: BLE001 - numba raises what its pickles raise
+        return None
