@@ -1,59 +1,207 @@
-"""The page in a real browser without a head, where there is one."""
+"""The pages in a real browser without a head, where there is one: drawn, touched, printed."""
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import pytest
+from report_stories import diagnosed, history
 
-from valveflow_ros.report.identification import identification_report
+from valveflow_ros.report.diagnosis import diagnosis_page
+from valveflow_ros.report.identification import identification_page
 
-BROWSERS = ('chromium', 'chromium-browser', 'google-chrome', 'chrome')
+PHONE, DESKTOP = 390, 1280
+LEAST_PX = 14.0
 
 
-@pytest.fixture(scope='module')
-def browser():
-    found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
-    if found is None:
-        pytest.skip(f'none of {", ".join(BROWSERS)} is installed')
+def made_pages(identified):
+    """Every kind of picture: an identification with a history, a reference, holes; a diagnosis."""
+    table = identified.table
+    values = table.values.copy()
+    values[1000:3000, 2] = float('nan')
+    data = replace(
+        identified, table=replace(table, values=values), reference=identified.characteristic,
+        history=history(),
+    )  # fmt: skip
+    return {'identify': identification_page(data), 'diagnose': diagnosis_page(diagnosed())}
+
+
+# What is asked of the page in its present look; one answer serves several tests.
+_DRAWN = """
+JSON.stringify([...document.querySelectorAll('.js-plotly-plot')].map(p => ({
+  name: p.id, width: p.querySelector('.main-svg').getBoundingClientRect().width,
+  parts: p.querySelectorAll('.trace path, .hm image, .heatmaplayer image').length,
+  y: p.data.map(t => Array.isArray(t.y) ? t.y : null)})))
+"""
+_WIDE = """
+[...document.querySelectorAll('.plot, .svg-container, table, p, figcaption, li, .legendtext, '
+  + '[class$=title] text, text[class$=title]')]
+  .filter(e => e.getBoundingClientRect().right > innerWidth + 1 && e.offsetWidth)
+  .map(e => e.id + e.tagName + e.textContent.slice(0, 40))
+"""
+_SMALL = """
+[...document.querySelectorAll('main p, main td, main th, main li, figcaption, footer, .plot text')]
+  .filter(e => e.textContent.trim() && e.getBoundingClientRect().width &&
+    parseFloat(getComputedStyle(e).fontSize) < %s)
+  .map(e => e.textContent.slice(0, 30))
+"""
+_COLOURS = """
+[getComputedStyle(document.body).backgroundColor, getComputedStyle(document.body).color,
+ getComputedStyle(document.querySelector('.xtick text')).fill]
+"""
+# Listens after the page itself does.
+_LISTEN = """
+window.addEventListener('beforeprint', () => { window.atPrint = {
+  widths: [...document.querySelectorAll('.js-plotly-plot')].map(
+    p => p.querySelector('.main-svg').getBoundingClientRect().width),
+  paper: getComputedStyle(document.body).backgroundColor,
+  folded: document.querySelectorAll('details:not([open])').length}; })
+"""
+
+
+def seen(browser, path, width, *, dark=False):
+    browser.look(width, dark=dark)
+    browser.open(path)
+    browser.settle()
+    return browser
+
+
+def met(browser):
+    """Return what the browser complained of and asked for."""
+    return [*browser.said, *browser.asked]
+
+
+def looked_at(browser, path, pdf):
+    """Open a page once in each look, and return what was seen."""
+    seen(browser, path, DESKTOP)
+    found = {
+        'drawn': json.loads(browser.ask(_DRAWN)),
+        'waiting': browser.ask("document.querySelectorAll('.waiting').length"),
+        'buttons': browser.ask(
+            "[...document.querySelectorAll('.modebar-btn')].map(b => b.dataset.title)"
+        ),
+        'light': browser.ask(_COLOURS), 'met': met(browser),
+    }  # fmt: skip
+    seen(browser, path, PHONE)
+    found |= {
+        'scroll': browser.ask('document.documentElement.scrollWidth'),
+        'wide': browser.ask(_WIDE), 'small': browser.ask(_SMALL % LEAST_PX),
+        'phone': json.loads(browser.ask(_DRAWN)), 'met_on_phone': met(browser),
+    }  # fmt: skip
+    seen(browser, path, DESKTOP, dark=True)
+    found['dark'] = browser.ask(_COLOURS)
+    browser.ask(_LISTEN)
+    pdf.write_bytes(browser.paper())
+    found |= {'printed': browser.ask('window.atPrint'), 'pdf': pdf, 'met_in_dark': met(browser)}
     return found
 
 
 @pytest.fixture(scope='module')
-def dom(browser, identified, tmp_path_factory):
-    """Return the page after its scripts ran, and what the browser said."""
-    folder = tmp_path_factory.mktemp('browser')
-    page = folder / 'report.html'
-    page.write_text(identification_report(identified), encoding='utf-8')
-    words = [
-        browser, '--headless', '--no-sandbox', '--disable-gpu', '--disable-background-networking',
-        f'--user-data-dir={folder / "profile"}', '--virtual-time-budget=20000',
-        '--enable-logging=stderr', '--dump-dom', page.as_uri(),
-    ]  # fmt: skip
-    done = subprocess.run(words, capture_output=True, text=True, timeout=180, check=True)
-    return done.stdout, done.stderr
+def pages(identified, tmp_path_factory):
+    """Return the pages by name: their content, and the file."""
+    folder = tmp_path_factory.mktemp('pages')
+    made = {}
+    for name, content in made_pages(identified).items():
+        path = folder / f'{name}.html'
+        path.write_text(content.to_html(), encoding='utf-8')
+        made[name] = content, path
+    return made
 
 
-def test_every_picture_is_drawn(dom):
-    text, _ = dom
-    assert 'data-drawn="yes"' in text
-    for name in ('curve', 'signals', 'choice', 'dynamics'):
-        assert re.search(rf'id="{name}"[^>]*class="[^"]*js-plotly-plot|class="[^"]*js-plotly-plot'
-                         rf'[^"]*"[^>]*id="{name}"', text), name  # fmt: skip
-    # u and power, each twice: steady state and slope response; the four costs and two turns.
-    assert text.count('class="trace scatter') >= 12
-    assert 'cannot be drawn' not in text.split('<script')[0]
+@pytest.fixture(scope='module', params=['identify', 'diagnose'])
+def page(request, browser, pages, tmp_path_factory):
+    """Return a page's content, and what was seen of it."""
+    content, path = pages[request.param]
+    return content, looked_at(browser, path, tmp_path_factory.mktemp('pdf') / 'page.pdf')
 
 
-def test_the_browser_has_nothing_to_complain_of(dom):
-    _, said = dom
-    assert [line for line in said.splitlines() if 'CONSOLE' in line] == []
+def test_every_picture_is_drawn_and_nothing_is_asked_for(page):
+    content, found = page
+    assert [d['name'] for d in found['drawn']] == [f.name for f in content.figures]
+    assert all(d['width'] > 600 and d['parts'] for d in found['drawn'])
+    assert found['waiting'] == 0
+    assert found['met'] == found['met_on_phone'] == found['met_in_dark'] == []
 
 
-def test_no_button_sends_the_data_anywhere(dom):
-    text, _ = dom
-    titles = set(re.findall(r'class="modebar-btn"[^>]*data-title="([^"]*)"', text))
+def test_numbers_in_the_drawn_page_are_those_of_the_pictures(page):
+    content, found = page
+    for figure, drawn in zip(content.figures, found['drawn'], strict=True):
+        given = [t.get('y') for t in json.loads(figure.to_json())['data']]
+        assert drawn['y'] == [y if isinstance(y, list) else None for y in given], figure.name
+
+
+def test_no_button_sends_the_data_anywhere(page):
+    titles = page[1]['buttons']
     assert titles
     assert not [t for t in titles if re.search(r'cloud|studio|share|link', t, re.IGNORECASE)]
+
+
+def test_a_telephone_needs_no_scrolling_to_the_side(page):
+    found = page[1]
+    assert found['scroll'] <= PHONE
+    assert found['wide'] == []
+    assert all(0.8 * PHONE < d['width'] <= PHONE for d in found['phone'])
+
+
+def test_text_on_a_telephone_can_be_read(page):
+    assert page[1]['small'] == []
+
+
+def test_light_and_dark_differ_and_can_both_be_read(page):
+    for look in ('light', 'dark'):
+        paper, ink, tick = (sum(map(int, re.findall(r'\d+', c)[:3])) for c in page[1][look])
+        assert (paper < ink) is (look == 'dark')
+        assert abs(paper - ink) > 450, 'ink stands out'
+        assert abs(paper - tick) > 450, 'so do the numbers at an axis'
+
+
+def test_paper_gets_every_picture_whole_and_light(page):
+    """Printed from a dark window: as wide as A4, white, opened, each caption there."""
+    content, found = page
+    at = found['printed']
+    assert len(at['widths']) == len(content.figures)
+    a4_px = (210 - 28) / 25.4 * 96
+    assert all(0.9 * a4_px < w <= a4_px for w in at['widths'])
+    assert at['paper'] == 'rgb(255, 255, 255)'
+    assert at['folded'] == 0
+    if (tool := shutil.which('pdftotext')) is None:
+        return
+    words = [tool, str(found['pdf']), '-']
+    printed = subprocess.run(words, capture_output=True, text=True, check=True)
+    told = ' '.join(printed.stdout.split())
+    for figure in content.figures:
+        first = re.match(r'<b>(.*?)</b>', figure.caption).group(1)
+        plain = ' '.join(re.sub(r'<[^>]+>', '', first).split())
+        assert plain in told, figure.name
+
+
+def test_a_point_tells_its_value_and_pictures_follow_the_window(browser, pages):
+    """The mouse over the breakpoint shows its number; a narrower window, a narrower picture."""
+    content, path = pages['identify']
+    seen(browser, path, DESKTOP)
+    point = next(t for t in content.figures[0].traces if t['name'].startswith('breakpoints'))
+    x, y = browser.ask(
+        "(() => { const p = document.getElementById('curve'), l = p._fullLayout;"
+        "p.scrollIntoView({block: 'center'}); const r = p.getBoundingClientRect();"
+        f'return [r.left + l.xaxis._offset + l.xaxis.d2p({point["x"][0]}),'
+        f' r.top + l.yaxis._offset + l.yaxis.d2p({point["y"][0]})]; }})()'
+    )
+    browser.hover(x - 40, y - 40)
+    browser.hover(x, y)
+    text = browser.ask(
+        'new Promise(done => { const look = () => { const h = '
+        "document.querySelector('#curve .hoverlayer .hovertext');"
+        'h ? done(h.textContent) : requestAnimationFrame(look); }; look(); })'
+    )
+    assert f'u {point["x"][0]:.0f}' in text
+    browser.look(700)
+    width = browser.ask(
+        'new Promise(done => { const look = () => { const w = document.querySelector('
+        "'.main-svg').getBoundingClientRect().width;"
+        'w < 700 ? done(w) : requestAnimationFrame(look); }; look(); })'
+    )
+    assert 500 < width < 700

@@ -12,13 +12,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from report_stories import diagnosed, history
 
 from valveflow_ros.config import Settings
 from valveflow_ros.errors import InputError
 from valveflow_ros.report import library
 from valveflow_ros.report.curve import band
+from valveflow_ros.report.diagnosis import diagnosis_page
 from valveflow_ros.report.figure import Figure, packed, rounded
-from valveflow_ros.report.identification import identification_report
+from valveflow_ros.report.identification import identification_page, identification_report
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.library import packed_plotly, read_text
 from valveflow_ros.report.quality import gaps, rejected, usable_share
@@ -77,7 +79,7 @@ def test_gain_of_one_percent_of_opening_is_slope_times_pressure(report):
 
 def test_pictures_hold_the_curve_the_segments_and_the_choice(report, identified):
     figures = figures_of(report)
-    assert list(figures) == ['curve', 'signals', 'choice', 'dynamics']
+    assert list(figures) == ['curve', 'signals', 'choice', 'dynamics', 'coverage']
     for name in figures:
         assert f'id="{name}"' in report
     curve = next(t for t in figures['curve']['data'] if t['name'] == 'flow characteristic')
@@ -258,3 +260,16 @@ def test_a_missing_library_is_one_sentence(monkeypatch, tmp_path):
             library.packed_plotly()
     finally:
         library.packed_plotly.cache_clear()
+
+
+def test_pointing_at_anything_tells_a_unit(identified):
+    unit = re.compile(r'MW|%|°C| s<|\bh<|samples|J = |\d{4}-\d\d-\d\d')
+    data = replace(identified, history=history(), reference=identified.characteristic)
+    for figure in [*identification_page(data).figures, *diagnosis_page(diagnosed()).figures]:
+        for trace in figure.traces:
+            if trace.get('hoverinfo') == 'skip':
+                continue
+            told = trace.get('hovertext') or [trace.get('hovertemplate', '')]
+            assert all(unit.search(h) or h.startswith('breakpoint') for h in told), (
+                figure.name, trace['name'],
+            )  # fmt: skip

@@ -12,6 +12,7 @@ from valveflow_ros.core.units import integrated_input
 from valveflow_ros.records import Signal
 from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.identification import identification_report
+from valveflow_ros.report.segment_figure import segments_figure
 from valveflow_ros.report.shift import shift_section
 
 
@@ -95,3 +96,21 @@ def test_a_piece_the_reference_does_not_know_is_said(judged):
     unknown = replace(data.shift.pieces[1], u_from=nan, u_to=nan, middle_mw=nan)
     shift = replace(data.shift, pieces=(data.shift.pieces[0], unknown))
     assert 'not in the reference' in shift_section(replace(data, shift=shift)).parts[1]
+
+
+def test_what_the_curve_leaves_shows_over_u_and_over_time(make):
+    data = make()
+    assert segments_figure(data) is None, 'records without means say nothing'
+    data = replace(data, segments=with_means(data))
+    figure = segments_figure(data)
+    over_u, over_time = figure.traces
+    assert over_u['y'] == over_time['y']
+    assert abs(np.mean(over_u['y'])) < 0.2
+    # One point a segment of those inside the curve's range, wherever it is drawn.
+    assert len(over_u['x']) == len(over_u['y']) <= len(data.segments)
+    lifted = tuple(
+        replace(s, power_start_mw=s.power_start_mw + 5.0, power_end_mw=s.power_end_mw + 5.0)
+        for s in data.segments
+    )
+    moved = segments_figure(replace(data, segments=lifted))
+    assert np.mean(moved.traces[0]['y']) == pytest.approx(np.mean(over_u['y']) + 5.0, abs=1e-3)

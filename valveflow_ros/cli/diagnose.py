@@ -8,6 +8,11 @@ from pathlib import Path
 from valveflow_ros.cli.console import Console, Outcome
 from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
 from valveflow_ros.cli.parameter_options import add_parameters
+from valveflow_ros.cli.report_files import (
+    add_report_files,
+    check_report_files,
+    with_report_files,
+)
 
 _DESCRIPTION = """\
 Compare the simulation (flow characteristic and regional dynamics, run on the measured opening
@@ -38,6 +43,7 @@ def arguments(parser: ArgumentParser) -> None:
         'this one; found anew without it',
     )  # fmt: skip
     add_parameters(parser)
+    add_report_files(parser)
     add_mapping(parser)
 
 
@@ -50,6 +56,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     from valveflow_ros.cli.log_input import open_input
     from valveflow_ros.cli.model_file import check_exponent
     from valveflow_ros.cli.parameters import read_parameters
+    from valveflow_ros.report.diagnosis import diagnosis_page
 
     given = read_parameters(options.params, options.pairs)
     model = read_model(options.model) if options.model else None
@@ -57,9 +64,11 @@ def run(options: Namespace, console: Console) -> Outcome:
         check_exponent(model, options.model, given)
         given = {**given, 'pressure_exponent': model.pressure_exponent}
     check_folder(options.output)
+    check_report_files(options)
     console.progress(0.02, 'reading')
     log = open_input(options.log, mapping, console)
     found = diagnosed_in(log, model, given, options.log, console)
     console.progress(0.95, 'writing the report')
-    written = write_texts(options.output, texts(found))
-    return outcome(found, written)
+    page = diagnosis_page(found.page)
+    written = write_texts(options.output, texts(found, page))
+    return with_report_files(outcome(found, written), options, page)

@@ -15,6 +15,7 @@ from valveflow_ros.cli.console import Console, Outcome
 from valveflow_ros.cli.first_run import SENTENCE, is_first_run
 from valveflow_ros.cli.log_input import LogInput, steps_of
 from valveflow_ros.cli.model_file import read_either
+from valveflow_ros.cli.monitor_history import history_in
 from valveflow_ros.cli.parameters import settings_for
 from valveflow_ros.cli.report_words import columns
 from valveflow_ros.config import Settings
@@ -31,9 +32,10 @@ from valveflow_ros.diagnosis.result import NAMED, NOTHING, UNEXPLAINED, Diagnosi
 from valveflow_ros.diagnosis.views import Views, views
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import SIGNALS, IntArray, SampleTable
-from valveflow_ros.report.diagnosis import Diagnosed, diagnosis_report
+from valveflow_ros.report.diagnosis import Diagnosed, diagnosis_page
 from valveflow_ros.report.diagnosis_words import cells
 from valveflow_ros.report.numbers import decimals
+from valveflow_ros.report.page import Page
 from valveflow_ros.report.words import held_words
 
 _VERDICTS = {
@@ -123,7 +125,9 @@ def diagnosed_in(
     found = replace(found, notes=(*log.contents.warnings, *notes, *found.notes))
     ends = int(rows.table.time_ns[0]), int(rows.table.time_ns[-1])
     return Result(
-        Diagnosed(source.name, *ends, found, signatures, answers, maps), exponent, earlier
+        Diagnosed(source.name, *ends, found, signatures, answers, maps, history_in(log.contents)),
+        exponent,
+        earlier,
     )
 
 
@@ -184,14 +188,14 @@ def _complete(table: SampleTable) -> bool:
     )
 
 
-def texts(found: Result) -> dict[str, str]:
+def texts(found: Result, report: Page | None = None) -> dict[str, str]:
     """Return the files of the result by name."""
     d, page = found.page.diagnosis, found.page
     extended = model_json(d.final, found.exponent, page.start_ns, d.reference, found.on_top_of)
     return {
         'diagnosis.json': json.dumps(to_json(d), indent=2, allow_nan=False) + '\n',
         'extended_model.json': json.dumps(extended, indent=2, allow_nan=False) + '\n',
-        'report.html': diagnosis_report(page),
+        'report.html': (report or diagnosis_page(page)).to_html(),
     }
 
 

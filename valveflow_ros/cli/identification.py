@@ -14,6 +14,7 @@ from valveflow_ros.cli.console import Console, Outcome
 from valveflow_ros.cli.first_run import SENTENCE, is_first_run
 from valveflow_ros.cli.log_input import LogInput, steps_of
 from valveflow_ros.cli.manual_test import advice_for, found_in_step_test, refusal
+from valveflow_ros.cli.monitor_history import history_in
 from valveflow_ros.cli.parameters import settings_for
 from valveflow_ros.cli.report_words import columns, rejected_words
 from valveflow_ros.config import Settings
@@ -29,7 +30,7 @@ from valveflow_ros.diagnosis.extended_model import ExtendedModel
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.answer import explained, opening_gain, temperature_words
-from valveflow_ros.report.identification import identification_report
+from valveflow_ros.report.identification import identification_page
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.numbers import (
     count,
@@ -41,6 +42,7 @@ from valveflow_ros.report.numbers import (
     plain,
     with_error,
 )
+from valveflow_ros.report.page import Page
 from valveflow_ros.report.quality import rejected
 from valveflow_ros.report.words import held_words
 
@@ -90,6 +92,7 @@ def found_in(
         source=source.name, characteristic=characteristic, table=watched.table,
         segments=watched.segments, counts=watched.counts, settings=settings,
         notes=(*log.contents.warnings, *(d.sentence for d in log.doubts), *notes),
+        history=history_in(log.contents),
     )  # fmt: skip
 
 
@@ -118,12 +121,14 @@ def judged(found: Identified, reference: Characteristic) -> Identified:
     return replace(found, shift=shift, reference=reference)
 
 
-def texts(found: Identified, extended: ExtendedModel | None = None) -> dict[str, str]:
+def texts(
+    found: Identified, extended: ExtendedModel | None = None, page: Page | None = None
+) -> dict[str, str]:
     """Return the files of the result by name; an extended model gets the new curve."""
     content = json.dumps(to_json(found.characteristic), indent=2, allow_nan=False)
     files = {
         'characteristic.json': content + '\n',
-        'report.html': identification_report(found),
+        'report.html': (page or identification_page(found)).to_html(),
     }
     if found.shift is not None:
         told = json.dumps(shift_json(found.shift), indent=2, allow_nan=False)

@@ -9,6 +9,11 @@ from typing import TYPE_CHECKING
 from valveflow_ros.cli.console import Console, Outcome
 from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
 from valveflow_ros.cli.parameter_options import add_parameters
+from valveflow_ros.cli.report_files import (
+    add_report_files,
+    check_report_files,
+    with_report_files,
+)
 from valveflow_ros.cli.usage import UsageError
 
 if TYPE_CHECKING:
@@ -56,6 +61,7 @@ def arguments(parser: ArgumentParser) -> None:
         '--step-test', action='store_true',
         help='the log is a manual test: pressure constant, the opening in steps, each held',
     )  # fmt: skip
+    add_report_files(parser)
     add_mapping(parser)
 
 
@@ -68,9 +74,11 @@ def run(options: Namespace, console: Console) -> Outcome:
     from valveflow_ros.cli.log_input import open_input
     from valveflow_ros.cli.model_file import check_exponent, read_extended, read_model
     from valveflow_ros.cli.parameters import read_parameters
+    from valveflow_ros.report.identification import identification_page
 
     given = read_parameters(options.params, options.pairs)
     check_folder(options.output)
+    check_report_files(options)
     reference = read_model(options.reference) if options.reference else None
     extended = None
     # A file of the node's parameters may name a model too.
@@ -87,5 +95,6 @@ def run(options: Namespace, console: Console) -> Outcome:
     if reference is not None:
         found = judged(found, reference)
     console.progress(0.9, 'writing the report')
-    written = write_texts(options.output, texts(found, extended))
-    return outcome(found, written, log)
+    page = identification_page(found)
+    written = write_texts(options.output, texts(found, extended, page))
+    return with_report_files(outcome(found, written, log), options, page)

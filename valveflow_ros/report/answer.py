@@ -169,7 +169,8 @@ def breakpoints_table(c: Characteristic) -> str:
             zip(c.pieces[:-1], c.breakpoint_intervals, c.values()[1:-1], strict=True)
         )
     ]
-    head = ['breakpoint', f'u ({input_unit(c.pressure_exponent)})', '95 % interval', 'power (MW)']
+    unit = input_unit(c.pressure_exponent)
+    head = ['break&shy;point', f'u ({unit})', '95 % interval', 'power (MW)']
     return table(head, rows)
 
 

@@ -53,18 +53,40 @@ def choice_figure(choice: Choice, chosen: int) -> Figure:
         choice.turning_angle, 'y2', chosen, 'turning angle',
         'J = %{x}<br>Λ = %{y:.3f}<extra></extra>',
     )  # fmt: skip
+    sure = bool(choice.confidence)
+    first, second = ([0.7, 1.0], [0.34, 0.64]) if sure else ([0.56, 1.0], [0.0, 0.44])
     layout = {
-        'xaxis': {'title': {'text': 'number of pieces J'}, 'dtick': 1, 'anchor': 'y2'},
+        'xaxis': {
+            'title': {'text': 'number of pieces J'}, 'dtick': 1, 'anchor': 'y3' if sure else 'y2',
+        },
         'yaxis': {
-            'domain': [0.56, 1.0], 'type': 'log', 'title': {'text': 'cost Ω(J) (MW²)'},
+            'domain': first, 'type': 'log', 'title': {'text': 'cost Ω(J)<br>(MW²)'},
             **_ticks(np.array(list(choice.cost.values()))),
         },
         'yaxis2': {
-            'domain': [0.0, 0.44], 'rangemode': 'tozero', 'title': {'text': 'turning angle Λ(J)'},
+            'domain': second, 'rangemode': 'tozero', 'title': {'text': 'turning<br>angle Λ(J)'},
         },
         'hovermode': 'closest',
     }  # fmt: skip
-    return Figure('choice', _caption(choice, chosen), _description(choice, chosen), traces, layout)
+    if sure:
+        traces.append(_confidence(choice, chosen))
+        layout['yaxis3'] = {
+            'domain': [0.0, 0.28], 'rangemode': 'tozero', 'title': {'text': 'confidence<br>(%)'},
+        }  # fmt: skip
+    return Figure(
+        'choice', _caption(choice, chosen), _description(choice, chosen), traces, layout,
+        height=560 if sure else 420,
+    )  # fmt: skip
+
+
+def _confidence(choice: Choice, chosen: int) -> Spec:
+    j = sorted(choice.confidence)
+    return {
+        'type': 'bar', 'name': 'confidence', 'yaxis': 'y3', 'showlegend': False, 'x': j,
+        'y': [100.0 * choice.confidence[k] for k in j],
+        'marker': {'color': [token('chosen') if k == chosen else token('data') for k in j]},
+        'hovertemplate': 'J = %{x}<br>%{y:.1f} %<extra></extra>',
+    }  # fmt: skip
 
 
 def confidence_table(choice: Choice) -> str:
@@ -126,6 +148,8 @@ def _caption(choice: Choice, chosen: int) -> str:
         kept = _KEPT.get(choice.rule, 'another number was kept')
         words += f'It turns most sharply at J = {sharpest}; {kept}. '
     words += f'<b>Chosen: J = {chosen}.</b>'
+    if choice.confidence:
+        words += ' At the bottom, how probable each J is.'
     if choice.note:
         words += f' {escape(choice.note)}'
         words += '' if choice.note.endswith('.') else '.'

@@ -24,19 +24,25 @@ from valveflow_ros.report.comparison_words import data_words, finding_words
 from valveflow_ros.report.dynamics import dynamics_table
 from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.numbers import counted, moment, plain
-from valveflow_ros.report.page import Section, page, paragraph, table, text
+from valveflow_ros.report.page import Page, Section, paragraph, table, text
 
 
 def comparison_report(data: Compared) -> str:
     """Return ``report.html``: one self-contained page that opens without a network."""
+    return comparison_page(data).to_html()
+
+
+def comparison_page(data: Compared) -> Page:
+    """Return the report: what came out and the curves first, then the evidence."""
     c = data.result.characteristic
-    lead = paragraph(text(data_words(data))) + paragraph(
+    lead = paragraph(text(data_words(data)), 'where') + paragraph(
         f'{moment(int(data.learnt.time_ns[0]))} to {moment(int(data.learnt.time_ns[-1]))}, and '
-        f'{moment(int(data.judged.time_ns[0]))} to {moment(int(data.judged.time_ns[-1]))}'
+        f'{moment(int(data.judged.time_ns[0]))} to {moment(int(data.judged.time_ns[-1]))}',
+        'where',
     )
     sections = [
         _finding(data),
-        Section('The curves', [parameters_table(data), curves_figure(data)]),
+        Section('The curves', [parameters_table(data)]),
         *_truth(data),
         _other_days(data),
         _dynamics(data),
@@ -50,7 +56,7 @@ def comparison_report(data: Compared) -> str:
         f'Made by valveflow {text(__version__)}. Curve <code>{text(c.model_id)}</code>; the same '
         'numbers, unrounded, stand in comparison.json and the tables beside this page.'
     )
-    return page('Three methods compared', lead, sections, foot)
+    return Page('Three methods compared', lead, sections, foot)
 
 
 def _finding(data: Compared) -> Section:
@@ -59,6 +65,7 @@ def _finding(data: Compared) -> Section:
         'What came out',
         [
             paragraph(text(first), 'answer'),
+            curves_figure(data),
             *(paragraph(text(sentence)) for sentence in rest),
             pairs_table(data.result.pairs),
         ],

@@ -10,7 +10,7 @@ from valveflow_ros.report.comparison_csv import curves_of
 from valveflow_ros.report.comparison_data import LABELS, METHODS, Compared
 from valveflow_ros.report.downsample import thin
 from valveflow_ros.report.figure import Figure, Spec, rounded, token
-from valveflow_ros.report.words import input_title
+from valveflow_ros.report.words import input_axis
 
 _DOTS = 5000
 # Colour, dash and width of each method's line, everywhere on the page.
@@ -76,7 +76,7 @@ def _curves(data: Compared, axis: str = 'y') -> list[Spec]:
 def curves_figure(data: Compared) -> Figure:
     """Return the curves over the special samples they are judged by (Fig. 7)."""
     layout = {
-        'xaxis': {'title': {'text': input_title(data.result.characteristic.pressure_exponent)}},
+        'xaxis': {'title': input_axis(data.result.characteristic.pressure_exponent)},
         'yaxis': {'title': {'text': 'generated power (MW)'}},
         'showlegend': True,
     }
@@ -104,7 +104,7 @@ def truth_figure(data: Compared) -> Figure:
             )  # fmt: skip
     layout = {
         'xaxis': {
-            'title': {'text': input_title(data.result.characteristic.pressure_exponent)},
+            'title': input_axis(data.result.characteristic.pressure_exponent),
             'anchor': 'y2',
         },
         'yaxis': {'domain': [0.44, 1.0], 'title': {'text': 'power (MW)'}},

@@ -155,8 +155,9 @@ def validation_report(data: Validated) -> str:
     """Return ``report.html``: one self-contained page that opens without a network."""
     v = data.result
     first, *rest = verdict_words(data)
-    lead = paragraph(text(f'{data.model}, held against {data.source}')) + paragraph(
-        f'{moment(int(data.contents.time_ns[0]))} to {moment(int(data.contents.time_ns[-1]))}'
+    lead = paragraph(text(f'{data.model}, held against {data.source}'), 'where') + paragraph(
+        f'{moment(int(data.contents.time_ns[0]))} to {moment(int(data.contents.time_ns[-1]))}',
+        'where',
     )
     sections = [
         Section(
@@ -165,10 +166,11 @@ def validation_report(data: Validated) -> str:
                 paragraph(text(first), 'answer'),
                 *(_told(sentence, v) for sentence in rest),
                 notice(text(data.held)) if data.held else '',
+                input_figure(v),
                 pieces_table(v),
             ],
         ),
-        Section('Where it differs', [input_figure(v), time_figure(v)]),
+        Section('When it differs', [time_figure(v)]),
         Section('Predictions', [totals_table(v), segments_table(v)]),
     ]
     if data.notes:

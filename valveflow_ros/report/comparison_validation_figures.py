@@ -10,7 +10,7 @@ from valveflow_ros.compare.validation import Validation
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.report.figure import Figure, Spec, packed, rounded, token
 from valveflow_ros.report.numbers import plain
-from valveflow_ros.report.words import input_title
+from valveflow_ros.report.words import input_axis
 
 
 def _markers(v: Validation, by_time: bool) -> list[Spec]:
@@ -61,7 +61,7 @@ def input_figure(v: Validation) -> Figure:
         },
     ]  # fmt: skip
     layout = {
-        'xaxis': {'title': {'text': input_title(v.characteristic.pressure_exponent)}},
+        'xaxis': {'title': input_axis(v.characteristic.pressure_exponent)},
         'yaxis': {'title': {'text': 'measured − predicted (MW)'}},
         'shapes': _tolerance(v), 'showlegend': True,
     }  # fmt: skip

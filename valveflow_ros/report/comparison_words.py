@@ -20,23 +20,48 @@ _TERMS = {
     Terms.ALL_ROWS: 'Simulation against simulation, over all rows,',
 }
 
+_HEADLINE = {
+    Outcome.BETTER: 'better than', Outcome.WORSE: 'worse than',
+    Outcome.OPEN: 'and cannot be told apart from',
+}  # fmt: skip
+_ABOUT = {
+    Terms.ALL_ROWS: 'simulates the power of all rows',
+    Terms.DYNAMIC: 'simulates the power of special segments',
+    Terms.STATIC: 'predicts the power of steady-state segments',
+    Terms.AS_PAPER: 'predicts the power of special segments',
+}
+
 
 def finding_words(data: Compared) -> list[str]:
     """Return what the run says of the paper's finding, and what holds on equal terms."""
     r = data.result
-    told = [
+    told = [_headline(r.pairs)] if r.pairs else []
+    told += [words for terms in _TERMS if (words := _on_terms(terms, r.pairs))]
+    told += [
         "The paper finds that a curve from special segments predicts other days' special segments "
         'better than the simulations of a Hammerstein and of a sparse model. '
         + _FINDING[finding_of(r.pairs)]
         + _as_paper(data)
     ]
-    told += [words for terms in _TERMS if (words := _on_terms(terms, r.pairs))]
     if r.failure:
         told.append(r.failure + ' So it is missing here.')
     if r.errors:
         told.append(_truth(data))
     told.append(_samples(data))
     return told
+
+
+def _headline(pairs: tuple[Pair, ...]) -> str:
+    """Say who predicts better, like against like, on the most that was judged."""
+    terms = next(t for t in (Terms.ALL_ROWS, Terms.DYNAMIC, Terms.STATIC, Terms.AS_PAPER)
+                 if _of(t, pairs))  # fmt: skip
+    met = _of(terms, pairs)
+    parts = [
+        f'{words} {" and ".join(names)}'
+        for outcome, words in _HEADLINE.items()
+        if (names := [LABELS[p.baseline] for p in met if p.outcome is outcome])
+    ]
+    return f'On data that no method had seen, valveflow {_ABOUT[terms]} {"; ".join(parts)}.'
 
 
 def _of(terms: Terms, pairs: tuple[Pair, ...]) -> list[Pair]:
@@ -60,8 +85,13 @@ def _against(pair: Pair) -> str:
     said = f'{LABELS[pair.baseline]} has {_mse(pair.mse_theirs_mw2)}'
     if pair.failed:
         said = f'{said}, and gives no finite answer in {counted(pair.failed, "segment")}'
-        return f'{said} ({_tested(pair)})' if math.isfinite(pair.test.p_value) else said
+        return f'{said} (over the others {_tested(pair)})' if _is_tested(pair) else said
     return f'{said} ({_tested(pair)})'
+
+
+def _is_tested(pair: Pair) -> bool:
+    """Tell whether what is left without the failures says something of its own."""
+    return math.isfinite(pair.test.p_value) and pair.test.zero_is_rejected()
 
 
 def _mse(value: float) -> str:

@@ -12,11 +12,13 @@ from valveflow_ros.report.downsample import Density, density
 from valveflow_ros.report.figure import Figure, Spec, rounded, token
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.numbers import plain
-from valveflow_ros.report.words import input_title
+from valveflow_ros.report.words import input_axis
 
 _Z95 = 1.959963984540054
 _SHADES = 5
 _COLUMNS, _ROWS = 150, 100
+_DAY_NS = 86400 * 10**9
+_LONGER = 1.5  # of a log in days, for its last day to be worth marking
 
 
 def band(piece: Piece, u_samples: FloatArray, u: FloatArray) -> FloatArray:
@@ -112,6 +114,57 @@ def _breakpoints(data: Identified) -> Spec:
     }  # fmt: skip
 
 
+def last_range(data: Identified) -> tuple[float, float] | None:
+    """Return between which u the unit ran in the last day of the log, but for 1 % of the time.
+
+    None where the log is hardly longer than that, or u is not known then.
+    """
+    time_ns = data.table.time_ns
+    if not len(time_ns) or time_ns[-1] - time_ns[0] < _LONGER * _DAY_NS:
+        return None
+    u = data.u[np.searchsorted(time_ns, time_ns[-1] - _DAY_NS) :]
+    u = u[np.isfinite(u)]
+    if not len(u):
+        return None
+    low, high = np.quantile(u, (0.005, 0.995))
+    return float(low), float(high)
+
+
+def _last_day(data: Identified) -> Spec:
+    """Return the marks of the last day's range, as part of the layout."""
+    span = last_range(data)
+    if span is None:
+        return {}
+    return {
+        'shapes': [
+            {
+                'type': 'rect', 'layer': 'below', 'yref': 'paper', 'y0': 0, 'y1': 1,
+                'x0': span[0], 'x1': span[1], 'fillcolor': token('today'), 'line': {'width': 0},
+            }
+        ],
+        'annotations': [
+            {
+                'text': 'last day', 'showarrow': False, 'x': span[1], 'xanchor': 'right',
+                'yref': 'paper', 'y': 0.01, 'yanchor': 'bottom', 'font': {'color': token('muted')},
+            }
+        ],
+    }  # fmt: skip
+
+
+def _reference(data: Identified) -> list[Spec]:
+    if data.reference is None:
+        return []
+    x, y = _lines(data.reference.pieces)
+    return [
+        {
+            'type': 'scatter', 'mode': 'lines', 'name': 'reference',
+            'x': rounded(x, 7), 'y': rounded(y, 7),
+            'line': {'color': token('chosen'), 'width': 2, 'dash': 'dot'},
+            'hovertemplate': 'u %{x:.0f}<br>%{y:.1f} MW<extra>reference</extra>',
+        }
+    ]  # fmt: skip
+
+
 def curve_figure(data: Identified) -> Figure:
     """Return the picture of the characteristic."""
     c = data.characteristic
@@ -136,11 +189,13 @@ def curve_figure(data: Identified) -> Figure:
     ]  # fmt: skip
     if c.pieces == c.partition_pieces:
         del traces[-2]
+    traces[-1:-1] = _reference(data)
     if len(c.pieces) > 1:
         traces.append(_breakpoints(data))
     layout = {
-        'xaxis': {'title': {'text': input_title(c.pressure_exponent)}},
+        'xaxis': {'title': input_axis(c.pressure_exponent)},
         'yaxis': {'title': {'text': 'generated power (MW)'}},
+        **_last_day(data),
     }
     return Figure('curve', _caption(data), _description(data), traces, layout, height=500)
 
@@ -159,6 +214,13 @@ def _caption(data: Identified) -> str:
     parts.append(
         'The shaded band, often thinner than the line itself, is the 95 % range of the curve.'
     )
+    if data.reference is not None:
+        parts.append('The dotted <span class="key reference">line</span> is the reference.')
+    if (span := last_range(data)) is not None:
+        parts.append(
+            f'The tinted background is where the unit ran in the last day, u {span[0]:.0f} to '
+            f'{span[1]:.0f}.'
+        )
     if c.pieces != c.partition_pieces:
         parts.append(
             'The dashed <span class="key raw">line</span> is the exact partition before the '

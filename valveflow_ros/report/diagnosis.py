@@ -14,8 +14,10 @@ from valveflow_ros.report.diagnosis_figures import answer_figure, segments_figur
 from valveflow_ros.report.diagnosis_map import map_figure
 from valveflow_ros.report.diagnosis_words import cells, times_in_effect, variable
 from valveflow_ros.report.figure import Figure
+from valveflow_ros.report.history import history_sections
+from valveflow_ros.report.history_data import History
 from valveflow_ros.report.numbers import decimals, moment, percent, plain
-from valveflow_ros.report.page import Section, notice, page, paragraph, table, text
+from valveflow_ros.report.page import Page, Section, notice, paragraph, table, text
 
 _HOW = (
     'Means of bins with equally many minutes. A model that is right stays in the band, here and '
@@ -34,34 +36,72 @@ class Diagnosed:
     signatures: tuple[Signature, ...]
     answers: tuple[Answer, ...]
     maps: tuple[ResidualMap, ...] = ()
+    history: History | None = None
 
 
 def diagnosis_report(data: Diagnosed) -> str:
     """Return ``report.html``: one self-contained page in four steps."""
+    return diagnosis_page(data).to_html()
+
+
+def diagnosis_page(data: Diagnosed) -> Page:
+    """Return the report: the answer and its picture first, then the four steps."""
     d = data.diagnosis
     title = {
         NAMED: 'Why simulation and measurement disagree',
         NOTHING: 'Simulation and measurement agree',
     }.get(d.verdict, 'Simulation and measurement disagree')
-    lead = paragraph(text(data.source))
-    lead += paragraph(f'{moment(data.start_ns)} to {moment(data.end_ns)}')
-    lead += notice(text(d.sentence))
-    sections = [_wrong(data), _why(data), _model(d), _proof(data)]
+    lead = paragraph(text(data.source), 'where')
+    lead += paragraph(f'{moment(data.start_ns)} to {moment(data.end_ns)}', 'where')
+    ranked = sorted(data.signatures, key=lambda s: -(s.share_before / max(s.share_chance, 1e-9)))
+    sections = [
+        _answer(data, ranked), _wrong(data, ranked), _why(data), _model(d), _proof(data),
+        *history_sections(data.history),
+    ]  # fmt: skip
     foot = (
         f'Made by valveflow {text(__version__)}. The same numbers, unrounded, stand in '
         'diagnosis.json and extended_model.json beside this page.'
     )
-    return page(title, lead, sections, foot)
+    return Page(title, lead, sections, foot)
 
 
-def _wrong(data: Diagnosed) -> Section:
-    worst = sorted(data.signatures, key=lambda s: -(s.share_before / max(s.share_chance, 1e-9)))
+def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
+    """Return the verdict with its doubts, what it is worth, and the one telling picture."""
+    d = data.diagnosis
+    told = text(d.sentence)
+    parts: list[str | Figure] = [
+        paragraph(told, 'good') if d.verdict == NOTHING else notice(told),
+        *(notice(words) for words in _doubts(d)),
+        paragraph(
+            'On blocks of time that nothing was fitted to, the simulation misses the measured '
+            f'power by {decimals(d.rmse_simulation, 2)} MW, the extended model by '
+            f'{decimals(d.rmse_extended, 2)} MW; noise alone makes about '
+            f'{decimals(d.rmse_noise_floor, 2)} MW.'
+        ),
+    ]
+    if ranked:
+        parts.append(signature_figure(ranked[0], data.start_ns, _HOW))
+    return Section('The answer', parts)
+
+
+def _doubts(d: Diagnosis) -> list[str]:
+    """Return what the verdict cannot tell apart, and what would; HTML."""
+    if not d.not_told_apart:
+        return []
+    names = ' and '.join(text(n) for n in d.not_told_apart)
+    told = f'These data do not tell apart: {names}.'
+    if d.experiments:
+        told += ' What would tell them apart: ' + ' '.join(text(e) for e in d.experiments)
+    return [told]
+
+
+def _wrong(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
     rows = [
         [
             text(variable(s.variable).removeprefix('the ')), percent(s.share_before),
             percent(s.share_after), percent(s.share_chance),
         ]
-        for s in worst
+        for s in ranked
     ]  # fmt: skip
     told = paragraph(
         'The simulation (curve and regional dynamics) was run on the measured opening and '
@@ -71,7 +111,7 @@ def _wrong(data: Diagnosed) -> Section:
         told,
         table(['variable', 'simulation', 'extended model', 'by chance (99 %)'], rows),
     ]
-    parts += [signature_figure(s, data.start_ns, '' if k else _HOW) for k, s in enumerate(worst)]
+    parts += [signature_figure(s, data.start_ns) for s in ranked[1:]]
     if data.answers:
         parts.append(answer_figure(data.answers))
     parts += [map_figure(m, data.start_ns) for m in data.maps]
@@ -129,7 +169,8 @@ def _model(d: Diagnosis) -> Section:
     )
     parts: list[str | Figure] = [told]
     if rows:
-        parts.append(table(['cause', 'parameter', 'value', '95 % interval'], rows))
+        head = ['cause', 'parameter', 'value', '95 % interval']
+        parts.append(table(head, rows, sentences=True))
     return Section('3. The extended model', parts)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from valveflow_ros.diagnosis.gain import SegmentGain
 from valveflow_ros.diagnosis.signature import Answer, Signature
 from valveflow_ros.records import FloatArray
-from valveflow_ros.report.diagnosis_words import axis_title, variable
+from valveflow_ros.report.diagnosis_words import axis_title, axis_titles, points_to, variable
 from valveflow_ros.report.figure import Figure, Spec, rounded, token
 from valveflow_ros.report.numbers import plain
 from valveflow_ros.report.page import text
@@ -44,27 +44,36 @@ def _band(x: list[float | None], width: FloatArray) -> Spec:
     }  # fmt: skip
 
 
+def hover(variable_name: str) -> str:
+    """Return what a point of a mean residual says when pointed at."""
+    if variable_name == 'time':
+        return '%{x|%d %b %H:%M}<br>%{y:+.2f} MW'
+    return f'{axis_title(variable_name)}: %{{x:.4~g}}<br>%{{y:+.2f}} MW'
+
+
 def signature_figure(s: Signature, start_ns: int, how: str = '') -> Figure:
     """Return the mean residual against one variable, before and after extending.
 
     ``how`` says how such a picture is read.
     """
-    over: Spec = {'title': {'text': axis_title(s.variable)}}
+    over: Spec = {'title': axis_titles(s.variable)}
     x = rounded(s.middle, 6)
     if s.variable == 'time':
         over, x = TIME_AXIS, moments(start_ns, s.middle)
     elif s.variable == 'time of day':
         x = rounded(s.middle / 3600.0, 6)
-    name = s.variable.replace(' ', '-')
     return Figure(
-        f'residual-{name}',
-        f'<b>Measured minus simulated power against {text(variable(s.variable))}.</b> {how}',
+        f'residual-{s.variable.replace(" ", "-")}',
+        f'<b>Measured minus simulated power against {text(variable(s.variable))}.</b> '
+        f'{points_to(s.variable)} {how}',
         f'Mean residual against {variable(s.variable)}, from {plain(float(s.before.min()), 2)} to '
         f'{plain(float(s.before.max()), 2)} MW before and {plain(float(s.after.min()), 2)} to '
         f'{plain(float(s.after.max()), 2)} MW after.',
         [_band(x, s.chance),
-         _line(x, s.before, 'simulation', 'raw', 'dash'),
-         _line(x, s.after, 'extended model', 'curve')],
+         *({**_line(x, values, name, colour, dash), 'hovertemplate': hover(s.variable)}
+           for values, name, colour, dash in (
+               (s.before, 'simulation', 'raw', 'dash'),
+               (s.after, 'extended model', 'curve', 'solid')))],
         {'xaxis': over,
          'yaxis': {'title': {'text': 'mean residual (MW)'}}},
         height=300,
@@ -78,8 +87,11 @@ def answer_figure(answers: Sequence[Answer]) -> Figure:
         time_s = rounded(a.time_s, 6)
         way = f'{"opening" if a.up else "closing"}, {a.moves} moves'
         colour = 'steady' if a.up else 'slope'
-        traces.append(_line(time_s, a.before, f'simulation, {way}', colour, 'dash'))
-        traces.append(_line(time_s, a.after, f'extended model, {way}', colour))
+        for name, values, dash in (
+            ('simulation', a.before, 'dash'), ('extended model', a.after, 'solid'),
+        ):  # fmt: skip
+            line = _line(time_s, values, f'{name}, {way}', colour, dash)
+            traces.append({**line, 'hovertemplate': '%{x:.0f} s<br>%{y:+.2f} MW'})
     chance = max(a.chance for a in answers)
     return Figure(
         'fast-moves',
@@ -102,6 +114,7 @@ def segments_figure(segments: Sequence[SegmentGain]) -> Figure:
             'type': 'scatter', 'mode': 'markers', 'name': name, 'x': at,
             'y': rounded(np.array(values), 4),
             'marker': {'color': token(colour), 'size': 6, 'symbol': symbol},
+            'hovertemplate': '%{x|%d %b %H:%M}<br>%{y:.2f} MW',
         }
         for name, values, colour, symbol in (
             ('simulation', [s.rmse_before for s in segments], 'raw', 'circle-open'),

@@ -17,7 +17,7 @@ def map_figure(m: ResidualMap, start_ns: int) -> Figure:
     across, over = rounded(m.across_edges, 6), Spec()
     if m.across == 'time':
         across = moments(start_ns, m.across_edges)
-        over = {'type': 'date', 'nticks': 3, 'tickangle': 0, 'tickformat': '%b %d'}
+        over = {'type': 'date', 'nticks': 4, 'tickangle': 0, 'tickformat': '%-d'}
     largest = max(
         (float(np.nanmax(np.abs(x))) for x in (m.before, m.after) if np.isfinite(x).any()),
         default=1.0,
@@ -38,7 +38,7 @@ def map_figure(m: ResidualMap, start_ns: int) -> Figure:
             'yaxis': {'title': {'text': axis_title(m.up)}},
             # One title for both axes: side by side there is no room for two on a telephone.
             'annotations': [
-                {'text': axis_title(m.across), 'showarrow': False, 'xref': 'paper', 'x': 0.5,
+                {'text': _below(m.across), 'showarrow': False, 'xref': 'paper', 'x': 0.5,
                  'xanchor': 'center', 'yref': 'paper', 'y': 0.0, 'yshift': -56}
             ],
             'margin': {'l': 56, 'r': 12, 't': 34, 'b': 70},
@@ -48,11 +48,16 @@ def map_figure(m: ResidualMap, start_ns: int) -> Figure:
     )  # fmt: skip
 
 
+def _below(name: str) -> str:
+    return 'day of the month (UTC)' if name == 'time' else axis_title(name)
+
+
 def _half(
     cells: np.ndarray, across: list[float | None], up: np.ndarray, largest: float, axis: str
 ) -> Spec:
     return {
-        'type': 'heatmap', 'x': across, 'y': rounded(up, 4),
+        'type': 'heatmap', 'name': 'extended model' if axis else 'simulation',
+        'x': across, 'y': rounded(up, 4),
         'z': [rounded(row, 3) for row in cells], 'zmin': -largest, 'zmax': largest, 'zmid': 0.0,
         'colorscale': 'RdBu', 'showscale': axis == '2',
         'colorbar': {'title': {'text': 'MW'}}, 'xaxis': f'x{axis}', 'yaxis': f'y{axis}',

@@ -7,27 +7,62 @@ from collections.abc import Sequence
 from valveflow_ros.diagnosis.estimate import Estimate, dates, told
 from valveflow_ros.report.numbers import UNKNOWN, interval, plain
 
-# What the residual is held against: in a sentence, and at an axis.
+# What the residual is held against: in a sentence, at an axis, at a narrow one, and what a
+# line that leaves the band there points to.
 _VARIABLES = {
-    'u': ('the integrated input u', 'integrated input u (% MPa^m)'),
-    'pressure given u': ('the steam pressure given u', 'pressure above its usual at that u (MPa)'),
-    'temperature': ('the steam temperature', 'main steam temperature (°C)'),
-    'time': ('time', 'time (UTC)'),
-    'time of day': ('the time of day', 'time of day (h UTC)'),
-    'ramp': ('the ramp rate', 'change of u in 3 min (% MPa^m)'),
-    'direction': ('the direction of motion', 'last motion (−1 closing, +1 opening)'),
-}
+    'u': (
+        'the integrated input u', 'integrated input u (% MPa<sup>m</sup>)', '',
+        'A bend or a step here points to the shape of the curve.',
+    ),
+    'pressure given u': (
+        'the steam pressure given u', 'pressure above its usual at that u (MPa)',
+        'pressure above usual (MPa)',
+        'A tilt here points to the pressure exponent or to a flow that is choked.',
+    ),
+    'temperature': (
+        'the steam temperature', 'main steam temperature (°C)', 'steam temperature (°C)',
+        'A tilt here points to steam temperature or reheating.',
+    ),
+    'time': (
+        'time', 'time (UTC)', '',
+        'A step points to something that happened then, a slope to wear or drift.',
+    ),
+    'time of day': (
+        'the time of day', 'time of day (h UTC)', '',
+        'A wave here points to cooling water or ambient temperature.',
+    ),
+    'ramp': (
+        'the ramp rate', 'change of u in 3 min (% MPa<sup>m</sup>)', '',
+        'A tilt here points to lag and delay, or to a valve that is slower than its command.',
+    ),
+    'direction': (
+        'the direction of motion', 'last motion (−1 closing, +1 opening)',
+        'last motion (−1 to +1)',
+        'A difference between the two ends points to backlash or stiction.',
+    ),
+}  # fmt: skip
 _MOST_SPANS = 20
 
 
 def variable(name: str) -> str:
     """Return a variable as it stands in a sentence."""
-    return _VARIABLES.get(name, (name, name))[0]
+    return _VARIABLES[name][0] if name in _VARIABLES else name
 
 
 def axis_title(name: str) -> str:
-    """Return what stands at the axis of a variable."""
-    return _VARIABLES.get(name, (name, name))[1]
+    """Return what stands at the axis of a variable, as HTML."""
+    return _VARIABLES[name][1] if name in _VARIABLES else name
+
+
+def axis_titles(name: str) -> dict[str, str]:
+    """Return what stands at an axis, and at a narrow one, as HTML."""
+    short = _VARIABLES[name][2] if name in _VARIABLES else ''
+    return {'text': axis_title(name), **({'short': short} if short else {})}
+
+
+def points_to(name: str) -> str:
+    """Return what a line that leaves the band points to; '' where nothing is known."""
+    return _VARIABLES[name][3] if name in _VARIABLES else ''
 
 
 def cells(estimate: Estimate) -> tuple[str, str]:

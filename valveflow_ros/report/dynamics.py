@@ -49,7 +49,12 @@ def dynamics_figure(dynamics: tuple[RegionDynamics, ...]) -> Figure:
             }
         )  # fmt: skip
     layout = {
-        'xaxis': {'title': {'text': 'seconds after a step of the steam flow'}},
+        'xaxis': {
+            'title': {
+                'text': 'seconds after a step of the steam flow',
+                'short': 'seconds after a step',
+            }
+        },
         'yaxis': {'title': {'text': 'power has moved (%)'}},
         'showlegend': True,
     }

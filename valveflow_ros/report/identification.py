@@ -14,48 +14,64 @@ from valveflow_ros.report.answer import (
     window_words,
 )
 from valveflow_ros.report.choice import choice_figure, confidence_table
+from valveflow_ros.report.coverage import coverage_figure, presence_figure
 from valveflow_ros.report.curve import curve_figure
 from valveflow_ros.report.dynamics import dynamics_figure, dynamics_table
+from valveflow_ros.report.figure import Figure
+from valveflow_ros.report.history import history_sections
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.numbers import moment, plain
-from valveflow_ros.report.page import Section, page, paragraph, table, text
+from valveflow_ros.report.page import Page, Section, paragraph, table, text
 from valveflow_ros.report.quality import quality_table, quality_words
+from valveflow_ros.report.segment_figure import segments_figure
 from valveflow_ros.report.shift import shift_section
 from valveflow_ros.report.signals import signals_figure
 
 
 def identification_report(data: Identified) -> str:
     """Return ``report.html``: one self-contained page that opens without a network."""
+    return identification_page(data).to_html()
+
+
+def identification_page(data: Identified) -> Page:
+    """Return the report: the answer and its picture first, then the evidence."""
     c = data.characteristic
     tag = data.settings.text('unit_tag')
     named = tag != PARAMETERS['unit_tag'].default
     title = f'Flow characteristic of {tag}' if named else 'Main steam valve flow characteristic'
-    lead = paragraph(text(data.source)) + paragraph(
+    lead = paragraph(text(data.source), 'where') + paragraph(
         f'{moment(c.source.window_start_ns)} to {moment(c.source.window_end_ns)} '
-        f'({window_words(c)})'
+        f'({window_words(c)})',
+        'where',
     )
     sections = [
         _answer(data),
         *([shift] if (shift := shift_section(data)) else []),
-        Section('The moments that carry it', [signals_figure(data)]),
+        *history_sections(data.history),
+        _moments(data),
         _choice(c),
         _dynamics(data),
-        Section('The data', [quality_words(data), quality_table(data), _read(data)]),
+        _data(data),
         Section('How it was made', [_settings(data)]),
     ]
     foot = (
         f'Made by valveflow {text(__version__)}. Curve <code>{text(c.model_id)}</code>; the same '
         'numbers, unrounded, stand in characteristic.json beside this page.'
     )
-    return page(title, lead, sections, foot)
+    return Page(title, lead, sections, foot)
 
 
 def _answer(data: Identified) -> Section:
     c = data.characteristic
     return Section(
         'The answer',
-        [answer_words(data), pieces_table(data), curve_figure(data), breakpoints_table(c)],
+        [answer_words(data), curve_figure(data), pieces_table(data), breakpoints_table(c)],
     )
+
+
+def _moments(data: Identified) -> Section:
+    rest = segments_figure(data)
+    return Section('The moments that carry it', [signals_figure(data), *([rest] if rest else [])])
 
 
 def _choice(c: Characteristic) -> Section:
@@ -78,6 +94,12 @@ def _dynamics(data: Identified) -> Section:
     return Section(
         'How fast the unit answers', [dynamics_table(dynamics), dynamics_figure(dynamics)]
     )
+
+
+def _data(data: Identified) -> Section:
+    parts: list[str | Figure] = [quality_words(data), quality_table(data)]
+    parts += [f for f in (presence_figure(data), coverage_figure(data)) if f is not None]
+    return Section('The data', [*parts, _read(data)])
 
 
 def _read(data: Identified) -> str:

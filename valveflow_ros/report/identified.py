@@ -20,6 +20,7 @@ from valveflow_ros.records import (
     SpecialSegment,
 )
 from valveflow_ros.report.downsample import segment_rows
+from valveflow_ros.report.history_data import History
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +44,8 @@ class Identified:
     shift : Shift, optional
         The judgement against ``reference``, where there was one.
     reference : Characteristic, optional
+    history : History, optional
+        What a monitor published meanwhile, where the log is its recording.
     u : float64 (n,)
         Integrated input of each row, made from the table.
     rows : int64 (k, 2)
@@ -60,6 +63,7 @@ class Identified:
     notes: tuple[str, ...] = ()
     shift: Shift | None = None
     reference: Characteristic | None = None
+    history: History | None = None
     u: FloatArray = field(init=False)
     rows: IntArray = field(init=False)
     special: IntArray = field(init=False)

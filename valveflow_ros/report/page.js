@@ -1,7 +1,8 @@
 'use strict';
 (function () {
   const figures = JSON.parse(document.getElementById('figures').textContent);
-  const paperWidth = 680;
+  // A4 less its margins, in the browser's pixels of 1/96 inch.
+  const paperWidth = 685;
   let printing = false;
 
   function colours() {
@@ -26,24 +27,36 @@
     return value;
   }
 
-  function axis(given, colour) {
+  // A long title would run out of a narrow picture.
+  function titled(given, narrow) {
+    const title = Object.assign({ standoff: 8 }, given.title);
+    if (narrow && title.short) title.text = title.short;
+    delete title.short;
+    return title;
+  }
+
+  function axis(given, colour, narrow) {
     return Object.assign({
       gridcolor: colour('grid'), linecolor: colour('rule'), tickcolor: colour('rule'),
       zeroline: false, ticks: 'outside', automargin: true, hoverformat: given.hoverformat,
-    }, given, { title: Object.assign({ standoff: 8 }, given.title) });
+    }, given, { title: titled(given, narrow) });
   }
 
-  function layout(given, colour, narrow) {
+  function layout(figure, colour, narrow) {
+    const given = figure.layout;
+    const named = figure.data.filter((t) => t.name && t.showlegend !== false).length;
     const out = painted(given, colour);
     const base = {
       paper_bgcolor: colour('paper'), plot_bgcolor: colour('paper'),
-      font: { family: getComputedStyle(document.body).fontFamily, size: 13, color: colour('ink') },
-      margin: { l: 56, r: 12, t: 34, b: 46 }, hovermode: 'closest', dragmode: narrow ? false : 'zoom',
-      legend: { orientation: 'h', x: 0, y: 1.02, xanchor: 'left', yanchor: 'bottom', font: { size: 12 } },
+      font: { family: getComputedStyle(document.body).fontFamily, size: 14, color: colour('ink') },
+      margin: { l: 60, r: 12, t: narrow || printing ? 34 : 46, b: 50 }, hovermode: 'closest', dragmode: narrow ? false : 'zoom',
+      legend: { orientation: 'h', x: 0, y: 1.02, xanchor: 'left', yanchor: 'bottom', font: { size: 14 } },
       hoverlabel: { bgcolor: colour('panel'), bordercolor: colour('rule'), font: { color: colour('ink') } },
     };
+    // There the entries of a legend stand one below the other, and need their own room.
+    if (narrow) out.height += 22 * Math.max(0, named - 1);
     for (const key of Object.keys(out)) {
-      base[key] = /^[xy]axis/.test(key) ? axis(out[key], colour) : out[key];
+      base[key] = /^[xy]axis/.test(key) ? axis(out[key], colour, narrow) : out[key];
     }
     return base;
   }
@@ -61,8 +74,9 @@
       const place = document.getElementById(name);
       const waiting = place.querySelector('.waiting');
       if (waiting) waiting.remove();
-      const look = layout(figures[name].layout, colour, narrow);
-      if (printing) Object.assign(look, { width: paperWidth, height: Math.min(look.height, 400) });
+      const look = layout(figures[name], colour, narrow);
+      if (printing) Object.assign(look, { width: paperWidth, height: Math.min(0.8 * look.height, 400) });
+      place.style.height = look.height + 'px';
       return Plotly.react(place, painted(figures[name].data, colour), look, settings);
     });
     return Promise.all(jobs);
@@ -85,6 +99,8 @@
 
   function print(on) {
     printing = on;
+    // On paper nobody can open anything.
+    for (const folded of document.querySelectorAll('details')) folded.open = on;
     document.documentElement.classList.toggle('printing', on);
     draw();
   }

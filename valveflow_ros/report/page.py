@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -9,6 +10,10 @@ from html import escape
 from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.library import packed_plotly, read_text
 
+# A cell of more signs may be broken on a telephone, and of more still anywhere.
+_NUMBER, _SENTENCE = 16, 34
+_WORDS = ' class="words"'
+_MANY = 4  # columns; more do not fit side by side on a telephone
 # Nothing may be loaded from anywhere: the browser itself sees to it.
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
@@ -32,6 +37,34 @@ class Section:
     parts: list[str | Figure] = field(default_factory=list)
 
 
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A report before it is written: as a page, or its pictures one by one.
+
+    Attributes
+    ----------
+    title : str
+        Plain text, also the window's title.
+    lead, foot : str
+        HTML under the title and at the end.
+    sections : list of Section
+    """
+
+    title: str
+    lead: str
+    sections: list[Section]
+    foot: str
+
+    @property
+    def figures(self) -> list[Figure]:
+        """Return the pictures in their order."""
+        return [p for s in self.sections for p in s.parts if isinstance(p, Figure)]
+
+    def to_html(self) -> str:
+        """Return the whole file, which opens without a network."""
+        return page(self.title, self.lead, self.sections, self.foot)
+
+
 def text(value: object) -> str:
     """Escape what came from outside: names of files, tags, sentences."""
     return escape(str(value), quote=True)
@@ -43,30 +76,63 @@ def paragraph(html: str, kind: str = '') -> str:
 
 
 def table(
-    head: Sequence[str], rows: Sequence[Sequence[str]], *, caption: str = '', first: str = 'name'
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    caption: str = '',
+    first: str = 'name',
+    sentences: bool = False,
 ) -> str:
     """Return a table of ready HTML cells.
+
+    On a telephone a table of many columns shows each row as a list of its own; for that
+    each cell carries the name of its column.
 
     Parameters
     ----------
     first : str
         'name' if the first column names the row, 'number' if it is a value like the others.
+    sentences : bool
+        Some cells are sentences: the table counts as one of many columns.
     """
+    labels = [label(h) for h in head]
+    many = sentences or len(head) > _MANY
 
     def cell(k: int, html: str) -> str:
+        words = _breaks(html)
         if k == 0 and first == 'name':
-            return f'<th scope="row">{html}</th>'
-        return f'<td>{html}</td>'
+            return f'<th scope="row" data-label="{labels[k]}">{html}</th>'
+        # There a cell's name and its content stand side by side: the content must be one thing.
+        whole = f'<span>{html}</span>' if many and '<' in html else html
+        return f'<td data-label="{labels[k]}"{words}>{whole}</td>'
 
-    top = ''.join(f'<th scope="col">{h}</th>' for h in head)
+    told = {k for row in rows for k, c in enumerate(row) if k and _breaks(c) == _WORDS}
+    top = ''.join(
+        f'<th scope="col"{_WORDS if k in told else ""}>{h}</th>' for k, h in enumerate(head)
+    )
     body = ''.join(
         '<tr>' + ''.join(cell(k, c) for k, c in enumerate(row)) + '</tr>' for row in rows
     )
     title = f'<caption>{caption}</caption>' if caption else ''
+    kind = ' class="many"' if many else ''
     return (
-        f'<div class="scroll"><table>{title}<thead><tr>{top}</tr></thead>'
+        f'<div class="scroll"><table{kind}>{title}<thead><tr>{top}</tr></thead>'
         f'<tbody>{body}</tbody></table></div>'
     )
+
+
+def label(html: str) -> str:
+    """Return a column's name for where no HTML can stand."""
+    plain = re.sub(r'<[^>]+>', '', html.replace('<sup>', '^'))
+    return plain.replace('&shy;', '').replace('"', '&quot;')
+
+
+def _breaks(html: str) -> str:
+    """Return whether a cell may be broken into lines, as a class: a number never is."""
+    signs = len(re.sub(r'<[^>]+>', '', html))
+    if signs > _SENTENCE:
+        return _WORDS
+    return ' class="long"' if signs > _NUMBER else ''
 
 
 def notice(html: str) -> str:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from valveflow_ros.records import SIGNALS, IntArray, SampleTable, SignalInfo
-from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.numbers import count, counted, duration, moment, percent, plain
 from valveflow_ros.report.page import paragraph, table
+
+if TYPE_CHECKING:
+    from valveflow_ros.report.identified import Identified
 
 # The aligner's reasons as a person would say them, in the order of the table.
 REASON_WORDS = {

@@ -64,8 +64,9 @@ def _buttons(days: float) -> Spec | None:
 
 def signals_figure(data: Identified) -> Figure:
     """Return u and power over time (the paper's Fig. 5)."""
+    power = exponent(data.characteristic.pressure_exponent)
     traces = [
-        *_panel(data, data.u, 'y', '', 0),
+        *_panel(data, data.u, 'y', f'% MPa<sup>{power}</sup>', 0),
         *_panel(data, data.power, 'y2', 'MW', 1),
     ]
     table = data.table
@@ -73,7 +74,6 @@ def signals_figure(data: Identified) -> Figure:
     axis: Spec = {'type': 'date', 'anchor': 'y2', 'title': {'text': 'time (UTC)'}}
     if buttons := _buttons(days):
         axis['rangeselector'] = buttons
-    power = exponent(data.characteristic.pressure_exponent)
     layout = {
         'xaxis': axis,
         'margin': {'l': 60, 'r': 12, 't': 34, 'b': 96 if buttons else 46},
@@ -98,7 +98,7 @@ def _caption(data: Identified) -> str:
         f'<span class="key slope">Slope response</span> ({slope}): both move along a ramp, '
         'counted only after the turbine has caught up. Together they last '
         f'{time}; everything else (grey) is left out of the search for the pieces. '
-        'Drag to zoom, double-click to return.'
+        '<span class="mouse">Drag to zoom, double-click to return.</span>'
     )
 
 

@@ -7,6 +7,8 @@ from fractions import Fraction
 from valveflow_ros.core.characteristic import HeldCause
 from valveflow_ros.report.numbers import plain
 
+_DATED = ('t0_days',)  # parameters that are moments
+
 
 def exponent(value: float) -> str:
     """Write the pressure exponent as people know it: 9/8, or a decimal number."""
@@ -26,6 +28,11 @@ def input_title(value: float) -> str:
     return f'integrated input u = V p<sup>{exponent(value)}</sup> ({input_unit(value)})'
 
 
+def input_axis(value: float) -> dict[str, str]:
+    """Return the title of an axis of u, and a short one for narrow pictures, as HTML."""
+    return {'text': input_title(value), 'short': f'u ({input_unit(value)})'}
+
+
 def held_words(held: tuple[HeldCause, ...]) -> str:
     """Say which causes were taken out of the rows; nothing where none were."""
     if not held:
@@ -39,5 +46,6 @@ def held_words(held: tuple[HeldCause, ...]) -> str:
 
 
 def _held(h: HeldCause) -> str:
-    values = ', '.join(f'{name} = {value:.4g}' for name, value in h.values)
-    return f'{h.name} ({values})'
+    # When a cause began stands as a date in its sentence; a number of days says nothing.
+    values = ', '.join(f'{n} = {value:.4g}' for n, value in h.values if n not in _DATED)
+    return f'{h.name} ({values})' if values else h.name

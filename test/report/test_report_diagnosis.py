@@ -1,0 +1,100 @@
+"""The page of a diagnosis: the answer with its doubts first, then the four steps."""
+
+from __future__ import annotations
+
+import html
+import re
+from dataclasses import replace
+
+import pytest
+from report_stories import diagnosed, diagnosis
+
+from valveflow_ros.core.characteristic import HeldCause
+from valveflow_ros.diagnosis.result import NOTHING
+from valveflow_ros.report.diagnosis import diagnosis_page
+from valveflow_ros.report.diagnosis_words import axis_titles, points_to
+from valveflow_ros.report.numbers import decimals
+from valveflow_ros.report.picture_data import plain_text
+from valveflow_ros.report.words import held_words
+
+
+def words_of(text):
+    body = text.split('<body>')[1].split('<script')[0]
+    return re.sub(r'\s+', ' ', html.unescape(re.sub(r'<[^>]+>', ' ', body)))
+
+
+@pytest.fixture(scope='module')
+def page():
+    return diagnosis_page(diagnosed())
+
+
+def test_the_answer_names_the_cause_its_rival_and_the_experiment(page):
+    d = diagnosis()
+    assert page.sections[0].title == 'The answer'
+    first = ' '.join(p for p in page.sections[0].parts if isinstance(p, str))
+    for part in (d.sentence, 'do not tell apart: input_step', 'Weigh the coal.'):
+        assert part in first
+    for value in (d.rmse_simulation, d.rmse_extended, d.rmse_noise_floor):
+        assert decimals(value, 2) in first
+
+
+def test_the_one_picture_is_the_variable_that_shows_most():
+    data = diagnosed()
+    strong = [replace(s, share_before=0.9 if s.variable == 'time' else 0.1)
+              for s in data.signatures]  # fmt: skip
+    page = diagnosis_page(replace(data, signatures=tuple(strong)))
+    assert page.figures[0].name == 'residual-time'
+    # Every picture stands once.
+    names = [f.name for f in page.figures]
+    assert len(names) == len(set(names))
+    assert {'residual-u', 'fast-moves', 'map-time', 'segments', 'history', 'alarms'} < set(names)
+
+
+def test_the_steps_follow_in_their_order(page):
+    titles = [s.title for s in page.sections]
+    assert titles == [
+        'The answer', '1. What is wrong', '2. Why', '3. The extended model', '4. The proof',
+        'How the curve moved', 'What the monitor said',
+    ]  # fmt: skip
+
+
+def test_a_moment_is_told_as_a_date(page):
+    words = words_of(page.to_html())
+    assert '2023-11-15 10:10 UTC' in words
+    assert not re.search(r'\b(nan|None|inf)\b', words)
+
+
+def test_a_plant_without_a_fault_is_told_calmly():
+    data = diagnosed()
+    fine = replace(
+        data.diagnosis, verdict=NOTHING, sentence='Nothing is wrong.', causes=(),
+        not_told_apart=(), experiments=(),
+    )  # fmt: skip
+    page = diagnosis_page(replace(data, diagnosis=fine, history=None))
+    assert page.title == 'Simulation and measurement agree'
+    assert page.sections[0].parts[0] == '<p class="good">Nothing is wrong.</p>'
+    assert len(page.sections) == 5
+
+
+def test_every_caption_says_what_to_look_for(page):
+    for figure in page.figures:
+        assert figure.caption.startswith('<b>')
+        assert len(words_of(f'<body>{figure.caption}<script')) > 60, figure.name
+
+
+@pytest.mark.parametrize(
+    'name', ['u', 'pressure given u', 'temperature', 'time', 'time of day', 'ramp', 'direction']
+)
+def test_every_variable_has_an_axis_and_a_hint(name):
+    titles = axis_titles(name)
+    assert titles['text'] != name
+    assert len(plain_text(titles.get('short', titles['text']))) < 36
+    assert points_to(name)
+
+
+def test_a_held_cause_is_told_without_a_number_of_days():
+    step = HeldCause('gain_step', (('g', 0.0057), ('t0_days', 1.986)), 'From 2023-11-16 on.')
+    told = held_words((step,))
+    assert 'gain_step (g = 0.0057)' in told
+    assert 't0_days' not in told
+    assert 'From 2023-11-16 on.' in told

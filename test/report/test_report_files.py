@@ -1,0 +1,109 @@
+"""Pictures as PNG and SVG, and what they show as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from report_stories import START_NS, diagnosed, history
+
+from valveflow_ros.errors import InputError
+from valveflow_ros.report import drawing
+from valveflow_ros.report.diagnosis import diagnosis_page
+from valveflow_ros.report.drawing import figure_files, palette
+from valveflow_ros.report.figure import Figure, packed
+from valveflow_ros.report.identification import identification_page
+from valveflow_ros.report.picture_data import figure_csv, numbers, plain_text
+
+
+@pytest.fixture(scope='module')
+def figures(identified):
+    data = replace(identified, history=history(), reference=identified.characteristic)
+    both = [*identification_page(data).figures, *diagnosis_page(diagnosed()).figures]
+    return {f.name: f for f in both}
+
+
+def rows_of(figure):
+    return list(csv.DictReader(io.StringIO(figure_csv(figure))))
+
+
+@pytest.mark.parametrize(
+    'name', ['curve', 'choice', 'coverage', 'history', 'alarms', 'map-time', 'residual-time']
+)
+def test_a_picture_becomes_png_and_svg(figures, name):
+    pytest.importorskip('matplotlib')
+    files = figure_files(figures[name])
+    assert set(files) == {f'{name}.png', f'{name}.svg'}
+    assert files[f'{name}.png'].startswith(b'\x89PNG')
+    tree = ElementTree.fromstring(files[f'{name}.svg'])
+    drawn = [e for e in tree.iter() if e.tag.endswith(('}path', '}use', '}image'))]
+    assert len(drawn) > 10
+    # What to look for goes with the file.
+    about = ''.join(tree.itertext())
+    assert plain_text(re.match(r'<b>(.*?)</b>', figures[name].caption).group(1)) in about
+
+
+def test_the_same_picture_gives_the_same_file(figures):
+    pytest.importorskip('matplotlib')
+    assert figure_files(figures['dynamics']) == figure_files(figures['dynamics'])
+
+
+def test_without_matplotlib_one_sentence_says_what_to_do(figures, monkeypatch):
+    monkeypatch.setattr(drawing, 'find_spec', lambda name: None)
+    with pytest.raises(InputError, match='pip install matplotlib'):
+        figure_files(figures['curve'])
+
+
+def test_every_colour_of_a_picture_is_known(figures):
+    known = palette()
+    for figure in figures.values():
+        for name in re.findall(r'token:([a-z0-9-]+)', figure.to_json()):
+            assert name in known
+
+
+def test_the_table_of_the_curve_has_its_ends_and_the_cloud(figures, identified):
+    rows = rows_of(figures['curve'])
+    line = [(float(r['x']), float(r['y'])) for r in rows if r['line'] == 'flow characteristic']
+    assert line == [(800.0, 100.0), (1200.0, 180.0), (1200.0, 180.0), (1500.0, 195.0)]
+    cloud = [int(float(r['value'])) for r in rows if r['line'] == 'special samples']
+    assert sum(cloud) == len(identified.special)
+    assert {r['x_axis'] for r in rows} == {'integrated input u = V p^9/8 (% MPa^9/8)'}
+    assert {r['y_axis'] for r in rows} == {'generated power (MW)'}
+
+
+def test_times_of_a_table_are_told_in_utc(figures):
+    rows = rows_of(figures['history'])
+    knees = [r for r in rows if r['line'] == 'breakpoints, 95 %']
+    at = np.datetime64(knees[0]['x'].removesuffix('Z'), 'ms').astype(int)
+    assert at == START_NS // 10**6 + 8 * 3_600_000
+    assert [float(knees[0][k]) for k in ('y', 'y_low', 'y_high')] == [1200.0, 1190.0, 1210.0]
+    alarms = rows_of(figures['alarms'])
+    assert {r['y'] for r in alarms} == {'residual', 'diagnosis', 'new curve'}
+
+
+def test_every_table_has_every_point_that_is_drawn(figures):
+    for figure in figures.values():
+        drawn = 0
+        for trace in figure.traces:
+            if trace['type'] == 'heatmap':
+                drawn += sum(v is not None for row in trace['z'] for v in row)
+            elif trace['y'] and isinstance(trace['y'][0], str):
+                drawn += sum(v is not None for v in trace['x'])
+            else:
+                known = np.isfinite(numbers(trace, 'x')) & np.isfinite(numbers(trace, 'y'))
+                drawn += int(known.sum())
+        assert len(rows_of(figure)) == drawn, figure.name
+
+
+def test_packed_and_stepped_places_are_read_back():
+    x = np.array([1.0, np.nan, 3.0])
+    assert np.array_equal(numbers({'x': packed(x)}, 'x'), x, equal_nan=True)
+    stepped = {'x0': 5.0, 'dx': 0.5, 'y': [1.0, None, 2.0]}
+    assert numbers(stepped, 'x').tolist() == [5.0, 5.5, 6.0]
+    figure = Figure('f', '', '', [{'type': 'scatter', 'name': 'a "b"', **stepped}])
+    assert [r['line'] for r in rows_of(figure)] == ['a "b"'] * 2

@@ -1,0 +1,155 @@
+"""From a monitor's recording to the history its page tells, by the recording's own schemas."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from mcap_ros2.writer import Writer
+from report_stories import HOUR_NS, START_NS, history
+
+from valveflow_ros.cli.monitor_history import history_in
+from valveflow_ros.logs import Definitions, open_log
+from valveflow_ros.records import NS_PER_S
+
+
+def stamp(time_ns):
+    return {'sec': time_ns // NS_PER_S, 'nanosec': time_ns % NS_PER_S}
+
+
+def header(time_ns):
+    return {'stamp': stamp(time_ns), 'frame_id': 'unit 1'}
+
+
+def curve_message(c, **changes):
+    n = len(c.u)
+    return {
+        'header': header(c.time_ns), 'model_id': c.model_id, 'status': 1, 'cause': '',
+        'window_start': stamp(START_NS), 'window_end': stamp(c.time_ns),
+        'breakpoints': c.u.tolist(), 'values': c.power_mw.tolist(), 'pieces': n - 1,
+        'slopes': [0.1] * (n - 1), 'intercepts': [1.0] * (n - 1),
+        'slope_stderr': [math.nan] * (n - 1), 'intercept_stderr': [math.nan] * (n - 1),
+        'breakpoint_low': c.low.tolist(), 'breakpoint_high': c.high.tolist(),
+        'region_power_from': [], 'region_power_to': [], 'time_constants': [], 'delays': [],
+        'time_constant_stderr': [], 'delay_stderr': [], 'power_to_stderr': [],
+        'cost': [], 'turning_angle': [], 'confidence': [], 'pressure_exponent': c.exponent,
+        'samples': 10, 'steady_segments': 3, 'slope_segments': 1, 'rmse_mw': c.rmse_mw,
+        'temperature_mean_degc': 540.0, 'temperature_spread_degc': 1.0, 'temperature_flag': False,
+        'reference_model_id': '', 'shift_sentence': '', 'shift_mw': [], 'shift_confidence': [],
+        'shift_since': stamp(0), 'shift_since_low': stamp(0), 'shift_since_high': stamp(0),
+        **changes,
+    }  # fmt: skip
+
+
+def alarm_message(a):
+    return {
+        'header': header(a.time_ns), 'name': a.name, 'state': int(a.state), 'previous_state': 0,
+        'priority': 2, 'value': 1.0, 'limit': 2.0, 'unit': 'MW', 'sentence': a.sentence,
+        'occurrence': 1, 'raised': stamp(a.time_ns), 'model_id': '', 'first_out': '',
+    }  # fmt: skip
+
+
+def diagnosis_message(d, verdict=2):
+    return {
+        'header': header(d.time_ns), 'model_id': 'x', 'verdict': verdict, 'sentence': d.sentence,
+        'causes': [], 'not_told_apart': [], 'unexplained_by': [], 'rejected_names': [],
+        'rejected_reasons': [], 'disturbance_rms_mw': math.nan,
+        'disturbance_time_scale_s': math.nan, 'rmse_simulation': 2.0, 'rmse_extended': 2.0,
+        'rmse_noise_floor': 2.0,
+    }  # fmt: skip
+
+
+class Tape:
+    """A recording to be written message by message."""
+
+    def __init__(self, path):
+        self.path = path
+        self._file = path.open('wb')
+        self._writer = Writer(self._file)
+        self._known = {}
+
+    def add(self, topic, kind, time_ns, message, definition=''):
+        if kind not in self._known:
+            text = definition or Definitions().text(kind)
+            self._known[kind] = self._writer.register_msgdef(kind, text)
+        self._writer.write_message(topic, self._known[kind], message, time_ns, time_ns)
+
+    def done(self):
+        self._writer.finish()
+        self._file.close()
+        return open_log(self.path)
+
+
+@pytest.fixture
+def tape(tmp_path):
+    made = Tape(tmp_path / 'log.mcap')
+    for k in range(3):
+        made.add('/valve_opening', 'std_msgs/msg/Float64', START_NS + k * HOUR_NS, {'data': 50.0})
+    return made
+
+
+CURVE = 'valveflow_msgs/msg/FlowCharacteristic'
+ALARM, DIAGNOSIS = 'valveflow_msgs/msg/Alarm', 'valveflow_msgs/msg/Diagnosis'
+
+
+def test_what_was_published_comes_back_under_any_name_of_the_node(tape):
+    told = history()
+    for c in told.curves:
+        tape.add('/boiler/watch/curve', CURVE, c.time_ns, curve_message(c))
+        # Latched ones are published again when the status changes.
+        tape.add('/boiler/watch/curve', CURVE, c.time_ns + 1, curve_message(c, status=2))
+    for a in told.alarms:
+        tape.add('/boiler/watch/alarms', ALARM, a.time_ns, alarm_message(a))
+    for d in told.diagnoses:
+        tape.add('/boiler/watch/why', DIAGNOSIS, d.time_ns - 1, diagnosis_message(d, verdict=0))
+        tape.add('/boiler/watch/why', DIAGNOSIS, d.time_ns, diagnosis_message(d))
+    found = history_in(tape.done())
+    assert [c.model_id for c in found.curves] == [c.model_id for c in told.curves]
+    for mine, theirs in zip(found.curves, told.curves, strict=True):
+        assert mine.time_ns == theirs.time_ns
+        assert mine.u.tolist() == theirs.u.tolist()
+        assert mine.power_mw.tolist() == theirs.power_mw.tolist()
+        assert mine.high.tolist() == theirs.high.tolist()
+    assert found.alarms == told.alarms
+    assert found.diagnoses == told.diagnoses
+    assert found.notes == ()
+    assert (found.start_ns, found.end_ns) == (START_NS, told.alarms[-1].time_ns)
+
+
+def test_a_plants_log_is_no_monitors(tape):
+    assert history_in(tape.done()) is None
+
+
+def test_no_curve_yet_is_no_curve(tape):
+    c = history().curves[0]
+    none = curve_message(c, breakpoints=[], values=[], breakpoint_low=[], breakpoint_high=[])
+    tape.add('/m/characteristic', CURVE, c.time_ns, none)
+    assert history_in(tape.done()) is None
+
+
+def test_two_monitors_in_one_log_are_said(tape):
+    c = history().curves[0]
+    tape.add('/b/characteristic', CURVE, c.time_ns, curve_message(c, model_id='b'))
+    tape.add('/a/characteristic', CURVE, c.time_ns, curve_message(c, model_id='a'))
+    found = history_in(tape.done())
+    assert [x.model_id for x in found.curves] == ['a']
+    (note,) = found.notes
+    assert '/a/characteristic and /b/characteristic; only /a/characteristic is shown' in note
+
+
+def test_a_schema_of_another_day_is_said_and_nothing_is_lost(tape):
+    old = 'string name\nstring sentence\n'
+    tape.add('/m/alarms', ALARM, START_NS, {'name': 'x', 'sentence': 'y'}, old)
+    found = history_in(tape.done())
+    assert found.alarms == ()
+    (note,) = found.notes
+    assert 'What the monitor published on /m/alarms cannot be shown' in note
+    assert "'header'" in note
+
+
+def test_a_state_nobody_knows_is_said(tape):
+    a = history().alarms[0]
+    tape.add('/m/alarms', ALARM, a.time_ns, {**alarm_message(a), 'state': 77})
+    (note,) = history_in(tape.done()).notes
+    assert '77' in note
+    assert 'lacks' not in note

@@ -1,0 +1,121 @@
+"""What a monitor published, read from its own recording by the recording's own schemas."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
+
+import numpy as np
+
+from valveflow_ros.core.alarm_records import AlarmState
+from valveflow_ros.errors import RecordingError
+from valveflow_ros.logs import LogContents
+from valveflow_ros.records import NS_PER_S
+from valveflow_ros.report.history_data import AlarmMoment, CurveMoment, DiagnosisMoment, History
+
+_CURVE = 'valveflow_msgs/msg/FlowCharacteristic'
+_ALARM = 'valveflow_msgs/msg/Alarm'
+_DIAGNOSIS = 'valveflow_msgs/msg/Diagnosis'
+_UNKNOWN = 0  # verdict of a diagnosis that says nothing yet
+
+Found = TypeVar('Found')
+
+
+def history_in(log: LogContents) -> History | None:
+    """Return what a monitor published; None if the log is no monitor's recording.
+
+    Topics are taken by their type: the node may have any name. What cannot be decoded
+    becomes a sentence among the notes.
+    """
+    notes: list[str] = []
+    curves = _all(log, _CURVE, _curve, notes)
+    alarms = _all(log, _ALARM, _alarm, notes)
+    diagnoses = _all(log, _DIAGNOSIS, _diagnosis, notes)
+    if not (curves or alarms or diagnoses or notes):
+        return None
+    times = [x.time_ns for part in (curves, alarms, diagnoses) for x in part]
+    if len(log.readings):
+        times += [int(log.readings.time_ns.min()), int(log.readings.time_ns.max())]
+    return History(
+        min(times, default=0),
+        max(times, default=0),
+        tuple(_once(curves)),
+        tuple(sorted(alarms, key=lambda a: a.time_ns)),
+        tuple(sorted(diagnoses, key=lambda d: d.time_ns)),
+        tuple(notes),
+    )
+
+
+def _all(
+    log: LogContents,
+    kind: str,
+    made: Callable[[dict[str, Any]], Found | None],
+    notes: list[str],
+) -> list[Found]:
+    """Return what the messages of one type say; of several topics only the first is taken."""
+    topics = sorted(t.name for t in log.topics.values() if t.type == kind and t.count)
+    if not topics:
+        return []
+    if len(topics) > 1:
+        notes.append(
+            f'The log holds {kind.rsplit("/", 1)[-1]} messages on {" and ".join(topics)}; '
+            f'only {topics[0]} is shown.'
+        )
+    try:
+        return [x for m in _decoded(log, topics[0]) if (x := made(m)) is not None]
+    except (RecordingError, KeyError, TypeError, ValueError) as error:
+        told = f'it lacks {error}.' if isinstance(error, KeyError) else str(error)
+        notes.append(f'What the monitor published on {topics[0]} cannot be shown: {told}')
+        return []
+
+
+def _decoded(log: LogContents, topic: str) -> Iterator[dict[str, Any]]:
+    decoder = log.decoder(topic)
+    for message in log.iter_messages([topic]):
+        yield decoder.decode(message.data)
+
+
+def _stamp(message: dict[str, Any]) -> int:
+    stamp = message['header']['stamp']
+    return int(stamp['sec']) * NS_PER_S + int(stamp['nanosec'])
+
+
+def _curve(message: dict[str, Any]) -> CurveMoment | None:
+    """Return a curve; None while there is none to show."""
+    u = np.array(message['breakpoints'], dtype=np.float64)
+    power = np.array(message['values'], dtype=np.float64)
+    low = np.array(message['breakpoint_low'], dtype=np.float64)
+    high = np.array(message['breakpoint_high'], dtype=np.float64)
+    finite = np.all(np.isfinite(u)) and np.all(np.isfinite(power))
+    if len(u) < 2 or len(power) != len(u) or not finite or np.any(np.diff(u) <= 0.0):
+        return None
+    if len(low) != len(u) - 2 or len(high) != len(u) - 2:
+        low = high = np.full(len(u) - 2, np.nan)
+    return CurveMoment(
+        _stamp(message), str(message['model_id']), float(message['pressure_exponent']), u, power,
+        low, high, float(message['rmse_mw']),
+    )  # fmt: skip
+
+
+def _alarm(message: dict[str, Any]) -> AlarmMoment:
+    return AlarmMoment(
+        _stamp(message), str(message['name']), AlarmState(message['state']),
+        str(message['sentence']),
+    )  # fmt: skip
+
+
+def _diagnosis(message: dict[str, Any]) -> DiagnosisMoment | None:
+    if message['verdict'] == _UNKNOWN or not message['sentence']:
+        return None
+    return DiagnosisMoment(_stamp(message), str(message['sentence']))
+
+
+def _once(curves: list[CurveMoment]) -> list[CurveMoment]:
+    """Return each curve when it first came: a latched one is published again and again."""
+    seen: set[str] = set()
+    kept = []
+    for curve in sorted(curves, key=lambda c: c.time_ns):
+        if curve.model_id not in seen:
+            seen.add(curve.model_id)
+            kept.append(curve)
+    return kept
