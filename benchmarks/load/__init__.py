@@ -1,0 +1,1 @@
+"""The running monitor under load: who sends, who counts, and what is tried."""
