@@ -7,6 +7,8 @@ import re
 from naive_stream import NaiveAlarm
 
 S = 10**9
+DAY = 86_400 * S
+STANDING = ('UNACKNOWLEDGED', 'ACKNOWLEDGED', 'RETURNED_UNACKNOWLEDGED')
 
 
 def held_in(change):
@@ -29,6 +31,7 @@ class SlowLife:
         self.suppressed = False
         self.shelf_left = None  # ns
         self.now = None
+        self.told_ago = 0  # ns since anything was announced
         self.announced_ago = []  # ns since each announcement, newest last
         self.occurrences = 0
         self.told = self.shown = self.before = 'NORMAL'
@@ -46,6 +49,7 @@ class SlowLife:
         step = 0 if self.now is None else time - self.now
         self.now = time
         passed = max(step, 0)
+        self.told_ago += passed
         self.announced_ago = [ago + passed for ago in self.announced_ago]
         if self.shelf_left is not None:
             self.shelf_left -= passed
@@ -96,18 +100,23 @@ class SlowLife:
     def tell(self):
         if self.state != self.shown:
             self.before, self.shown = self.shown, self.state
-        if self.state == self.told:
+        again = self.state == self.told and self.told in STANDING and self.told_ago >= DAY
+        if self.state == self.told and not again:
             self.holding = False
             return
-        if self.state == 'UNACKNOWLEDGED':
+        if again:
+            self.before = self.told
+        elif self.state == 'UNACKNOWLEDGED':
             lately = sum(ago < 600 * S for ago in self.announced_ago)
             just_now = sum(ago < 60 * S for ago in self.announced_ago)
             if lately >= self.most or just_now >= 2:
                 self.held += int(not self.holding)
                 self.holding = True
                 return
-            self.announced_ago.append(0)
             self.held -= int(self.holding)
+        if self.state == 'UNACKNOWLEDGED':
+            self.announced_ago.append(0)
         row = self.alarm.row
         self.changes.append((row, self.before, self.state, self.occurrences, self.held))
         self.told, self.held, self.holding = self.state, 0, False
+        self.told_ago = 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 
 import numpy as np
 import pytest
@@ -33,6 +34,8 @@ from valveflow_ros.core.offline import JournalReplayer, feed_rows
 from valveflow_ros.core.shift import PieceShift, Shift
 from valveflow_ros.core.shift_alarm import ShiftAlarm
 from valveflow_ros.errors import DataError
+from valveflow_ros.plant.simulator import simulate
+from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.records import NS_PER_S, SampleTable, Signal
 
 SETTINGS = Settings({**QUICK_MONITOR, 'alarm_shelve_time': 60.0, 'alarm_suppress_time': 30.0})
@@ -235,3 +238,42 @@ def test_an_upset_gives_at_most_ten_announcements_in_ten_minutes(settings, seed)
         assert all(b - a >= 60 * NS_PER_S for a, b in zip(own, own[2:], strict=False))
     new = [c for c in announced if c.name == 'residual' and c.previous != AlarmState.SUPPRESSED]
     assert monitor.alarm.occurrence >= len(new)
+
+
+# --- days on end ----------------------------------------------------------------------------
+
+# As set by default, but for fits: few are enough to follow a plant that stays as it is.
+SEDATE = Settings({'refit_period': 43_200.0, 'refit_segments': 0})
+DAY_NS = 86_400 * NS_PER_S
+ASIDE = (AlarmState.SHELVED, AlarmState.SUPPRESSED, AlarmState.NORMAL)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('seed', [21, 22])
+def test_a_healthy_plant_calls_at_most_once_in_ten_minutes_for_days(seed):
+    monitor, events = run(SEDATE, simulate(2.5, seed).table, {90_000: 'set_reference'})
+    assert monitor.characteristic is not None
+    assert monitor.reference.curve is not None
+    raised = [c.time_ns for c in changes_of(events) if c.state == AlarmState.UNACKNOWLEDGED]
+    assert all(b - a > 600 * NS_PER_S for a, b in itertools.pairwise(raised))
+    # One false alarm in 30 days is promised of each of the two; two in these days would be chance
+    # in one case of 80.
+    assert len(raised) <= 1
+
+
+@pytest.mark.slow
+def test_what_nobody_answers_is_never_told_longer_ago_than_a_day():
+    fault = EffectSpec.parse('gain_step:g=-0.12,t0_days=0.5')
+    rows = simulate(3.2, 23, effects=[fault]).table
+    _, events = run(SEDATE.changed({'refit_period': 21_600.0}), rows, {})
+    told = [c for c in changes_of(events) if c.name == 'residual']
+    assert {c.occurrence for c in told if c.state == AlarmState.UNACKNOWLEDGED} == {1}
+    # A row is a second. What is put aside is not what stands.
+    ends = [*(c.time_ns for c in told[1:]), int(rows.time_ns[-1])]
+    standing = [
+        end - change.time_ns
+        for change, end in zip(told, ends, strict=True)
+        if change.state not in ASIDE
+    ]
+    assert max(standing) <= DAY_NS + NS_PER_S
+    assert sum(standing) > DAY_NS

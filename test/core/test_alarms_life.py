@@ -11,10 +11,12 @@ from streams import START_NS
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.alarm_life import AlarmLife
-from valveflow_ros.core.alarms import AlarmState, ResidualAlarm
+from valveflow_ros.core.alarms import AlarmState, Priority, ResidualAlarm
+from valveflow_ros.core.state_bytes import from_bytes, to_bytes
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import NS_PER_S
 
+DAY_S = 86_400
 NORMAL, UNACKNOWLEDGED, _, RETURNED, SHELVED, SUPPRESSED, _ = AlarmState
 
 
@@ -187,3 +189,97 @@ def test_shelved_again_before_its_return_was_told_it_is_shelved_all_the_same():
     assert (alarm.state, alarm.held) == (UNACKNOWLEDGED, 1)
     assert alarm.shelve(START_NS, 'm') == (True, [])
     assert alarm.state == SHELVED
+
+
+def waiting(flood):
+    """Return an alarm whose next announcement waits for the limit, and the second it is at."""
+    alarm = ResidualAlarm(Settings({**NERVOUS, 'alarm_flood': flood}))
+    changes = fed(alarm, [2.0, *[0.0] * 99] * flood + [2.0, 2.0])
+    assert sum(c.state == UNACKNOWLEDGED for _, c in changes) == flood
+    assert (alarm.state, alarm.held) == (UNACKNOWLEDGED, 1)
+    return alarm, 100 * flood + 2
+
+
+@pytest.mark.parametrize(('before', 'after'), [(1, 2), (1, 5), (2, 3), (4, 100)])
+def test_a_limit_that_is_raised_lets_out_what_waits_with_the_next_row(before, after):
+    alarm, second = waiting(before)
+    alarm.configure(Settings({**NERVOUS, 'alarm_flood': after}))
+    ((row, change),) = fed(alarm, [2.0] * 5, second)
+    assert (row, change.state, change.occurrence) == (1, UNACKNOWLEDGED, before + 1)
+    # It comes late, but nothing was missed.
+    assert held_in(change) == 0
+    assert alarm.held == 0
+
+
+def test_a_limit_that_is_raised_does_not_let_it_chatter():
+    """Three a minute are too many whatever the limit."""
+    alarm = ResidualAlarm(Settings({**NERVOUS, 'alarm_flood': 2}))
+    fed(alarm, [2.0, 0.0, 2.0, 0.0, 2.0])
+    assert alarm.held == 1
+    alarm.configure(Settings({**NERVOUS, 'alarm_flood': 100}))
+    ((row, change),) = fed(alarm, [2.0] * 100, 5)
+    assert (row, change.state) == (56, UNACKNOWLEDGED)
+
+
+def test_a_limit_that_is_lowered_holds_back_what_would_have_been_due_earlier():
+    alarm, second = waiting(4)
+    alarm.configure(Settings({**NERVOUS, 'alarm_flood': 1}))
+    changes = fed(alarm, [2.0] * 700, second)
+    assert [(row + second, c.state) for row, c in changes] == [(901, UNACKNOWLEDGED)]
+
+
+STANDS = [
+    ([], UNACKNOWLEDGED),
+    (['acknowledge'], AlarmState.ACKNOWLEDGED),
+]
+
+
+@pytest.mark.parametrize(('acts', 'state'), STANDS)
+def test_what_stands_for_a_day_is_told_again_once_a_day(acts, state):
+    alarm = ResidualAlarm(Settings({'alarm_suppress_time': 600.0}))
+    ((_, raised),) = fed(alarm, [2.0])
+    for act in acts:
+        getattr(alarm, act)(START_NS, 'm')
+    changes = fed(alarm, [2.0] * (3 * DAY_S - 1), 1)
+    assert [row for row, _ in changes] == [DAY_S, 2 * DAY_S]
+    for _, change in changes:
+        assert (change.state, change.previous) == (state, state)
+        assert (change.occurrence, change.raised_ns) == (1, raised.raised_ns)
+        assert change.sentence.startswith('It stands since 20')
+    assert alarm.occurrence == 1
+    assert alarm.last == changes[-1][1]
+
+
+def test_what_returned_and_waits_is_told_again_and_what_is_over_or_aside_is_not():
+    alarm = ResidualAlarm(Settings(NERVOUS))
+    changes = fed(alarm, [2.0, *[0.0] * (DAY_S + 1)])
+    assert [(row, c.state) for row, c in changes] == [
+        (1, UNACKNOWLEDGED), (2, RETURNED), (DAY_S + 2, RETURNED),
+    ]  # fmt: skip
+    alarm.acknowledge(START_NS, 'm')
+    assert alarm.due_ns is None
+    assert fed(alarm, [0.0] * (2 * DAY_S), DAY_S + 2) == []
+    aside = ResidualAlarm(Settings({**NERVOUS, 'alarm_shelve_time': 604_800.0}))
+    fed(aside, [2.0])
+    aside.shelve(START_NS, 'm')
+    assert fed(aside, [2.0] * (3 * DAY_S), 1) == []
+
+
+def test_a_clock_set_back_makes_nobody_wait_longer_to_be_told_again():
+    alarm = ResidualAlarm(Settings(NERVOUS))
+    fed(alarm, [2.0] * 100)
+    changes = fed(alarm, [2.0] * DAY_S, -50_000)
+    assert [row for row, _ in changes] == [DAY_S - 98]
+
+
+def test_what_was_told_last_is_saved_with_the_alarm():
+    alarm, other = ResidualAlarm(Settings(NERVOUS)), ResidualAlarm(Settings(NERVOUS))
+    assert alarm.last is None
+    other.restore(from_bytes(to_bytes(alarm.snapshot())))
+    assert other.last is None
+    ((_, told),) = fed(alarm, [2.0])
+    assert alarm.last == told
+    other.restore(from_bytes(to_bytes(alarm.snapshot())))
+    assert other.last == told
+    assert isinstance(other.last.state, AlarmState)
+    assert isinstance(other.last.priority, Priority)

@@ -24,6 +24,8 @@ NEXT = {
     SHELVED: {UNACKNOWLEDGED, NORMAL, SUPPRESSED},
     SUPPRESSED: {NORMAL, UNACKNOWLEDGED, ACKNOWLEDGED, RETURNED, SHELVED},
 }
+STANDING = (UNACKNOWLEDGED, ACKNOWLEDGED, RETURNED)
+DAY_NS = 86_400 * NS_PER_S
 SHELF_S = 100
 rules_of_life = st.fixed_dictionaries(
     {
@@ -51,6 +53,7 @@ class Living(RuleBasedStateMachine):
         self.acknowledged = 0  # the occurrence that was
         self.shelved_for_s = 0
         self.announced_ns = []
+        self.told_ns = 0
 
     def both(self, act, *given):
         """Do the same to both; they say the same."""
@@ -77,7 +80,12 @@ class Living(RuleBasedStateMachine):
         assert len(changes) <= 1
         for change in changes:
             assert (change.state, change.time_ns) == (after, self.now_ns)
-            assert change.state in NEXT[change.previous]
+            if change.state == change.previous:
+                assert change.state in STANDING
+                assert self.now_ns - self.told_ns >= DAY_NS
+            else:
+                assert change.state in NEXT[change.previous]
+            self.told_ns = self.now_ns
             assert 'nan' not in change.sentence
             if change.state == UNACKNOWLEDGED:
                 self.announced_ns.append(self.now_ns)
@@ -103,9 +111,14 @@ class Living(RuleBasedStateMachine):
         for k in range(count):
             self.step(2.0 * (k % 2))
 
-    @rule(seconds=st.sampled_from([-3000, -1, 0, 30, 3000]), value=st.sampled_from([0.0, 2.0]))
+    @rule(
+        seconds=st.sampled_from([-3000, -1, 0, 30, 3000, 90_000]),
+        value=st.sampled_from([0.0, 2.0]),
+    )
     def leap(self, seconds, value):
         before = len(self.announced_ns)
+        if seconds <= 0:
+            self.told_ns += seconds * NS_PER_S
         self.step(value, seconds)
         if seconds <= 0:
             # The clock was set back: what was said before is as long ago as it was.
@@ -166,7 +179,12 @@ class Living(RuleBasedStateMachine):
     @invariant()
     def what_stands_is_told_or_waits(self):
         if hasattr(self, 'alarm') and self.alarm.state == UNACKNOWLEDGED and not self.alarm.held:
-            assert self.alarm.due_ns is None
+            assert self.alarm.due_ns == self.told_ns + DAY_NS
+
+    @invariant()
+    def nothing_that_stands_is_told_longer_ago_than_a_day(self):
+        if hasattr(self, 'alarm') and self.alarm.state in STANDING and not self.alarm.held:
+            assert self.now_ns - self.told_ns < DAY_NS
 
 
 Living.TestCase.settings = hypothesis_settings(

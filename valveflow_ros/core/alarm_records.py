@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import NamedTuple
+
+from valveflow_ros.core.state import State
 
 
 class AlarmState(enum.IntEnum):
@@ -34,7 +36,8 @@ class AlarmChange:
     Attributes
     ----------
     state, previous : AlarmState
-        From now on, and just before, whether or not that was announced.
+        From now on, and just before, whether or not that was announced; the same where one that
+        has stood for long is only told again.
     occurrence : int
         How often the condition has begun, whether or not that was announced.
     first_out : str
@@ -54,6 +57,17 @@ class AlarmChange:
     raised_ns: int
     model_id: str
     first_out: str = ''
+
+    def snapshot(self) -> State:
+        """Return it as plain values; see `core.state`."""
+        numbers = {name: int(getattr(self, name)) for name in ('state', 'previous', 'priority')}
+        return {**asdict(self), **numbers}
+
+    @classmethod
+    def restored(cls, saved: State) -> AlarmChange:
+        """Return the change in a snapshot."""
+        states = {name: AlarmState(saved[name]) for name in ('state', 'previous')}
+        return cls(**{**saved, **states, 'priority': Priority(saved['priority'])})
 
 
 class Judged(NamedTuple):

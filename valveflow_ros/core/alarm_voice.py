@@ -16,6 +16,13 @@ from valveflow_ros.core.state import State
 from valveflow_ros.records import NS_PER_S
 
 _LAST_NS = (1 << 63) - 1
+# What has stood so long since it was told is told again, so that no shift takes it for old news.
+_AGAIN_NS = 86_400 * NS_PER_S
+_STANDING = (
+    AlarmState.UNACKNOWLEDGED,
+    AlarmState.ACKNOWLEDGED,
+    AlarmState.RETURNED_UNACKNOWLEDGED,
+)
 
 
 class Content(NamedTuple):
@@ -32,12 +39,17 @@ class VoicedAlarm(ABC):
 
     The state is always true; what is announced follows it, held back by the flood limit. What was
     held back and stands is announced as soon as the limit lets it, and the next announcement tells
-    how many were missed.
+    how many were missed. What stands for a day is announced again.
 
     Parameters
     ----------
     settings : Settings
         Latch, time on the shelf, flood limit.
+
+    Attributes
+    ----------
+    last : AlarmChange or None
+        What was announced last.
     """
 
     NAME = ''
@@ -47,6 +59,8 @@ class VoicedAlarm(ABC):
         self._flood = FloodLimit()
         self._told = self._now = self._before = AlarmState.NORMAL
         self._waits = False
+        self._told_ns = 0
+        self.last: AlarmChange | None = None
         self._beside: Sequence[VoicedAlarm] = (self,)
         self.configure(settings)
 
@@ -105,7 +119,13 @@ class VoicedAlarm(ABC):
         if self._waits:
             # None: the limit was raised meanwhile, and it may go out at once.
             return self._flood.free_ns or 0
-        return self._life.shelved_until_ns
+        due = (self._life.shelved_until_ns, self._again_ns)
+        return min((ns for ns in due if ns is not None), default=None)
+
+    @property
+    def _again_ns(self) -> int | None:
+        """Return when it is to be told again; None if there is nothing that could be forgotten."""
+        return self._told_ns + _AGAIN_NS if self._told in _STANDING else None
 
     def stand_beside(self, alarms: Sequence[VoicedAlarm]) -> None:
         """Know the others, and this one among them, to tell which came first."""
@@ -121,6 +141,7 @@ class VoicedAlarm(ABC):
     def shift_time(self, step_ns: int) -> None:
         """Follow a clock that was set back, so that no shelf outlives its time."""
         self._flood.shift(step_ns)
+        self._told_ns += step_ns
         if self._life.shelved_until_ns is not None:
             self._life.shelved_until_ns += step_ns
 
@@ -149,7 +170,9 @@ class VoicedAlarm(ABC):
             self._before, self._now = self._now, state
         if state == self._told:
             self._waits = False
-            return []
+            again_ns = self._again_ns
+            due = again_ns is not None and time_ns >= again_ns
+            return [self._announced(state, time_ns, model_id)] if due else []
         if state == AlarmState.UNACKNOWLEDGED and not self._flood.allows(time_ns):
             self._flood.held += 0 if self._waits else 1
             self._waits = True
@@ -163,7 +186,8 @@ class VoicedAlarm(ABC):
             # What is announced late is not missed.
             missed -= 1 if self._waits else 0
         self._flood.held, self._waits = 0, False
-        self._told, previous = state, self._before
+        previous = state if state == self._told else self._before
+        self._told, self._told_ns = state, time_ns
         first = self._first_out()
         content = self._content(state)
         parts = [
@@ -171,11 +195,12 @@ class VoicedAlarm(ABC):
             _missed(missed),
             '' if first in ('', self.NAME) else f'The alarm {first} came first.',
         ]
-        return AlarmChange(
+        self.last = AlarmChange(
             time_ns, self.NAME, state, previous, Priority.MEDIUM, content.value, content.limit,
             content.unit, ' '.join(p for p in parts if p), self.occurrence, self.raised_ns,
             model_id, first,
         )  # fmt: skip
+        return self.last
 
     def _worded(self, state: AlarmState, previous: AlarmState, sentence: str) -> str:
         """Return the sentence, with what shelf and suppression have to do with it."""
@@ -184,6 +209,8 @@ class VoicedAlarm(ABC):
             return f'Put aside until {_utc(until_ns)}; new alarms are not hidden by that.'
         if state == AlarmState.SUPPRESSED:
             return f'{self._blind()} What the alarm was is kept until then.'
+        if previous == state:
+            return f'It stands since {_utc(self.raised_ns)}. {sentence}'
         if previous == AlarmState.SHELVED:
             return f'No longer put aside. {sentence}'
         if previous == AlarmState.SUPPRESSED:
@@ -204,6 +231,8 @@ class VoicedAlarm(ABC):
             'now': int(self._now),
             'before': int(self._before),
             'waits': self._waits,
+            'told_ns': self._told_ns,
+            'last': None if self.last is None else self.last.snapshot(),
         }
 
     def restore(self, saved: State) -> None:
@@ -212,6 +241,8 @@ class VoicedAlarm(ABC):
         self._flood.restore(saved['flood'])
         self._told, self._now = AlarmState(saved['told']), AlarmState(saved['now'])
         self._before, self._waits = AlarmState(saved['before']), saved['waits']
+        self._told_ns = saved['told_ns']
+        self.last = None if saved['last'] is None else AlarmChange.restored(saved['last'])
 
 
 def _missed(count: int) -> str:

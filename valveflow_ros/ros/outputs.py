@@ -21,7 +21,7 @@ from valveflow_msgs.msg import (
 )
 
 from valveflow_ros.core import events as engine
-from valveflow_ros.core.alarms import AlarmChange
+from valveflow_ros.core.alarms import AlarmChange, AlarmState
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.curve_status import CurveStatus
 from valveflow_ros.core.events import JournalKind
@@ -42,8 +42,11 @@ class OutputTopic:
     message_type: type
     type_name: str
     latched: bool
+    kept: int = 1  # messages that who comes late is given, if latched
 
 
+# Of two alarms that stand the later one must not take the earlier one's place.
+_ALARMS_KEPT = 10
 OUTPUTS: Mapping[str, OutputTopic] = {
     'characteristic': OutputTopic(
         FlowCharacteristic, 'valveflow_msgs/msg/FlowCharacteristic', True
@@ -52,7 +55,7 @@ OUTPUTS: Mapping[str, OutputTopic] = {
     'slopes': OutputTopic(Float64MultiArray, 'std_msgs/msg/Float64MultiArray', True),
     'prediction': OutputTopic(Prediction, 'valveflow_msgs/msg/Prediction', False),
     'segments': OutputTopic(SpecialSegment, 'valveflow_msgs/msg/SpecialSegment', False),
-    'alarms': OutputTopic(Alarm, 'valveflow_msgs/msg/Alarm', True),
+    'alarms': OutputTopic(Alarm, 'valveflow_msgs/msg/Alarm', True, _ALARMS_KEPT),
     'diagnosis': OutputTopic(Diagnosis, 'valveflow_msgs/msg/Diagnosis', True),
     'journal': OutputTopic(JournalEntry, 'valveflow_msgs/msg/JournalEntry', False),
 }
@@ -88,6 +91,7 @@ class Outputs:
         self.reference_id = ''
         self.shift: Shift | None = None
         self._diagnosed: engine.Diagnosed | None = None
+        self._alarms: dict[str, AlarmChange] = {}
 
     def first(self) -> Iterator[Output]:
         """Return what stands there before anything has happened."""
@@ -127,6 +131,7 @@ class Outputs:
             message = conversions.segment(event.segment, tag)
             yield _output('segments', message, event.segment.end_ns)
         elif isinstance(event, AlarmChange):
+            self._alarms[event.name] = event
             yield _output('alarms', conversions.alarm(event, tag), event.time_ns)
         elif isinstance(event, engine.CurveAdopted):
             self.curve, self.status, self.cause = event.characteristic, CurveStatus.FRESH, ''
@@ -144,6 +149,7 @@ class Outputs:
                 # Who listens to a process that was started again finds everything there.
                 self.shift = None
                 yield from self.latched()
+                yield from self._standing()
             elif self._note(event):
                 yield from self._curve_messages()
 
@@ -153,6 +159,8 @@ class Outputs:
         self.curve, self.status, self.cause = monitor.characteristic, monitor.status, monitor.cause
         self.reference_id = '' if reference is None else reference.model_id
         self.shift, self._diagnosed = None, monitor.diagnosing.last
+        told = (monitor.alarm.last, monitor.reference.alarm.last)
+        self._alarms = {change.name: change for change in told if change is not None}
 
     def latched(self) -> Iterator[Output]:
         """Yield the messages that stand on the latched topics."""
@@ -162,6 +170,13 @@ class Outputs:
             yield _output('diagnosis', message, 0)
         else:
             yield self._diagnosis(self._diagnosed)
+
+    def _standing(self) -> Iterator[Output]:
+        """Yield what was said last of the alarms that stand; nothing in it is new."""
+        told = sorted(self._alarms.values(), key=lambda change: (change.time_ns, change.name))
+        for change in told:
+            if change.state != AlarmState.NORMAL:
+                yield _output('alarms', conversions.alarm(change, self._tag), change.time_ns)
 
     def _diagnosis(self, event: engine.Diagnosed) -> Output:
         message = diagnosis_message.of(event, self._tag)

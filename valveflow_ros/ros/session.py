@@ -22,7 +22,7 @@ from valveflow_ros.ros.input_health import InputHealth
 from valveflow_ros.ros.inputs import INPUTS, Decoder
 from valveflow_ros.ros.intake import Clock, Intake
 from valveflow_ros.ros.live import LiveEngine
-from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
+from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs, OutputTopic
 from valveflow_ros.ros.recording import Recording
 from valveflow_ros.ros.reference_file import reference_of
 from valveflow_ros.ros.stamps import LogClock
@@ -31,7 +31,8 @@ from valveflow_ros.ros.warmup import warm_up
 from valveflow_ros.ros.worker import DiagnosisWorker, FitWorker
 
 DIAGNOSTICS = '/diagnostics'
-_GRAPH_S = 2.0
+# A look costs a fraction of a millisecond.
+_GRAPH_S = 0.5
 _DEPTH = 1000
 
 
@@ -72,7 +73,7 @@ class Session:
             silent = PublisherEventCallbacks(use_default_callbacks=False)
             self._publishers = {
                 name: node.create_publisher(
-                    topic.message_type, f'~/{name}', _qos(topic.latched), event_callbacks=silent
+                    topic.message_type, f'~/{name}', _qos(topic), event_callbacks=silent
                 )
                 for name, topic in OUTPUTS.items()
             }
@@ -266,10 +267,11 @@ class Session:
         return recording
 
 
-def _qos(latched: bool) -> QoSProfile:
+def _qos(topic: OutputTopic) -> QoSProfile:
     """Return what outputs are offered with: reliable, and kept for who comes late if latched."""
+    kept = DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE
     return QoSProfile(
-        depth=1 if latched else _DEPTH,
+        depth=topic.kept if topic.latched else _DEPTH,
         reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        durability=kept,
     )
