@@ -1,13 +1,22 @@
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros_helpers import Processes, wait_until
+from std_msgs.msg import Float32, Float64
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.align import REASONS
 from valveflow_ros.records import SIGNALS, Signal
+from valveflow_ros.ros.demo_processes import ros_arguments
 from valveflow_ros.ros.diagnostics import Changes, Item, Level, array
 from valveflow_ros.ros.graph import Publishers
 from valveflow_ros.ros.input_health import InputHealth
@@ -196,3 +205,93 @@ def test_only_changes_get_into_the_log_and_not_too_often() -> None:
     assert changes.pick([well], 3.0) == []
     assert changes.pick([ill], 4.0) == []
     assert changes.pick([well], 40.0) == [well]
+
+
+class Listener:
+    """Hears the health of a monitor that runs, and publishes to it."""
+
+    def __init__(self, context: Any) -> None:
+        self.node = Node('gateway', context=context)
+        self._executor = SingleThreadedExecutor(context=context)
+        self._executor.add_node(self.node)
+        self._said: dict[str, DiagnosticStatus] = {}
+        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._hear, 10)
+
+    def publisher(self, kind: type, topic: str, reliable: bool = True) -> Publisher:
+        weak, strong = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
+        return self.node.create_publisher(
+            kind, topic, QoSProfile(depth=10, reliability=strong if reliable else weak)
+        )
+
+    def until(self, condition: Any, what: str) -> float:
+        """Listen until something holds; return how many seconds that took."""
+        begun_s = time.monotonic()
+
+        def look() -> bool:
+            self._executor.spin_once(timeout_sec=0.02)
+            return bool(condition())
+
+        wait_until(look, what, 60.0)
+        return time.monotonic() - begun_s
+
+    def says(self, topic: str, level: Level, words: str) -> bool:
+        """Tell whether the newest health of an input is that."""
+        status = self._said.get(f'input {topic}')
+        return status is not None and status.level == bytes([level]) and words in status.message
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self.node.destroy_node()
+
+    def _hear(self, message: DiagnosticArray) -> None:
+        self._said |= {status.name.split(' ', 2)[2]: status for status in message.status}
+
+
+@pytest.fixture
+def gateway(context: Any) -> Iterator[Listener]:
+    made = Listener(context)
+    yield made
+    made.close()
+
+
+@pytest.mark.ros
+def test_publishers_that_do_not_fit_are_named_while_the_monitor_runs(
+    processes: Processes, gateway: Listener
+) -> None:
+    """Weak quality of service is said within 1 s, another publisher or a wrong type within 2 s."""
+    given = {'input_reliability': 'reliable', 'record': False, 'diagnostics_period': 0.5}
+    monitor = processes.start('valveflow_ros.ros.monitor_main', *ros_arguments(given))
+    topics = [info.topic for info in SIGNALS if info.required]
+    gateway.until(
+        lambda: all(gateway.node.count_subscribers(f'/{t}') for t in topics)
+        and gateway.says(topics[0], Level.OK, 'Waiting for'),
+        'the monitor',
+    )  # fmt: skip
+    took = {}
+    gateway.publisher(Float64, '/valve_opening', reliable=False)
+    words = 'published as best effort and asked for as reliable, so nothing comes'
+    took['mismatch'] = gateway.until(
+        lambda: gateway.says('valve_opening', Level.ERROR, words), 'the mismatch'
+    )
+    first = gateway.publisher(Float64, '/main_steam_pressure')
+    gateway.until(lambda: first.get_subscription_count(), 'the match')
+
+    def sent_and(level: Level, words: str) -> bool:
+        first.publish(Float64(data=16.0))
+        return gateway.says('main_steam_pressure', level, words)
+
+    gateway.until(lambda: sent_and(Level.OK, 'Hz'), 'one publisher')
+    gateway.publisher(Float64, '/main_steam_pressure')
+    took['second'] = gateway.until(
+        lambda: sent_and(Level.WARN, '/main_steam_pressure has 2 publishers'), 'the second'
+    )
+    gateway.publisher(Float32, '/generated_power')
+    took['type'] = gateway.until(
+        lambda: gateway.says('generated_power', Level.ERROR, 'published as std_msgs/msg/Float32'),
+        'the wrong type',
+    )
+    print({what: round(seconds, 2) for what, seconds in took.items()})
+    limits = {'mismatch': 1.0, 'second': 2.0, 'type': 2.0}
+    # A second more for a machine that does other things at the same time.
+    assert {what: s for what, s in took.items() if s > limits[what] + 1.0} == {}
+    assert monitor.poll() is None, processes.output(monitor)

@@ -3,10 +3,12 @@ from __future__ import annotations
 import os
 import signal
 import time
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import hurt_jobs
 import numpy as np
@@ -22,6 +24,8 @@ from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.state import State
 from valveflow_ros.core.window import NO_ROWS
 from valveflow_ros.errors import DataError
+from valveflow_ros.ros import memory
+from valveflow_ros.ros import worker as worker_module
 from valveflow_ros.ros.frames import FrameReader, send
 from valveflow_ros.ros.letters import result_letter, result_of, task_letter, task_of
 from valveflow_ros.ros.outcome import Outcome
@@ -266,3 +270,39 @@ def test_tasks_and_results_arrive_as_they_were_sent() -> None:
     _, again = task_of(task_letter(9, DIAGNOSIS))
     assert isinstance(again, DiagnosisTask)
     assert repr(replace(again, **bare)) == repr(replace(DIAGNOSIS, **bare))
+
+
+@pytest.mark.parametrize(('job', 'works'), [(FIT_JOB, True), ('nothing_of_the_kind', False)])
+def test_memory_is_given_back_once_after_each_outcome_when_the_task_was_let_go(
+    job: str, works: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A task holds days of rows; what is given back while they are held is not given back."""
+    held: list[bool] = []
+    time_ns = TASK.contents.time_ns.copy()
+    watched = weakref.ref(time_ns)
+    task = replace(TASK, contents=replace(TASK.contents, time_ns=time_ns))
+    monkeypatch.setattr(worker_module, 'give_back', lambda: held.append(watched() is not None))
+    with worker(job) as made:
+        made.submit(task)
+        del task, time_ns
+        (outcome,) = wait_until(made.poll, 'the outcome')
+        assert isinstance(outcome.result, str) != works
+        assert len(held) == 1
+        # Where the process died, the thread that sends to it may be at work still.
+        assert held == [False] or not works
+        assert made.poll() == []
+    assert len(held) == 1
+
+
+def test_memory_is_given_back_by_what_the_c_library_has_or_not_at_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    memory.give_back()
+    asked: list[int] = []
+    with_it = SimpleNamespace(malloc_trim=asked.append)
+    monkeypatch.setattr(memory.ctypes, 'CDLL', lambda _name: with_it)
+    memory.give_back()
+    assert asked == [0]
+    monkeypatch.setattr(memory.ctypes, 'CDLL', lambda _name: SimpleNamespace())
+    memory.give_back()
+    assert asked == [0]

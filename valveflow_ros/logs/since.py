@@ -43,10 +43,14 @@ def _read(home: Path, after_ns: int) -> LogContents:
         if not wanted:
             break
         try:
-            return read_recording(wanted, str(home), {})
+            found = read_recording(wanted, str(home), {})
         except RecordingError:
             if not left or all(path.exists() for path in wanted):
                 raise
+            continue
+        # Of several files one that is gone is passed over, with a warning only.
+        if not left or all(path.exists() for path in wanted):
+            return found
     return LogContents(str(home), Readings.of([]), np.empty(0, dtype=np.int64))
 
 

@@ -99,6 +99,7 @@ class RecordingWriter:
         self._file: ChunkFile | None = None
         self._schedule = TableSchedule()
         self._sequences: dict[int, int] = {}
+        self._on_disk: dict[int, int] = {}  # the same, without what waits
         try:
             make_folder(self.folder)
             self._listing = Listing(self.folder)
@@ -227,10 +228,10 @@ class RecordingWriter:
         try:
             file.put_chunk(chunk)
         finally:
-            # Even if the index behind it failed, a whole chunk is on disk and must not be
-            # written again.
+            # A whole chunk is not to be written again, even if the index behind it failed.
             if file.messages > before:
                 self.written += self.waiting
+                self._on_disk = dict(self._sequences)
                 self._builder.clear()
         self._schedule.done(topics, due)
 
@@ -249,8 +250,7 @@ class RecordingWriter:
             except OSError:
                 out.discard()
                 raise
-            self._begun += 1
-            self._file, self._schedule = file, TableSchedule()
+            self._begun, self._file, self._schedule = self._begun + 1, file, TableSchedule()
         return self._file
 
     def _repeat(self, file: ChunkFile) -> None:
@@ -259,9 +259,9 @@ class RecordingWriter:
         for message in self._head_messages():
             channel = self._topics.ids[message.topic]
             # Never before the original, so that a reader can tell which is which.
-            log_ns = max(self._builder.first_log_ns, message.log_time_ns)
-            times = (log_ns, message.publish_time_ns)
-            head.add(channel, self._sequences.get(channel, 0), *times, message.data)
+            times = max(self._builder.first_log_ns, message.log_time_ns), message.publish_time_ns
+            # Its own number: a newer message of its topic may be waiting to be written.
+            head.add(channel, self._on_disk.get(channel, 0), *times, message.data)
         if len(head):
             file.put_chunk(head.build(self._topics.packed()))
 

@@ -189,7 +189,10 @@ class Worker:
                 running.begun_s = self._clock()
             if running is None or running.number != number:
                 continue
-            self._conclude(self._believed(running.task, result), outcomes)
+            believed = self._believed(running.task, result)
+            # The task holds days of rows; it is to be gone when memory is given back.
+            del running
+            self._conclude(believed, outcomes)
             self.failures_in_a_row = 0
             self._pause_s = _FIRST_PAUSE_S
         if results and self._running is None and not self._trade.stays:
