@@ -61,7 +61,7 @@ def test_another_middleware_is_left_alone(reach: str) -> None:
 
 @pytest.mark.parametrize('reach', ['', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT'])
 def test_the_reach_stays_as_it_was(reach: str) -> None:
-    assert chosen(**{RANGE: reach}) == {RANGE: reach, TRANSPORTS: 'UDPv4'}
+    assert chosen(**{RANGE: reach}) == {RANGE: reach, TRANSPORTS: 'UDPv4?sockets_size=4MB'}
 
 
 def test_on_one_host_the_profile_takes_the_place_of_the_limit() -> None:

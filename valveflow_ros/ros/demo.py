@@ -105,6 +105,8 @@ class Demo:
             f'Hidden in it: from {_FAULT_FROM * o.days:.2g} days on one of the valves gives up to '
             f'{-_FAULT_MW:g} MW less. The monitor is not told.'
         )
+        domain = os.environ['ROS_DOMAIN_ID']
+        tell(f'To look on from another terminal: ROS_DOMAIN_ID={domain} valveflow watch')
         tell(f'Starting the monitor. {SENTENCE}' if is_first_run() else 'Starting the monitor.')
 
     def _start(self) -> tuple[Process, Process]:

@@ -19,6 +19,8 @@ from rclpy.utilities import get_rmw_implementation_identifier
 
 _TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
 _PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
+# With room for what comes while the monitor is held up, as far as the system grants it.
+_SOCKETS = 'UDPv4?sockets_size=4MB'
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 # With one of these the middleware looks for more than this host in ways of its own.
 _OTHERWISE = ('ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER')
@@ -46,7 +48,7 @@ def choose_transport(
     if middleware not in _FAST_DDS or any(environ.get(n) for n in (_TRANSPORTS, *_PROFILES)):
         return
     if environ.get(_RANGE, '').upper() != 'LOCALHOST':
-        environ[_TRANSPORTS] = 'UDPv4'
+        environ[_TRANSPORTS] = _SOCKETS
         return
     profile = _profile()
     if profile is not None and not any(environ.get(name) for name in _OTHERWISE):
