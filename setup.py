@@ -14,7 +14,6 @@ MANIFEST = ElementTree.parse(Path(__file__).with_name('package.xml')).getroot()
 MAINTAINER = MANIFEST.find('maintainer')
 # colcon runs a link to this file from a folder that has no README.
 README = Path(__file__).resolve().with_name('README.md')
-URLS = {url.get('type'): url.text for url in MANIFEST.findall('url')}
 
 COMMAND = ['valveflow = valveflow_ros.cli.main:main']
 NODES = [
@@ -39,13 +38,6 @@ setup(
     description=MANIFEST.findtext('description'),
     long_description=README.read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
-    url=URLS['website'],
-    project_urls={
-        'Source': URLS['repository'],
-        'Issues': URLS['bugtracker'],
-        'Changes': f'{URLS["repository"]}/blob/main/CHANGELOG.rst',
-        'Handbook': f'{URLS["repository"]}/blob/main/docs/index.md',
-    },
     classifiers=[
         'Development Status :: 4 - Beta',
         'Environment :: Console',

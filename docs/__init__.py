@@ -1,0 +1,1 @@
+"""The handbook, and the programs that make its tables and pictures."""

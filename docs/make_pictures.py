@@ -1,0 +1,166 @@
+"""The pictures of the handbook, drawn from what ``docs.picture_data`` has kept.
+
+Run: ``python -m docs.make_pictures [NAME ...]``. The same data give the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+
+from docs.picture_data import CASES, DATA
+
+mpl.use('svg')
+from matplotlib import pyplot as plt
+
+PICTURES = DATA.parent
+# The colours of the report, told apart by all common kinds of colour blindness.
+INK, MUTED, BAND, GRID = '#1b1f24', '#59636e', '#d9dde2', '#e6e9ed'
+PLAIN, EXTENDED, UP, DOWN = '#b05a00', '#0067b1', '#d55e00', '#00876a'
+_AXES = {
+    'u': ('integrated input u (% MPa^9/8)', 1.0),
+    'pressure given u': ('pressure off its usual line (MPa)', 1.0),
+    'temperature': ('main steam temperature (°C)', 1.0),
+    'time': ('days', 1.0 / 86400.0),
+    'time of day': ('hour of the day (UTC)', 1.0 / 3600.0),
+    'ramp': ('ramp: change of u in 3 min', 1.0),
+    'direction': ('after closing  ←  last move  →  after opening', 1.0),
+}
+mpl.rcParams.update({
+    'svg.fonttype': 'none', 'svg.hashsalt': 'valveflow', 'font.family': 'sans-serif',
+    'font.size': 10, 'axes.spines.top': False, 'axes.spines.right': False,
+    'axes.edgecolor': MUTED, 'axes.labelcolor': INK, 'xtick.color': MUTED, 'ytick.color': MUTED,
+    'text.color': INK, 'axes.grid': True, 'grid.color': GRID, 'axes.axisbelow': True,
+    'legend.frameon': False, 'legend.fontsize': 9, 'savefig.facecolor': 'white',
+})  # fmt: skip
+
+
+def _save(figure: Any, name: str) -> Path:
+    path = PICTURES / f'{name}.svg'
+    figure.savefig(path, metadata={'Date': None, 'Creator': None})
+    plt.close(figure)
+    return path
+
+
+def _binned(axis: Any, variable: str, view: dict[str, list[float]]) -> None:
+    label, scale = _AXES[variable]
+    x = scale * np.array(view['middle'])
+    order = np.argsort(x)
+    x = x[order]
+    chance = np.array(view['chance'])[order]
+    axis.fill_between(x, -chance, chance, color=BAND, lw=0, label='chance, 99 %')
+    axis.plot(x, np.array(view['before'])[order], 'o--', color=PLAIN, ms=3.5, label='plain model')
+    axis.plot(x, np.array(view['after'])[order], 'o-', color=EXTENDED, ms=3.5,
+              label='extended model')  # fmt: skip
+    axis.set_xlabel(label)
+
+
+def _moves(axis: Any, answers: list[dict[str, Any]]) -> None:
+    if not answers:
+        axis.text(0.5, 0.5, 'too few fast moves', ha='center', transform=axis.transAxes)
+        return
+    chance = max(a['chance'] for a in answers)
+    axis.axhspan(-chance, chance, color=BAND, lw=0)
+    for a in answers:
+        way, colour = ('opening', UP) if a['up'] else ('closing', DOWN)
+        axis.plot(a['time_s'], a['before'], '--', color=colour, label=f'{way}, plain')
+        axis.plot(a['time_s'], a['after'], '-', color=colour, lw=2, label=f'{way}, extended')
+    axis.set_xlabel('seconds after a fast move')
+
+
+def _map(figure: Any, axis: Any, across: str, view: dict[str, Any]) -> None:
+    label, scale = _AXES[across]
+    cells = np.ma.masked_equal(np.array(view['before']), 0.0)
+    most = float(np.abs(cells).max()) if cells.count() else 1.0
+    drawn = axis.pcolormesh(scale * np.array(view['across']), np.array(view['up']), cells,
+                            cmap='PuOr_r', vmin=-most, vmax=most, rasterized=True)  # fmt: skip
+    axis.set_xlabel(label)
+    axis.set_ylabel('u')
+    axis.grid(visible=False)
+    figure.colorbar(drawn, ax=axis, label='plain model, MW')
+
+
+def effect(name: str) -> Path:
+    """Draw the residual of one effect in the two views that tell most."""
+    data = json.loads((DATA / f'{name}.json').read_text())
+    views = data['views']
+    if 'record' in views:
+        return _record(name, views['record'])
+    wanted = CASES[name].views
+    figure, axes = plt.subplots(1, len(wanted), figsize=(9, 3.3))
+    for axis, variable in zip(axes, wanted, strict=True):
+        if variable.startswith('map '):
+            _map(figure, axis, variable.removeprefix('map '), views[variable])
+            continue
+        axis.axhline(0.0, color=MUTED, lw=0.8)
+        if variable == 'fast moves':
+            _moves(axis, views[variable])
+        else:
+            _binned(axis, variable, views[variable])
+        axis.margins(y=0.28)
+        axis.legend(loc='best', ncols=2 if variable == 'fast moves' else 1)
+    axes[0].set_ylabel('measured − simulated (MW)')
+    figure.suptitle(f'{name}: {data["parameters"].replace(",", ", ")}', fontsize=11)
+    figure.tight_layout()
+    return _save(figure, name)
+
+
+def _record(name: str, view: dict[str, Any]) -> Path:
+    figure, axis = plt.subplots(figsize=(9, 3.0))
+    minutes = 60.0 * (np.array(view['hours']) - view['hours'][0])
+    axis.plot(minutes, view['recorded'], '-', color=PLAIN, lw=1.2, label='recorded')
+    axis.plot(minutes, view['true'], '-', color=EXTENDED, lw=1.0, alpha=0.8, label='the plant')
+    axis.set_xlabel('minutes')
+    axis.set_ylabel(f'{view["signal"].replace("_", " ")} ({view["unit"]})')
+    axis.legend(loc='best', ncols=2)
+    figure.suptitle(f'{name}: {CASES[name].parameters.replace(",", ", ")}', fontsize=11)
+    figure.tight_layout()
+    return _save(figure, name)
+
+
+def curve() -> Path:
+    """Draw the curve with its band over the density of the special samples."""
+    data = json.loads((DATA / 'curve.json').read_text())
+    x, y = np.array(data['x']), np.array(data['y'])
+    counts = np.zeros((len(x) - 1, len(y) - 1))
+    for i, j, n in data['cells']:
+        counts[i, j] = n
+    figure, axis = plt.subplots(figsize=(9, 4.6))
+    axis.pcolormesh(x, y, np.ma.masked_equal(np.log1p(counts), 0.0).T, cmap='Blues',
+                    vmin=-1.5, rasterized=True)  # fmt: skip
+    for k, piece in enumerate(data['pieces']):
+        u, mw, error = (np.array(piece[key]) for key in ('u', 'mw', 'error'))
+        axis.fill_between(u, mw - 1.96 * error, mw + 1.96 * error, color=INK, alpha=0.25, lw=0,
+                          label='95 % band' if k == 0 else None)  # fmt: skip
+        axis.plot(u, mw, color=INK, lw=2, label='flow characteristic' if k == 0 else None)
+    for k, ((low, high), piece) in enumerate(
+        zip(data['breakpoint_intervals'], data['pieces'], strict=False)
+    ):
+        at, mw = piece['u'][-1], piece['mw'][-1]
+        axis.errorbar([at], [mw], xerr=[[at - low], [high - at]], fmt='o', color=INK, mfc='white',
+                      capsize=4, label='breakpoints, 95 %' if k == 0 else None)  # fmt: skip
+    axis.set_xlabel('integrated input u = V p^(9/8)  (% MPa^9/8)')
+    axis.set_ylabel('generated power (MW)')
+    axis.legend(loc='lower right')
+    figure.tight_layout()
+    return _save(figure, 'curve')
+
+
+def main(names: list[str]) -> int:
+    """Draw what is named, or everything there are data for."""
+    for name in names or ['curve', *CASES]:
+        if not (DATA / f'{name}.json').exists():
+            print(f'{name}: no data; run python -m docs.picture_data {name}')
+            continue
+        path = curve() if name == 'curve' else effect(name)
+        print(f'{path.name}: {path.stat().st_size // 1024} kB')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,212 @@
+"""Every command of README and handbook is run here, in a folder of its own, as a reader would."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+import shlex
+import subprocess
+import sys
+from argparse import ArgumentParser
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').rglob('*.md'))]
+_FENCE = re.compile(r'^( *)```([^\n]*)\n(.*?)^\1```', re.M | re.S)
+# sh: run here. long: the same, but only where slow tests are asked for. jazzy: needs what is not
+# here; its names are checked. The others are not commands.
+KINDS = {
+    'sh', 'sh long', 'sh jazzy', 'sh make', 'console', 'console fails', 'yaml', 'text', 'python',
+}  # fmt: skip
+RUN = ('sh', 'console', 'console fails')
+EXECUTABLES = {'monitor', 'replay', 'plant_simulator', 'watch'}
+
+
+class Block(NamedTuple):
+    """A fenced block of a page."""
+
+    page: str
+    line: int
+    kind: str
+    text: str
+
+
+def blocks(page: Path) -> list[Block]:
+    """Return the blocks of a page in their order."""
+    source = page.read_text()
+    name = str(page.relative_to(ROOT))
+    return [
+        Block(name, source.count('\n', 0, found.start()) + 1, found[2].strip(), found[3])
+        for found in _FENCE.finditer(source)
+    ]
+
+
+ALL = [block for page in PAGES for block in blocks(page)]
+
+
+def commands(block: Block) -> list[list[str]]:
+    """Return the commands of a block as words; a here-document is left out."""
+    text = re.sub(r"<<'?(\w+)'?\n.*?^\1$", '', block.text, flags=re.M | re.S)
+    joined = text.replace('\\\n', ' ')
+    if block.kind.startswith('console'):
+        joined = '\n'.join(line[2:] for line in joined.splitlines() if line.startswith('$ '))
+    lines = [part for line in joined.splitlines() for part in re.split(r'\s*(?:&&|\|)\s*', line)]
+    return [words for line in lines if (words := shlex.split(line, comments=True))]
+
+
+@pytest.mark.parametrize('block', ALL, ids=lambda b: f'{b.page}:{b.line}')
+def test_every_block_says_what_it_is(block: Block) -> None:
+    assert block.kind in KINDS
+
+
+def _parser(verb: str) -> ArgumentParser:
+    from valveflow_ros.cli.verbs import load
+
+    parser = ArgumentParser(exit_on_error=False)
+    load(verb).arguments(parser)
+    parser.add_argument('--json', action='store_true')
+    parser.add_argument('--quiet', action='store_true')
+    return parser
+
+
+@pytest.mark.parametrize(
+    'block',
+    [b for b in ALL if b.kind.split()[0] in ('sh', 'console')],
+    ids=lambda b: f'{b.page}:{b.line}',
+)
+def test_every_command_is_one_the_programs_take(block: Block) -> None:
+    for words in commands(block):
+        while words and ('=' in words[0] or words[0] in ('nice', 'sudo')):
+            words = words[1:]
+        if words[:1] == ['valveflow'] and len(words) > 1 and not words[1].startswith('-'):
+            known, rest = _parser(words[1]).parse_known_args(
+                [w for w in words[2:] if not w.startswith(('>', '2>')) and w != '&']
+            )
+            assert not [w for w in rest if w.startswith('-')], words
+            assert known is not None
+        elif words[:3] == ['ros2', 'run', 'valveflow_ros']:
+            assert words[3] in EXECUTABLES, words
+            _check_ros(words[4:])
+        elif words[:3] == ['ros2', 'launch', 'valveflow_ros']:
+            text = (ROOT / 'launch' / words[3]).read_text()
+            for word in words[4:]:
+                assert f"'{word.split(':=')[0]}'" in text, words
+        elif words[:2] == ['python', '-m']:
+            assert (ROOT / (words[2].replace('.', '/') + '.py')).exists() or (
+                ROOT / words[2].replace('.', '/') / '__main__.py'
+            ).exists(), words
+        elif words[:1] == ['make']:
+            makefile = (ROOT / 'Makefile').read_text()
+            for target in (w for w in words[1:] if not w.startswith('-') and '=' not in w):
+                assert re.search(rf'^{target}:', makefile, re.M), words
+
+
+def _check_ros(words: list[str]) -> None:
+    """Look at parameters and remaps of a node."""
+    from valveflow_ros.config import PARAMETERS
+    from valveflow_ros.records import SIGNALS
+
+    topics = {s.topic for s in SIGNALS} | {'plant_sample'}
+    for option, value in itertools.pairwise(words):
+        if option == '-p':
+            name = value.split(':=')[0]
+            others = {'rate', 'stamped', 'use_clock', 'effects', 'days', 'seed', 'use_sim_time'}
+            assert name in PARAMETERS or name in others, value
+        elif option == '-r':
+            assert value.split(':=')[0] in topics or value.startswith('__'), value
+
+
+@pytest.mark.parametrize('block', [b for b in ALL if b.kind == 'yaml'], ids=str)
+def test_parameter_files_are_ones_the_monitor_takes(block: Block) -> None:
+    yaml = pytest.importorskip('yaml')
+    from valveflow_ros.config import Settings
+
+    found = yaml.safe_load(block.text)
+    (node,) = found.values()
+    assert Settings(node['ros__parameters'])
+
+
+def _shim(folder: Path) -> dict[str, str]:
+    """Return an environment in which the command and this Python are found first."""
+    tools = folder / '.tools'
+    tools.mkdir()
+    for name, arguments in (('valveflow', '-m valveflow_ros.cli'), ('python', '')):
+        path = tools / name
+        path.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} {arguments} "$@"\n')
+        path.chmod(0o755)
+    python = os.pathsep.join(filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')]))
+    return {
+        **os.environ, 'PATH': f'{tools}{os.pathsep}{os.environ["PATH"]}', 'PYTHONPATH': python,
+    }  # fmt: skip
+
+
+def _bare(text: str) -> str:
+    """Return the words of an output: numbers, blanks and file names may differ."""
+    return ' '.join(re.sub(r'[-+−±]?\d[\d\s.,:]*', ' # ', text).split())
+
+
+def run(page: Path, folder: Path, kinds: tuple[str, ...], environment: dict[str, str]) -> int:
+    """Run the blocks of a page one after the other; return how many there were."""
+    done = 0
+    for block in blocks(page):
+        if block.kind not in kinds:
+            continue
+        if not block.kind.startswith('console'):
+            _shell(block, block.text, folder, environment)
+            done += 1
+            continue
+        for part in re.split(r'^\$ ', block.text, flags=re.M)[1:]:
+            lines = part.replace('\\\n', ' ').splitlines()
+            fails = block.kind == 'console fails'
+            said = _bare(_shell(block, lines[0], folder, environment, 1 if fails else 0))
+            for line in lines[1:]:
+                for piece in filter(None, (_bare(p) for p in line.split('…'))):
+                    assert piece in said, f'{block.page}:{block.line}: not said: {line}\n{said}'
+            done += 1
+    return done
+
+
+def _shell(
+    block: Block, text: str, folder: Path, environment: dict[str, str], status: int = 0
+) -> str:
+    ended = subprocess.run(
+        ['bash', '-euo', 'pipefail', '-c', text],
+        cwd=folder, env=environment, capture_output=True, text=True, timeout=600, check=False,
+    )  # fmt: skip
+    said = ended.stdout + ended.stderr
+    assert ended.returncode == status, f'{block.page}:{block.line}: {text}\n{said}'
+    return said
+
+
+SHORT = ['docs/tutorial_csv.md', 'README.md', 'docs/troubleshooting.md']
+
+
+@pytest.mark.parametrize('name', SHORT)
+def test_the_commands_of_a_page_work_in_their_order(name: str, tmp_path: Path) -> None:
+    environment = _shim(tmp_path)
+    assert run(ROOT / name, tmp_path, RUN, environment) > 0
+
+
+@pytest.mark.ros
+def test_the_live_tutorial_works(tmp_path: Path, ros_environment: dict[str, str]) -> None:
+    environment = {**ros_environment, **_shim(tmp_path)}
+    assert run(ROOT / 'docs/tutorial_live.md', tmp_path, RUN, environment) > 0
+
+
+def test_every_page_that_is_run_here_is_named() -> None:
+    """A page with commands that no test runs would be a promise."""
+    named = {*SHORT, 'docs/tutorial_live.md'}
+    others = {b.page for b in ALL if b.kind in RUN} - named
+    assert not others
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('page', sorted({b.page for b in ALL if b.kind == 'sh long'}), ids=str)
+def test_the_commands_that_take_minutes_work(page: str, tmp_path: Path) -> None:
+    if not os.environ.get('VALVEFLOW_SLOW'):
+        pytest.skip('minutes; VALVEFLOW_SLOW=1 runs it')
+    assert run(ROOT / page, tmp_path, ('sh long',), _shim(tmp_path)) > 0

@@ -1,0 +1,171 @@
+"""The pages keep up with the code: tables, effects, links, pictures and quoted figures."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from docs import make_pages, page_claims, page_effects, page_health, page_tables, picture_data
+from valveflow_ros.config import TABLE
+from valveflow_ros.diagnosis.catalogue import catalogue as causes
+from valveflow_ros.plant.effects import catalogue as effects
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCS = ROOT / 'docs'
+PAGES = make_pages.pages()
+_LINK = re.compile(r'\]\(([^)\s]+)\)')
+_LARGEST = 60 * 1024
+DRAWN = sorted(picture_data.DATA.parent.glob('*.svg'))
+TAKEN = sorted(picture_data.DATA.parent.glob('*.png'))
+
+
+def test_generated_parts_are_what_the_code_says() -> None:
+    assert not make_pages.stale(), 'run python -m docs.make_pages'
+
+
+def test_a_part_that_was_changed_by_hand_is_noticed() -> None:
+    page = DOCS / 'messages.md'
+    text = page.read_text().replace('alarm_run_length', 'alarm_run_width')
+    assert make_pages.made(page, text) != text
+
+
+def test_every_effect_has_a_page_a_picture_and_a_case_and_nothing_else_has() -> None:
+    known = set(effects())
+    assert set(causes()) <= known
+    assert set(page_effects.names()) == known
+    assert {p.stem for p in (DOCS / 'effects').glob('*.md')} - {'README'} == known
+    assert {p.stem for p in picture_data.DATA.parent.glob('*.svg')} == known | {'curve'}
+    assert set(picture_data.CASES) == known
+
+
+@pytest.mark.parametrize('name', sorted(effects()))
+def test_a_page_names_parameters_and_units_as_the_code_does(name: str) -> None:
+    text = (DOCS / 'effects' / f'{name}.md').read_text()
+    for p in effects()[name].parameters:
+        assert f'| `{p.name}` | {p.default} | {p.unit} |' in text
+    for u in causes()[name].unknowns if name in causes() else ():
+        assert f'| `{u.name}` | {u.unit} | {u.low:g} to {u.high:g} |' in text
+    for other in causes()[name].confusers if name in causes() else ():
+        assert f'[{other}]({other}.md)' in text
+    for heading in ('How it looks', 'What it is confused with', 'What to do about it'):
+        body = re.sub(r'<!--.*?-->', '', text.split(f'## {heading}\n')[1].split('\n## ')[0])
+        assert len(body.split()) > 10
+
+
+@pytest.mark.parametrize('name', sorted(effects()))
+def test_the_trial_shown_is_the_one_in_the_data_and_was_answered_right(name: str) -> None:
+    kept = json.loads((picture_data.DATA / f'{name}.json').read_text())
+    assert kept['parameters'] == picture_data.CASES[name].parameters
+    assert kept['commands'] == picture_data.commands(name)
+    assert name in [cause['name'] for cause in kept['diagnosis']['causes']]
+
+
+@pytest.mark.parametrize('path', [*DRAWN, *TAKEN], ids=lambda p: p.stem)
+def test_a_picture_is_small_and_asks_nothing_of_the_network(path: Path) -> None:
+    assert path.stat().st_size <= _LARGEST
+    if path in TAKEN:
+        return
+    for element in ElementTree.parse(path).iter():
+        assert 'script' not in element.tag
+        for key, value in element.attrib.items():
+            if key.endswith('href'):
+                assert value.startswith(('#', 'data:'))
+
+
+def test_a_picture_is_drawn_again_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip('matplotlib')
+    from docs import make_pictures
+
+    monkeypatch.setattr(make_pictures, 'PICTURES', tmp_path)
+    drawn = make_pictures.effect('backlash').read_bytes()
+    assert drawn == make_pictures.effect('backlash').read_bytes()
+    assert len(drawn) > 10_000
+
+
+def _anchors(page: Path) -> set[str]:
+    text = re.sub(r'^```.*?^```', '', page.read_text(), flags=re.M | re.S)
+    heads = re.findall(r'^#+ (.*)$', text, re.M)
+    return {re.sub(r'[^\w\- ]', '', h.lower()).strip().replace(' ', '-') for h in heads}
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    for link in _LINK.findall(page.read_text()):
+        if link.startswith(('http://', 'https://')):
+            continue
+        name, _, anchor = link.partition('#')
+        target = (page.parent / name).resolve() if name else page
+        assert target.exists(), link
+        if anchor:
+            assert anchor in _anchors(target), link
+
+
+def test_every_page_is_reached_from_the_readme() -> None:
+    seen, todo = set(), [ROOT / 'README.md']
+    while todo:
+        page = todo.pop()
+        if page in seen:
+            continue
+        seen.add(page)
+        names = (link.partition('#')[0] for link in _LINK.findall(page.read_text()))
+        todo += [(page.parent / n).resolve() for n in names if n.endswith('.md')]
+    assert set(PAGES) <= seen
+
+
+def test_every_output_service_and_item_of_the_health_has_a_line() -> None:
+    assert set(page_tables.output_topics()) == set(page_tables._OUTPUTS)
+    assert set(page_tables.service_names()) == set(page_tables._SERVICES)
+    assert set(page_health.items()) == set(page_health._ABOUT)
+
+
+def test_every_message_and_field_is_in_the_handbook() -> None:
+    text = (DOCS / 'messages.md').read_text()
+    for path in sorted((ROOT / 'msg').glob('*.msg')):
+        _, fields, constants = page_tables.message(path)
+        assert f'### {path.stem}\n' in text
+        lines = [re.sub(r'#.*', '', line) for line in path.read_text().splitlines()]
+        assert len(fields) + len(constants) == sum(bool(line.strip()) for line in lines)
+        for name, kind, unit, meaning in fields:
+            assert f'| `{name}` | `{kind}` | {unit} | {meaning} |' in text
+            assert unit, f'{path.stem}.{name} has no unit'
+
+
+def test_every_parameter_is_in_the_handbook() -> None:
+    text = (DOCS / 'messages.md').read_text()
+    assert all(re.search(rf'^\| `{row.name}`', text, re.M) for row in TABLE)
+
+
+def test_the_readme_quotes_the_studies_as_they_are() -> None:
+    text = re.sub(r'\s+', ' ', (ROOT / 'README.md').read_text())
+    study = page_claims.result('paper_study_2001_2020')
+    line = study['summary'][0]
+    slope, worst_slope, knee, worst_knee = re.findall(
+        r'slope error median (\S+) worst (\S+); largest knee error median (\S+) worst (\S+);', line
+    )[0]
+    assert f'largest slope error is {slope} in the median and {worst_slope} at worst' in text
+    assert f'knee error {knee} and {worst_knee}, with the right number' in text
+    covered = page_claims.result('coverage_9000_9199')['summary']
+    for key in ('slope', 'knee', 'time_constant', 'delay'):
+        assert f'{100 * covered[key]["covered_95"]:.0f} %' in text
+    noise = page_claims.result('alarm_run_length_6000_6029')['noise']
+    days = [row['days_per_alarm'] for row in noise]
+    assert f'one in {min(days):.0f} to {max(days):.0f} days' in text
+    lost = page_claims.result('torture_kill9')['measured']['most_lost_s']
+    assert f'at most {lost:.2f} s were lost' in text
+    for name in (
+        'hidden_9000_9011',
+        'confounded_9000_9003',
+        'outside_9600_9601',
+        'pair_9000_9003',
+    ):
+        r = page_claims.result(f'diagnosis_{name}_5d')
+        assert f'{r["right"]} of {r["records"]}' in text
+    for command in re.findall(r'`(python -m benchmarks\.[^`]*--first[^`]*)`', text):
+        results = page_claims.RESULTS.glob('*.json')
+        assert any(command == json.loads(p.read_text()).get('command') for p in results), command
