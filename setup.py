@@ -72,6 +72,8 @@ setup(
         'scipy',
         'zstandard',
     ],
+    # What only some need: reading .xlsx, and pictures as files.
+    extras_require={'excel': ['openpyxl'], 'figures': ['matplotlib']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),

@@ -140,9 +140,8 @@ def test_an_unknown_unit_is_wrong_usage_and_the_known_ones_are_listed(
 @pytest.mark.parametrize(
     ('words', 'part'),
     [
-        ([], "no column 'valve_opening_percent'"),
-        (OPTIONS[2:], "no column 'time'"),
-        (['--column', 'time=Zeit'], "no column 'valve_opening_percent'"),
+        ([], "no column 'main_steam_temperature_degc'"),
+        (['--column', 'time=Clock', *OPTIONS[2:]], "no column 'Clock'"),
         ([*OPTIONS[:2], '--column', 'valve_opening=VALVE'], "no column 'VALVE'"),
         (['--column', 'time=Spare', *OPTIONS[2:]], 'holds no time'),
     ],
@@ -162,7 +161,8 @@ def test_missing_columns_are_named(run, tmp_path, history, words, part):
         ('empty.parquet', '', 'empty'),
         ('head.csv', HEADER + '\n', 'without rows'),
         ('picture.csv', '\x00\x01\x02\x03', ''),
-        ('table.xlsx', 'PK', 'no .csv or .parquet'),
+        ('table.xlsx', 'PK', 'table.xlsx'),
+        ('table.ods', 'PK', 'no .csv, .xlsx or .parquet'),
         ('text.parquet', 'no parquet at all', ''),
     ],
 )

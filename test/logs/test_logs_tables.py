@@ -161,7 +161,7 @@ def test_rows_without_a_time_are_left_out_and_counted(tmp_path):
     assert raw.notes == ('3 rows have no readable time and were left out, the first is row 2.',)
 
 
-@pytest.mark.parametrize('text', ['01/02/2024 12:00', 'never', ''])
+@pytest.mark.parametrize('text', ['never', ''])
 def test_a_time_that_could_be_anything_is_not_guessed(tmp_path, text):
     with pytest.raises(InputError, match=r"'time' holds no time; .*--column time=THEIRS"):
         read_table(csv(tmp_path, *rows(text)))
@@ -207,7 +207,8 @@ def test_a_decimal_comma_beside_semicolons(tmp_path):
     assert raw.columns['valve_opening_percent'][:2].tolist() == [50.5, 50.5]
     assert raw.columns['generated_power_mw'].tolist() == [600, -150, 600]
     assert np.isnan(raw.columns['main_steam_temperature_degc'][1])
-    assert raw.bad_cells == {'valve_opening_percent': 1, 'main_steam_pressure_mpa': 1}
+    assert raw.columns['main_steam_pressure_mpa'].tolist() == [16.25, 16.25, 1234.5]
+    assert raw.bad_cells == {'valve_opening_percent': 1}
 
 
 def test_cells_that_are_no_numbers_are_missing_and_told(tmp_path):
@@ -272,7 +273,7 @@ def test_columns_by_other_names(tmp_path):
     [
         (
             {},
-            r"no column 'main_steam_pressure_mpa'; the columns are: time, valve_opening_percent",
+            r"no column 'main_steam_pressure_mpa', .*the columns are: time, valve_opening_percent",
         ),
         ({'generated_power': 'P'}, r"no column 'main_steam|no column 'P'"),
         ({'time': 'Zeit'}, r'no column|--column time=THEIRS'),

@@ -1,226 +1,266 @@
-"""A historian's table as samples, with everything that had to be understood about it."""
+"""A historian's table as readings, with everything that had to be understood about it."""
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from valveflow_ros.cli.console import Console
-from valveflow_ros.cli.header import unused_columns
+from valveflow_ros.cli.historian_facts import Imported, SignalSource, Tally
+from valveflow_ros.cli.historian_order import Ordered
+from valveflow_ros.cli.historian_spool import Spool
 from valveflow_ros.cli.log_input import (
     advice,
     check_constants,
     names_for,
+    refuse_guesses,
     unit_for,
     unknown_unit,
+    with_constants,
 )
 from valveflow_ros.cli.mapping import Mapping
 from valveflow_ros.cli.plausible import doubt
 from valveflow_ros.config import Settings
-from valveflow_ros.core.units import convert
+from valveflow_ros.core.unit_table import convert
 from valveflow_ros.errors import DataError, InputError, RecordingError
-from valveflow_ros.logs import RawTable, read_table
+from valveflow_ros.logs.reader import TABLE_SUFFIXES
+from valveflow_ros.logs.table_reader import RawBlock, TableReader
 from valveflow_ros.records import (
     SIGNALS,
+    ByteArray,
     FloatArray,
     IntArray,
     Quality,
+    Readings,
     SampleTable,
     Signal,
-    SignalInfo,
+    table_to_readings,
 )
-from valveflow_ros.report.quality import Gap, gaps
+from valveflow_ros.report.quality import gaps
 
-_TIMES = ('time', 'date')
-_QUALITY = '_quality'  # what stands behind the name of a column of marks
-_TABLES = ('.csv', '.tsv', '.txt', '.parquet', '.pq')
-
-
-@dataclass(frozen=True, slots=True)
-class SignalSource:
-    """Where one signal comes from; ``low`` and ``high`` in the engine's unit."""
-
-    topic: str
-    column: str
-    written_unit: str
-    unit: str
-    low: float
-    high: float
-    missing: int
-    constant: bool
+_ROWS = 200_000  # in memory at a time
+_BY_COLUMN = {info.column: info for info in SIGNALS}
 
 
-@dataclass(frozen=True, slots=True)
-class Imported:
-    """A table that was understood.
+class Historian:
+    """A table that is read once, judged, and then given out in the order of time.
 
-    Attributes
+    Parameters
     ----------
-    table : SampleTable
-    sources : list of SignalSource
-        In the order of `Signal`.
-    rows_read, duplicates : int
-        Rows of the file with a readable time, and those left out for having one twice.
-    period_s : float
-        Median step.
-    gaps : list of Gap
-        The longest first.
-    ignored : tuple of str
-        Columns that were not used.
-    notes : tuple of str
-        Sentences of the reader.
-    """
-
-    path: Path
-    table: SampleTable
-    sources: list[SignalSource]
-    rows_read: int
-    duplicates: int
-    period_s: float
-    gaps: list[Gap]
-    ignored: tuple[str, ...]
-    notes: tuple[str, ...]
-
-    @property
-    def span_ns(self) -> tuple[int, int]:
-        """Return the times of the first and the last row."""
-        return int(self.table.time_ns[0]), int(self.table.time_ns[-1])
-
-    def summary(self) -> dict[str, Any]:
-        """Return everything but the values, for a program."""
-        return {
-            'source': str(self.path),
-            'rows': len(self.table),
-            'rows_read': self.rows_read,
-            'duplicates': self.duplicates,
-            'period_s': self.period_s,
-            'start_ns': self.span_ns[0],
-            'end_ns': self.span_ns[1],
-            'gaps': len(self.gaps),
-            'signals': [asdict(source) for source in self.sources],
-            'ignored': list(self.ignored),
-            'notes': list(self.notes),
-        }
-
-    def as_json(self) -> str:
-        """Return the summary as the text that goes into the log; the file's name only."""
-        content = {**self.summary(), 'source': self.path.name}
-        finite = [
-            {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in s.items()}
-            for s in content['signals']
-        ]
-        return json.dumps({**content, 'signals': finite}, indent=2, allow_nan=False)
-
-
-def read_historian(path: Path, mapping: Mapping, console: Console) -> Imported:
-    """Read a table, convert it, and warn aloud of what looks wrong.
+    path : Path
+        The table.
+    mapping : Mapping
+        What the person said of it.
+    console : Console
+        Hears what was understood and what looks wrong.
 
     Raises
     ------
     RecordingError, InputError, DataError
-        It cannot be read, a column is missing, a unit unknown, no row is usable.
+        It cannot be read, a column is missing, a unit unknown.
     """
-    if path.suffix.lower() not in _TABLES:
-        raise RecordingError(path, 'is no .csv or .parquet table')
-    raw = _read(path, mapping)
-    for note in raw.notes:
-        console.say(note)
-    time_ns, first = np.unique(raw.time_ns, return_index=True)
-    columns, quality, sources = _signals(raw, first, mapping, console)
-    table = SampleTable.from_columns(time_ns, columns, quality)
-    if not any(np.isfinite(table.column(i.signal)).any() for i in SIGNALS):
-        raise DataError(f'{path}: there is no number in any of the columns used.')
-    period_s = float(np.median(np.diff(time_ns))) / 1e9 if len(time_ns) > 1 else 0.0
-    return Imported(
-        path, table, sources, len(raw.time_ns), len(raw.time_ns) - len(time_ns), period_s,
-        gaps(time_ns, max(1, round(period_s * 1e9))), _ignored(raw, mapping),
-        raw.notes,
-    )  # fmt: skip
+
+    def __init__(self, path: Path, mapping: Mapping, console: Console) -> None:
+        if path.suffix.lower() not in TABLE_SUFFIXES:
+            raise RecordingError(path, 'is no .csv, .xlsx or .parquet table')
+        self._console = console
+        self._mapping = mapping
+        self._reader = _reader(path, mapping)
+        self._constants = {
+            info.signal: mapping.constants[info.topic].value
+            for info in SIGNALS
+            if info.topic in mapping.constants
+        }
+        check_constants(self._constants)
+        told = {_BY_COLUMN[n].signal: unit for n, unit in self._reader.units.items()}
+        self._units = {
+            name: unit_for(_BY_COLUMN[name].signal, mapping, told) for name in self._reader.names
+        }
+        self._used = [
+            name for name in self._reader.names if _BY_COLUMN[name].signal not in self._constants
+        ]
+        self._warn_of_constants()
+
+    @property
+    def signals(self) -> list[Signal]:
+        """Return the signals there will be readings of."""
+        return sorted({*(_BY_COLUMN[name].signal for name in self._used), *self._constants})
+
+    @property
+    def is_long(self) -> bool:
+        """Tell whether the table has a row for each value."""
+        return self._reader.long is not None
+
+    def read(self, spool: Spool | None) -> tuple[Imported, Ordered]:
+        """Read the whole table into the spool (or only look at it) and judge it.
+
+        Raises
+        ------
+        RecordingError, InputError, DataError
+            As the constructor; or no row is usable, or the values of a column
+            speak against what it was taken for.
+        """
+        times: list[IntArray] = []
+        tallies = {name: Tally() for name in self._used}
+        uncertain = 0
+        for block in self._reader.blocks():
+            times.append(block.time_ns)
+            self._console.progress(0.1 + 0.5 * self._reader.share, 'reading')
+            for name in self._used:
+                there = block.present.get(name)
+                column = block.columns[name]
+                tallies[name].add(column if there is None else column[there])
+                uncertain += _uncertain(block, name)
+            if spool is not None:
+                self._keep(block, spool)
+        notes = self._reader.notes()
+        ordered = Ordered.of(np.concatenate(times), self.is_long)
+        if ordered.sorted_how:
+            notes.append(ordered.sorted_how)
+        for note in notes:
+            self._console.say(note)
+        if not any(tally.known for tally in tallies.values()):
+            path = self._reader.path
+            raise DataError(f'{path}: there is no number in any of the columns used.')
+        self._judge(tallies)
+        if uncertain:
+            self._console.warn(
+                f'{uncertain} values are marked uncertain; a plain recording has no place for '
+                'that mark, they stand there as good.'
+            )
+        return self._told(tallies, ordered, notes), ordered
+
+    def tables(self, spool: Spool, ordered: Ordered) -> Iterator[SampleTable]:
+        """Yield the rows in the order of time, in the engine's units."""
+        for time_ns, rows in ordered.blocks(_ROWS):
+            columns, quality = self._columns(spool, rows)
+            for signal, value in self._constants.items():
+                columns[signal] = np.full(len(time_ns), value)
+            yield SampleTable.from_columns(time_ns, columns, quality)
+
+    def readings(self, spool: Spool, ordered: Ordered) -> Iterator[Readings]:
+        """Yield the values one by one in the order of time, in the engine's units."""
+        if not self.is_long:
+            yield from map(table_to_readings, self.tables(spool, ordered))
+            return
+        names = self._used
+        for time_ns, rows in ordered.blocks(_ROWS):
+            columns, quality = self._columns(spool, rows)
+            table = SampleTable.from_columns(time_ns, columns, quality)
+            there = np.column_stack([spool.take(f'{name}?', rows) for name in names])
+            row, column = np.nonzero(there)
+            signal = np.array([_BY_COLUMN[name].signal for name in names], np.int8)[column]
+            readings = Readings(
+                time_ns[row], signal, table.values[row, signal], table.quality[row, signal]
+            )
+            yield with_constants(readings, self._constants)
+
+    def _columns(
+        self, spool: Spool, rows: slice | IntArray
+    ) -> tuple[dict[Signal, FloatArray], dict[Signal, ByteArray]]:
+        columns: dict[Signal, FloatArray] = {}
+        quality: dict[Signal, ByteArray] = {}
+        for name in self._used:
+            signal = _BY_COLUMN[name].signal
+            columns[signal] = convert(signal, self._units[name], spool.take(name, rows))
+            if spool.holds(f'{name}!'):
+                quality[signal] = spool.take(f'{name}!', rows)
+        return columns, quality
+
+    def _keep(self, block: RawBlock, spool: Spool) -> None:
+        for name in self._used:
+            spool.append(name, block.columns[name])
+            if name in block.quality:
+                spool.append(f'{name}!', block.quality[name])
+            if name in block.present:
+                spool.append(f'{name}?', block.present[name])
+
+    def _warn_of_constants(self) -> None:
+        for name, theirs in self._reader.names.items():
+            if _BY_COLUMN[name].signal in self._constants:
+                self._console.warn(
+                    f"{_BY_COLUMN[name].topic} stands in the table as '{theirs}' too; the "
+                    'constant is used instead.'
+                )
+
+    def _judge(self, tallies: dict[str, Tally]) -> None:
+        """Refuse what was guessed wrongly, and warn of the rest; raises `InputError`."""
+        settings, doubts = Settings(), {}
+        for name, tally in tallies.items():
+            signal = _BY_COLUMN[name].signal
+            found = doubt(signal, tally.sample(), self._units[name], settings)
+            if found is not None:
+                doubts[name] = found
+        grounds = {_BY_COLUMN[name].signal for name in self._reader.grounds}
+        names = {_BY_COLUMN[name].signal: theirs for name, theirs in self._reader.names.items()}
+        try:
+            refuse_guesses(self._reader.path, doubts.values(), grounds, names)
+        except InputError:
+            # What was understood until then is of use to who has to correct it.
+            for sentence in self._reader.understood():
+                self._console.say(sentence)
+            raise
+        for name, found in doubts.items():
+            self._console.warn(advice(found, self._reader.names[name]))
+
+    def _told(self, tallies: dict[str, Tally], ordered: Ordered, notes: list[str]) -> Imported:
+        reader = self._reader
+        period_s = ordered.period_s
+        unused = [reader.names[n] for n in reader.names if n not in self._used]
+        return Imported(
+            reader.path, self._sources(tallies), ordered.rows_read, ordered.rows,
+            ordered.duplicates, period_s, ordered.span_ns,
+            gaps(ordered.distinct(), max(1, round(period_s * 1e9))),
+            (*reader.ignored, *unused), (*reader.understood(), *notes),
+            reader.time_zone, reader.time_words,
+        )  # fmt: skip
+
+    def _sources(self, tallies: dict[str, Tally]) -> list[SignalSource]:
+        sources = []
+        for info in SIGNALS:
+            if info.signal in self._constants:
+                value = self._constants[info.signal]
+                sources.append(
+                    SignalSource(info.topic, '', info.unit, info.unit, value, value, 0, True)
+                )
+            elif info.column in self._used:
+                tally, unit = tallies[info.column], self._units[info.column]
+                low, high = np.sort(convert(info.signal, unit, np.array([tally.low, tally.high])))
+                sources.append(
+                    SignalSource(
+                        info.topic,
+                        self._reader.names[info.column],
+                        unit,
+                        info.unit,
+                        float(low),
+                        float(high),
+                        tally.missing,
+                        False,
+                        dict(self._reader.words[info.column].most_common(8)),
+                        self._reader.empty[info.column],
+                        self._reader.grounds.get(info.column, ''),
+                    )
+                )
+        return sources
 
 
-def _read(path: Path, mapping: Mapping) -> RawTable:
+def _reader(path: Path, mapping: Mapping) -> TableReader:
     columns, strange = names_for(mapping)
     try:
-        return read_table(path, columns, list(mapping.constants))
+        return TableReader(path, columns, list(mapping.constants), mapping.table)
     except InputError as error:
         if not strange:
             raise
         raise unknown_unit(strange[0]) from error
 
 
-def _ignored(raw: RawTable, mapping: Mapping) -> tuple[str, ...]:
-    """Return the columns that stand for nothing here."""
-    used = [name for column, name in raw.names.items() if not _is_constant(column, mapping)]
-    unused = unused_columns(Path(raw.path), used)
-    times = {mapping.columns[key].theirs for key in _TIMES if key in mapping.columns}
-    times |= set(_TIMES) - set(mapping.columns)
-    marks = {f'{name}{_QUALITY}' for name in used}
-    return tuple(name for name in unused if name not in times | marks)
-
-
-def _is_constant(column: str, mapping: Mapping) -> bool:
-    return any(i.column == column and i.topic in mapping.constants for i in SIGNALS)
-
-
-def _signals(
-    raw: RawTable, rows: IntArray, mapping: Mapping, console: Console
-) -> tuple[dict[Signal, FloatArray], dict[Signal, Any], list[SignalSource]]:
-    """Convert each column and fill in the constants."""
-    constants = {c.name: c.value for c in mapping.constants.values()}
-    check_constants({i.signal: constants[i.topic] for i in SIGNALS if i.topic in constants})
-    columns: dict[Signal, FloatArray] = {}
-    quality: dict[Signal, Any] = {}
-    sources = []
-    for info in SIGNALS:
-        written = raw.columns.get(info.column)
-        if info.topic in constants:
-            if written is not None:
-                console.warn(
-                    f"{info.topic} stands in the table as '{raw.names[info.column]}' too; "
-                    'the constant is used instead.'
-                )
-            value = constants[info.topic]
-            columns[info.signal] = np.full(len(rows), value)
-            sources.append(
-                SignalSource(info.topic, '', info.unit, info.unit, value, value, 0, True)
-            )
-        elif written is not None:
-            unit = unit_for(info.signal, mapping)
-            columns[info.signal] = convert(info.signal, unit, written[rows])
-            if info.column in raw.quality:
-                quality[info.signal] = raw.quality[info.column][rows]
-            sources.append(_source(info, raw, unit, columns[info.signal]))
-            _doubt_aloud(info, written, unit, raw.names[info.column], console)
-    _say_uncertain(quality, console)
-    return columns, quality, sources
-
-
-def _source(info: SignalInfo, raw: RawTable, unit: str, values: FloatArray) -> SignalSource:
-    known = values[np.isfinite(values)]
-    low, high = (float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)
-    return SignalSource(
-        info.topic, raw.names[info.column], unit, info.unit, low, high,
-        len(values) - len(known), False,
-    )  # fmt: skip
-
-
-def _doubt_aloud(
-    info: SignalInfo, written: FloatArray, unit: str, theirs: str, console: Console
-) -> None:
-    found = doubt(info.signal, written, unit, Settings())
-    if found is not None:
-        console.warn(advice(found, theirs))
-
-
-def _say_uncertain(quality: dict[Signal, Any], console: Console) -> None:
-    """Say what a plain recording cannot hold."""
-    uncertain = sum(int((codes == Quality.UNCERTAIN).sum()) for codes in quality.values())
-    if uncertain:
-        console.warn(
-            f'{uncertain} values are marked uncertain; a plain recording has no place for that '
-            'mark, they stand there as good.'
-        )
+def _uncertain(block: RawBlock, name: str) -> int:
+    codes: Any = block.quality.get(name)
+    if codes is None:
+        return 0
+    there = block.present.get(name)
+    return int(((codes == Quality.UNCERTAIN) if there is None else
+                ((codes == Quality.UNCERTAIN) & there)).sum())  # fmt: skip

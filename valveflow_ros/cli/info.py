@@ -29,6 +29,12 @@ def run(options: Namespace, console: Console) -> Outcome:
     """Read and describe."""
     mapping = read_mapping(options.column, options.constant)
     console.progress(0.1, 'reading')
+    if not options.json:
+        from valveflow_ros.cli.first_facts import first_facts
+
+        told = first_facts(options.log)
+        if told:
+            console.say(told)
     from valveflow_ros.cli.inspection import inspect
     from valveflow_ros.cli.log_input import open_input
 

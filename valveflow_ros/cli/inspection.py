@@ -217,9 +217,14 @@ def _in_order(readings: Readings, settings: Settings) -> bool:
 def _facts(log: LogInput, signal: Signal, step_s: float) -> SignalFacts:
     info = SIGNALS[signal]
     mine = log.readings.signal == signal
-    values, times = log.readings.value[mine], np.sort(log.readings.time_ns[mine])
-    known = values[np.isfinite(values)]
-    low, middle, high = np.quantile(known, (0.0, 0.5, 1.0)) if len(known) else (np.nan,) * 3
+    values, times = log.readings.value[mine], log.readings.time_ns[mine]
+    if (times[1:] < times[:-1]).any():
+        times = np.sort(times)
+    finite = np.isfinite(values)
+    known = values if finite.all() else values[finite]
+    low, middle, high = (
+        (known.min(), np.median(known), known.max()) if len(known) else (np.nan,) * 3
+    )
     found = gaps(times, round(step_s * 1e9), _GAP_STEPS) if np.isfinite(step_s) else []
     return SignalFacts(
         info.topic,

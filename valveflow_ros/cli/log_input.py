@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,11 +14,14 @@ from valveflow_ros.cli.mapping import Column, Mapping
 from valveflow_ros.cli.plausible import Doubt, doubt, limits
 from valveflow_ros.cli.usage import UsageError
 from valveflow_ros.config import Settings
-from valveflow_ros.core.units import UNITS, convert
+from valveflow_ros.core.unit_table import UNITS, convert
 from valveflow_ros.errors import DataError, InputError
 from valveflow_ros.logs import LogContents, open_log
+from valveflow_ros.logs.historian_match import option
 from valveflow_ros.records import SIGNALS, Quality, Readings, Signal
 
+# A column is not the signal it is named after if most of its values cannot be.
+_MOST = 0.5
 _BY_TOPIC = {info.topic: info for info in SIGNALS}
 
 
@@ -62,12 +65,15 @@ def open_input(path: Path, mapping: Mapping, console: Console) -> LogInput:
     contents = open_with(path, mapping)
     for sentence in contents.warnings:
         console.warn(sentence)
+    for sentence in contents.understood:
+        console.say(sentence)
     told = units_told(contents)
     units = {s: unit_for(s, mapping, told) for s in contents.signals}
     constants = {_BY_TOPIC[c.name].signal: c.value for c in mapping.constants.values()}
     check_constants(constants)
     readings = _converted(contents.readings, units)
     doubts = _doubts(contents, units, constants)
+    refuse_guesses(path, doubts, contents.grounds, contents.signals)
     for found in doubts:
         console.warn(advice(found, contents.signals[found.signal]))
     for signal in constants.keys() & contents.signals.keys():
@@ -75,14 +81,14 @@ def open_input(path: Path, mapping: Mapping, console: Console) -> LogInput:
             f"{SIGNALS[signal].topic} stands in the log as '{contents.signals[signal]}' too; "
             'the constant is used instead.'
         )
-    return LogInput(contents, _with_constants(readings, constants), units, constants, doubts)
+    return LogInput(contents, with_constants(readings, constants), units, constants, doubts)
 
 
 def open_with(path: Path, mapping: Mapping) -> LogContents:
     """Open a log under the names of ``--column``; raises like `open_input`."""
     columns, strange = names_for(mapping)
     try:
-        return open_log(path, columns=columns, absent=list(mapping.constants))
+        return open_log(path, columns=columns, absent=list(mapping.constants), table=mapping.table)
     except InputError as error:
         if not strange:
             raise
@@ -130,8 +136,11 @@ def units_told(contents: LogContents) -> dict[Signal, str]:
     """Return the units a recording of the monitor was made with.
 
     The monitor records what the gateway sent, as it was sent, and its own
-    parameters beside it. Stamped samples carry the units of the contract.
+    parameters beside it. Stamped samples carry the units of the contract. The
+    columns of a table may name their units.
     """
+    if contents.units:
+        return dict(contents.units)
     try:
         parameters = json.loads(contents.attachments['parameters.json'])
         named = {s: parameters.get(f'{SIGNALS[s].topic}_unit') for s in contents.signals}
@@ -162,6 +171,29 @@ def check_constants(constants: dict[Signal, float]) -> None:
                 f'{high:g} {info.unit}); for another unit write {info.topic}=VALUE:UNIT with one '
                 f'of {others}.'
             )
+
+
+def refuse_guesses(
+    path: object, doubts: Iterable[Doubt], grounds: Container[Signal], names: dict[Signal, str]
+) -> None:
+    """Refuse a column that was found by its name and whose values speak against it.
+
+    Raises
+    ------
+    InputError
+        With the option that would help.
+    """
+    for found in doubts:
+        if found.signal in grounds and (found.looks_like or found.impossible > _MOST):
+            theirs = names[found.signal]
+            topic = SIGNALS[found.signal].topic
+            said = advice(found, theirs)
+            if not found.looks_like:
+                chosen = option(topic, theirs, SIGNALS[found.signal].unit)
+                said += f' If it is that signal all the same, add {chosen}; if not, name the right'
+                said += f' one with --column {topic}=THEIRS[:unit]'
+            said = said.removeprefix(f'{topic}: ')
+            raise InputError(f"{path}: '{theirs}' reads like {topic}, but {said}.")
 
 
 def advice(found: Doubt, theirs: str) -> str:
@@ -207,8 +239,14 @@ def _doubts(
     return [d for d in found if d is not None]
 
 
-def _with_constants(readings: Readings, constants: dict[Signal, float]) -> Readings:
-    """Put each constant beside every reading of a measured signal."""
+def with_constants(readings: Readings, constants: dict[Signal, float]) -> Readings:
+    """Put each constant beside every reading of a measured signal.
+
+    Raises
+    ------
+    DataError
+        If no signal is measured.
+    """
     if not constants:
         return readings
     kept = ~np.isin(readings.signal, [int(s) for s in constants])

@@ -1,15 +1,16 @@
-"""The options that say which column is which signal: ``--column`` and ``--constant``."""
+"""The options that say how a log is to be understood: ``--column``, ``--constant`` and more."""
 
 from __future__ import annotations
 
 from argparse import ArgumentParser
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from valveflow_ros.cli.usage import UsageError
 
 if TYPE_CHECKING:
+    from valveflow_ros.logs.table_options import TableOptions
     from valveflow_ros.records import Signal
 
 _TIMES = ('time', 'date')
@@ -46,16 +47,35 @@ class Constant:
     written: str
 
 
+def _as_seen() -> TableOptions:
+    from valveflow_ros.logs.table_options import AS_SEEN
+
+    return AS_SEEN
+
+
 @dataclass(frozen=True, slots=True)
 class Mapping:
     """All of them, by the topic's name."""
 
     columns: dict[str, Column] = field(default_factory=dict)
     constants: dict[str, Constant] = field(default_factory=dict)
+    table: TableOptions = field(default_factory=_as_seen)
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What one of the options says of a table: the name of a field and its value."""
+
+    name: str
+    value: str
 
 
 def add_mapping(parser: ArgumentParser) -> None:
-    """Add the two options."""
+    """Add the options.
+
+    Those about tables are gathered in the same list as ``--column``, so that
+    every verb hands on one thing.
+    """
     parser.add_argument(
         '--column', action='append', default=[], metavar='NAME=THEIRS[:UNIT]',
         help='which column or topic of yours is the signal NAME, and its unit if it is not the '
@@ -65,6 +85,27 @@ def add_mapping(parser: ArgumentParser) -> None:
         '--constant', action='append', default=[], metavar='NAME=VALUE[:UNIT]',
         help='a signal that was not logged and hardly changes',
     )  # fmt: skip
+    about = parser.add_argument_group('how a table is written, where it does not show it itself')
+    about.add_argument(
+        '--time-zone', dest='column', action='append', type=_about('time_zone'), metavar='ZONE',
+        help='zone of times that name none, such as Europe/Berlin or +01:00 (default: UTC)',
+    )  # fmt: skip
+    about.add_argument(
+        '--date-order', dest='column', action='append', type=_about('date_order'),
+        metavar='dmy|mdy', help='whether 01/02/2026 is in February (dmy) or in January (mdy)',
+    )  # fmt: skip
+    about.add_argument(
+        '--decimal', dest='column', action='append', type=_about('decimal'),
+        metavar='point|comma', help='what stands before the decimals of a number',
+    )  # fmt: skip
+    about.add_argument(
+        '--sheet', dest='column', action='append', type=_about('sheet'), metavar='NAME',
+        help='which sheet of a workbook',
+    )  # fmt: skip
+
+
+def _about(name: str) -> Callable[[str], About]:
+    return lambda value: About(name, value)
 
 
 MAPPING_HELP = """\
@@ -74,10 +115,11 @@ names and units (the usual unit first):
   main_steam_temperature    degC, K, degF
   generated_power           MW, kW, W
   valve_command             %, fraction; optional
-  time, date                ISO 8601 or Unix seconds"""
+  time, date                date and time of the usual kinds, or Unix seconds
+Columns of a table that are named after what they hold need no --column."""
 
 
-def read_mapping(columns: Sequence[str], constants: Sequence[str]) -> Mapping:
+def read_mapping(columns: Sequence[str | About], constants: Sequence[str]) -> Mapping:
     """Read both options.
 
     Raises
@@ -85,8 +127,8 @@ def read_mapping(columns: Sequence[str], constants: Sequence[str]) -> Mapping:
     UsageError
         Something is not of the right form, given twice, or contradictory.
     """
-    found = Mapping()
-    for text in columns:
+    found = Mapping(table=_table([c for c in columns if isinstance(c, About)]))
+    for text in (c for c in columns if isinstance(c, str)):
         column = _column(text)
         if column.name in found.columns:
             raise UsageError(f'--column {column.name} is given twice.')
@@ -103,6 +145,20 @@ def read_mapping(columns: Sequence[str], constants: Sequence[str]) -> Mapping:
     return found
 
 
+def _table(said: Sequence[About]) -> TableOptions:
+    from valveflow_ros.errors import InputError
+    from valveflow_ros.logs.historian_zone import zone_of
+
+    options = _as_seen()
+    try:
+        for one in said:
+            options = replace(options, **{one.name: one.value.strip()})
+        zone_of(options.time_zone)
+    except InputError as error:
+        raise UsageError(str(error)) from None
+    return options
+
+
 def _split(option: str, text: str) -> tuple[str, str]:
     name, equals, rest = text.partition('=')
     if not equals or not name.strip() or not rest.strip():
@@ -111,7 +167,7 @@ def _split(option: str, text: str) -> tuple[str, str]:
 
 
 def _column(text: str) -> Column:
-    from valveflow_ros.core.units import UNITS
+    from valveflow_ros.core.unit_table import UNITS
 
     name, whole = _split('column', text)
     if name in _TIMES:
@@ -128,7 +184,7 @@ def _column(text: str) -> Column:
 def _constant(text: str) -> Constant:
     import numpy as np
 
-    from valveflow_ros.core.units import convert
+    from valveflow_ros.core.unit_table import convert
     from valveflow_ros.errors import InputError
 
     name, rest = _split('constant', text)

@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from valveflow_ros.cli.usage import UsageError
 from valveflow_ros.core.characteristic import Characteristic
-from valveflow_ros.core.characteristic_json import from_json
-from valveflow_ros.diagnosis import model_json
-from valveflow_ros.diagnosis.extended_model import ExtendedModel
+from valveflow_ros.core.characteristic_json import FORMAT, from_json
 from valveflow_ros.errors import DataError, RecordingError
+
+if TYPE_CHECKING:
+    from valveflow_ros.diagnosis.extended_model import ExtendedModel
 
 _MOST_BYTES = 50_000_000
 _CURVE, _EXTENDED = 'characteristic.json', 'extended_model.json'
@@ -27,7 +28,7 @@ def read_model(path: Path) -> Characteristic:
         It cannot be read, or is no characteristic this version can read.
     """
     model = read_either(path)
-    if isinstance(model, ExtendedModel):
+    if not isinstance(model, Characteristic):
         raise RecordingError(path, 'is an extended model; here a characteristic.json is wanted')
     return model
 
@@ -68,7 +69,7 @@ def read_either(
         if path.stat().st_size > _MOST_BYTES:
             raise RecordingError(path, 'is too large to be a flow characteristic')
         raw = json.loads(path.read_text(encoding='utf-8'))
-        return model_json.from_json(raw) if model_json.is_model(raw) else from_json(raw)
+        return _of_json(raw)
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise RecordingError(path, f'cannot be read ({reason})') from None
@@ -76,6 +77,14 @@ def read_either(
         raise RecordingError(path, 'is no flow characteristic: it holds no JSON') from None
     except DataError as error:
         raise RecordingError(path, f'cannot be used. {str(error).rstrip(".")}') from None
+
+
+def _of_json(raw: object) -> Characteristic | ExtendedModel:
+    if not isinstance(raw, dict) or raw.get('format') == FORMAT:
+        return from_json(raw)
+    from valveflow_ros.diagnosis import model_json
+
+    return model_json.from_json(raw) if model_json.is_model(raw) else from_json(raw)
 
 
 def check_exponent(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.units import UNITS
+from valveflow_ros.core.unit_table import UNITS
 from valveflow_ros.records import SIGNALS, FloatArray, Signal
 
 # What the signals of a steam unit in operation usually read, in engine units.

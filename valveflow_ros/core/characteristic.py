@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from valveflow_ros.core.chart import ChartDesign
+from valveflow_ros.core.chart_design import ChartDesign
 from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import FloatArray

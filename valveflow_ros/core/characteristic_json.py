@@ -14,7 +14,7 @@ from valveflow_ros.core.characteristic import (
     Source,
     Support,
 )
-from valveflow_ros.core.chart import ChartDesign
+from valveflow_ros.core.chart_design import ChartDesign
 from valveflow_ros.core.held_json import held_from, held_json
 from valveflow_ros.core.json_field import Field
 from valveflow_ros.errors import DataError

@@ -11,12 +11,12 @@ the curve (`run_length`): they belong to a wanted time between false alarms.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from valveflow_ros.core.chart_design import ChartDesign
 from valveflow_ros.core.jit import jit
 from valveflow_ros.core.state import ArrayMemory
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
@@ -30,34 +30,6 @@ _SUM, _LAST, _EVIDENCE, _SHIFT = range(4)
 # For each of four sums: its value, the residuals added since it left zero, and how many.
 _C, _TOTAL, _COUNT = range(3)
 SMALL, LARGE = 0, 1
-
-
-@dataclass(frozen=True, slots=True)
-class ChartDesign:
-    """What a chart needs to know of the residual it watches.
-
-    Attributes
-    ----------
-    block_s : float
-        Length of a block.
-    correlation : float
-        From block to block, 0 <= correlation < 1.
-    innovation_mw : float
-        sd of a block mean given the one before.
-    slack : tuple of float
-        What each sum lets pass per block, in innovations: for small and for large shifts.
-    limit : tuple of float
-        Where each sum raises the alarm, in innovations.
-    run_length_days : float
-        Mean time between false alarms that the limits were set for.
-    """
-
-    block_s: float
-    correlation: float
-    innovation_mw: float
-    slack: tuple[float, float]
-    limit: tuple[float, float]
-    run_length_days: float
 
 
 @jit

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.core import regional_kernel as kernel
 from valveflow_ros.records import ByteArray, FloatArray
 
 
@@ -60,6 +59,9 @@ class RegionalModel:
 
     def taps(self, step_s: float) -> FloatArray:
         """Return the filter of each region as the kernels want it, shape (I, 7)."""
+        # A model that is only looked at can do without compiled code.
+        from valveflow_ros.core import regional_kernel as kernel
+
         return kernel.make_taps(self.time_constants, self.delays, step_s)
 
     def respond(
@@ -68,6 +70,8 @@ class RegionalModel:
         """Return the dynamic prediction in MW and where it has settled, shapes (n,)."""
         answer = np.empty(len(u))
         settled = np.empty(len(u), dtype=np.uint8)
+        from valveflow_ros.core import regional_kernel as kernel
+
         kernel.respond(
             self.static(u), usable, self.levels, self.taps(step_s),
             round(settle_s / step_s), answer, settled,

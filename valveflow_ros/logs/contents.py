@@ -89,6 +89,12 @@ class LogContents:
         First and last log time of any message.
     damaged_chunks : int
         Places where something was lost.
+    units : dict[Signal, str]
+        The unit the log names for a signal, as a table's column does.
+    grounds : dict[Signal, str]
+        Why a column was taken for a signal, where that had to be found out.
+    understood : list of str
+        Sentences about what had to be found out.
     """
 
     path: str
@@ -103,6 +109,9 @@ class LogContents:
     end_ns: int | None = None
     damaged_chunks: int = 0
     source: MessageSource = field(default_factory=NoMessages)
+    units: dict[Signal, str] = field(default_factory=dict)
+    grounds: dict[Signal, str] = field(default_factory=dict)
+    understood: list[str] = field(default_factory=list)
 
     def iter_messages(self, topics: Collection[str] | None = None) -> Iterator[LoggedMessage]:
         """Yield raw messages in the order of their log times, read anew from the file.

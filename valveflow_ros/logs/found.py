@@ -84,8 +84,9 @@ Placed = tuple[IntArray, Rows]
 
 def float_rows(content: bytes, table: MessageTable, mine: IntArray) -> tuple[Placed, IntArray]:
     """Return the values of the Float64 messages ``mine``, and those that are none."""
-    fitting = np.isin(table.size[mine], _SIZES)
-    picked = mine[fitting]
+    size = table.size if len(mine) == len(table) else table.size[mine]
+    fitting = (size == _SIZES[0]) | (size == _SIZES[1])
+    picked = mine if fitting.all() else mine[fitting]
     payload = rows(content, _PAYLOAD, HEAD_SIZE, table.offset[picked])
     mark = payload['mark']
     value = np.ascontiguousarray(payload['value'])
@@ -96,15 +97,17 @@ def float_rows(content: bytes, table: MessageTable, mine: IntArray) -> tuple[Pla
     if len(wrong):
         picked, value = picked[plain], value[plain]
     n = len(picked)
+    # Almost always every message of a group is picked, and in order.
+    cut = slice(None) if n == len(table) else picked
     found = Rows(
-        table.log_time[picked],
-        table.publish_time[picked],
-        table.channel[picked],
+        table.log_time[cut],
+        table.publish_time[cut],
+        table.channel[cut],
         np.full(n, -1, dtype=np.int8),
         value,
         np.zeros(n, dtype=np.uint8),
     )
-    return (table.offset[picked], found), wrong
+    return (table.offset[cut], found), wrong
 
 
 def sample_rows(table: MessageTable, picked: IntArray, samples: Samples) -> Placed:

@@ -95,7 +95,9 @@ class _Collector:
             self._learn()
         if not len(table):
             return
-        present, counts = np.unique(table.channel, return_counts=True)
+        per_channel = np.bincount(table.channel)
+        present = np.flatnonzero(per_channel)
+        counts = per_channel[present]
         for channel, count in zip(present.tolist(), counts.tolist(), strict=True):
             self.contents.counts[channel] = self.contents.counts.get(channel, 0) + count
             if channel not in self.known:

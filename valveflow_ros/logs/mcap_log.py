@@ -209,15 +209,21 @@ def _readings(files: list[FileContents], chosen: dict[str, Signal]) -> tuple[Rea
     signal = np.concatenate([signal for _, signal in parts])
     log_time = np.concatenate([rows.log_time for rows, _ in parts])
     keep = signal >= 0
+    whole = bool(keep.all())
     # Almost always the order of the file is the order of the log times already.
-    sorted_already = bool((np.diff(log_time) >= 0).all())
-    order = None if sorted_already else np.argsort(log_time[keep], kind='stable')
+    sorted_already = bool((log_time[1:] >= log_time[:-1]).all())
+    order = (
+        None
+        if sorted_already
+        else np.argsort(log_time if whole else log_time[keep], kind='stable')
+    )
     columns = [
         np.concatenate([getattr(rows, field) for rows, _ in parts])
         for field in ('time_ns', 'value', 'quality')
     ]
-    picked = [
-        column[keep] if order is None else column[keep][order]
-        for column in (columns[0], signal, columns[1], columns[2], log_time)
-    ]
+    everything = (columns[0], signal, columns[1], columns[2], log_time)
+    # Picking all of some million values takes as long as reading them.
+    picked = [column if whole else column[keep] for column in everything]
+    if order is not None:
+        picked = [column[order] for column in picked]
     return Readings(*picked[:4]), picked[4]

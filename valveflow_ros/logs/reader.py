@@ -20,10 +20,11 @@ from valveflow_ros.logs.layout import MAGIC
 from valveflow_ros.logs.mcap_log import read_recording
 from valveflow_ros.logs.part_file import PART_SUFFIX
 from valveflow_ros.logs.source import Source, os_problem
+from valveflow_ros.logs.table_options import AS_SEEN, TableOptions
 from valveflow_ros.logs.tables import open_table
 
 MAX_METADATA_BYTES = 16 << 20
-_TABLES = ('.csv', '.tsv', '.txt', '.parquet', '.pq')
+TABLE_SUFFIXES = ('.csv', '.tsv', '.txt', '.parquet', '.pq', '.xlsx', '.xlsm')
 
 
 def open_log(
@@ -32,20 +33,23 @@ def open_log(
     columns: Mapping[str, str] | None = None,
     absent: Collection[str] = (),
     unchecked: bool = False,
+    table: TableOptions = AS_SEEN,
 ) -> LogContents:
     """Return what a log holds.
 
     Parameters
     ----------
     path : str or Path
-        An ``.mcap`` file in any state, a rosbag2 folder, a ``.csv`` or a
-        ``.parquet`` table.
+        An ``.mcap`` file in any state, a rosbag2 folder, a ``.csv``, ``.xlsx``
+        or ``.parquet`` table.
     columns : mapping of str to str, optional
         Contract name to the topic or column that is to stand for it.
     absent : collection of str
         Contract names that a table need not have.
     unchecked : bool
         Also read chunks that were written without a checksum.
+    table : TableOptions
+        What a table does not say itself.
 
     Raises
     ------
@@ -64,14 +68,16 @@ def open_log(
         files, warnings = _files_of(place)
         contents = read_recording(files, str(path), names, unchecked)
         return replace(contents, warnings=(*warnings, *contents.warnings))
-    if place.suffix.lower() in _TABLES:
-        return open_table(place, names, absent)
+    if place.suffix.lower() in TABLE_SUFFIXES:
+        return open_table(place, names, absent, table)
     if place.suffix.lower() == '.db3':
         raise RecordingError(path, _sqlite_problem())
     if place.suffix.lower() not in ('.mcap', PART_SUFFIX):
         with Source.open(place) as source:
             if source.read(0, len(MAGIC)) != MAGIC:
-                raise RecordingError(path, 'is neither an .mcap file nor a .csv or .parquet table')
+                raise RecordingError(
+                    path, 'is neither an .mcap file nor a .csv, .xlsx or .parquet table'
+                )
     return read_recording([place], str(path), names, unchecked)
 
 

@@ -135,17 +135,21 @@ class Scanner:
         They make up most records of a slow plant's file; a wrong length
         disagrees with the length that stands within.
         """
-        block = self._source.read(position, _INDEX_BLOCK)
-        place = 0
-        while place + _INDEX_HEAD.size <= len(block):
+        block, place = b'', 0
+        while True:
+            if place + _INDEX_HEAD.size > len(block):
+                # Those of large chunks are longer than what was looked at at once.
+                position, place = position + place, 0
+                block = self._source.read(position, _INDEX_BLOCK)
+                if len(block) < _INDEX_HEAD.size:
+                    return position
             op, length, _, inner = _INDEX_HEAD.unpack_from(block, place)
             after = place + RECORD_HEAD.size + length
             if op != Op.MESSAGE_INDEX or inner != length - 6:
-                break
+                return position + place
             if position + after > self._source.size:
-                break
+                return position + place
             place = after
-        return position + place
 
     def _step(self, position: int) -> tuple[Chunk | None, int]:
         """Deal with the record at a position; return its chunk, if any, and where to go on."""

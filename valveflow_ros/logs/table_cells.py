@@ -1,8 +1,9 @@
-"""Makes numbers of the cells of a table, and says which were none."""
+"""Makes numbers of the cells of a table, and counts the words that stand in place of one."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,44 +15,127 @@ if TYPE_CHECKING:
 
 
 QUALITY_SUFFIX = '_quality'
+_WORD_LENGTH = 40
+# So many different words are told apart; a column of free text has no end of them.
+_MOST_WORDS = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Marks:
+    """How numbers are written: decimal and thousands mark."""
+
+    decimal: str = '.'
+    thousands: str = ''
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Numbers of a column; ``bad`` counts cells that hold something else than a number."""
+    """Numbers of a column; ``words`` counts what stands in cells that hold no number.
+
+    Attributes
+    ----------
+    values : float64 (n,)
+        NaN where no number stands.
+    words : Counter
+        Texts that are no numbers; cells that are empty, or hold a word that
+        means empty, are not among them.
+    empty : int
+        Such cells.
+    first_bad_row : int
+        Row of the first word, -1 if there is none.
+    """
 
     values: FloatArray
-    bad: int = 0
+    words: Counter[str] = field(default_factory=Counter)
     empty: int = 0
     first_bad_row: int = -1
-    first_bad_text: str = ''
+
+    @property
+    def bad(self) -> int:
+        """Return how many cells hold something else than a number."""
+        return self.words.total()
 
 
-def to_numbers(column: pd.Series[Any], decimal_comma: bool) -> Column:
+def to_numbers(column: pd.Series[Any], marks: Marks = Marks()) -> Column:
     """Return float64 values; NaN where a cell is empty or no number.
 
     Parameters
     ----------
     column : Series
         Cells in the order of the file.
-    decimal_comma : bool
-        Whether ``1,5`` means one and a half.
+    marks : Marks
+        How its numbers are written.
     """
     import pandas as pd
 
     if column.dtype.kind in 'iufb' and not hasattr(column.dtype, 'na_value'):
         values = column.to_numpy(dtype=np.float64)
         return Column(values, empty=int(np.isnan(values).sum()))
-    text = column.astype('string').str.strip()
-    empty = text.isna() | text.str.lower().isin(_EMPTY)
-    clean = text.str.replace(',', '.', regex=False) if decimal_comma else text
-    numbers = pd.to_numeric(clean, errors='coerce')
-    values = numbers.to_numpy(dtype=np.float64, na_value=np.nan)
-    bad = np.isnan(values) & ~empty.to_numpy(dtype=bool)
-    if not bad.any():
-        return Column(values, empty=int(empty.sum()))
-    first = int(bad.argmax())
-    return Column(values, int(bad.sum()), int(empty.sum()), first, str(text.iloc[first])[:40])
+    if column.dtype.kind == 'M':
+        text = column.astype(str)
+    else:
+        text = column
+        numbers = pd.to_numeric(column, errors='coerce') if marks.thousands != '.' else None
+        if numbers is not None and column.dtype.kind != 'O':
+            values = numbers.to_numpy(dtype=np.float64, na_value=np.nan, copy=True)
+            return _finish(values, text, marks)
+    return _finish(np.full(len(column), np.nan), text, marks)
+
+
+def _finish(values: FloatArray, text: pd.Series[Any], marks: Marks) -> Column:
+    """Look at the cells that are no plain numbers one kind of text at a time."""
+    import pandas as pd
+
+    left = np.flatnonzero(np.isnan(values))
+    if not len(left):
+        return Column(values)
+    codes, kinds = pd.factorize(text.iloc[left].astype('string').str.strip())
+    kinds = kinds.tolist()
+    numbers = np.array([_number(kind, marks) for kind in kinds] + [np.nan])
+    values[left] = numbers[codes]
+    counts = np.bincount(codes[codes >= 0], minlength=len(kinds))
+    words: Counter[str] = Counter()
+    empty, first = int((codes < 0).sum()), -1
+    for k, kind in enumerate(kinds):
+        if not np.isnan(numbers[k]):
+            continue
+        if kind.lower() in _EMPTY:
+            empty += int(counts[k])
+            continue
+        row = int(left[int((codes == k).argmax())]) if len(words) < _MOST_WORDS else first
+        first = row if first < 0 else min(first, row)
+        words[kind[:_WORD_LENGTH] if len(words) < _MOST_WORDS else '...'] += int(counts[k])
+    return Column(values, words, empty, first)
+
+
+def _number(text: str, marks: Marks) -> float:
+    """Return the number a text spells, NaN if it spells none."""
+    plain = text
+    for mark in _PARTING:
+        if mark in plain and _is_grouped(plain.replace(marks.decimal, '.'), mark):
+            plain = plain.replace(mark, '')
+    if marks.thousands and marks.thousands in plain:
+        head, _, tail = plain.partition(marks.decimal)
+        if _is_grouped(head, marks.thousands) and marks.thousands not in tail:
+            plain = plain.replace(marks.thousands, '')
+    if marks.decimal == ',':
+        plain = plain.replace(',', '.')
+    if '_' in plain or not plain.isascii():
+        return float('nan')
+    try:
+        value = float(plain)
+    except ValueError:
+        return float('nan')
+    return value
+
+
+def _is_grouped(text: str, mark: str) -> bool:
+    """Tell whether a mark parts a number's digits by threes."""
+    head, *groups = text.lstrip('+-').partition('.')[0].split(mark)
+    if mark == '.':
+        head, *groups = text.lstrip('+-').split(mark)
+    digits = 1 <= len(head) <= 3 and head.isdecimal()
+    return digits and bool(groups) and all(len(g) == 3 and g.isdecimal() for g in groups)
 
 
 def to_quality(column: pd.Series[Any]) -> ByteArray:
@@ -63,4 +147,5 @@ def to_quality(column: pd.Series[Any]) -> ByteArray:
     return np.where(known, codes, float(Quality.BAD)).astype(np.uint8)
 
 
-_EMPTY = frozenset({'', 'nan', 'na', 'n/a', 'null', 'none', '-'})
+_PARTING = ("'", '’', ' ', '\u00a0', '\u202f')
+_EMPTY = frozenset({'', 'nan', 'na', 'n/a', '#n/a', 'null', 'none', '-', '--'})

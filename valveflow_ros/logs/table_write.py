@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from valveflow_ros.errors import InputError, RecordingError
+from valveflow_ros.logs.historian_match import TIME
 from valveflow_ros.logs.part_file import make_folder
 from valveflow_ros.logs.table_cells import QUALITY_SUFFIX
-from valveflow_ros.logs.tables import TIME
 from valveflow_ros.records import SIGNALS, IntArray, Quality, SampleTable
 
 if TYPE_CHECKING:

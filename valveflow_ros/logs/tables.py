@@ -1,35 +1,26 @@
-"""Reads a historian's table, CSV or Parquet, into columns of numbers over time."""
+"""Reads a historian's table, CSV, Excel or Parquet, into columns of numbers over time."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from valveflow_ros.errors import InputError
 from valveflow_ros.logs.contents import LogContents
-from valveflow_ros.logs.names import signal_of, signals_of
-from valveflow_ros.logs.table_cells import QUALITY_SUFFIX, to_numbers, to_quality
-from valveflow_ros.logs.table_file import load_frame
-from valveflow_ros.logs.table_time import never, to_nanoseconds
+from valveflow_ros.logs.names import signal_of
+from valveflow_ros.logs.table_options import AS_SEEN, TableOptions
+from valveflow_ros.logs.table_reader import TableReader
 from valveflow_ros.records import (
-    SIGNALS,
+    BoolArray,
     ByteArray,
     FloatArray,
     IntArray,
+    Readings,
     SampleTable,
-    Signal,
     table_to_readings,
 )
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-TIME = 'time'
-DATE = 'date'
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +45,14 @@ class RawTable:
         Cells that are not empty and hold no number, by contract column name.
     bad_times : int
         Rows left out because their time cannot be read.
+    units : dict[str, str]
+        The unit the file names, by contract column name.
+    grounds : dict[str, str]
+        Why a column was taken for what it is, where that had to be found out.
+    ignored : tuple of str
+        Columns (of a long table: tags) that were not used.
+    present : dict[str, bool (n,)]
+        Of a long table: which rows have a value of this signal at all.
     """
 
     path: str
@@ -64,161 +63,126 @@ class RawTable:
     notes: tuple[str, ...]
     bad_cells: dict[str, int]
     bad_times: int = 0
+    units: dict[str, str] = field(default_factory=dict)
+    grounds: dict[str, str] = field(default_factory=dict)
+    ignored: tuple[str, ...] = ()
+    present: dict[str, BoolArray] = field(default_factory=dict)
+
+    def readings(self) -> Readings:
+        """Return the values one by one, in the order of time."""
+        by_signal = {signal_of(name): column for name, column in self.columns.items()}
+        quality = {signal_of(name): codes for name, codes in self.quality.items()}
+        table = SampleTable.from_columns(self.time_ns, by_signal, quality)
+        if not self.present:
+            return table_to_readings(table)
+        order = [signal_of(name) for name in self.present]
+        there = np.column_stack([self.present[name] for name in self.present])
+        row, column = np.nonzero(there)
+        signal = np.array(order, dtype=np.int8)[column]
+        return Readings(
+            table.time_ns[row], signal, table.values[row, signal], table.quality[row, signal]
+        )
 
 
 def read_table(
     path: str | Path,
     columns: Mapping[str, str] | None = None,
     absent: Collection[str] = (),
+    options: TableOptions = AS_SEEN,
 ) -> RawTable:
     """Return the table in a file.
 
     Parameters
     ----------
     path : str or Path
-        ``.csv`` (separated by comma, semicolon or tab; decimal comma with the
-        semicolon) or ``.parquet``.
+        ``.csv`` and the like (any common separator, encoding and decimal
+        mark), ``.xlsx`` or ``.parquet``; a column a signal, or a row a value.
     columns : mapping of str to str, optional
-        Contract name, also ``time`` and ``date``, to their column.
+        Contract name, also ``time`` and ``date``, to their column. Signals that
+        are not named are found by the names and units of the columns.
     absent : collection of str
         Contract names that need not be there.
+    options : TableOptions
+        What the table does not say itself.
 
     Raises
     ------
     RecordingError
         If the file is not a table that can be read.
     InputError
-        If a column is missing or a contract name unknown.
+        If a column is missing or could be several, or a contract name is unknown.
     """
-    place = Path(path)
-    wanted = dict(columns or {})
-    times = {name: wanted.pop(name) for name in (TIME, DATE) if name in wanted}
-    by_signal = {signal_of(name): theirs for name, theirs in wanted.items()}
-    spared = signals_of(absent)
-    frame, separator, notes = load_frame(place)
-    chosen = _choose(str(path), frame, by_signal, spared)
-    time_ns, time_notes = _time(str(path), frame, times)
-    notes += time_notes
-    values: dict[str, FloatArray] = {}
-    quality: dict[str, ByteArray] = {}
-    bad_cells: dict[str, int] = {}
-    for name, theirs in chosen.items():
-        column = to_numbers(frame[theirs], separator == ';')
-        values[name] = column.values
-        if column.bad:
-            bad_cells[name] = column.bad
-            notes.append(
-                f"{column.bad} cells of '{theirs}' are no numbers and count as missing; "
-                f"the first is '{column.first_bad_text}' in row {column.first_bad_row + 1}."
-            )
-        if theirs == name and name + QUALITY_SUFFIX in frame.columns:
-            quality[name] = to_quality(frame[name + QUALITY_SUFFIX])
-    raw = RawTable(str(path), time_ns, values, chosen, quality, tuple(notes), bad_cells)
-    return _ordered(raw)
+    return whole_table(TableReader(Path(path), columns or {}, absent, options))
+
+
+def whole_table(reader: TableReader) -> RawTable:
+    """Return all blocks of a table in the order of time; raises like `read_table`."""
+    blocks = list(reader.blocks())
+    notes = reader.notes()
+    raw = RawTable(
+        str(reader.path),
+        np.concatenate([block.time_ns for block in blocks]),
+        {n: np.concatenate([b.columns[n] for b in blocks]) for n in reader.names},
+        dict(reader.names),
+        {n: np.concatenate([b.quality[n] for b in blocks]) for n in blocks[0].quality},
+        (),
+        reader.bad_cells,
+        reader.bad_times,
+        dict(reader.units),
+        dict(reader.grounds),
+        reader.ignored,
+        {n: np.concatenate([b.present[n] for b in blocks]) for n in blocks[0].present},
+    )
+    return _ordered(raw, notes)
 
 
 def open_table(
-    path: Path, columns: Mapping[str, str], absent: Collection[str] = ()
+    path: Path,
+    columns: Mapping[str, str],
+    absent: Collection[str] = (),
+    options: TableOptions = AS_SEEN,
 ) -> LogContents:
     """Return a table as a log; raises like `read_table`."""
-    raw = read_table(path, columns, absent)
-    by_signal = {signal_of(name): column for name, column in raw.columns.items()}
-    quality = {signal_of(name): codes for name, codes in raw.quality.items()}
-    readings = table_to_readings(SampleTable.from_columns(raw.time_ns, by_signal, quality))
-    names = {signal_of(name): theirs for name, theirs in raw.names.items()}
-    start, end = int(raw.time_ns[0]), int(raw.time_ns[-1])
+    reader = TableReader(path, columns, absent, options)
+    raw = whole_table(reader)
+    readings = raw.readings()
     return LogContents(
         raw.path,
         readings,
         readings.time_ns,
-        signals=names,
+        signals={signal_of(name): theirs for name, theirs in raw.names.items()},
         warnings=raw.notes,
-        start_ns=start,
-        end_ns=end,
+        start_ns=int(raw.time_ns[0]),
+        end_ns=int(raw.time_ns[-1]),
+        units={signal_of(name): unit for name, unit in raw.units.items()},
+        grounds={signal_of(name): ground for name, ground in raw.grounds.items()},
+        understood=reader.understood(),
     )
 
 
-def _choose(
-    path: str,
-    frame: pd.DataFrame,
-    wanted: Mapping[Signal, str],
-    spared: set[Signal],
-) -> dict[str, str]:
-    """Return the column of the file for each contract column that can be had."""
-    chosen: dict[str, str] = {}
-    for info in SIGNALS:
-        theirs = wanted.get(info.signal, info.column)
-        if theirs in frame.columns:
-            _check_single(path, frame, theirs)
-            chosen[info.column] = theirs
-        elif info.signal in wanted or (info.required and info.signal not in spared):
-            raise _missing(path, frame, theirs, info.column)
-    return chosen
+def order_note(newest_first: bool) -> str:
+    """Return the sentence for rows that had to be sorted."""
+    kind = 'newest first' if newest_first else 'not in the order of time'
+    return f'The rows stood {kind} and were sorted.'
 
 
-def _missing(path: str, frame: pd.DataFrame, theirs: str, name: str) -> InputError:
-    have = ', '.join(frame.columns[:40])
-    return InputError(
-        f"{path}: there is no column '{theirs}'; the columns are: {have}. "
-        f'Name theirs with --column {name}=THEIRS[:unit].'
-    )
-
-
-def _check_single(path: str, frame: pd.DataFrame, name: str) -> None:
-    if list(frame.columns).count(name) > 1:
-        raise InputError(f"{path}: there are several columns called '{name}'.")
-
-
-def _time(path: str, frame: pd.DataFrame, names: Mapping[str, str]) -> tuple[IntArray, list[str]]:
-    time, date = names.get(TIME, TIME), names.get(DATE, DATE)
-    for key, theirs in names.items():
-        if theirs not in frame.columns:
-            raise _missing(path, frame, theirs, key)
-    if time not in frame.columns:
-        if DATE not in names and date not in frame.columns:
-            raise _missing(path, frame, time, TIME)
-        time = date
-    _check_single(path, frame, time)
-    column = frame[time]
-    if date in frame.columns and date != time and _is_clock(column):
-        _check_single(path, frame, date)
-        column = frame[date].astype('string').str.strip() + 'T' + column.str.strip()
-    return to_nanoseconds(column, path, time)
-
-
-def _is_clock(column: pd.Series[Any]) -> bool:
-    """Tell whether a column holds the time of day only, so that a date is wanted beside it."""
-    if column.dtype.kind in 'iufbM':
-        return False
-    text = column.astype('string').str.strip()
-    clock = text.str.fullmatch(r'[0-9]{1,2}:[0-9]{2}(?::[0-9]{2}(?:[.,][0-9]+)?)?')
-    return bool(clock.fillna(False).mean() > 0.5)
-
-
-def _ordered(raw: RawTable) -> RawTable:
-    """Return the rows whose time is known, in the order of time."""
-    known = raw.time_ns != never()
-    bad_times = int((~known).sum())
-    notes = list(raw.notes)
-    order = np.flatnonzero(known)
-    if bad_times:
-        first = int((~known).argmax()) + 1
-        notes.append(
-            f'{bad_times} rows have no readable time and were left out, the first is row {first}.'
-        )
-    steps = np.diff(raw.time_ns[order])
-    if (steps < 0).any():
-        newest_first = bool((steps <= 0).all())
-        if newest_first:
-            order = order[::-1]
-        order = order[np.argsort(raw.time_ns[order], kind='stable')]
-        kind = 'newest first' if newest_first else 'not in the order of time'
-        notes.append(f'The rows stood {kind} and were sorted.')
+def _ordered(raw: RawTable, notes: list[str]) -> RawTable:
+    """Return the rows in the order of time."""
+    steps = np.diff(raw.time_ns)
+    if not (steps < 0).any():
+        return replace(raw, notes=tuple(notes))
+    newest_first = bool((steps <= 0).all())
+    order = np.arange(len(raw.time_ns))
+    if newest_first:
+        order = order[::-1]
+    order = order[np.argsort(raw.time_ns[order], kind='stable')]
+    if not raw.present:
+        notes = [*notes, order_note(newest_first)]
     return replace(
         raw,
         time_ns=raw.time_ns[order],
         columns={name: column[order] for name, column in raw.columns.items()},
         quality={name: codes[order] for name, codes in raw.quality.items()},
         notes=tuple(notes),
-        bad_times=bad_times,
+        present={name: there[order] for name, there in raw.present.items()},
     )

@@ -1,0 +1,84 @@
+"""``valveflow config``: a file that the monitor takes, and what is wrong with one."""
+
+from __future__ import annotations
+
+import pytest
+import yaml
+
+from valveflow_ros.cli.parameters import read_parameters
+from valveflow_ros.config import PARAMETERS, Settings
+from valveflow_ros.plant.simulator import simulate
+from valveflow_ros.records import SampleTable, Signal
+
+
+@pytest.fixture(scope='module')
+def slow_table(tmp_path_factory):
+    """A day of the plant, a row every ten seconds, pressure in bar and told so."""
+    path = tmp_path_factory.mktemp('config') / 'slow.csv'
+    table: SampleTable = simulate(1.0, 3).table
+    lines = ['Time (UTC),Valve position [%],Live steam pressure [bar],Live steam temp [degC],MW']
+    for k in range(0, len(table), 10):
+        u, p, t, w = (table.column(s)[k] for s in list(Signal)[:4])
+        stamp = str(table.time_ns[k].astype('datetime64[ns]').astype('datetime64[s]'))
+        lines.append(f'{stamp},{u:.3f},{10 * p:.3f},{t:.2f},{w:.3f}')
+    path.write_text('\n'.join(lines))
+    return path
+
+
+def test_the_file_is_taken_and_says_what_it_is_from(run, slow_table, tmp_path):
+    file = tmp_path / 'monitor.yaml'
+    ran = run('config', 'init', slow_table, '-o', file, '--unit-tag', 'U3', '--json')
+    assert ran.status == 0, ran.err
+    fitted = ran.json['fitted']
+    settings = Settings(read_parameters(file, []))
+    assert settings['sample_period'] == 10.0
+    assert settings['main_steam_pressure_unit'] == 'bar'
+    assert settings['unit_tag'] == 'U3'
+    assert settings['window_days'] == PARAMETERS['window_days'].default
+    assert settings.real('input_noise') > 0.0
+    assert settings.real('power_noise') > 0.0
+    changed = {n for n in settings if settings[n] != PARAMETERS[n].default}
+    assert changed == set(fitted)
+    lines = file.read_text().splitlines()
+    for name in PARAMETERS:
+        (at,) = (k for k, line in enumerate(lines) if line.startswith(f'    {name}: '))
+        assert lines[at - 1].startswith('    # fitted: ') == (name in fitted)
+        assert lines[at - 1 - (name in fitted)].startswith(f'    # {PARAMETERS[name].sentence}')
+    assert set(yaml.safe_load(file.read_text())['/**']['ros__parameters']) == set(PARAMETERS)
+    ran = run('config', 'check', file)
+    assert f'{len(fitted)} differ from their defaults' in ran.out
+    assert 'sample_period: 10 s, default 1 s' in ran.out
+    assert 'exists already' in run('config', 'init', slow_table, '-o', file).refused()
+
+
+def test_a_short_log_leaves_the_noise_to_the_monitor(run, slow_table, tmp_path):
+    short = tmp_path / 'short.csv'
+    short.write_text('\n'.join(slow_table.read_text().splitlines()[:30]))
+    ran = run('config', 'init', short)
+    assert ran.status == 0, ran.err
+    assert '# input_noise and power_noise: the log is too short' in ran.out
+    assert '# time_constant and delay: kept at their defaults' in ran.out
+    assert 'input_noise: 0.0' in ran.out
+    Settings(yaml.safe_load(ran.out)['/**']['ros__parameters'])
+
+
+@pytest.mark.parametrize(
+    ('text', 'part'),
+    [
+        ('dellay: 3', "did you mean 'delay'"),
+        ('block: 0.5', 'must not be below sample_period'),
+        ('time_constant: fast', 'must be a number'),
+        ('[', 'no YAML file'),
+    ],
+)
+def test_what_the_monitor_would_refuse_is_named(run, tmp_path, text, part):
+    file = tmp_path / 'x.yaml'
+    file.write_text(f'/**:\n  ros__parameters:\n    {text}\n')
+    sentence = run('config', 'check', file).refused()
+    assert part in sentence
+    assert 'x.yaml' in sentence
+
+
+def test_only_init_and_check(run, tmp_path):
+    assert "not 'make'" in run('config', 'make', tmp_path / 'x').refused(2)
+    assert 'no such file' in run('config', 'check', tmp_path / 'x.yaml').refused()

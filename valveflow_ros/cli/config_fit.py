@@ -1,0 +1,167 @@
+"""Finds out which parameters a log of the plant speaks about."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from valveflow_ros.cli.alignment import Progress, aligned_blocks
+from valveflow_ros.cli.console import Console
+from valveflow_ros.cli.log_input import LogInput, steps_of
+from valveflow_ros.cli.parameters import fitting
+from valveflow_ros.config import PARAMETERS, Settings, Value
+from valveflow_ros.core.align import Aligner
+from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.core.events import FitRequested
+from valveflow_ros.core.fit import fit
+from valveflow_ros.core.monitor import Monitor
+from valveflow_ros.core.offline import feed_aligned
+from valveflow_ros.errors import DataError
+from valveflow_ros.records import SIGNALS
+from valveflow_ros.report.numbers import duration
+
+# A transient cut short spoils segments, one too long only costs some: up in small steps,
+# down in large ones.
+_MORE, _LESS = 0.05, 0.2
+_SURE = 2.0  # standard errors
+_OFFLINE = {'refit_period': 0.0, 'refit_segments': 0}
+_OF_STEP = ('sample_period', 'hold_limit', 'lateness', 'block', 'longest_segment', 'alarm_block',
+            'alarm_average')  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class FittedValue:
+    """A parameter that follows from the data, and from what."""
+
+    name: str
+    value: Value
+    ground: str
+
+    @property
+    def shown(self) -> str:
+        """Return the value with its unit."""
+        unit = PARAMETERS[self.name].unit
+        text = f'{self.value:g}' if isinstance(self.value, float) else str(self.value)
+        return f'{text} {unit}'.strip()
+
+
+class Fitted(dict[str, FittedValue]):
+    """Fitted parameters by name; ``left`` has a sentence for each that could not be fitted."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.left: list[str] = []
+
+    def put(self, name: str, value: Value, ground: str) -> None:
+        """Add one."""
+        self[name] = FittedValue(name, PARAMETERS[name].check(value), ground)
+
+    def changes(self) -> dict[str, Value]:
+        """Return the values alone."""
+        return {name: one.value for name, one in self.items()}
+
+
+def fitted(log: LogInput, unit_tag: str | None, console: Console) -> Fitted:
+    """Return the parameters that a log tells.
+
+    Raises
+    ------
+    DataError
+        It holds no readings.
+    """
+    if not len(log.readings):
+        raise DataError(f'{log.contents.path} holds no readings of the inputs.')
+    found = Fitted()
+    if unit_tag:
+        found.put('unit_tag', unit_tag, 'as you said')
+    _units(log, found)
+    _steps(log, found)
+    settings = Settings({**found.changes(), **_window(log, found), **_OFFLINE})
+    monitor = _watched(log, settings, console.progress)
+    _noise(monitor, found)
+    _dynamics(monitor, found, console.progress)
+    return found
+
+
+def _units(log: LogInput, found: Fitted) -> None:
+    for signal, unit in log.units.items():
+        name = f'{SIGNALS[signal].topic}_unit'
+        if unit != PARAMETERS[name].default and signal not in log.constants:
+            found.put(name, unit, f"'{log.name_of(signal)}' of the log is in {unit}")
+
+
+def _steps(log: LogInput, found: Fitted) -> None:
+    steps = steps_of(log.readings)
+    measured = {s: step for s, step in steps.items() if s not in log.constants}
+    adapted = fitting(measured, 0.0, {})
+    if not measured:
+        return
+    quickest, slowest = min(measured.values()), max(measured.values())
+    for name in _OF_STEP:
+        if name in adapted:
+            step = slowest if name == 'hold_limit' else quickest
+            found.put(name, adapted[name], f'the log has a value every {duration(step)}')
+
+
+def _window(log: LogInput, found: Fitted) -> dict[str, float]:
+    """Return a window that holds the whole log; that of the monitor stays as it is."""
+    span_s = float(np.ptp(log.readings.time_ns)) / 1e9
+    adapted = fitting(steps_of(log.readings), span_s, found.changes())
+    return {name: value for name, value in adapted.items() if name == 'window_days'}
+
+
+def _watched(log: LogInput, settings: Settings, progress: Progress) -> Monitor:
+    monitor = Monitor(settings)
+    for aligned in aligned_blocks(Aligner(settings), log.readings, progress, 'finding segments'):
+        feed_aligned(monitor, aligned)
+    return monitor
+
+
+def _noise(monitor: Monitor, found: Fitted) -> None:
+    level = monitor.noise()
+    if not level.learnt:
+        found.left.append(
+            'input_noise and power_noise: the log is too short to learn the noise; the monitor '
+            'learns it while it runs.'
+        )
+        return
+    ground = 'sd of block means about a line in the log; 0 would learn it anew at each start'
+    for name, value in (('input_noise', level.input), ('power_noise', level.power_mw)):
+        if value > 0.0:
+            found.put(name, float(f'{value:.3g}'), ground)
+
+
+def _dynamics(monitor: Monitor, found: Fitted, progress: Progress) -> None:
+    kept = 'time_constant and delay: kept at their defaults, because '
+    if not monitor.segments:
+        found.left.append(f'{kept}the log shows no steady state or ramp to learn them from.')
+        return
+    task = next(e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
+    try:
+        curve = fit(task, lambda what: progress(0.6, what))
+    except DataError as error:
+        found.left.append(f'{kept}no curve could be fitted ({str(error).rstrip(".")}).')
+        return
+    if not curve.dynamics:
+        found.left.append(f'{kept}the log does not tell the dynamics.')
+        return
+    _largest(curve, found)
+
+
+def _largest(curve: Characteristic, found: Fitted) -> None:
+    for name, what, found_here in (
+        ('time_constant', 'time constant',
+         [(d.time_constant_s, d.time_constant_stderr_s) for d in curve.dynamics]),
+        ('delay', 'delay', [(d.delay_s, d.delay_stderr_s) for d in curve.dynamics]),
+    ):  # fmt: skip
+        value, error = max(found_here)
+        error = error if math.isfinite(error) else 0.0
+        default = float(PARAMETERS[name].default)
+        wanted = float(max(1, math.ceil(value + _SURE * error)))
+        if wanted > (1.0 + _MORE) * default or wanted < (1.0 - _LESS) * default:
+            ground = f'the largest {what} found in the log is {value:.3g} s'
+            if error:
+                ground += f' (standard error {error:.2g} s)'
+            found.put(name, wanted, ground)
