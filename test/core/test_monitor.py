@@ -364,10 +364,10 @@ def test_the_evidence_is_the_share_of_the_fixed_limit_or_what_the_chart_of_the_c
     average, evidence = column(events, 'average_mw'), column(events, 'evidence')
     assert evidence == pytest.approx(average / 3.0, nan_ok=True)
     other, _ = with_curve()
-    other.reconfigure(SETTINGS.changed({'alarm_limit': 0.0}))
-    chart = ResidualChart(other.characteristic.residuals.chart, 1.0)
-    chart.restore(other.snapshot()['force']['predictor']['chart'])
+    held = {'alarm_limit': 0.0, 'refit_period': 0.0, 'refit_segments': 0}
+    other.reconfigure(SETTINGS.changed(held))
     events = feed_rows(other, part)
+    chart = ResidualChart(other.characteristic.residuals.chart, 1.0)
     wanted, _ = chart.feed(part.time_ns, column(events, 'residual_mw'))
     known = np.isfinite(wanted)
     assert known.sum() > 200
