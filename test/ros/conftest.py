@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 from ros_helpers import Processes
 
+TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
+PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
 HERE = Path(__file__).resolve().parent
 # Without rclpy nothing here can even be imported. `make test` promises it and then fails loudly.
 if importlib.util.find_spec('rclpy') is None and not os.environ.get('VALVEFLOW_REQUIRE_ROS'):
@@ -40,8 +42,13 @@ def processes(ros_environment: dict[str, str], tmp_path: Path) -> Iterator[Proce
 
 
 @pytest.fixture
-def here(ros_environment: dict[str, str]) -> Iterator[None]:
-    """Let a test call the main function of a node in this process; signals are put back."""
+def here(ros_environment: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Let a test call the main function of a node in this process.
+
+    Signals are put back, and so is what it chose in the environment for the middleware.
+    """
+    for name in (TRANSPORTS, *PROFILES):
+        monkeypatch.setenv(name, '')
     kept = {number: signal.getsignal(number) for number in (SIGINT, SIGTERM, SIGHUP)}
     yield
     for number, handler in kept.items():

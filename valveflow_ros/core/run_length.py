@@ -80,7 +80,7 @@ def design_chart(
     blocks = 2.0 * _SPARE * run_length_days * _DAY_S / block_s
     e = _innovations(means, correlation, sd)
     drawn = _drawn(e, int(min(_ALARMS * blocks, 4_000_000)))
-    judged_days = np.count_nonzero(np.isfinite(means)) * block_s / _DAY_S
+    judged_days = int(np.isfinite(means).sum()) * block_s / _DAY_S
     wider = 1.0 + min(1.0, _YOUNG_DAYS / max(judged_days, 1e-9))
     limit = tuple(
         wider * max(limit_for(drawn, k, blocks), normal_limit(k, blocks), _LEAST_LIMIT)

@@ -94,7 +94,8 @@ def marks(name: str, about: str, unit: Spelling | None) -> dict[Signal, float]:
         if plain.rsplit('/', 1)[-1].lower() in (info.topic, info.column):
             return {info.signal: EXACT}
     text = f'{folded(name)} {folded(about)}'.strip()
-    by_words = _by_words(text)
+    # P is the pressure to one and the power to another: a letter says nothing, its unit does.
+    by_words = _by_words(text) if len(text) > 1 else {}
     if unit is None:
         return by_words
     # What is named after one quantity and measured in the unit of another is neither.
