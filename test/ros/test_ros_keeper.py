@@ -23,7 +23,7 @@ from valveflow_ros.ros.live import LiveEngine
 from valveflow_ros.ros.outcome import Outcome
 from valveflow_ros.ros.outputs import Outputs
 from valveflow_ros.ros.recording import Recording
-from valveflow_ros.ros.state_folder import STATE, StateFolder, StateWriter
+from valveflow_ros.ros.state_folder import ASIDE, STATE, StateFolder, StateWriter
 from valveflow_ros.ros.warmup import made_up_curve
 
 ENGINE = {'numbers': np.arange(3.0)}
@@ -85,6 +85,32 @@ def test_a_state_of_other_parameters_is_used_only_where_they_do_not_matter(
     assert (keeper.saved is None) == bool(words)
     assert words in keeper.sentence
     keeper.close()
+
+
+def test_a_mistyped_parameter_costs_no_state(tmp_path: Path) -> None:
+    written(tmp_path)
+    for _ in range(2):
+        keeper = Keeper(settings(tmp_path, window_days=5.0))
+        assert keeper.saved is None
+        assert 'a run that it fits takes it up again' in keeper.sentence
+        nothing = Recording(settings(tmp_path).changed({'record': False}), {}, 0.0)
+        # A young state takes its place at once.
+        keeper.write(
+            settings(tmp_path, window_days=5.0), {'numbers': np.arange(1.0)}, 9, nothing, {}
+        )
+        keeper.close()
+        mended = Keeper(settings(tmp_path))
+        assert mended.sentence == ''
+        assert mended.saved is not None
+        np.testing.assert_array_equal(mended.saved['engine']['numbers'], ENGINE['numbers'])
+        mended.close()
+        # The other one is not lost either.
+        again = Keeper(settings(tmp_path, window_days=5.0))
+        assert again.saved is not None
+        assert len(again.saved['engine']['numbers']) == 1
+        again.close()
+        written(tmp_path)
+        (tmp_path / 'state_unit' / ASIDE).unlink()
 
 
 @pytest.mark.parametrize('given', ['/proc/nothing', '~nobody_of_that_name/x'])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -91,7 +92,12 @@ class Keeper:
     def drop(self, reason: str) -> None:
         """Use nothing of what was saved."""
         self.saved = None
-        self.sentence = f'The state saved by an earlier run is not used. {reason}'
+        self.sentence = (
+            f'The state saved by an earlier run is not used. {reason} It stays beside the new '
+            'one, and a run that it fits takes it up again.'
+        )
+        if self._folder is not None:
+            self._folder.set_aside()
 
     def curve(self, model_id: str) -> Characteristic:
         """Return a curve that was adopted lately; raises `DataError` if it is not there."""
@@ -182,19 +188,42 @@ class Keeper:
             raise
 
     def _look(self, folder: StateFolder, settings: Settings) -> None:
+        """Find a state that fits: the last one, or one that was set aside because it did not."""
         try:
-            data = folder.read()
-            if data is None:
-                return
-            saved = from_bytes(data)
-            other = _other(Settings(saved['settings']), settings)
+            self.saved = _fitting(folder.read(), settings)
+        except _OtherError as error:
+            # Whoever mends a mistyped parameter gets back what was there before.
+            with contextlib.suppress(ValveflowError, KeyError, TypeError):
+                self.saved = _fitting(folder.read(folder.aside), settings)
+            if self.saved is None:
+                self.drop(str(error))
+            else:
+                folder.take_back()
         except (ValveflowError, KeyError, TypeError) as error:
             self.drop(str(error) if isinstance(error, ValveflowError) else 'It is not whole.')
-            return
-        if other:
-            self.drop(f'It was made with another {other}.')
-            return
-        self.saved = saved
+
+
+class _OtherError(DataError):
+    """A state was made with other parameters."""
+
+
+def _fitting(data: bytes | None, settings: Settings) -> State | None:
+    """Return the state in those bytes, None if there are none.
+
+    Raises
+    ------
+    _OtherError
+        It was made with other parameters.
+    DataError
+        It is damaged.
+    """
+    if data is None:
+        return None
+    saved = from_bytes(data)
+    other = _other(Settings(saved['settings']), settings)
+    if other:
+        raise _OtherError(f'It was made with another {other}.')
+    return saved
 
 
 def _other(then: Mapping[str, object], now: Mapping[str, object]) -> str:

@@ -19,6 +19,7 @@ from valveflow_ros.errors import DataError, RecordingError
 from valveflow_ros.logs.part_file import FILE_MODE, make_folder, write_whole
 
 STATE = 'monitor.state'
+ASIDE = 'monitor.state.unused'
 LOCK = 'lock'
 _CURVE, _CURVES = 'curve_', 5
 _MOST_BYTES = 4 << 30
@@ -50,7 +51,7 @@ class StateFolder:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.path = folder / STATE
+        self.path, self.aside = folder / STATE, folder / ASIDE
         try:
             make_folder(folder)
             self._lock = _locked(folder / LOCK)
@@ -63,24 +64,49 @@ class StateFolder:
             for stale in folder.glob('.*.tmp'):
                 stale.unlink()
 
-    def read(self) -> bytes | None:
-        """Return what was saved last, None if nothing was.
+    def read(self, path: Path | None = None) -> bytes | None:
+        """Return what was saved last, or what was set aside; None if nothing was.
+
+        Parameters
+        ----------
+        path : Path, optional
+            `path` by default, or `aside`.
 
         Raises
         ------
         RecordingError
             It is there and cannot be read.
         """
+        path = self.path if path is None else path
         flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         try:
-            with os.fdopen(os.open(self.path, flags), 'rb') as file:
+            with os.fdopen(os.open(path, flags), 'rb') as file:
                 if os.fstat(file.fileno()).st_size > _MOST_BYTES:
-                    raise RecordingError(self.path, 'is too large to be a saved state')
+                    raise RecordingError(path, 'is too large to be a saved state')
                 return file.read()
         except FileNotFoundError:
             return None
         except OSError as error:
-            raise RecordingError(self.path, f'cannot be read ({_reason(error)})') from None
+            raise RecordingError(path, f'cannot be read ({_reason(error)})') from None
+
+    def set_aside(self) -> None:
+        """Keep a state that cannot be used from being written over by the next one.
+
+        Of two such the larger one stays: it knows more of the unit.
+        """
+        with contextlib.suppress(OSError):
+            if not self.aside.exists() or self.aside.lstat().st_size < self.path.lstat().st_size:
+                self.path.replace(self.aside)
+
+    def take_back(self) -> None:
+        """Let the state that was set aside and the last one change places."""
+        between = self.folder / f'.{STATE}.tmp'
+        with contextlib.suppress(OSError):
+            if self.path.exists():
+                self.path.replace(between)
+            self.aside.replace(self.path)
+            if between.exists():
+                between.replace(self.aside)
 
     def write(self, data: bytes) -> None:
         """Put a state in place of the last one: it is the old or the new one, never half."""
