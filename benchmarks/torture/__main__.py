@@ -65,6 +65,8 @@ def say(name: str, outcome: Outcome, seconds: float) -> None:
     print(f'{name:17} {verdict}  {outcome.sentence}  ({seconds:.0f} s)')
     for failure in outcome.failures:
         print(f'    {failure}')
+    for missed in outcome.missed:
+        print(f'    missed: {missed}')
 
 
 def run_apart(name: str, given: argparse.Namespace) -> int:

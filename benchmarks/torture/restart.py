@@ -104,6 +104,8 @@ def restart(options: Options) -> Outcome:
     plant.node.destroy_node()
     rclpy.shutdown()
     counts = outcome.counts
+    soon = counts.get('within_3_s', 0)
+    outcome.wish(soon == counts['kills'], f'{soon} of {counts["kills"]} curves within 3 s')
     outcome.sentence = (
         f'{counts["kills"]} kills: the same curve again {counts.get("same_curve", 0)} times, '
         f'in {outcome.measured.get("longest_s", 0):.1f} s at most; one recording of '

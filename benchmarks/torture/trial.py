@@ -50,12 +50,16 @@ class Outcome:
         Times and memory, which do.
     failures : list of str
         Sentences, the first few of them; `failed` counts all.
+    missed : list of str
+        Times that were wished for and not kept. They depend on the machine, so no trial fails by
+        them, but they are told.
     """
 
     counts: dict[str, Any] = field(default_factory=dict)
     measured: dict[str, Any] = field(default_factory=dict)
     failures: list[str] = field(default_factory=list)
     failed: int = 0
+    missed: list[str] = field(default_factory=list)
     sentence: str = ''
 
     def expect(self, holds: bool, sentence: str) -> None:
@@ -64,6 +68,11 @@ class Outcome:
             self.failed += 1
             if len(self.failures) < SHOWN:
                 self.failures.append(sentence)
+
+    def wish(self, holds: bool, sentence: str) -> None:
+        """Note a time that was not kept unless ``holds``."""
+        if not holds:
+            self.missed.append(sentence)
 
     def count(self, name: str, by: int = 1) -> None:
         """Add to a count."""
@@ -89,6 +98,7 @@ def write_result(name: str, outcome: Outcome, options: Options, seconds: float, 
         'passed': not outcome.failed,
         'failed': outcome.failed,
         'failures': outcome.failures,
+        'missed': outcome.missed,
         'counts': outcome.counts,
         'measured': {**outcome.measured, 'seconds': round(seconds, 1)},
         'sentence': outcome.sentence,

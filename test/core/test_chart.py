@@ -179,6 +179,21 @@ def test_a_wandering_residual_gets_wider_limits_and_a_doubtful_curve_more_slack(
     assert c.slack[0] > a.slack[0] + 0.1
 
 
+def test_limits_are_twice_as_wide_at_first_and_hardly_wider_after_weeks():
+    r = correlated(np.random.default_rng(6), 30 * 1440, 0.5)
+
+    def limits(days):
+        part = r[: round(days * 1440)]
+        return design_chart(part, np.ones(len(part), np.uint8), 60.0, block_s=60.0,
+                            run_length_days=30.0, floor_mw=0.0, curve_error_mw=0.0).limit  # fmt: skip
+
+    least = normal_limit(0.25, 2.0 * 1.4 * 30.0 * 1440.0)
+    assert limits(0.2)[0] >= 2.0 * least - 1e-9
+    assert limits(0.8)[0] >= 1.5 * least - 1e-9
+    assert limits(0.2)[0] > 1.6 * limits(30.0)[0]
+    assert limits(30.0)[0] < 1.3 * least
+
+
 def test_hardly_any_clean_rows_still_give_limits():
     for n in (0, 1, 2, 5):
         d = design_chart(np.ones(n), np.ones(n, np.uint8), 60.0, block_s=60.0,
