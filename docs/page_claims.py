@@ -125,8 +125,24 @@ def _diagnosis() -> list[tuple[str, str, str]]:
     return rows
 
 
+def _speed() -> list[tuple[str, str, str]]:
+    name = 'ten_days'
+    steps = {step['step']: step for step in result(name)['steps']}
+    values = steps['read MCAP']['what'].replace(',', ' ')
+    info = result('reading')
+    return [
+        _row(f'ten days, {values}: read from MCAP', f'{steps["read MCAP"]["wall_s"]:.1f} s', name),
+        _row('the same: read, aligned, segmented, fitted and reported, in a process that has '
+             'compiled and loaded everything', f'{result(name)["total_wall_s"]:.0f} s, of which '
+             f'{steps["fit"]["wall_s"]:.0f} s the fit', name),
+        _row(f'`valveflow info` on {_count(info["results"]["file"]["messages"])} messages, '
+             'with a start of its own',
+             f'{info["results"]["info mcap"]["wall_s"]:.1f} s', 'reading'),
+    ]  # fmt: skip
+
+
 def measured() -> str:
     """Return what the studies found, with the command of each."""
     rows = [*_paper(), *_partition(), *_choice(), *_coverage(), *_rivals(), *_alarm(),
-            *_diagnosis()]  # fmt: skip
+            *_diagnosis(), *_speed()]  # fmt: skip
     return table(('question', 'answer', 'measured by'), rows)
