@@ -86,7 +86,7 @@ def _rivals() -> list[tuple[str, str, str]]:
 
 
 def _alarm() -> list[tuple[str, str, str]]:
-    name = 'alarm_run_length_6000_6029'
+    name = 'alarm_run_length_6100_6129'
     days = [row['days_per_alarm'] for row in result(name)['noise']]
     study = result('alarm_320_335')['summary']
     return [

@@ -153,7 +153,7 @@ def test_the_readme_quotes_the_studies_as_they_are() -> None:
     covered = page_claims.result('coverage_9000_9199')['summary']
     for key in ('slope', 'knee', 'time_constant', 'delay'):
         assert f'{100 * covered[key]["covered_95"]:.0f} %' in text
-    noise = page_claims.result('alarm_run_length_6000_6029')['noise']
+    noise = page_claims.result('alarm_run_length_6100_6129')['noise']
     days = [row['days_per_alarm'] for row in noise]
     assert f'one in {min(days):.0f} to {max(days):.0f} days' in text
     lost = page_claims.result('torture_kill9')['measured']['most_lost_s']

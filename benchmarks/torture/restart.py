@@ -165,7 +165,8 @@ def _judge(plant: Plant, folder: Path, outcome: Outcome) -> None:
     outcome.counts['rows'] = result.rows
     outcome.expect(result.identical, result.difference)
     different = [a for k, a in enumerate(plant.alarms) if a not in plant.alarms[:k]]
-    raised = Counter((a.name, a.occurrence) for a in different if a.state == a.UNACKNOWLEDGED)
+    begun = [a for a in different if a.state == a.UNACKNOWLEDGED != a.previous_state]
+    raised = Counter((a.name, a.occurrence) for a in begun)
     outcome.counts['alarms_raised'] = len(raised)
     # The fault sets in where a quarter of the full trial is over.
     if result.rows > FAULT_ROW + 3600:

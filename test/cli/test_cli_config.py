@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
@@ -82,3 +84,22 @@ def test_what_the_monitor_would_refuse_is_named(run, tmp_path, text, part):
 def test_only_init_and_check(run, tmp_path):
     assert "not 'make'" in run('config', 'make', tmp_path / 'x').refused(2)
     assert 'no such file' in run('config', 'check', tmp_path / 'x.yaml').refused()
+
+
+def test_a_column_s_name_cannot_write_parameters(run, tmp_path):
+    name = "PT\n    unit_tag: 'OWNED'\r\u2028    # [bar]"
+    n = 600
+    frame = pd.DataFrame({
+        'time': pd.date_range('2026-01-01', periods=n, freq='s', tz='UTC'),
+        'valve_opening_percent': 70.0 + np.arange(n) % 7, name: 160.0,
+        'main_steam_temperature_degc': 540.0, 'generated_power_mw': 230.0 + np.arange(n) % 9,
+    })  # fmt: skip
+    frame.to_parquet(tmp_path / 'x\n    unit_tag: OWNED.parquet')
+    ran = run('config', 'init', *tmp_path.glob('*.parquet'))
+    assert ran.status == 0, ran.err
+    lines = [line for line in ran.out.splitlines() if 'OWNED' in line]
+    assert len(lines) == 2
+    assert all(line.lstrip().startswith('#') for line in lines)
+    assert yaml.safe_load(ran.out)['/**']['ros__parameters']['unit_tag'] != 'OWNED'
+    ran = run('config', 'init', *tmp_path.glob('*.parquet'), '-o', tmp_path / 'x.yaml')
+    assert not any(line.startswith('    unit_tag') for line in ran.out.splitlines())

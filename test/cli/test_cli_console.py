@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import unicodedata
 
 import pytest
 from hypothesis import given
@@ -85,6 +86,27 @@ def test_results_go_to_stdout_as_text_or_json():
             assert out.getvalue() == expected
         else:
             assert json.loads(out.getvalue()) == {'a': [1.5, None, [None, 'ü']], 'b': {'c': None}}
+
+
+@given(st.text(st.characters(categories=['Cc', 'Cf', 'L', 'Zl', 'Zp']), max_size=30))
+def test_nothing_of_others_commands_the_terminal(word):
+    for as_json in (False, True):
+        out, err = io.StringIO(), io.StringIO()
+        console = Console(out, err, as_json=as_json)
+        for tell in (console.say, console.warn, console.fail):
+            tell(f'Column {word}.')
+        console.finish(Outcome(f'Column {word}.', {word: [word]}))
+        told = out.getvalue() + err.getvalue()
+        assert all(c in '\n\t' or unicodedata.category(c) != 'Cc' for c in told)
+        assert not set(told) & set('\u2028\u2029\u202a\u202e\u2066\u2069')
+        if as_json:
+            assert json.loads(out.getvalue()) == {word: [word]}
+
+
+def test_a_picture_keeps_its_colours():
+    out = io.StringIO()
+    Console(out, io.StringIO()).finish(Outcome('\x1b[1mAlarms\x1b[0m', {}, drawn=True))
+    assert out.getvalue() == '\x1b[1mAlarms\x1b[0m\n'
 
 
 @given(st.lists(st.lists(st.text('abc 12', max_size=9), min_size=3, max_size=3), max_size=6))

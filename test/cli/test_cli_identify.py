@@ -175,7 +175,10 @@ def test_a_log_without_a_signal_names_the_two_options(run, logs, tmp_path):
     text = (logs / 'plant.csv').read_text().replace('main_steam_pressure_mpa', 'P', 1)
     (tmp_path / 'x.csv').write_text(text)
     sentence = run('identify', tmp_path / 'x.csv', '-o', tmp_path / 'out').refused()
-    assert '--column main_steam_pressure_mpa=THEIRS' in sentence
+    assert '--column main_steam_pressure=THEIRS[:unit], or give --constant' in sentence
+    option = ('--column', 'main_steam_pressure=P:MPa')
+    ran = run('info', tmp_path / 'x.csv', *option, '--json')
+    assert ran.json['signals']['main_steam_pressure']['low'] > 0.0
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from monitor_recording import START_NS, Monitor, alarm, cdr, recording, stamp
 
 from valveflow_ros.cli import watch_run
 from valveflow_ros.cli.watch_log import LogWatch
-from valveflow_ros.report.terminal_board import KEPT, Board
+from valveflow_ros.report.terminal_board import HEALTH, KEPT, Board
 from valveflow_ros.report.terminal_frame import OK, STALE, WARN
 
 SECOND = 10**9
@@ -93,6 +93,37 @@ def test_a_clock_that_goes_back_begins_the_residuals_anew(tmp_path):
     monitor.seconds(3)
     monitor.writer.close()
     assert len(frame_of(tmp_path / 'r').samples) == 3
+
+
+@pytest.mark.parametrize('early', [False, True])
+@pytest.mark.parametrize('tag', ['U1', ''])
+def test_the_health_of_another_unit_is_not_taken_for_this_ones(tag, early):
+    def health(of, level, sentence):
+        items = [('input valve_opening', level, sentence), ('recorder', level, sentence)]
+        board.take(HEALTH, {'status': [
+            {'name': f'valveflow: {of} {name}', 'hardware_id': of, 'level': level, 'message': told}
+            for name, level, told in items
+        ]})  # fmt: skip
+
+    def speak():
+        board.take('valveflow_msgs/msg/Diagnosis', {
+            'header': {'stamp': stamp(START_NS), 'frame_id': tag}, 'verdict': 0, 'sentence': '',
+            'causes': [],
+        })  # fmt: skip
+
+    board = Board()
+    if early:
+        # Which monitor of several it is, is not known yet.
+        health('U2', 3, 'silent')
+        speak()
+        assert (board.frame('x').inputs, board.frame('x').recorder) == ((), None)
+    speak()
+    health(tag, 0, 'fine')
+    health('U2', 3, 'silent')
+    frame = board.frame('x')
+    assert [(i.name, i.sentence) for i in frame.inputs] == [('valve_opening', 'fine')]
+    assert frame.recorder is not None
+    assert frame.recorder.sentence == 'fine'
 
 
 # The verb

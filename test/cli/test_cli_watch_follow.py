@@ -11,6 +11,9 @@ from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import open_log
 from valveflow_ros.logs.cdr import Decoder
 from valveflow_ros.logs.follow import Follower
+from valveflow_ros.logs.layout import Op
+from valveflow_ros.logs.seek import candidates
+from valveflow_ros.logs.source import Source
 
 SECOND = 10**9
 
@@ -84,6 +87,58 @@ def test_a_damaged_place_is_left_out_and_counted(tmp_path):
     times(follower)
     assert follower.damaged == 1
     assert follower.finished
+
+
+@pytest.mark.parametrize('number', [0, 3, -1])
+def test_one_flipped_bit_of_a_chunks_length_loses_that_chunk_alone(tmp_path, number):
+    monitor = Monitor(tmp_path / 'r')
+    for _ in range(7):
+        monitor.seconds(2)
+    monitor.writer.close()
+    (path,) = (tmp_path / 'r').glob('*.mcap')
+    raw = path.read_bytes()
+    with Source.open(path) as source:
+        start = list(candidates(source, 0, source.size))[number]
+    whole = len(times(Follower(path)))
+    for bit in range(64):
+        hurt = bytearray(raw)
+        hurt[start + 1 + bit // 8] ^= 1 << bit % 8
+        path.write_bytes(hurt)
+        follower = Follower(path)
+        seen = times(follower)
+        assert len(seen) == whole - 10, bit
+        assert (follower.damaged, follower.finished) == (1, True), bit
+        assert len(seen) == sum(1 for _ in open_log(path).iter_messages())
+
+
+def test_a_chunk_that_looks_like_the_end_does_not_end_the_file(tmp_path):
+    folder = recording(tmp_path / 'r')
+    (path,) = folder.glob('*.mcap')
+    with Source.open(path) as source:
+        start = next(candidates(source, 0, source.size))
+    raw = bytearray(path.read_bytes())
+    raw[start] = Op.FOOTER  # one bit from that of a chunk
+    path.write_bytes(raw)
+    follower = Follower(path)
+    assert times(follower)
+    assert (follower.damaged, follower.finished) == (1, True)
+
+
+def test_a_damaged_length_in_a_file_of_a_dead_writer_is_passed_by(tmp_path):
+    monitor = Monitor(tmp_path / 'r')
+    for _ in range(5):
+        monitor.seconds(2)
+    (part,) = (tmp_path / 'r').glob('*.part')
+    raw = bytearray(part.read_bytes())
+    with Source.open(part) as source:
+        start, last = [list(candidates(source, 0, source.size))[k] for k in (1, -1)]
+    raw[start + 3] ^= 0x40
+    left = tmp_path / 'left.mcap.part'
+    left.write_bytes(raw[: last + 30])
+    follower = Follower(left)
+    assert len(times(follower)) == 3 * 10
+    assert (follower.damaged, follower.finished, follower.written) == (1, False, False)
+    monitor.writer.close()
 
 
 def test_a_file_cut_off_is_waited_for(tmp_path):

@@ -8,7 +8,6 @@ from naive_stream import NaiveAlarm
 
 S = 10**9
 DAY = 86_400 * S
-STANDING = ('UNACKNOWLEDGED', 'ACKNOWLEDGED', 'RETURNED_UNACKNOWLEDGED')
 
 
 def held_in(change):
@@ -100,7 +99,8 @@ class SlowLife:
     def tell(self):
         if self.state != self.shown:
             self.before, self.shown = self.shown, self.state
-        again = self.state == self.told and self.told in STANDING and self.told_ago >= DAY
+        stands = self.alarm.state != 'NORMAL'
+        again = self.state == self.told and stands and self.told_ago >= DAY
         if self.state == self.told and not again:
             self.holding = False
             return
@@ -114,7 +114,7 @@ class SlowLife:
                 self.holding = True
                 return
             self.held -= int(self.holding)
-        if self.state == 'UNACKNOWLEDGED':
+        if self.state == 'UNACKNOWLEDGED' and not again:
             self.announced_ago.append(0)
         row = self.alarm.row
         self.changes.append((row, self.before, self.state, self.occurrences, self.held))

@@ -250,7 +250,7 @@ def test_what_stands_for_a_day_is_told_again_once_a_day(acts, state):
     assert alarm.last == changes[-1][1]
 
 
-def test_what_returned_and_waits_is_told_again_and_what_is_over_or_aside_is_not():
+def test_what_returned_and_waits_is_told_again_and_what_is_over_is_not():
     alarm = ResidualAlarm(Settings(NERVOUS))
     changes = fed(alarm, [2.0, *[0.0] * (DAY_S + 1)])
     assert [(row, c.state) for row, c in changes] == [
@@ -259,10 +259,6 @@ def test_what_returned_and_waits_is_told_again_and_what_is_over_or_aside_is_not(
     alarm.acknowledge(START_NS, 'm')
     assert alarm.due_ns is None
     assert fed(alarm, [0.0] * (2 * DAY_S), DAY_S + 2) == []
-    aside = ResidualAlarm(Settings({**NERVOUS, 'alarm_shelve_time': 604_800.0}))
-    fed(aside, [2.0])
-    aside.shelve(START_NS, 'm')
-    assert fed(aside, [2.0] * (3 * DAY_S), 1) == []
 
 
 def test_a_clock_set_back_makes_nobody_wait_longer_to_be_told_again():

@@ -20,7 +20,7 @@ from valveflow_ros.report.history import (
     powers,
 )
 from valveflow_ros.report.history_data import AlarmMoment, History
-from valveflow_ros.report.timeline import spans, standing_s, timeline_figure
+from valveflow_ros.report.timeline import alarms_table, spans, standing_s, timeline_figure
 
 
 def test_a_log_of_no_monitor_has_no_history():
@@ -92,6 +92,18 @@ def test_bars_last_from_change_to_change():
     hovers = [h for t in figure.traces for h in t.get('hovertext', [])]
     assert any('6 MW less &amp; it &lt;lasts&gt;' in h for h in hovers)
     assert figure.layout['yaxis']['categoryarray'] == ['residual', 'diagnosis', 'new curve']
+
+
+def test_the_name_of_an_alarm_is_no_markup():
+    told = History(
+        0, HOUR_NS, alarms=(AlarmMoment(0, '<b>x</b>&', AlarmState.UNACKNOWLEDGED, ''),)
+    )
+    figure = timeline_figure(told)
+    name = '&lt;b&gt;x&lt;/b&gt;&amp;'
+    assert figure.layout['yaxis']['categoryarray'] == [name]
+    assert {cell for t in figure.traces for cell in t['y']} == {name, None}
+    assert f'<br>{name}: ' in figure.traces[-1]['hovertext'][0]
+    assert alarms_table(told).count(name) == 1
 
 
 STATES = st.sampled_from(list(AlarmState))

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 from mcap_ros2.writer import Writer
 from report_stories import HOUR_NS, START_NS, history
 
 from valveflow_ros.cli.monitor_history import history_in
+from valveflow_ros.core.alarm_records import AlarmState
 from valveflow_ros.logs import Definitions, open_log
 from valveflow_ros.records import NS_PER_S
+from valveflow_ros.report.history_data import AlarmMoment
 
 
 def stamp(time_ns):
@@ -41,11 +44,14 @@ def curve_message(c, **changes):
     }  # fmt: skip
 
 
-def alarm_message(a):
+def alarm_message(a, before=None):
+    if before is None:
+        before = (a.state + 1) % len(AlarmState)
     return {
-        'header': header(a.time_ns), 'name': a.name, 'state': int(a.state), 'previous_state': 0,
-        'priority': 2, 'value': 1.0, 'limit': 2.0, 'unit': 'MW', 'sentence': a.sentence,
-        'occurrence': 1, 'raised': stamp(a.time_ns), 'model_id': '', 'first_out': '',
+        'header': header(a.time_ns), 'name': a.name, 'state': int(a.state),
+        'previous_state': before, 'priority': 2, 'value': 1.0, 'limit': 2.0, 'unit': 'MW',
+        'sentence': a.sentence, 'occurrence': 1, 'raised': stamp(a.time_ns), 'model_id': '',
+        'first_out': '',
     }  # fmt: skip
 
 
@@ -114,6 +120,23 @@ def test_what_was_published_comes_back_under_any_name_of_the_node(tape):
     assert found.diagnoses == told.diagnoses
     assert found.notes == ()
     assert (found.start_ns, found.end_ns) == (START_NS, told.alarms[-1].time_ns)
+
+
+def test_what_is_told_again_is_no_change(tape):
+    """A new start publishes all that stands, and what stands is told again every day."""
+    day = 24 * 3600 * 10**9
+    raised = AlarmMoment(START_NS + 1, 'residual', AlarmState.UNACKNOWLEDGED, 'Less.')
+    again = replace(raised, time_ns=START_NS + day, sentence='It stands.')
+    old = replace(again, time_ns=START_NS, name='curve_shift')
+    for a in (old, raised, raised, again, again, replace(old, time_ns=START_NS + 2 * day)):
+        tape.add('/m/alarms', ALARM, a.time_ns, alarm_message(a, 0 if a is raised else 1))
+    d = history().diagnoses[0]
+    for _ in range(3):
+        tape.add('/m/diagnosis', DIAGNOSIS, d.time_ns, diagnosis_message(d))
+    found = history_in(tape.done())
+    # That which stood when the recording began is known by its first word alone.
+    assert found.alarms == (old, raised)
+    assert found.diagnoses == (d,)
 
 
 def test_a_plants_log_is_no_monitors(tape):

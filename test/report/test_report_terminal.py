@@ -9,6 +9,7 @@ import re
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from valveflow_ros.report import terminal_text
 from valveflow_ros.report.terminal_canvas import DOTS_X, DOTS_Y, Canvas
 from valveflow_ros.report.terminal_changes import changes
 from valveflow_ros.report.terminal_draw import screen
@@ -174,6 +175,27 @@ def test_cutting(text, width):
     assert cells(short) <= width
     assert short == text or short == '' or short.endswith('…')
     assert cells(painted(((text, 'bad'),), width, colour=False)) <= width
+
+
+@given(st.text('a\u0301漢\u202f …', max_size=30), st.integers(0, 12))
+def test_what_is_cut_is_as_long_as_it_may_be(text, width):
+    """Slow truth: letter after letter is taken away until it fits."""
+    left = text
+    while left and cells(left) > width - 1:
+        left = left[:-1]
+    short = f'{left.rstrip()}…' if width else ''
+    assert cut(text, width) == (text if cells(text) <= width else short)
+
+
+def test_the_length_of_a_word_of_others_costs_nothing(monkeypatch):
+    looked = []
+    count = terminal_text.cells
+    monkeypatch.setattr(
+        terminal_text, 'cells', lambda text: looked.append(len(text)) or count(text)
+    )
+    assert cut('x' * 100_000, 60) == 'x' * 59 + '…'
+    assert sum(looked) < 100
+    assert len(clean('y ' * 100_000)) < 5000
 
 
 def test_changes_tell_each_thing_once():

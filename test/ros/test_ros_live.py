@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rclpy.serialization import deserialize_message
+from valveflow_msgs.msg import Alarm
 
 from valveflow_ros.config import Settings
+from valveflow_ros.core.alarm_desk import AlarmDesk
+from valveflow_ros.core.alarms import ResidualAlarm
 from valveflow_ros.core.align import Aligner
 from valveflow_ros.core.events import CurveAdopted, Event, JournalEntry, JournalKind
 from valveflow_ros.core.fit import fit
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.offline import JournalReplayer
+from valveflow_ros.core.shift import PieceShift, Shift
+from valveflow_ros.core.shift_alarm import ShiftAlarm
 from valveflow_ros.errors import DataError
-from valveflow_ros.plant.simulator import simulate
-from valveflow_ros.records import Readings, table_to_readings
+from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
+from valveflow_ros.records import NS_PER_S, Readings, table_to_readings
 from valveflow_ros.ros.inputs import Row
 from valveflow_ros.ros.live import LiveEngine
 from valveflow_ros.ros.outcome import Outcome
@@ -156,6 +162,27 @@ def test_a_clock_that_goes_back_restarts_the_engine_and_is_journaled() -> None:
     replayer = JournalReplayer(Monitor(SETTINGS), journal)
     assert said([replayer.feed(table)]) == said(calls)
     assert np.diff(table.time_ns).min() < 0
+
+
+def test_who_comes_late_finds_every_alarm_that_stands_among_what_is_kept() -> None:
+    """One stands and nothing happens to it; the other comes and goes for an hour."""
+    nervous = Settings({'alarm_on_delay': 0.0, 'alarm_off_delay': 0.0, 'alarm_flood': 10})
+    residual, shift = ResidualAlarm(nervous), ShiftAlarm(nervous)
+    AlarmDesk(residual, shift)
+    nan, start_ns = float('nan'), DEFAULT_START_NS
+    piece = PieceShift(1e3, 2e3, 2.0, 2.0, 2.0, 0.1, nan, nan, 200.0, 1e-6, True, 0.4)
+    moved = Shift('then', 'now', start_ns, start_ns, (piece,), 0, 0, 0, 'It moved.')
+    events: list[Event] = [*shift.judge(moved, start_ns, nervous)]
+    time_ns = DEFAULT_START_NS + NS_PER_S * np.arange(1, 3601)
+    values = np.where(np.arange(3600) % 2, 0.0, 2.0)
+    events += [c for _, c in residual.feed(time_ns, values, values, 'm', [shift])]
+    told = [deserialize_message(o.data, Alarm) for o in Outputs('u').of(events)]
+    kept = OUTPUTS['alarms'].kept
+    assert len(told) > 5 * kept
+    for k in range(2, len(told)):
+        newest = {a.name: a.state for a in told[max(0, k - kept) : k]}
+        assert newest['curve_shift'] == Alarm.UNACKNOWLEDGED
+        assert newest['residual'] == [a.state for a in told[:k] if a.name == 'residual'][-1]
 
 
 def test_nothing_in_nothing_out() -> None:

@@ -21,6 +21,7 @@ from valveflow_ros.core.offline import feed_aligned
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.numbers import duration
+from valveflow_ros.report.terminal_text import clean
 
 # A transient cut short spoils segments, one too long only costs some: up in small steps,
 # down in large ones.
@@ -56,7 +57,7 @@ class Fitted(dict[str, FittedValue]):
 
     def put(self, name: str, value: Value, ground: str) -> None:
         """Add one."""
-        self[name] = FittedValue(name, PARAMETERS[name].check(value), ground)
+        self[name] = FittedValue(name, PARAMETERS[name].check(value), clean(ground))
 
     def changes(self) -> dict[str, Value]:
         """Return the values alone."""
@@ -142,7 +143,7 @@ def _dynamics(monitor: Monitor, found: Fitted, progress: Progress) -> None:
     try:
         curve = fit(task, lambda what: progress(0.6, what))
     except DataError as error:
-        found.left.append(f'{kept}no curve could be fitted ({str(error).rstrip(".")}).')
+        found.left.append(f'{kept}no curve could be fitted ({clean(str(error)).rstrip(".")}).')
         return
     if not curve.dynamics:
         found.left.append(f'{kept}the log does not tell the dynamics.')

@@ -5,6 +5,7 @@ from __future__ import annotations
 from valveflow_ros import __version__
 from valveflow_ros.cli.config_fit import Fitted
 from valveflow_ros.config import TABLE, Settings, as_yaml
+from valveflow_ros.report.terminal_text import clean
 
 
 def parameter_file(source: str, found: Fitted) -> str:
@@ -24,16 +25,17 @@ def parameter_file(source: str, found: Fitted) -> str:
     """
     values = found.changes()
     Settings(values)
+    # Names of files and columns come from others: a line break in one would end the comment.
     lines = [
-        f'# Parameters of the monitor, fitted to {source} by valveflow {__version__}.',
+        f'# Parameters of the monitor, fitted to {clean(source)} by valveflow {__version__}.',
         "# Lines marked 'fitted' follow from the data; all others are the defaults.",
-        *(f'# {sentence}' for sentence in found.left),
+        *(f'# {clean(sentence)}' for sentence in found.left),
         *as_yaml([], {}).splitlines(),
     ]
     for row in TABLE:
         about, value = as_yaml([row], values).splitlines()[2:]
         lines.append(about)
         if row.name in found:
-            lines.append(f'    # fitted: {found[row.name].ground}.')
+            lines.append(f'    # fitted: {clean(found[row.name].ground)}.')
         lines.append(value)
     return '\n'.join(lines) + '\n'

@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TextIO
 
 from valveflow_ros.cli.pace import pace_of
 from valveflow_ros.report.terminal_progress import Progress
+
+# What commands a terminal, or turns the order of what it shows: all but tabs and line feeds.
+_COMMANDS = re.compile('[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]')
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,10 +27,14 @@ class Outcome:
         For a person.
     data : mapping
         The same for a program; what is not finite becomes null.
+    drawn : bool
+        The text is a picture that was made for this terminal, colours and all, of words that were
+        made harmless. Any other text is printed without what commands a terminal.
     """
 
     text: str
     data: Mapping[str, Any]
+    drawn: bool = False
 
 
 class Console:
@@ -74,7 +82,7 @@ class Console:
         A bar on a terminal; anywhere else a line now and then, once it takes long.
         """
         if not self._quiet:
-            self._progress.at(share, what)
+            self._progress.at(share, _harmless(what))
 
     def clear(self) -> None:
         """Take the progress bar away."""
@@ -85,13 +93,19 @@ class Console:
         self._progress.end()
         if self._as_json:
             text = json.dumps(_finite(outcome.data), indent=2, allow_nan=False, ensure_ascii=False)
-            self._out.write(text + '\n')
+            self._out.write(_COMMANDS.sub(lambda c: f'\\u{ord(c[0]):04x}', text) + '\n')
         elif outcome.text:
-            self._out.write(outcome.text.rstrip('\n') + '\n')
+            text = outcome.text if outcome.drawn else _harmless(outcome.text)
+            self._out.write(text.rstrip('\n') + '\n')
         self._out.flush()
 
     def _write(self, line: str) -> None:
-        self._progress.write(line)
+        self._progress.write(_harmless(line))
+
+
+def _harmless(text: str) -> str:
+    """Return a text as it may go to a terminal: names and cells of others may stand in it."""
+    return _COMMANDS.sub('?', text)
 
 
 def _finite(value: Any) -> Any:

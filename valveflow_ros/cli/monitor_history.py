@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -19,6 +20,16 @@ _DIAGNOSIS = 'valveflow_msgs/msg/Diagnosis'
 _UNKNOWN = 0  # verdict of a diagnosis that says nothing yet
 
 Found = TypeVar('Found')
+Item = TypeVar('Item')
+
+
+@dataclass(frozen=True, slots=True)
+class _Word:
+    """What was said of an alarm, and whether the alarm was in that state before."""
+
+    time_ns: int
+    moment: AlarmMoment
+    again: bool
 
 
 def history_in(log: LogContents) -> History | None:
@@ -39,9 +50,10 @@ def history_in(log: LogContents) -> History | None:
     return History(
         min(times, default=0),
         max(times, default=0),
-        tuple(_once(curves)),
-        tuple(sorted(alarms, key=lambda a: a.time_ns)),
-        tuple(sorted(diagnoses, key=lambda d: d.time_ns)),
+        # What is latched is published again and again, and all that stands at a new start.
+        tuple(_once(sorted(curves, key=lambda c: c.time_ns), lambda c: c.model_id)),
+        tuple(_changes(sorted(alarms, key=lambda a: a.time_ns))),
+        tuple(_once(sorted(diagnoses, key=lambda d: d.time_ns), lambda d: d)),
         tuple(notes),
     )
 
@@ -97,11 +109,12 @@ def _curve(message: dict[str, Any]) -> CurveMoment | None:
     )  # fmt: skip
 
 
-def _alarm(message: dict[str, Any]) -> AlarmMoment:
-    return AlarmMoment(
+def _alarm(message: dict[str, Any]) -> _Word:
+    moment = AlarmMoment(
         _stamp(message), str(message['name']), AlarmState(message['state']),
         str(message['sentence']),
     )  # fmt: skip
+    return _Word(moment.time_ns, moment, message.get('previous_state') == moment.state)
 
 
 def _diagnosis(message: dict[str, Any]) -> DiagnosisMoment | None:
@@ -110,12 +123,24 @@ def _diagnosis(message: dict[str, Any]) -> DiagnosisMoment | None:
     return DiagnosisMoment(_stamp(message), str(message['sentence']))
 
 
-def _once(curves: list[CurveMoment]) -> list[CurveMoment]:
-    """Return each curve when it first came: a latched one is published again and again."""
-    seen: set[str] = set()
-    kept = []
-    for curve in sorted(curves, key=lambda c: c.time_ns):
-        if curve.model_id not in seen:
-            seen.add(curve.model_id)
-            kept.append(curve)
-    return kept
+def _once(items: Iterable[Item], key: Callable[[Item], Hashable]) -> list[Item]:
+    """Return each item when it first came."""
+    first: dict[Hashable, Item] = {}
+    for item in items:
+        first.setdefault(key(item), item)
+    return list(first.values())
+
+
+def _changes(words: list[_Word]) -> list[AlarmMoment]:
+    """Return the changes: that an alarm still stands, which is told every day, is none.
+
+    The first word of a standing alarm counts even so: it stood when the recording began.
+    """
+    known: set[str] = set()
+    found = []
+    for word in _once(words, lambda w: w.moment):
+        first = word.moment.name not in known and word.moment.state != AlarmState.NORMAL
+        known.add(word.moment.name)
+        if first or not word.again:
+            found.append(word.moment)
+    return found

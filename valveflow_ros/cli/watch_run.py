@@ -50,7 +50,7 @@ def _once(watch: LogWatch, options: Namespace, console: Console) -> Outcome:
     for _ in watch.read():
         console.progress(watch.share, 'reading what was recorded so far')
     frame = watch.frame()
-    return Outcome(Screen(sys.stdout).text(frame), dataclasses.asdict(frame))
+    return Outcome(Screen(sys.stdout).text(frame), dataclasses.asdict(frame), drawn=True)
 
 
 def _follow(watch: LogWatch, screen: Screen, interval_s: float) -> None:

@@ -18,11 +18,8 @@ from valveflow_ros.records import NS_PER_S
 _LAST_NS = (1 << 63) - 1
 # What has stood so long since it was told is told again, so that no shift takes it for old news.
 _AGAIN_NS = 86_400 * NS_PER_S
-_STANDING = (
-    AlarmState.UNACKNOWLEDGED,
-    AlarmState.ACKNOWLEDGED,
-    AlarmState.RETURNED_UNACKNOWLEDGED,
-)
+# So many announcements of others bury one that is not over: it is told again after them.
+BURIED = 8
 
 
 class Content(NamedTuple):
@@ -39,7 +36,9 @@ class VoicedAlarm(ABC):
 
     The state is always true; what is announced follows it, held back by the flood limit. What was
     held back and stands is announced as soon as the limit lets it, and the next announcement tells
-    how many were missed. What stands for a day is announced again.
+    how many were missed. What stands for a day, shelved or suppressed or not, is announced again,
+    and so is what is not over when others have been announced `BURIED` times since: who comes late
+    is given only the newest announcements. Neither counts for the limit, which is for what is new.
 
     Parameters
     ----------
@@ -60,6 +59,7 @@ class VoicedAlarm(ABC):
         self._told = self._now = self._before = AlarmState.NORMAL
         self._waits = False
         self._told_ns = 0
+        self._others = 0  # announcements of other alarms since it was told
         self.last: AlarmChange | None = None
         self._beside: Sequence[VoicedAlarm] = (self,)
         self.configure(settings)
@@ -125,7 +125,9 @@ class VoicedAlarm(ABC):
     @property
     def _again_ns(self) -> int | None:
         """Return when it is to be told again; None if there is nothing that could be forgotten."""
-        return self._told_ns + _AGAIN_NS if self._told in _STANDING else None
+        if self._others >= BURIED and self._told != AlarmState.NORMAL:
+            return self._told_ns
+        return self._told_ns + _AGAIN_NS if self._life.standing else None
 
     def stand_beside(self, alarms: Sequence[VoicedAlarm]) -> None:
         """Know the others, and this one among them, to tell which came first."""
@@ -180,14 +182,16 @@ class VoicedAlarm(ABC):
         return [self._announced(state, time_ns, model_id)]
 
     def _announced(self, state: AlarmState, time_ns: int, model_id: str) -> AlarmChange:
+        again = state == self._told
         missed = self._flood.held
-        if state == AlarmState.UNACKNOWLEDGED:
+        if state == AlarmState.UNACKNOWLEDGED and not again:
             self._flood.passed(time_ns)
             # What is announced late is not missed.
             missed -= 1 if self._waits else 0
         self._flood.held, self._waits = 0, False
-        previous = state if state == self._told else self._before
+        previous = state if again else self._before
         self._told, self._told_ns = state, time_ns
+        self._crowd_out()
         first = self._first_out()
         content = self._content(state)
         parts = [
@@ -201,6 +205,12 @@ class VoicedAlarm(ABC):
             model_id, first,
         )  # fmt: skip
         return self.last
+
+    def _crowd_out(self) -> None:
+        """Let the others know that there is one announcement more after theirs."""
+        for alarm in self._beside:
+            alarm._others += 1
+        self._others = 0
 
     def _worded(self, state: AlarmState, previous: AlarmState, sentence: str) -> str:
         """Return the sentence, with what shelf and suppression have to do with it."""
@@ -232,6 +242,7 @@ class VoicedAlarm(ABC):
             'before': int(self._before),
             'waits': self._waits,
             'told_ns': self._told_ns,
+            'others': self._others,
             'last': None if self.last is None else self.last.snapshot(),
         }
 
@@ -241,7 +252,7 @@ class VoicedAlarm(ABC):
         self._flood.restore(saved['flood'])
         self._told, self._now = AlarmState(saved['told']), AlarmState(saved['now'])
         self._before, self._waits = AlarmState(saved['before']), saved['waits']
-        self._told_ns = saved['told_ns']
+        self._told_ns, self._others = saved['told_ns'], saved['others']
         self.last = None if saved['last'] is None else AlarmChange.restored(saved['last'])
 
 

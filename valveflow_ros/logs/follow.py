@@ -9,10 +9,12 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs.folder import Split, in_order
+from valveflow_ros.logs.folder import in_order
+from valveflow_ros.logs.follow_files import files_in, final_of, first_in, part_of
 from valveflow_ros.logs.layout import (
     CHUNK_HEAD,
     FOOTER_RECORD_SIZE,
@@ -22,19 +24,20 @@ from valveflow_ros.logs.layout import (
     LayoutError,
     Op,
 )
-from valveflow_ros.logs.part_file import PART_SUFFIX, is_held
+from valveflow_ros.logs.limits import DEFAULT_LIMITS, OverBudgetError
+from valveflow_ros.logs.part_file import is_held
 from valveflow_ros.logs.scan import Scanner
-from valveflow_ros.logs.seek import candidates
+from valveflow_ros.logs.seek import candidates, ends_well
 from valveflow_ros.logs.source import Source
 from valveflow_ros.logs.topic_table import TopicTable
 from valveflow_ros.logs.walk import MessageTable, walk
-from valveflow_ros.records import NS_PER_S
 
 _MOST_ATTACHED = 1 << 20
 _GROUP_BYTES = 1 << 20
-# What stands is announced again within a day, so nothing older is needed to know it.
-LOOK_BACK_NS = 25 * 3600 * NS_PER_S
+_NEAR = 1 << 12
 _KINDS = frozenset(int(op) for op in Op)
+# Of these the length is known; it tells them from a chunk with a damaged first byte.
+_LAST = {int(Op.DATA_END): 4, int(Op.FOOTER): 20}
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +89,7 @@ class Follower:
         self.attachments: dict[str, bytes] = {}
         self.damaged = 0
         self._folder = path if path.is_dir() else None
-        self._current: Path | None = None if self._folder else _final(path)
+        self._current: Path | None = None if self._folder else final_of(path)
         self._ended = False
         self._started = self._current
         self._order: list[Path] = []
@@ -117,7 +120,7 @@ class Follower:
         """Tell whether a living writer holds the file that is being read."""
         if self._current is None:
             return False
-        part = _part(self._current)
+        part = part_of(self._current)
         try:
             return part.exists() and is_held(part)
         except OSError:
@@ -146,21 +149,21 @@ class Follower:
 
     def _find(self) -> bool:
         if self._current is None and self._folder is not None:
-            self._current = self._started = _first(self._folder)
+            self._current = self._started = first_in(self._folder)
         return self._current is not None and not (self._folder is None and self._ended)
 
     def _following(self) -> Path | None:
         """Return the file to go on with, if this one will not grow any more."""
         if self._folder is None or self._current is None or (not self._ended and self.written):
             return None
-        later = in_order({*_files(self._folder), self._current})
+        later = in_order({*files_in(self._folder), self._current})
         place = later.index(self._current) + 1
         return later[place] if place < len(later) else None
 
     def _open(self) -> Source:
         """Open the present file under the name it has now."""
         assert self._current is not None
-        part = _part(self._current)
+        part = part_of(self._current)
         try:
             return Source.open(part if part.exists() else self._current)
         except RecordingError:
@@ -196,28 +199,51 @@ class Follower:
             return None
         op, length = RECORD_HEAD.unpack(head)
         after = start + RECORD_HEAD.size + length
-        if op in (Op.DATA_END, Op.FOOTER):
+        if _LAST.get(op) == length:
             whole = source.size >= after + FOOTER_RECORD_SIZE
             self._ended = whole and source.read(source.size - len(MAGIC), len(MAGIC)) == MAGIC
             return None
-        if op not in _KINDS or (op == Op.CHUNK and length < CHUNK_HEAD.size):
+        if op not in _KINDS or op in _LAST or (op == Op.CHUNK and length < CHUNK_HEAD.size):
             return self._beyond_damage(source)
         if after > source.size:
-            return None
+            if self.written and length <= DEFAULT_LIMITS.record_bytes:
+                return None
+            return self._beyond_damage(source, sure=False)
+        if op == Op.CHUNK:
+            return self._chunk(source, scanner, after)
         self._position = after
         if op == Op.ATTACHMENT:
             self._attach(source, start, length)
-        if op != Op.CHUNK:
-            return b''
-        try:
-            return scanner.chunk_at(start).content
-        except LayoutError:
-            self.damaged += 1
-            return b''
+        return b''
 
-    def _beyond_damage(self, source: Source) -> bytes | None:
+    def _chunk(self, source: Source, scanner: Scanner, after: int) -> bytes | None:
+        start = self._position
+        try:
+            content = scanner.chunk_at(start).content
+        except OverBudgetError:
+            self.damaged += 1
+            self._position = source.size
+            return None
+        except LayoutError:
+            # Its length is believed if the fields within say the same.
+            if next(candidates(source, start, start + 1), None) is None:
+                return self._beyond_damage(source)
+            self.damaged += 1
+            content = b''
+        self._position = after
+        return content
+
+    def _beyond_damage(self, source: Source, sure: bool = True) -> bytes | None:
+        """Go on with the next chunk; if there is none, and no damage for sure, wait for more."""
+        start, size = self._position + 1, source.size
+        # First where reading costs little: there may be many false heads beside one another.
+        near = min(start + _NEAR, size)
+        heads = chain(candidates(source, start, near), candidates(source, near, size))
+        found = next(heads, None)
+        self._ended = found is None and ends_well(source)
+        if found is None and not (sure or self._ended):
+            return None
         self.damaged += 1
-        found = next(candidates(source, self._position + 1, source.size), None)
         self._position = source.size if found is None else found
         return None if found is None else b''
 
@@ -250,44 +276,7 @@ class Follower:
         if self._folder is None or self._current is None:
             return min(1.0, inside)
         if self._current not in self._order:
-            self._order = in_order({*_files(self._folder), self._current})
+            self._order = in_order({*files_in(self._folder), self._current})
         begun = self._order.index(self._started) if self._started in self._order else 0
         done = self._order.index(self._current) - begun
         return min(1.0, (done + inside) / max(1, len(self._order) - begun))
-
-
-def _part(path: Path) -> Path:
-    return path.with_name(path.name + PART_SUFFIX)
-
-
-def _final(path: Path) -> Path:
-    return path.with_suffix('') if path.suffix == PART_SUFFIX else path
-
-
-def _files(folder: Path) -> set[Path]:
-    """Return the files of a folder by their final names."""
-    try:
-        names = [entry.name for entry in folder.iterdir()]
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RecordingError(folder, f'cannot be read ({reason})') from None
-    return {
-        folder / name.removesuffix(PART_SUFFIX)
-        for name in names
-        if name.endswith(('.mcap', f'.mcap{PART_SUFFIX}'))
-    }
-
-
-def _first(folder: Path) -> Path | None:
-    """Return the file to begin with: the first that holds something of the last day."""
-    files = in_order(_files(folder))
-    begin: Path | None = None
-    newest = 0
-    for path in reversed(files):
-        split = Split.read(path) if path.exists() else None
-        if split is not None and split.messages:
-            newest = newest or split.end_ns
-            if begin is not None and split.end_ns < newest - LOOK_BACK_NS:
-                break
-        begin = path
-    return begin

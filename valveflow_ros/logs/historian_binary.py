@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,11 @@ if TYPE_CHECKING:
 _BLOCK_ROWS = 200_000
 _SHEET_BLOCK = 50_000
 _SAMPLES = 200
+_SHEET_ROWS = 1_048_576  # a sheet has no more
+# What a workbook may unpack to: XML of tables shrinks to a tenth, hardly ever to a hundredth.
+_UNPACKED_BYTES = 1 << 30
+_UNPACKED_FREELY = 64 << 20
+_UNPACKED_TIMES = 200
 
 
 def look_at_parquet(path: Path) -> tuple[tuple[str, ...], list[list[str]]]:
@@ -73,12 +79,24 @@ def look_at_sheet(path: Path, wanted: str, most: int) -> tuple[str, list[list[st
 def sheet_blocks(
     path: Path, sheet: str, first_row: int, places: list[int]
 ) -> Iterator[pd.DataFrame]:
-    """Yield the cells at these places, from a row on."""
+    """Yield the cells at these places, from a row on.
+
+    Raises
+    ------
+    RecordingError
+        If a row has a number that no row of a sheet can have.
+    """
     import pandas as pd
 
     with _book(path) as book:
         block: list[list[Any]] = []
-        for row in book[sheet].iter_rows(min_row=first_row + 1, values_only=True):
+        table = book[sheet]
+        table.reset_dimensions()
+        rows = table.iter_rows(min_row=first_row + 1, max_col=max(places) + 1, values_only=True)
+        # Rows that the file leaves out are given as empty ones, up to whatever number comes next.
+        for number, row in enumerate(rows, first_row + 1):
+            if number > _SHEET_ROWS:
+                raise RecordingError(path, f'has more than the {_SHEET_ROWS} rows of a sheet')
             picked = [row[k] if k < len(row) else None for k in places]
             if any(cell is not None for cell in picked):
                 block.append(picked)
@@ -125,12 +143,30 @@ def _text(cell: Any) -> str:
 
 
 def _first_rows(sheet: Any, most: int) -> list[list[str]]:
+    # Some tools write a size that leaves out most of the sheet.
+    sheet.reset_dimensions()
     rows = [
         [_text(cell) for cell in row] for row in sheet.iter_rows(max_row=most, values_only=True)
     ]
     while rows and not any(rows[-1]):
         rows.pop()
-    return rows
+    width = max(map(len, rows), default=0)
+    return [row + [''] * (width - len(row)) for row in rows]
+
+
+def _check_unpacked(path: Path) -> None:
+    """Refuse a workbook whose parts would fill the memory; raises `RecordingError`."""
+    with zipfile.ZipFile(path) as archive:
+        unpacked = sum(part.file_size for part in archive.infolist())
+    packed = path.stat().st_size
+    most = min(_UNPACKED_BYTES, max(_UNPACKED_FREELY, _UNPACKED_TIMES * packed))
+    if unpacked > most:
+        raise RecordingError(
+            path,
+            f'is a workbook of {packed / 1e6:.1f} MB that unpacks to {unpacked / 1e6:.0f} MB, '
+            f'more than the {most / 1e6:.0f} MB that are read of one its size; save the sheet as '
+            'CSV or Parquet',
+        )
 
 
 @contextmanager
@@ -143,6 +179,7 @@ def _book(path: Path) -> Iterator[Any]:
             "is an Excel workbook, and openpyxl that reads those is not installed; 'pip install "
             "openpyxl', or save the sheet as CSV",
         ) from None
+    _check_unpacked(path)
     book = openpyxl.load_workbook(path, read_only=True, data_only=True)
     try:
         yield book

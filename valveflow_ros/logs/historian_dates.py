@@ -15,7 +15,11 @@ _PARTS = re.compile(r'(\d{1,4})([./-])(\d{1,2})\2(\d{1,4})(?=[T ,]|$)')
 _NAMED = re.compile(r'(\d{1,2})[-. ]+([^\W\d]{3,9})\.?[-. ,]+(\d{2,4})(?=[T ,]|$)')
 _NAMED_FIRST = re.compile(r'([^\W\d]{3,9})\.? +(\d{1,2}),? +(\d{4})(?=[T ,]|$)')
 _TWELVE = re.compile(r'\d\s*[ap]\.?m\.?\s*$', re.IGNORECASE)
-_ZONED = re.compile(r'(?:Z|UTC|GMT|[+-]\d{2}:?\d{2})\s*$|\b(?:CES?T|MES?Z)\s*$')
+# An offset without a colon is one only behind a time of day: a date may end in '-05' or '-2026'.
+_ZONED = re.compile(
+    r'(?:Z|UTC|GMT|[+-]\d{2}:\d{2})\s*$|\b(?:CES?T|MES?Z)\s*$|'
+    r'(?:\d:\d{2}|T\d{2,6})(?:[.,]\d+)?\s*(?:UTC|GMT)?[+-]\d{2}(?:\d{2})?\s*$'
+)
 # The T of ISO 8601, which others put between date and time too.
 _BETWEEN = re.compile(r'(?:(?<=\d)|^)T(?=\d)')
 # Names of months as far as they differ from the English ones.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import zoneinfo
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
@@ -212,9 +213,13 @@ def _is_time(name: str) -> bool:
 
 def zone_in(name: str) -> str:
     """Return the zone that a time column's name tells, empty if it tells none."""
-    found = re.search(r'[\[({ ](UTC|GMT|[A-Z][A-Za-z]+/[A-Za-z_]+|(?:UTC)?[+-]\d{1,2}(?::?\d{2})?)'
+    found = re.search(r'[\[({ ](UTC|GMT|[A-Z][A-Za-z]+/[\w/+-]+|(?:UTC)?[+-]\d{1,2}(?::?\d{2})?)'
                       r'[\])} ]*$', name)  # fmt: skip
-    return found[1] if found else ''
+    if not found:
+        return ''
+    # 'PI Date/Time' reads like one, and is none.
+    named = '/' not in found[1] or found[1] in zoneinfo.available_timezones()
+    return found[1] if named else ''
 
 
 def local_zone_in(name: str) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +23,9 @@ _WORDS = {
     Quality.BAD: 'bad schlecht invalid ungueltig fault failed error stoerung timeout',
 }
 _BY_WORD = {word: quality for quality, words in _WORDS.items() for word in words.split()}
+_PRAISE = frozenset(['good', 'gut', 'ok', 'valid', 'gueltig', 'normal'])
+_NOT = frozenset(['not', 'no', 'nicht', 'kein', 'keine', 'keinen'])
+_CLAUSES = re.compile(r'[,;:|/()\[\]]+')
 # OPC: the two upper bits of the low byte, 11 good, 01 uncertain, 00 bad.
 _OPC_GOOD, _OPC_UNCERTAIN = 192, 64
 
@@ -76,8 +81,21 @@ def foreign_quality(column: pd.Series[Any]) -> ByteArray:
 
 
 def _word(text: str) -> Quality | None:
-    words = folded(text).split()
-    return next((_BY_WORD[word] for word in words if word in _BY_WORD), None)
+    """Return the gravest quality that a text tells: 'Raw, Bad' is bad, and so is 'Not Good'."""
+    found = [quality for clause in _CLAUSES.split(text) for quality in _told(folded(clause))]
+    return max(found, default=None)
+
+
+def _told(clause: str) -> Iterator[Quality]:
+    denied = False
+    for word in clause.split():
+        if word in _NOT:
+            denied = True
+        elif not denied and word in _BY_WORD:
+            yield _BY_WORD[word]
+        elif word in _PRAISE:
+            # What is not good is bad; what is not anything else ('no error') says nothing.
+            yield Quality.BAD
 
 
 def _quality(text: str) -> int:

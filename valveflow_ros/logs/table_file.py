@@ -21,6 +21,7 @@ from valveflow_ros.logs.historian_layout import (
 )
 from valveflow_ros.logs.source import Source
 from valveflow_ros.logs.table_cells import Marks
+from valveflow_ros.logs.table_lines import Lines
 from valveflow_ros.logs.table_options import AS_SEEN, TableOptions
 
 if TYPE_CHECKING:
@@ -109,11 +110,9 @@ class TableFile:
                 # From pandas 4 on the exact way of reading decimals is the only one.
                 warnings.simplefilter('ignore', DeprecationWarning)
                 frames = pd.read_csv(
-                    source.stream,
+                    Lines(self.path, source.stream, self.encoding),
                     sep=self.separator,
                     decimal=marks.decimal,
-                    encoding=self.encoding,
-                    encoding_errors='replace',
                     header=0,
                     skiprows=list(self.skip),
                     usecols=places,

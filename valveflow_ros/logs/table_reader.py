@@ -76,6 +76,7 @@ class TableReader:
         self.ignored = plan.ignored
         self.words: dict[str, Counter[str]] = {name: Counter() for name in self.names}
         self.empty: Counter[str] = Counter()
+        self._marked_bad: Counter[str] = Counter()
         self._first_bad: dict[str, tuple[int, str]] = {}
         self.bad_times = 0
         self.rows = 0
@@ -125,7 +126,7 @@ class TableReader:
                 if name in self._plan.quality:
                     cells = frame[self._plan.quality[name]]
                     own = self.names[name] == name
-                    quality[name] = to_quality(cells) if own else foreign_quality(cells)
+                    quality[name] = to_quality(cells) if own else self._foreign(name, cells)
             self.rows += len(frame)
             known = time_ns != never()
             if known.all():
@@ -156,6 +157,7 @@ class TableReader:
                 notes.append(
                     f"{one if n == 1 else are} as missing; the first is '{text}' in row {row + 1}."
                 )
+        notes += self._quality_notes()
         for name, chosen in self._plan.chosen.items():
             if chosen.unit is not None and not chosen.unit.plain:
                 notes.append(_converted_note(self.names[name], chosen.unit))
@@ -182,6 +184,20 @@ class TableReader:
         elif self._plan.options.time_zone or self.long is not None:
             said.append(f'Time zone: {self.time_zone}.')
         return said
+
+    def _foreign(self, name: str, cells: pd.Series[Any]) -> ByteArray:
+        codes = foreign_quality(cells)
+        self._marked_bad[name] += int((codes == Quality.BAD).sum())
+        return codes
+
+    def _quality_notes(self) -> Iterator[str]:
+        for name, n in self._marked_bad.items():
+            place = self._plan.quality[name] if self.long is None else self.long.quality
+            column = self._plan.file.names[place]
+            yield (
+                f"The quality of '{self.names[name]}' is read from '{column}', by which "
+                f'{n} of its values {"is" if n == 1 else "are"} bad.'
+            )
 
     def _read_times(self, frame: pd.DataFrame) -> IntArray:
         column = frame[self._plan.time]
@@ -227,7 +243,7 @@ class TableReader:
                 present[name] = mine
                 if coded:
                     codes = np.full(len(frame), int(Quality.GOOD), dtype=np.uint8)
-                    codes[place] = foreign_quality(frame[form.quality].iloc[place])
+                    codes[place] = self._foreign(name, frame[form.quality].iloc[place])
                     quality[name] = codes
             self.rows += len(frame)
             keep = (time_ns != never()) & np.any(list(present.values()), axis=0)

@@ -18,6 +18,8 @@ _ABBREVIATED = (
     (r'\s*\b(?:UTC|GMT)$', 'Z'),
     (r'\s*\b(?:CEST|MESZ)$', '+02:00'),
     (r'\s*\b(?:CET|MEZ)$', '+01:00'),
+    # PostgreSQL writes whole hours only.
+    (r'(:\d{2}(?:\.\d+)?\s*[+-]\d{2})$', r'\1:00'),
 )
 
 

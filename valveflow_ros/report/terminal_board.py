@@ -45,6 +45,9 @@ class Board:
         self.inputs: tuple[HealthView, ...] = ()
         self.recorder: HealthView | None = None
         self._unit = ''
+        # The tag of what the monitor publishes, and of the health that was taken; None: no word.
+        self._tag: str | None = None
+        self._health_tag: str | None = None
         self._now_ns = 0
         self._curve: CurveView | None = None
         self._diagnosis: DiagnosisView | None = None
@@ -85,7 +88,11 @@ class Board:
         self._now_ns = max(self._now_ns, time_ns)
 
     def _head(self, fields: Fields) -> int:
-        self._unit = str(fields['header']['frame_id']) or self._unit
+        self._tag = str(fields['header']['frame_id'])
+        if self._health_tag not in (None, self._tag):
+            # It came before it was known which monitor of several this is.
+            self.inputs, self.recorder, self._health_tag = (), None, None
+        self._unit = self._tag or self._unit
         return stamp_ns(fields['header']['stamp'])
 
     def _sample(self, fields: Fields) -> None:
@@ -115,6 +122,11 @@ class Board:
 
     def _health(self, fields: Fields) -> None:
         ours = [s for s in fields['status'] if str(s['name']).startswith('valveflow: ')]
+        if self._tag is not None:
+            # `/diagnostics` is one topic for every monitor there is.
+            ours = [s for s in ours if str(s['hardware_id']) == self._tag]
+        if ours:
+            self._health_tag = str(ours[0]['hardware_id'])
         items = [_item(status) for status in ours]
         inputs = [item for item in items if item.name.startswith('input ')]
         if inputs:

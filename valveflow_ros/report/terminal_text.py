@@ -14,11 +14,15 @@ Line = tuple[Span, ...]
 _SGR = {'strong': '1', 'dim': '2', 'curve': '36', 'good': '32', 'warn': '33', 'bad': '1;31'}
 # One letter for one, so that a line stays as long as it was.
 _PLAIN = str.maketrans('…·●┄─−\u202f±│°', '~|@--- ~| ')
+# More than any terminal shows of a sentence: what comes from others may be of any length.
+_LONGEST = 4096
 _BLANKS = re.compile(r'[^\S\u202f]+')
 
 
 def clean(text: str) -> str:
     """Return a text of others as it may stand on a terminal: no control characters, one line."""
+    if len(text) > _LONGEST:
+        text = f'{text[: _LONGEST - 1]}…'
     text = _BLANKS.sub(' ', text).strip()
     return ''.join(c if c.isprintable() or c == '\u202f' else '?' for c in text)
 
@@ -31,11 +35,14 @@ def cells(text: str) -> int:
 
 def cut(text: str, width: int) -> str:
     """Return a text, shortened to a width."""
-    if cells(text) <= width:
-        return text
-    while text and cells(text) > width - 1:
-        text = text[:-1]
-    return f'{text.rstrip()}…' if width > 0 else ''
+    taken, kept = 0, 0
+    for place, letter in enumerate(text):
+        taken += cells(letter)
+        if taken > width:
+            return f'{text[:kept].rstrip()}…' if width > 0 else ''
+        if taken <= width - 1:
+            kept = place + 1
+    return text
 
 
 def wrapped(text: str, width: int, most: int) -> list[str]:

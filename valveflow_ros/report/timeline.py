@@ -55,7 +55,8 @@ def _names(history: History) -> list[str]:
 
 
 def _row_of(name: str) -> str:
-    return name.replace('_', ' ')
+    """Return an alarm's name as the figure and the table show it: both read HTML."""
+    return text(name.replace('_', ' '))
 
 
 def _broken(sentence: str) -> str:
@@ -80,7 +81,7 @@ def _bars(history: History, state: AlarmState) -> list[Spec]:
     y = [cell for name, *_ in mine for cell in (_row_of(name), _row_of(name), None)]
     begins = np.array([a / 1e6 for _, _, a, _, _ in mine])
     hover = [
-        f'{moment(a)}<br>{text(_row_of(name))}: {words} for {duration((b - a) / 1e9)}'
+        f'{moment(a)}<br>{_row_of(name)}: {words} for {duration((b - a) / 1e9)}'
         f'<br>{_broken(sentence)}'
         for name, _, a, b, sentence in mine
     ]
@@ -178,6 +179,6 @@ def alarms_table(history: History) -> str:
 
 def _cells(change: AlarmMoment) -> list[str]:
     return [
-        moment(change.time_ns), text(_row_of(change.name)), _WORDS[change.state],
+        moment(change.time_ns), _row_of(change.name), _WORDS[change.state],
         text(change.sentence),
     ]  # fmt: skip

@@ -21,6 +21,7 @@ from valveflow_ros.plant.simulator import DEFAULT_START_NS
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.ros.conversions import from_time
+from valveflow_ros.ros.demo_options import parser
 from valveflow_ros.ros.demo_processes import Process, ros_arguments
 from valveflow_ros.ros.demo_watch import Watch
 from valveflow_ros.ros.sentences import with_place
@@ -32,25 +33,6 @@ _FAULT_MW = -12.0
 _FAULT_FROM = 0.5  # share of the run after which the fault begins
 _QUIET_LOOKS = 3
 _LONGEST_WAIT_S = 120.0
-
-
-def parser() -> argparse.ArgumentParser:
-    """Return the description of the command line."""
-    made = argparse.ArgumentParser(
-        prog='python -m valveflow_ros.ros.demo',
-        description='Run a simulated plant and the monitor as two ROS 2 processes, switch a '
-        'fault on, and show what the monitor says and records.',
-    )
-    made.add_argument('--output', type=Path, required=True, metavar='DIR', help='for all results')
-    made.add_argument('--days', type=float, default=3.0, help='of plant (default: 3)')
-    made.add_argument('--seed', type=int, default=1, help='of the plant (default: 1)')
-    made.add_argument(
-        '--rate',
-        type=float,
-        default=0.0,
-        help='plant seconds in a second; 0: as fast as the monitor takes it (default: 0)',
-    )
-    return made
 
 
 def tell(line: str) -> None:
@@ -106,7 +88,10 @@ class Demo:
             f'{-_FAULT_MW:g} MW less. The monitor is not told.'
         )
         domain = os.environ['ROS_DOMAIN_ID']
-        tell(f'To look on from another terminal: ROS_DOMAIN_ID={domain} valveflow watch')
+        tell(
+            'To look on from another terminal (after: source env.sh): '
+            f'ROS_DOMAIN_ID={domain} valveflow watch'
+        )
         tell(f'Starting the monitor. {SENTENCE}' if is_first_run() else 'Starting the monitor.')
 
     def _start(self) -> tuple[Process, Process]:

@@ -21,6 +21,7 @@ from valveflow_msgs.msg import (
 )
 
 from valveflow_ros.core import events as engine
+from valveflow_ros.core.alarm_voice import BURIED
 from valveflow_ros.core.alarms import AlarmChange, AlarmState
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.curve_status import CurveStatus
@@ -45,8 +46,9 @@ class OutputTopic:
     kept: int = 1  # messages that who comes late is given, if latched
 
 
-# Of two alarms that stand the later one must not take the earlier one's place.
-_ALARMS_KEPT = 10
+# Of two alarms that stand, one that comes and goes must not take the place of the other, which
+# is told again with the row after so many announcements; one or two may come before that row.
+_ALARMS_KEPT = BURIED + 2
 OUTPUTS: Mapping[str, OutputTopic] = {
     'characteristic': OutputTopic(
         FlowCharacteristic, 'valveflow_msgs/msg/FlowCharacteristic', True

@@ -1,0 +1,155 @@
+"""Tables that say what is easily misread, and files that would fill memory or time."""
+
+from __future__ import annotations
+
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from valveflow_ros.errors import RecordingError
+from valveflow_ros.logs import open_log, read_table
+from valveflow_ros.logs.historian_quality import foreign_quality
+from valveflow_ros.logs.table_lines import LONGEST_LINE
+from valveflow_ros.records import Quality, Signal
+
+HEAD = 'time,valve position,ms pressure [MPa],ms temperature,MW'
+ROWS = [f'2026-01-05 12:00:{k:02},50,13,538,{600 + k}' for k in range(20)]
+
+
+def text_of(path, head=HEAD, rows=ROWS):
+    path.write_text('\n'.join([head, *rows]) + '\n')
+    return path
+
+
+def book_of(path):
+    openpyxl = pytest.importorskip('openpyxl')
+    book = openpyxl.Workbook()
+    for line in (HEAD, *ROWS):
+        book.active.append(line.split(','))
+    book.save(path)
+    return path
+
+
+def changed(path, to, end):
+    """Write a workbook again with something put at the end of its rows."""
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(to, 'w', zipfile.ZIP_DEFLATED) as new:
+        for name in old.namelist():
+            head, mark, tail = old.read(name).partition(b'</sheetData>')
+            new.writestr(name, head + (end if mark else b'') + mark + tail)
+    return to
+
+
+def qualities(*texts):
+    return [Quality(code) for code in foreign_quality(pd.Series(list(texts)))]
+
+
+@given(st.permutations(['Raw', 'Good', 'Questionable', 'Bad']), st.integers(1, 4))
+def test_the_gravest_word_of_quality_counts(words, n):
+    alone = qualities(*words[:n])
+    assert qualities(', '.join(words[:n])) == [max(alone)]
+    assert qualities(' '.join(words[:n])) == [max(alone)]
+
+
+def test_what_is_not_good_is_bad():
+    bad = ('Not Good', 'No Good Data', 'nicht gut', 'NotGood', 'nicht mehr gültig', 'Raw, not ok')
+    assert qualities(*bad) == [Quality.BAD] * len(bad)
+    good = ('Good, no error', 'Good | not annotated', 'No alarm; Good', 'Good, Non-Specific')
+    assert qualities(*good) == [Quality.GOOD] * len(good)
+
+
+@pytest.mark.parametrize('long', [False, True])
+def test_the_column_of_quality_is_named_and_what_is_bad_by_it_counted(tmp_path, long):
+    mark = ['Raw, Bad' if k % 10 == 3 else 'Raw, Good' for k in range(20)]
+    if long:
+        head, rows = 'Tag,Time,Value,Quality', []
+        for tag, place in (('CV_POS', 1), ('PT100', 2), ('TT100', 3), ('JT1', 4)):
+            cells = [row.split(',') for row in ROWS]
+            rows += [f'{tag},{c[0]},{c[place]},"{m if place == 4 else "Good"}"'
+                     for c, m in zip(cells, mark, strict=True)]  # fmt: skip
+        said = "'JT1' is read from 'Quality', by which 2 of its values are bad."
+    else:
+        head = f'{HEAD},MW Quality'
+        rows = [f'{row},"{m}"' for row, m in zip(ROWS, mark, strict=True)]
+        said = "'MW' is read from 'MW Quality', by which 2 of its values are bad."
+    path = text_of(tmp_path / 'x.csv', head, rows)
+    assert any(note.endswith(said) for note in read_table(path).notes)
+    readings = open_log(path).readings
+    power = readings.value[readings.signal == Signal.GENERATED_POWER]
+    assert np.flatnonzero(np.isnan(power)).tolist() == [3, 13]
+
+
+@pytest.mark.parametrize('name', ['Sample Date/Time', 'PI Date/Time', 'Date/Time'])
+def test_date_and_time_parted_by_a_slash_are_no_zone(tmp_path, name):
+    plain = read_table(text_of(tmp_path / 'x.csv')).time_ns
+    odd = read_table(text_of(tmp_path / 'y.csv', HEAD.replace('time', name, 1))).time_ns
+    assert odd.tolist() == plain.tolist()
+    zoned = HEAD.replace('time', 'Time (Europe/Berlin)', 1)
+    berlin = read_table(text_of(tmp_path / 'z.csv', zoned)).time_ns
+    assert set((plain - berlin).tolist()) == {3600 * 10**9}
+
+
+@pytest.mark.parametrize('date', ['%Y-%m-%d %H:%M:%S', '%Y-%m-%dT%H:%M', '%d.%m.%Y %H:%M:%S'])
+@pytest.mark.parametrize(('offset', 'hours'), [('+01', 1), ('-05', -5), ('+0530', 5.5)])
+def test_an_offset_of_whole_hours_is_one(tmp_path, date, offset, hours):
+    days = pd.date_range('2026-01-05 12:00', periods=20, freq='h')
+    rows = [f'{day.strftime(date)}{offset},50,13,538,600' for day in days]
+    found = read_table(text_of(tmp_path / 'x.csv', rows=rows)).time_ns
+    utc = days - pd.Timedelta(hours=hours)
+    assert found.tolist() == utc.to_numpy().astype('datetime64[ns]').astype(int).tolist()
+
+
+@pytest.mark.parametrize('date', ['%Y-%m-%d', '%d-%m-%Y', '%Y-%m-%d %H:%M'])
+def test_the_end_of_a_date_is_no_offset(tmp_path, date):
+    days = pd.date_range('2026-01-05', periods=20, freq='D')
+    rows = [f'{day.strftime(date)},50,13,538,600' for day in days]
+    found = read_table(text_of(tmp_path / 'x.csv', rows=rows)).time_ns
+    assert found.tolist() == days.to_numpy().astype('datetime64[ns]').astype(int).tolist()
+
+
+def test_a_row_that_no_sheet_has_ends_the_reading(tmp_path):
+    path = book_of(tmp_path / 'x.xlsx')
+    row = '<row r="{0}"><c r="A{0}" t="n"><v>1</v></c></row>'
+    far = changed(path, tmp_path / 'far.xlsx', row.format(2_000_000_000).encode())
+    with pytest.raises(RecordingError, match='more than the 1048576 rows'):
+        read_table(far)
+    # What comes after the size that the sheet tells is read as well.
+    near = read_table(changed(path, tmp_path / 'near.xlsx', row.format(30_000).encode()))
+    assert len(near.time_ns) == len(read_table(path).time_ns)
+    assert near.bad_times == 1
+
+
+def test_a_workbook_that_unpacks_beyond_measure_is_refused(tmp_path):
+    path = book_of(tmp_path / 'x.xlsx')
+    cell = (
+        b'<row r="30"><c r="A30" t="inlineStr"><is><t>'
+        + b'x' * (80 << 20)
+        + b'</t></is></c></row>'
+    )
+    bomb = changed(path, tmp_path / 'bomb.xlsx', cell)
+    assert bomb.stat().st_size < 1 << 20
+    del cell
+    tracemalloc.start()
+    with pytest.raises(RecordingError, match=r'unpacks to 84 MB.*save the sheet as CSV'):
+        read_table(bomb)
+    assert tracemalloc.get_traced_memory()[1] < 32 << 20
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize('encoding', ['utf-8', 'utf-16'])
+def test_a_line_without_end_is_refused(tmp_path, encoding):
+    def written(length):
+        row = '2026-01-05 12:01:00,50,13,538,'
+        path = text_of(tmp_path / 'x.csv', rows=[*ROWS * 500, row + '6' * (length - len(row))])
+        path.write_bytes(path.read_text().encode(encoding))
+        return path
+
+    assert read_table(written(LONGEST_LINE)).bad_times == 0
+    with pytest.raises(RecordingError, match='a line of more than 1048576 letters'):
+        read_table(written(LONGEST_LINE + 1))
+    with pytest.raises(RecordingError, match='a line of more than 1048576 letters'):
+        read_table(written(9 * LONGEST_LINE))
