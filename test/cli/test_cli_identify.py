@@ -276,3 +276,20 @@ def test_readings_that_were_not_used_are_told(run, logs, tmp_path):
     quick = ['--set', 'refine=false', '--set', 'selection_rule=paper']
     ran = run('identify', tmp_path / 'x.csv', '-o', tmp_path / 'out', *quick)
     assert 'generated_power: 10 impossible value' in ran.out
+
+
+def test_a_curve_that_explains_little_is_not_to_be_relied_on(run, logs, tmp_path):
+    """The power is that of another time."""
+    table = [line.split(',') for line in (logs / 'plant.csv').read_text().splitlines()]
+    place = table[0].index('generated_power_mw')
+    power = [row[place] for row in table[1:]]
+    third = len(power) // 3
+    for row, value in zip(table[1:], power[third:] + power[:third], strict=True):
+        row[place] = value
+    (tmp_path / 'x.csv').write_text(''.join(','.join(row) + '\n' for row in table))
+    sound = run('identify', logs / 'plant.csv', '-o', tmp_path / 'a')
+    assert 'Do not rely' not in sound.out
+    ran = run('identify', tmp_path / 'x.csv', '-o', tmp_path / 'b')
+    assert ran.status == 0
+    assert 'Do not rely on this curve: it explains only' in ran.out
+    assert 'Do not rely on this curve' in (tmp_path / 'b' / 'report.html').read_text()

@@ -184,8 +184,9 @@ def test_limits_are_twice_as_wide_at_first_and_hardly_wider_after_weeks():
 
     def limits(days):
         part = r[: round(days * 1440)]
-        return design_chart(part, np.ones(len(part), np.uint8), 60.0, block_s=60.0,
-                            run_length_days=30.0, floor_mw=0.0, curve_error_mw=0.0).limit  # fmt: skip
+        weight = np.ones(len(part), np.uint8)
+        common = {'block_s': 60.0, 'run_length_days': 30.0, 'floor_mw': 0.0}
+        return design_chart(part, weight, 60.0, curve_error_mw=0.0, **common).limit
 
     least = normal_limit(0.25, 2.0 * 1.4 * 30.0 * 1440.0)
     assert limits(0.2)[0] >= 2.0 * least - 1e-9

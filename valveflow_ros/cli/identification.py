@@ -29,7 +29,7 @@ from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.extended_model import ExtendedModel
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import SIGNALS
-from valveflow_ros.report.answer import explained, opening_gain, temperature_words
+from valveflow_ros.report.answer import doubt, explained, opening_gain, temperature_words
 from valveflow_ros.report.identification import identification_page
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.numbers import (
@@ -168,6 +168,7 @@ def _text(found: Identified, written: Mapping[str, Path]) -> str:
         f'{found.source}: {moment(c.source.window_start_ns)} to {moment(c.source.window_end_ns)}',
         f'The flow characteristic has {counted(len(c.pieces), "piece")} and explains '
         f'{percent(explained(found))} of the variance of the power.',
+        doubt(found),
         _pieces(found),
         _breakpoints(c),
         _dynamics(c),

@@ -161,11 +161,11 @@ def write_readings(
         except BaseException:
             out.discard()
             raise
-        notes = _describe_beside(target, split)
+        _describe_beside(target, split)
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise RecordingError(target, f'cannot be written ({reason})') from None
-    return WrittenLog(target, records.count, notes)
+    return WrittenLog(target, records.count)
 
 
 def _in_blocks(table: SampleTable) -> Iterator[Readings]:
@@ -240,13 +240,12 @@ def _put_chunks(file: ChunkFile, parts: Iterable[NDArray[np.void]], book: TopicB
         schedule.done(topics, due)
 
 
-def _describe_beside(target: Path, split: Split) -> tuple[str, ...]:
+def _describe_beside(target: Path, split: Split) -> None:
     """Write `metadata.yaml`, unless one that tells of other files stands there."""
     path = target.parent / METADATA_NAME
-    if path.exists() and not _tells_of(path, target.name):
-        return (f'{path} tells of another recording and was left as it is.',)
-    write_metadata(target.parent, [split])
-    return ()
+    # A file by itself needs none: whoever writes several into one folder is not troubled by it.
+    if not path.exists() or _tells_of(path, target.name):
+        write_metadata(target.parent, [split])
 
 
 def _tells_of(path: Path, name: str) -> bool:

@@ -22,6 +22,8 @@ from valveflow_ros.report.numbers import (
 from valveflow_ros.report.page import notice, paragraph, table, text
 from valveflow_ros.report.words import held_words, input_unit
 
+# A power that the valve explains less of is governed by something else, or a signal is wrong.
+_LITTLE = 0.8
 _FLAT = 0.2  # a piece this much flatter than the steepest is said to answer hardly at all
 
 
@@ -35,6 +37,17 @@ def explained(data: Identified) -> float:
     rest = power - data.characteristic.model.static(data.u[rows])
     total = float(np.var(power))
     return 1.0 - float(np.mean(rest**2)) / total if total > 0.0 else math.nan
+
+
+def doubt(data: Identified) -> str:
+    """Return a warning where the curve explains so little that it is none; empty otherwise."""
+    share = explained(data)
+    if not share < _LITTLE:
+        return ''
+    return (
+        f'Do not rely on this curve: it explains only {percent(share)} of the variance of the '
+        'power. Look whether a signal is constant, taken for another one, or in another unit.'
+    )
 
 
 def opening_gain(data: Identified, piece: Piece) -> tuple[float, float]:
@@ -99,7 +112,7 @@ def _bends(c: Characteristic) -> str:
 
 def _warnings(data: Identified) -> str:
     c = data.characteristic
-    told = ''
+    told = notice(doubt(data)) if doubt(data) else ''
     if c.source.temperature_flag:
         limit = plain(data.settings.real('temperature_spread_limit'))
         told += notice(
