@@ -92,10 +92,11 @@ def _alarm() -> list[tuple[str, str, str]]:
     return [
         _row('days between false alarms, 30 asked for, AR(1) noise with phi 0 to 0.995',
              f'{min(days):.0f} to {max(days):.0f}', name),
-        _row('healthy plants, a month each: days between false alarms',
+        _row('healthy plants, a month each, with the narrower limits of before: days between '
+             'false alarms',
              f'{study["days_per_false_alarm"]:.0f} ({study["false_alarms"]} in '
              f'{study["days_watched"]:.0f} days)', 'alarm_320_335'),
-        _row('minutes until an alarm, at a lasting shift of 1 and of 3 sd of the residual',
+        _row('the same: minutes until an alarm, at a lasting shift of 1 and of 3 sd',
              f'{study["median_delay_min_1_sd"]:.0f} and {study["median_delay_min_3_sd"]:.1f}',
              'alarm_320_335'),
     ]  # fmt: skip

@@ -99,17 +99,14 @@ def _written(
                 'hold; write an .mcap file.'
             )
         table = SampleTable.concatenate(list(historian.tables(spool, ordered)))
-        place, notes = write_log(table, path, overwrite=options.overwrite)
+        place = write_log(table, path, overwrite=options.overwrite)
     else:
         # An empty file is no obstacle, and the writer knows no third way.
         replace = options.overwrite or (path.is_file() and path.stat().st_size == 0)
-        written = write_readings(
+        place = write_readings(
             historian.readings(spool, ordered), historian.signals, path,
             attachments=attachments, overwrite=replace,
-        )  # fmt: skip
-        place, notes = written.path, written.notes
-    for note in notes:
-        console.say(note)
+        ).path  # fmt: skip
     return _outcome(imported, place)
 
 

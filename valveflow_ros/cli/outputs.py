@@ -32,13 +32,13 @@ def write_log(
     *,
     overwrite: bool = False,
     attachments: Mapping[str, bytes] | None = None,
-) -> tuple[Path, tuple[str, ...]]:
-    """Write a table as MCAP, folder, CSV or Parquet; return where, and sentences about it."""
+) -> Path:
+    """Write a table as MCAP, folder, CSV or Parquet; return where."""
     if path.suffix.lower() in TABLES:
         with whole_file(path) as draft:
             write_table(table, draft)
-        return path, ()
+        return path
     # An empty file is no obstacle, and the writer knows no third way.
     replace = overwrite or (path.is_file() and path.stat().st_size == 0)
-    written = write_samples(table, path, attachments=dict(attachments or {}), overwrite=replace)
-    return written.path, written.notes
+    kept = dict(attachments or {})
+    return write_samples(table, path, attachments=kept, overwrite=replace).path

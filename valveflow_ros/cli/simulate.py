@@ -67,9 +67,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     except InputError as error:
         raise UsageError(str(error)) from None
     console.progress(0.6, 'writing')
-    written, notes = write_log(log.table, options.output, overwrite=options.overwrite)
-    for note in notes:
-        console.say(note)
+    written = write_log(log.table, options.output, overwrite=options.overwrite)
     truth = _truth(log, options)
     if options.truth is not None:
         _write_truth(options.truth, truth)

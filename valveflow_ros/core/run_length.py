@@ -28,8 +28,8 @@ _DAY_S = 86400.0
 # Correlation and spread come from days of data: without some to spare, residuals drawn anew gave
 # an alarm in 25 to 28 days where 30 were wanted (`benchmarks.alarm_run_length`).
 _SPARE = 1.4
-# A young curve has not seen all of its unit: where it comes first, its error goes on for a quarter
-# of an hour. On young plants that reached 1.4 times the limit (`benchmarks.young_curves`).
+# A young curve has not seen all of its unit: where that comes first, it is off for a quarter
+# of an hour. How often that raises an alarm is counted by `benchmarks.young_curves`.
 _YOUNG_DAYS = 0.4
 _HIGHEST = 400.0
 _LEAST_LIMIT = 4.5  # more than one clipped block can add

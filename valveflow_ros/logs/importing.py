@@ -61,11 +61,10 @@ _BLOCK_ROWS = 100_000
 
 @dataclass(frozen=True, slots=True)
 class WrittenLog:
-    """A recording that was written: its file, how many messages, and sentences about it."""
+    """A recording that was written: its file, and how many messages."""
 
     path: Path
     messages: int
-    notes: tuple[str, ...] = ()
 
 
 def write_samples(
