@@ -1,9 +1,10 @@
 """The node under load: what is lost, what it costs, how late it is.
 
     python -m benchmarks.node_load [CASE]... [--full] [--qos best_effort|reliable|both]
-                                   [--strict] [--output DIR]
+                                   [--hours H] [--strict] [--output DIR]
 
-CASE is one of rates, headroom, stall, refit, flood; without one all are run. The monitor runs as a
+CASE is one of rates, headroom, stall, refit, flood; without one all are run. There is also `soak`,
+hours at 4 x 100 Hz in real time, which is run only when it is named. The monitor runs as a
 process as ever, recording; the senders are processes of their own and number what they send. So
 what stands in the recording is known message by message, and every message that was sent must be
 recorded, dropped by the recorder and counted, or lost on the way and counted. Where that does not
@@ -33,7 +34,7 @@ from typing import Any
 import numpy as np
 import rclpy
 
-from benchmarks.load.cases import BOTH, CASES, cases
+from benchmarks.load.cases import BOTH, CASES, SOAK, cases
 from benchmarks.load.trial import result_of
 
 RESULTS = Path(__file__).resolve().parent / 'results'
@@ -47,7 +48,7 @@ def run_all(options: argparse.Namespace) -> list[str]:
         before = os.getloadavg()
         found: list[dict[str, Any]] = []
         for reliable in qualities(name, options):
-            for case in cases(name, options.full, reliable):
+            for case in cases(name, options.full, reliable, options.hours):
                 with tempfile.TemporaryDirectory(prefix='node_load') as folder:
                     found.append(result_of(case, Path(folder)))
                 print('\n'.join(lines(found[-1])), flush=True)
@@ -90,6 +91,7 @@ def write(
     """Write what was found, with the machine it was found on."""
     given = [name, *(['--full'] if options.full else [])]
     given += ['--qos', options.qos] if options.qos else []
+    given += ['--hours', f'{options.hours:g}'] if name == SOAK else []
     content = {
         'command': ' '.join(['python -m benchmarks.node_load', *given]),
         'passed': not any(r['faults'] for r in found),
@@ -119,15 +121,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument('cases', nargs='*', metavar='CASE', help=', '.join(CASES))
+    parser.add_argument('cases', nargs='*', metavar='CASE', help=', '.join((*CASES, SOAK)))
     parser.add_argument('--full', action='store_true', help='as long as the figures ask for')
     parser.add_argument('--qos', choices=('best_effort', 'reliable', 'both'))
+    parser.add_argument('--hours', type=float, default=8.0, help='of the soak (default 8)')
     parser.add_argument('--strict', action='store_true', help='a passed limit fails, too')
     parser.add_argument('--output', type=Path, default=RESULTS)
     options = parser.parse_args()
-    unknown = [name for name in options.cases if name not in CASES]
+    unknown = [name for name in options.cases if name not in (*CASES, SOAK)]
     if unknown:
-        parser.error(f'there is no case {unknown[0]}; there are {", ".join(CASES)}')
+        parser.error(f'there is no case {unknown[0]}; there are {", ".join((*CASES, SOAK))}')
     os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % _DOMAINS + 1)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     rclpy.init(args=[])

@@ -1,4 +1,4 @@
-"""What is tried: steady rates, more than that, a stall, refits meanwhile, a flood."""
+"""What is tried: steady rates, more than that, a stall, refits meanwhile, a flood, and hours."""
 
 from __future__ import annotations
 
@@ -6,10 +6,14 @@ from collections.abc import Iterator
 
 import psutil
 
+from benchmarks.load.steady import Steadiness
 from benchmarks.load.trial import REQUIRED, Case, Run
 
 CASES = ('rates', 'headroom', 'stall', 'refit', 'flood')
+# Takes hours, so it is run when it is asked for by name only.
+SOAK = 'soak'
 _REFIT_EVERY_S = 5.0
+_SOAK_REFIT_S = 60.0
 _FLOODED = 'valve_opening'
 _CPU = {1.0: 3.0, 100.0: 6.0, 1000.0: 20.0}
 _LATE = {'latency_p99_ms': 25.0, 'latency_max_ms': 100.0}
@@ -19,8 +23,11 @@ _LATE = {'latency_p99_ms': 25.0, 'latency_max_ms': 100.0}
 BOTH = ('headroom', 'stall')
 
 
-def cases(name: str, full: bool, reliable: bool) -> Iterator[Case]:
-    """Yield the cases of a name; short ones unless ``full``."""
+def cases(name: str, full: bool, reliable: bool, hours: float) -> Iterator[Case]:
+    """Yield the cases of a name; short ones unless ``full``, and the soak for so many hours."""
+    if name == SOAK:
+        yield _soak(hours, reliable)
+        return
     makers = {'rates': _rates, 'headroom': _headroom, 'stall': _stall, 'refit': _refit,
               'flood': _flood}  # fmt: skip
     for case in makers[name](full):
@@ -80,6 +87,21 @@ def _flood(full: bool) -> Iterator[Case]:
         parameters={'alarm_limit': 20.0, 'alarm_average': 1.0}, meanwhile=_hear_alarms,
         step_by=80.0, lossless=others, needs_room=True,
         limits={'memory_growth_mib': 20.0, 'alarm_s': 1.0},
+    )  # fmt: skip
+
+
+def _soak(hours: float, reliable: bool) -> Case:
+    """One long run: what it holds at its end must be what it held after its first tenth."""
+    return Case(
+        SOAK, f'4 topics at 100 Hz for {hours:g} hours, recorded, with a state and refits',
+        _even(100.0), 3600.0 * hours, curve=True, reliable=reliable,
+        meanwhile=Steadiness(_Refits(_SOAK_REFIT_S), 360.0 * hours),
+        parameters={'keep_state': True},
+        limits={
+            'cpu_percent': 6.0, 'latency_p99_ms': 25.0, 'memory_mib': 250.0,
+            'memory_mib_per_hour': 1.0, 'more_descriptors': 0.0, 'more_threads': 0.0,
+            'more_shared_memory_files': 0.0,
+        },
     )  # fmt: skip
 
 

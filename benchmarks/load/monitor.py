@@ -119,7 +119,8 @@ class Monitor:
         self.recordings = folder / 'recordings'
         self._probe = folder / 'probe.json'
         self._log = folder / 'monitor.log'
-        given = {'record_directory': self.recordings, 'keep_state': False, **parameters}
+        places = {'record_directory': self.recordings, 'state_directory': folder / 'state'}
+        given = {**places, 'keep_state': False, **parameters}
         command = [sys.executable, '-m', 'benchmarks.load.probed', str(self._probe)]
         with self._log.open('wb') as log:
             self._process = subprocess.Popen(

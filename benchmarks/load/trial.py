@@ -85,9 +85,11 @@ class Sender:
         threading.Thread(target=self._read, daemon=True).start()
         self.result: dict[str, Any] = {}
 
-    def line(self, ears: Ears, meanwhile: Callable[[], None] = lambda: None) -> str:
-        """Return its next line, doing something until it comes."""
-        end_s = time.monotonic() + _PATIENCE_S
+    def line(
+        self, ears: Ears, meanwhile: Callable[[], None] = lambda: None, busy_s: float = 0.0
+    ) -> str:
+        """Return its next line, doing something until it comes; it may be busy for so long."""
+        end_s = time.monotonic() + busy_s + _PATIENCE_S
         while time.monotonic() < end_s:
             try:
                 return self._lines.get_nowait()
@@ -198,7 +200,7 @@ class Run:
                 self.case.meanwhile(self, time.monotonic() - begun_s)
 
         for sender in self._senders:
-            assert sender.line(ears, meanwhile) == 'sent'
+            assert sender.line(ears, meanwhile, self.case.seconds) == 'sent'
         took_s = time.monotonic() - begun_s
         self.measured['cpu_percent'] = 100.0 * (monitor.used_s() - used_s) / took_s
         for sender in self._senders:
