@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from valveflow_ros.core.normal_kernel import square_sum
+from valveflow_ros.core.whitening import innovation_sum as square_sum
 from valveflow_ros.core.whitening import normal_equations, whitened
 
 

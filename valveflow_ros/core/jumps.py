@@ -13,7 +13,6 @@ import numpy as np
 
 from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.problem import Problem, free_parameters, move
-from valveflow_ros.core.whitening import normal_equations
 from valveflow_ros.records import BoolArray, FloatArray
 
 _SHORT = 0.06  # of the range of u
@@ -71,8 +70,7 @@ def _wald(problem: Problem, model: RegionalModel, ar: FloatArray) -> FloatArray:
 
     The jump that stands there counts, and what the joint regression would add to it.
     """
-    residual, jacobian, weight = problem.tangents(model)
-    sums, _, rows = normal_equations(jacobian, residual, weight, ar)
+    sums, rows = problem.normal(model, ar)
     used = np.append(np.diag(sums)[:-1] > 0.0, False)
     inverse = np.linalg.pinv(sums[np.ix_(used, used)])
     step = np.zeros(len(used) - 1)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from valveflow_ros.core.partition_layers import best_partitions, prepare
 from valveflow_ros.core.partition_levels import Levels, make_levels
+from valveflow_ros.core.threads import cores
 from valveflow_ros.errors import DataError, ParameterError, TooFewSamplesError
 from valveflow_ros.records import FloatArray, IntArray
 
@@ -180,7 +180,7 @@ def partition(
         raise TooFewSamplesError('Distinct values of u for one piece', len(levels), min_distinct)
     most = min(max_pieces, len(levels) // min_distinct)
     if threads is None:
-        threads = _cores() if len(levels) >= _SERIAL_BELOW else 1
+        threads = cores() if len(levels) >= _SERIAL_BELOW else 1
     slack = _SLACK * len(levels.u)  # the scaled sum of squares about one line
     problem = prepare(levels.x, levels.residual, levels.weight, min_distinct, slack, threads)
     found, starts = best_partitions(problem, most)
@@ -211,13 +211,6 @@ def _agree(levels: Levels, found: FloatArray, cost: FloatArray, starts: list[Int
 def _at_least(name: str, value: int, least: int) -> None:
     if not value >= least:
         raise ParameterError(name, f'is {value}, but must be at least {least}')
-
-
-def _cores() -> int:
-    """Return how many cores this process may use."""
-    if hasattr(os, 'sched_getaffinity'):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _limit(distinct: int, most: int, asked: int, least: int) -> str:

@@ -14,7 +14,7 @@ from valveflow_ros.core.partition_lift import fill_node_bounds
 from valveflow_ros.core.partition_moments import LEAF, Tree, build_tree, stretch_moments
 from valveflow_ros.core.partition_near import Near, fill_near, make_near
 from valveflow_ros.core.partition_search import Layer, search_groups
-from valveflow_ros.core.partition_threads import runs, share
+from valveflow_ros.core.threads import runs, share
 from valveflow_ros.records import FloatArray, IntArray
 
 # Groups that one thread searches before it asks for more. Fixed, so that the

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.core import regional_kernel as kernel
+from valveflow_ros.core.answer_kernel import answer_residual
 from valveflow_ros.core.model import RegionalModel
-from valveflow_ros.core.normal_kernel import square_sum
-from valveflow_ros.core.whitening import normal_equations
+from valveflow_ros.core.normal_kernel import normal_sums
+from valveflow_ros.core.tangent_kernel import tangents
+from valveflow_ros.core.threads import cores, runs, share
+from valveflow_ros.core.whitening import innovation_sum
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
 # What reacts to the power within the rows averaged, as a load controller does, would be
 # taken for dynamics of the valve: so in the end few rows are averaged.
 _FINE_S = 2.0
+# The filters of a stretch of rows begin so many time constants before it: what they began with is
+# then less than the last bit of the answer.
+_FORGOTTEN = 40.0
+# A stretch has this many means at least, and eight times what comes before it. How the rows are
+# cut depends on them and the model alone, so that the bits do not depend on the machine.
+_STRETCH = 8192
 _LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4, 0.2, 0.1, 0.05)
 
 
@@ -85,40 +94,96 @@ class Problem:
         self.settle = round(samples.settle_s / samples.step_s)
         self.u = np.ascontiguousarray(samples.u[:cut])
         self.usable = np.ascontiguousarray(samples.usable[:cut])
-        self._flow = np.empty(cut)
         power = np.where(self.usable > 0, samples.power_mw[:cut], 0.0)
         self.power = power.reshape(m, samples.group).mean(axis=1)
+        self._threads = cores()
 
     def answer(self, model: RegionalModel) -> tuple[FloatArray, ByteArray]:
         """Return residual means (m,) and their weight."""
         s = self.samples
-        means = np.empty(s.means)
+        residual = np.empty(s.means)
         weight = np.empty(s.means, dtype=np.uint8)
-        kernel.answer_means(
-            self.u, self.usable, model.knots, model.left, model.right, model.levels,
-            model.taps(s.step_s), self.settle, s.group,
-            self._flow, means, weight,
-        )  # fmt: skip
-        return np.where(weight > 0, self.power - means, 0.0), weight
+        taps = model.taps(s.step_s)
+
+        def stretch(begin: int, first: int, end: int) -> None:
+            answer_residual(
+                self.u, self.usable, self.power, model.knots, model.left, model.right,
+                model.levels, taps, self.settle, s.group, begin, first, end, residual, weight,
+            )  # fmt: skip
+
+        share(stretch, self._stretches(model), self._threads)
+        return residual, weight
 
     def tangents(self, model: RegionalModel) -> tuple[FloatArray, FloatArray, ByteArray]:
         """Return residual (m,), Jacobian of the prediction (m, P) and weight (m,)."""
         s = self.samples
-        m = s.means
-        answer = np.empty(m)
-        jacobian = np.empty((m, 3 * model.pieces - 1 + 2 * model.regions))
-        weight = np.empty(m, dtype=np.uint8)
-        kernel.tangents(
-            self.u, self.usable, model.knots, model.left, model.right, model.levels,
-            model.time_constants, model.delays, s.step_s, self.settle, s.group,
-            answer, jacobian, weight,
+        residual = np.empty(s.means)
+        jacobian = np.empty((s.means, 3 * model.pieces - 1 + 2 * model.regions))
+        weight = np.empty(s.means, dtype=np.uint8)
+
+        def stretch(begin: int, first: int, end: int) -> None:
+            part = slice(first, end)
+            self._tangents(
+                model, begin, first, end, residual[part], jacobian[part], weight[part]
+            )  # fmt: skip
+
+        share(stretch, self._stretches(model), self._threads)
+        return residual, jacobian, weight
+
+    def normal(self, model: RegionalModel, ar: FloatArray) -> tuple[FloatArray, int]:
+        """Return `normal_equations` of the tangents, which are never all in memory at once.
+
+        Returns
+        -------
+        sums : float64 (P + 1, P + 1)
+            The residual is the last column.
+        rows : int
+        """
+        order, columns = len(ar), 3 * model.pieces - 1 + 2 * model.regions
+        stretches = self._stretches(model, order)
+        sums = np.zeros((len(stretches), columns + 1, columns + 1))
+        rows = np.zeros(len(stretches), dtype=np.int64)
+
+        def stretch(k: int, begin: int, first: int, end: int) -> None:
+            back = min(first, order)
+            n = end - first + back
+            residual, jacobian = np.empty(n), np.empty((n, columns))
+            weight = np.empty(n, dtype=np.uint8)
+            self._tangents(model, begin, first - back, end, residual, jacobian, weight)
+            rows[k] = normal_sums(
+                jacobian, residual, weight, ar, back, n, sums[k], np.empty((0, columns))
+            )  # fmt: skip
+
+        share(stretch, [(k, *part) for k, part in enumerate(stretches)], self._threads)
+        total = np.tril(sums.sum(axis=0))
+        return total + np.tril(total, -1).T, int(rows.sum())
+
+    def _tangents(
+        self, model: RegionalModel, begin: int, first: int, end: int,
+        residual: FloatArray, jacobian: FloatArray, weight: ByteArray,
+    ) -> None:  # fmt: skip
+        s = self.samples
+        tangents(
+            self.u, self.usable, self.power, model.knots, model.left, model.right,
+            model.levels, model.time_constants, model.delays, s.step_s, self.settle, s.group,
+            begin, first, end, residual, jacobian, weight,
         )  # fmt: skip
-        return np.where(weight > 0, self.power - answer, 0.0), jacobian, weight
 
     def cost(self, model: RegionalModel, ar: FloatArray) -> float:
         """Return the sum of squared innovations."""
         residual, weight = self.answer(model)
-        return float(square_sum(residual, weight, ar))
+        return innovation_sum(residual, weight, ar)
+
+    def _stretches(self, model: RegionalModel, also: int = 0) -> list[tuple[int, int, int]]:
+        """Cut the means into stretches: where the filters begin, the first that counts, the end.
+
+        So many means before the first are to be right, ``also``.
+        """
+        s = self.samples
+        memory_s = _FORGOTTEN * float(model.time_constants.max()) + float(model.delays.max())
+        lead = math.ceil((memory_s / s.step_s + self.settle + 3) / s.group) + also
+        length = max(_STRETCH, 8 * lead)
+        return [(max(0, first - lead), first, end) for first, end in runs(s.means, length)]
 
 
 def free_parameters(pieces: int, regions: int, jumps: BoolArray | None = None) -> BoolArray:
@@ -149,8 +214,7 @@ def move(
     damping = 1e-4
     cost = problem.cost(model, ar)
     for _ in range(steps):
-        residual, jacobian, weight = problem.tangents(model)
-        sums, _, _ = normal_equations(jacobian, residual, weight, ar)
+        sums, _ = problem.normal(model, ar)
         normal, slope = sums[:-1, :-1][np.ix_(free, free)], sums[:-1, -1][free]
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-12 * np.diag(normal).max()))
         normal = normal / np.outer(scale, scale)

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_toeplitz
 
 from valveflow_ros.config import Settings
+from valveflow_ros.core.whitening import yule_walker
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SampleTable, Signal
 
 _LEAST_STEP_PERCENT = 0.3  # smaller moves of the opening are wander within a level
@@ -213,7 +213,7 @@ def long_run_sd(series: Sequence[FloatArray]) -> float:
     for _ in range(_ROUNDS):
         covariance = found + of_mean
         covariance[0] *= 1.0 + 1e-9  # solvable for a noise that hardly varies
-        ar = np.asarray(solve_toeplitz(covariance[:_ORDER], covariance[1:]))
+        ar = yule_walker(covariance)
         total = min(float(ar.sum()), _LARGEST_SUM)
         innovation = max(float(covariance[0] - ar @ covariance[1:]), 0.0)
         long_run = innovation / (1.0 - total) ** 2

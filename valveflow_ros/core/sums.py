@@ -39,3 +39,17 @@ def product(table: FloatArray, matrix: FloatArray) -> FloatArray:
             for q in range(matrix.shape[1]):
                 out[t, q] += value * matrix[p, q]
     return out
+
+
+@jit
+def running_average(values: FloatArray, forget: float) -> FloatArray:
+    """Return the exponential average of ``values`` (n,) after each, begun at zero, shape (n,).
+
+    Each step keeps ``forget`` (0 to 1) of the average before.
+    """
+    out = np.empty(values.size)
+    average = 0.0
+    for t in range(values.size):
+        average = forget * average + (1.0 - forget) * values[t]
+        out[t] = average
+    return out

@@ -10,7 +10,7 @@ from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.problem import Problem
 from valveflow_ros.core.sums import gram
 from valveflow_ros.core.whitening import normal_equations
-from valveflow_ros.records import BoolArray, FloatArray
+from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
 _MOST_BLOCKS = 60
 _LEAST_IN_BLOCK_S = 500.0
@@ -79,13 +79,14 @@ def covariance_of(
         covariance[:packed, :packed],
         np.sqrt(np.diag(covariance)[packed:]),
         float(np.sqrt(max(variance, 0.0))),
-        _prediction_error(jacobian[weight > 0][:, moved], covariance[np.ix_(moved, moved)]),
+        _prediction_error(jacobian[:, moved], weight, covariance[np.ix_(moved, moved)]),
     )
 
 
-def _prediction_error(jacobian: FloatArray, covariance: FloatArray) -> float:
+def _prediction_error(jacobian: FloatArray, weight: ByteArray, covariance: FloatArray) -> float:
     """Return the root mean square of what errors of the parameters do to the answer."""
-    square = np.sum(gram(np.ascontiguousarray(jacobian)) * covariance) / max(len(jacobian), 1)
+    sums, _, rows = normal_equations(jacobian, np.zeros(len(weight)), weight, np.empty(0))
+    square = np.sum(sums[:-1, :-1] * covariance) / max(rows, 1)
     return float(np.sqrt(max(square, 0.0)))
 
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import solve_toeplitz
 
-from valveflow_ros.core.normal_kernel import normal_sums
+from valveflow_ros.core.normal_kernel import normal_sums, square_sum
 from valveflow_ros.core.regional_kernel import lagged_products, whiten
+from valveflow_ros.core.threads import cores, runs, share
 from valveflow_ros.records import ByteArray, FloatArray
 
 ORDER = 4
 _LARGEST_SUM = 0.95
+# Rows whose sums are formed by themselves and then added in order: the bits do not depend on the
+# number of threads.
+_STRETCH = 16384
 
 
 def fit_ar(residual: FloatArray, weight: ByteArray, order: int = ORDER) -> FloatArray:
@@ -24,11 +27,18 @@ def fit_ar(residual: FloatArray, weight: ByteArray, order: int = ORDER) -> Float
         return np.zeros(order)
     # A touch of white noise keeps the system solvable for a residual that hardly varies.
     products[0] *= 1.0 + 1e-9
-    ar = np.asarray(solve_toeplitz(products[:order], products[1:]))
+    ar = yule_walker(products)
     # A residual that still holds a misfit looks like a random walk, and whitening by a
     # root at one would make levels, and with them the misfit, invisible.
     total = float(ar.sum())
     return ar * (_LARGEST_SUM / total) if total > _LARGEST_SUM else ar
+
+
+def yule_walker(products: FloatArray) -> FloatArray:
+    """Solve for the coefficients whose process has these mean products at lags 0 to k, (k,)."""
+    lags = np.arange(len(products) - 1)
+    # So few that the solver made for such matrices gains nothing, and takes long to load.
+    return np.asarray(np.linalg.solve(products[np.abs(lags[:, None] - lags)], products[1:]))
 
 
 def normal_equations(
@@ -52,10 +62,29 @@ def normal_equations(
     rows : int
     """
     columns = jacobian.shape[1]
-    sums = np.empty((columns + 1, columns + 1))
-    scores = np.empty((blocks, columns))
-    rows = normal_sums(np.ascontiguousarray(jacobian), residual, weight, ar, sums, scores)
-    return sums, scores, int(rows)
+    table = np.ascontiguousarray(jacobian)
+    parts = runs(len(residual), _STRETCH)
+    sums = np.zeros((len(parts), columns + 1, columns + 1))
+    scores = np.zeros((len(parts), blocks, columns))
+    rows = np.zeros(len(parts), dtype=np.int64)
+
+    def add(k: int, first: int, end: int) -> None:
+        rows[k] = normal_sums(table, residual, weight, ar, first, end, sums[k], scores[k])
+
+    share(add, [(k, *part) for k, part in enumerate(parts)], cores())
+    return sums.sum(axis=0), scores.sum(axis=0), int(rows.sum())
+
+
+def innovation_sum(residual: FloatArray, weight: ByteArray, ar: FloatArray) -> float:
+    """Return the sum of squared innovations of ``residual`` (m,) under ``ar`` (k,)."""
+    parts = runs(len(residual), _STRETCH)
+    sums = np.zeros(len(parts))
+
+    def add(k: int, first: int, end: int) -> None:
+        sums[k] = square_sum(residual, weight, ar, first, end)
+
+    share(add, [(k, *part) for k, part in enumerate(parts)], cores())
+    return float(sums.sum())
 
 
 def whitened(columns: FloatArray, weight: ByteArray, ar: FloatArray) -> FloatArray:
