@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from valveflow_ros.core.jit import jit
+from valveflow_ros.core.jit import inlined, jit
 from valveflow_ros.records import ByteArray, FloatArray, IntArray
 
 REASONS = (
@@ -72,7 +72,7 @@ class Rows(NamedTuple):
     resets: IntArray
 
 
-@jit
+@inlined
 def _accept(state: State, rules: Rules, time_ns: int, s: int, v: float, q: int) -> None:
     """Take one checked reading: hold it, or keep it for the open row it belongs to."""
     if time_ns <= state.newest_ns[s]:
@@ -96,7 +96,7 @@ def _accept(state: State, rules: Rules, time_ns: int, s: int, v: float, q: int) 
     state.open_value[s, k], state.open_quality[s, k] = v, q
 
 
-@jit
+@inlined
 def _can_close(state: State, rules: Rules) -> bool:
     """Tell whether the next row can no longer change."""
     tick = state.clock[_NEXT]
@@ -110,7 +110,7 @@ def _can_close(state: State, rules: Rules) -> bool:
     return True
 
 
-@jit
+@inlined
 def _close(state: State, rules: Rules, rows: Rows, place: int, coming_ns: int) -> bool:
     """Write the next row, if anybody has spoken lately, and go on to the one after it.
 
@@ -212,7 +212,7 @@ def _close_ready(
     return written
 
 
-@jit
+@inlined
 def _refusal(t: int, v: float, q: int, low: float, high: float) -> int:
     """Return why a reading is refused at the door, or `_ACCEPTED`."""
     if not 0 <= t < _LATEST_NS:
@@ -290,7 +290,7 @@ def align(  # noqa: C901 - one loop over all that can meet a reading
             if written < 0:
                 return i, -1 - written, resets
         last = i >= time_ns.size
-        if clock[_NEWEST] >= clock[_NEXT]:
+        if clock[_NEWEST] >= clock[_NEXT] and ((final and last) or _can_close(state, rules)):
             written = _close_ready(state, rules, rows, written, _LATEST_NS, final and last)
         if written >= limit or last:
             break
@@ -300,7 +300,7 @@ def align(  # noqa: C901 - one loop over all that can meet a reading
         if why != _ACCEPTED:
             state.counts[s, why] += 1
         elif newest == NEVER or abs(t - newest) <= rules.jump_ns:
-            if t > clock[_NEXT]:
+            if t > clock[_NEXT] and t >= clock[_NEXT] + rules.lateness_ns:
                 written = _close_ready(state, rules, rows, written, t, False)
                 if written >= limit:
                     break
