@@ -45,3 +45,9 @@ class TooFewSamplesError(DataError):
         self.need = need
         tail = f' {advice}' if advice else ''
         super().__init__(f'{what}: {have} found, at least {need} needed.{tail}')
+
+
+def counted(number: float, one: str, many: str = '') -> str:
+    """Write a number and its noun for a sentence: '1 row', '3 rows', '0.5 days'."""
+    told = str(number) if isinstance(number, int) else f'{number:g}'
+    return f'{told} {one if told == "1" else many or one + "s"}'

@@ -108,6 +108,17 @@ class Readings:
         cut = slice(start, end)
         return Readings(self.time_ns[cut], self.signal[cut], self.value[cut], self.quality[cut])
 
+    def by_signal(self) -> dict[int, Readings]:
+        """Return the readings of each signal that has any, in their order."""
+        found = {}
+        for info in SIGNALS:
+            mine = np.flatnonzero(self.signal == info.signal)
+            if len(mine):
+                found[int(info.signal)] = Readings(
+                    self.time_ns[mine], self.signal[mine], self.value[mine], self.quality[mine]
+                )
+        return found
+
 
 @dataclass(frozen=True, slots=True)
 class SampleTable:

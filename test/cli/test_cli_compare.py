@@ -41,7 +41,8 @@ def held_out(logs, truth, tmp_path_factory):
 
     folder = tmp_path_factory.mktemp('compared') / 'out'
     out, err = io.StringIO(), io.StringIO()
-    words = ['compare', str(logs / 'plant.mcap'), '-o', str(folder), '--truth', str(truth)]
+    words = ['compare', str(logs / 'plant.mcap'), '-o', str(folder), '--truth', str(truth),
+             '--table']  # fmt: skip
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         status = main(words)
     assert status == 0, err.getvalue()
@@ -57,8 +58,14 @@ def test_the_files_hold_the_comparison(held_out):
     _, err, folder = held_out
     assert '\r' not in err, 'a progress bar is for terminals'
     assert sorted(p.name for p in folder.iterdir()) == [
-        'comparison.json', 'curves.csv', 'parameters.csv', 'report.html', 'segments.csv',
+        'comparison.json', 'curves.csv', 'parameters.csv', 'report.html', 'segments.csv', 'tables',
     ]  # fmt: skip
+    page = (folder / 'report.html').read_text()
+    tables = {p.stem for p in (folder / 'tables').iterdir()}
+    assert {'curves', 'truth', 'choice'} <= tables
+    assert tables == set(re.findall(r'class="plot" id="([a-z-]+)"', page))
+    drawn = rows_of(folder / 'tables' / 'curves.csv')
+    assert {'truth', 'valveflow', 'Hammerstein'} <= {r['line'] for r in drawn}
     content = json.loads((folder / 'comparison.json').read_text())
     assert (content['format'], content['version']) == ('valveflow/comparison', 1)
     assert content['held_out'] is True

@@ -159,10 +159,10 @@ def test_a_gain_limit_of_ones_own(run, model, tmp_path):
     ('words', 'said'),
     [
         (['--points', '1'], 'from 2 to 10000'),
-        (['--pressure', '0'], 'from 0.05 to 40 MPa'),
+        (['--pressure', '0'], 'in MPa from 0.05 to 40'),
         (['--max-gain', '-1'], 'above 0'),
         (['--u-from', 'nan'], 'must be a number'),
-        (['--points', 'many'], 'many'),
+        (['--points', 'many'], "'many' is no whole number"),
     ],
 )
 def test_wrong_options_are_wrong_usage(run, model, tmp_path, words, said):

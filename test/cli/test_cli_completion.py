@@ -122,4 +122,4 @@ def test_fish_understands_its_script(scripts, tmp_path):
 
 def test_the_verb_prints_it(run, scripts):
     assert run('completion', 'bash').out == scripts['bash']
-    assert run('completion', 'tcsh').refused(2).startswith('valveflow: Argument SHELL: invalid')
+    assert run('completion', 'tcsh').refused(2).startswith('valveflow: SHELL must be one of bash')

@@ -133,7 +133,7 @@ def test_what_looks_in_order_is_what_the_engine_accepts(rows, tidy):
             {(t, s): (t, s, 55.0 if s == 2 else 30.0, 0) for t, s, _, _ in rows}.values()
         )
     readings = Readings.of([(t * NS_PER_S, s, v, q) for t, s, v, q in rows])
-    told = fates(readings, settings)
+    told = fates(readings, readings.by_signal(), settings)
     if tidy:
         assert all(set(by_reason) == {'accepted'} for by_reason in told.values())
     _, _, counts = align(readings, settings)

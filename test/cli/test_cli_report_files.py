@@ -35,14 +35,15 @@ def test_pictures_and_tables_stand_beside_the_report(run, logs, tmp_path):
         assert powers == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize('verb', ['identify', 'diagnose'])
+@pytest.mark.parametrize('verb', ['identify', 'diagnose', 'compare', 'validate'])
 def test_what_cannot_be_drawn_is_told_before_the_long_work(run, tmp_path, monkeypatch, verb):
     """The log cannot even be read: the refusal comes first."""
     log = tmp_path / 'no.mcap'
     log.write_bytes(b'nothing')
+    model = ['--model', log] if verb == 'validate' else []
     monkeypatch.setattr(drawing, 'find_spec', lambda name: None)
-    told = run(verb, log, '-o', tmp_path, '--figures').refused()
+    told = run(verb, log, *model, '-o', tmp_path, '--figures').refused()
     assert 'pip install matplotlib' in told
     (tmp_path / 'tables').write_text('')
-    told = run(verb, log, '-o', tmp_path, '--table').refused()
+    told = run(verb, log, *model, '-o', tmp_path, '--table').refused()
     assert 'tables' in told

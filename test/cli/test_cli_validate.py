@@ -53,7 +53,7 @@ def model(tmp_path):
 def test_the_true_curve_holds_on_its_plant(run, logs, model, tmp_path):
     ran = run(
         'validate', logs / 'plant.mcap', '--model', model(), '-o', tmp_path / 'out',
-        '--tolerance', '3',
+        '--tolerance', '3', '--table',
     )  # fmt: skip
     assert ran.status == 0, ran.err
     content = json.loads((tmp_path / 'out' / 'validation.json').read_text())
@@ -67,8 +67,12 @@ def test_the_true_curve_holds_on_its_plant(run, logs, model, tmp_path):
     # 2 MW slow and 2.2 MW white noise are 8.8 MW^2.
     assert 5.0 < content['totals']['simulated']['mse_mw2'] < 14.0
     assert sorted(p.name for p in (tmp_path / 'out').iterdir()) == [
-        'report.html', 'segments.csv', 'validation.json',
+        'report.html', 'segments.csv', 'tables', 'validation.json',
     ]  # fmt: skip
+    assert f'Wrote tables in {tmp_path / "out" / "tables"}.' in ran.out
+    with (tmp_path / 'out' / 'tables' / 'by-input.csv').open(newline='') as file:
+        points = [r for r in csv.DictReader(file) if r['line'] != 'mean of each piece']
+    assert len(points) == content['judged']['segments']
     with (tmp_path / 'out' / 'segments.csv').open(newline='') as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == content['judged']['segments']

@@ -113,6 +113,9 @@ class Chromium:
 
     def _keep(self, event: dict[str, Any]) -> None:
         what, about = event.get('method'), event.get('params', {})
+        if what == 'Runtime.executionContextsCleared':
+            # The page before has gone; what it still had to say is not of this one.
+            self.said.clear()
         if what == 'Runtime.consoleAPICalled':
             self.said.append(str([a.get('value') for a in about['args']]))
         elif what == 'Runtime.exceptionThrown':

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
 import re
 import shutil
 import subprocess
+from argparse import Namespace
 from dataclasses import replace
 
 import pytest
 from report_stories import diagnosed, history
 
+from valveflow_ros.cli.comparing import compared
+from valveflow_ros.cli.console import Console
+from valveflow_ros.cli.main import main
+from valveflow_ros.cli.mapping import read_mapping
+from valveflow_ros.cli.truth_file import read_truth_file
+from valveflow_ros.cli.validating import validated
+from valveflow_ros.report.comparison import comparison_page
+from valveflow_ros.report.comparison_validation import validation_page
 from valveflow_ros.report.diagnosis import diagnosis_page
 from valveflow_ros.report.identification import identification_page
 
@@ -28,6 +39,20 @@ def made_pages(identified):
         history=history(),
     )  # fmt: skip
     return {'identify': identification_page(data), 'diagnose': diagnosis_page(diagnosed())}
+
+
+def judged_pages(folder):
+    """Three methods on ten hours of the paper's plant, and its curve held against them."""
+    log, truth = folder / 'plant.mcap', folder / 'truth.json'
+    words = ['simulate', '-o', log, '--days', '0.4', '--seed', '1', '--truth', truth, '--quiet']
+    assert main([str(word) for word in words]) == 0
+    console, mapping = Console(io.StringIO(), io.StringIO()), read_mapping([], [])
+    quick = {'refine': False, 'selection_rule': 'paper'}
+    found = compared(log, None, read_truth_file(truth), mapping, quick, console)
+    options = Namespace(log=log, model=folder / 'a.json', against=None, tolerance=None)
+    curve = found.result.characteristic
+    checked = validated(options, curve, None, mapping, {}, console)
+    return {'compare': comparison_page(found), 'validate': validation_page(checked)}
 
 
 # What is asked of the page in its present look; one answer serves several tests.
@@ -105,16 +130,21 @@ def pages(identified, tmp_path_factory):
     """Return the pages by name: their content, and the file."""
     folder = tmp_path_factory.mktemp('pages')
     made = {}
-    for name, content in made_pages(identified).items():
+    contents = made_pages(identified)
+    if os.environ.get('NUMBA_DISABLE_JIT') != '1':  # hours of data need the compiled engine
+        contents |= judged_pages(folder)
+    for name, content in contents.items():
         path = folder / f'{name}.html'
         path.write_text(content.to_html(), encoding='utf-8')
         made[name] = content, path
     return made
 
 
-@pytest.fixture(scope='module', params=['identify', 'diagnose'])
+@pytest.fixture(scope='module', params=['identify', 'diagnose', 'compare', 'validate'])
 def page(request, browser, pages, tmp_path_factory):
     """Return a page's content, and what was seen of it."""
+    if request.param not in pages:
+        pytest.skip('hours of data need the compiled engine')
     content, path = pages[request.param]
     return content, looked_at(browser, path, tmp_path_factory.mktemp('pdf') / 'page.pdf')
 
@@ -179,24 +209,29 @@ def test_paper_gets_every_picture_whole_and_light(page):
         assert plain in told, figure.name
 
 
+def told_at(browser, figure, x, y):
+    """Return what a picture says when the mouse points at a place of its axes."""
+    left, top = browser.ask(
+        f"(() => {{ const p = document.getElementById('{figure}'), l = p._fullLayout;"
+        "p.scrollIntoView({block: 'center'}); const r = p.getBoundingClientRect();"
+        f'return [r.left + l.xaxis._offset + l.xaxis.d2p({x}),'
+        f' r.top + l.yaxis._offset + l.yaxis.d2p({y})]; }})()'
+    )
+    browser.hover(left - 40, top - 40)
+    browser.hover(left, top)
+    return browser.ask(
+        'new Promise(done => { const look = () => { const h = '
+        f"document.querySelector('#{figure} .hoverlayer .hovertext');"
+        'h ? done(h.textContent) : requestAnimationFrame(look); }; look(); })'
+    )
+
+
 def test_a_point_tells_its_value_and_pictures_follow_the_window(browser, pages):
     """The mouse over the breakpoint shows its number; a narrower window, a narrower picture."""
     content, path = pages['identify']
     seen(browser, path, DESKTOP)
     point = next(t for t in content.figures[0].traces if t['name'].startswith('breakpoints'))
-    x, y = browser.ask(
-        "(() => { const p = document.getElementById('curve'), l = p._fullLayout;"
-        "p.scrollIntoView({block: 'center'}); const r = p.getBoundingClientRect();"
-        f'return [r.left + l.xaxis._offset + l.xaxis.d2p({point["x"][0]}),'
-        f' r.top + l.yaxis._offset + l.yaxis.d2p({point["y"][0]})]; }})()'
-    )
-    browser.hover(x - 40, y - 40)
-    browser.hover(x, y)
-    text = browser.ask(
-        'new Promise(done => { const look = () => { const h = '
-        "document.querySelector('#curve .hoverlayer .hovertext');"
-        'h ? done(h.textContent) : requestAnimationFrame(look); }; look(); })'
-    )
+    text = told_at(browser, 'curve', point['x'][0], point['y'][0])
     assert f'u {point["x"][0]:.0f}' in text
     browser.look(700)
     width = browser.ask(
@@ -205,3 +240,31 @@ def test_a_point_tells_its_value_and_pictures_follow_the_window(browser, pages):
         'w < 700 ? done(w) : requestAnimationFrame(look); }; look(); })'
     )
     assert 500 < width < 700
+
+
+@pytest.mark.parametrize('verb', ['compare', 'validate'])
+def test_a_point_of_a_judgement_tells_its_value_and_unit(browser, pages, verb):
+    if verb not in pages:
+        pytest.skip('hours of data need the compiled engine')
+    content, path = pages[verb]
+    seen(browser, path, DESKTOP)
+    figure = content.figures[0]
+    line = next(t for t in figure.traces if t['name'] in ('valveflow', 'steady state'))
+    # The point that stands most alone: nothing else is nearer to the mouse.
+    k = len(line['x']) // 2 if verb == 'compare' else max(
+        range(len(line['x'])), key=lambda k: abs(line['y'][k])
+    )  # fmt: skip
+    text = told_at(browser, figure.name, line['x'][k], line['y'][k])
+    assert re.search(r'u \d+.*MW', text), text
+    if verb == 'validate':
+        assert f'{line["y"][k]:+.2f}'.replace('-', '−') in text
+
+
+def test_every_line_that_can_be_pointed_at_has_a_unit(pages):
+    for verb, (content, _) in pages.items():
+        for figure in content.figures:
+            for trace in figure.traces:
+                if trace.get('hoverinfo') != 'skip' and verb in ('compare', 'validate'):
+                    assert re.search(r'MW|J|%', trace.get('hovertemplate', '')), (
+                        figure.name, trace['name'],
+                    )  # fmt: skip

@@ -86,7 +86,7 @@ def test_every_caption_says_what_to_look_for(page):
     'name', ['u', 'pressure given u', 'temperature', 'time', 'time of day', 'ramp', 'direction']
 )
 def test_every_variable_has_an_axis_and_a_hint(name):
-    titles = axis_titles(name)
+    titles = axis_titles(name, 1.125)
     assert titles['text'] != name
     assert len(plain_text(titles.get('short', titles['text']))) < 36
     assert points_to(name)

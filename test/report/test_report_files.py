@@ -72,7 +72,7 @@ def test_the_table_of_the_curve_has_its_ends_and_the_cloud(figures, identified):
     assert line == [(800.0, 100.0), (1200.0, 180.0), (1200.0, 180.0), (1500.0, 195.0)]
     cloud = [int(float(r['value'])) for r in rows if r['line'] == 'special samples']
     assert sum(cloud) == len(identified.special)
-    assert {r['x_axis'] for r in rows} == {'integrated input u = V p^9/8 (% MPa^9/8)'}
+    assert {r['x_axis'] for r in rows} == {'integrated input u = V p^(9/8) (% MPa^(9/8))'}
     assert {r['y_axis'] for r in rows} == {'generated power (MW)'}
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from valveflow_ros.cli.console import Console, Outcome
 from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
 from valveflow_ros.cli.parameter_options import add_parameters
+from valveflow_ros.cli.report_files import add_report_files, check_report_files, with_report
 
 _DESCRIPTION = """\
 Identify the flow characteristic in three ways - from special segments, as a Hammerstein model
@@ -33,7 +34,7 @@ def arguments(parser: ArgumentParser) -> None:
     parser.add_argument('log', metavar='LOG', type=Path, help='the log to learn from')
     parser.add_argument(
         '-o', '--output', metavar='DIR', type=Path, required=True,
-        help='folder for the results, made if absent',
+        help='folder for the results, made if absent; the report of another verb there is kept',
     )  # fmt: skip
     parser.add_argument(
         '--test', metavar='LOG2', type=Path, help='a log of other days to judge by'
@@ -43,6 +44,7 @@ def arguments(parser: ArgumentParser) -> None:
         help='the true curve, as "simulate --truth" writes it; a characteristic.json too',
     )  # fmt: skip
     add_parameters(parser)
+    add_report_files(parser)
     add_mapping(parser)
 
 
@@ -51,14 +53,18 @@ def run(options: Namespace, console: Console) -> Outcome:
     mapping = read_mapping(options.column, options.constant)
     console.progress(0.0, 'starting')
     from valveflow_ros.cli.comparing import compared, outcome, texts
-    from valveflow_ros.cli.files import check_folder, write_texts
+    from valveflow_ros.cli.files import check_folder
     from valveflow_ros.cli.parameters import read_parameters
     from valveflow_ros.cli.truth_file import read_truth_file
+    from valveflow_ros.report.comparison import comparison_page
 
     given = read_parameters(options.params, options.pairs)
     check_folder(options.output)
+    check_report_files(options)
     truth = None if options.truth is None else read_truth_file(options.truth)
     data = compared(options.log, options.test, truth, mapping, given, console)
     console.progress(0.95, 'writing the report')
     content, files = texts(data)
-    return outcome(data, content, write_texts(options.output, files))
+    return with_report(
+        options, files, comparison_page(data), lambda written: outcome(data, content, written)
+    )

@@ -18,11 +18,12 @@ from valveflow_ros.compare.data import other_data, samples_of
 from valveflow_ros.compare.truth import Truth
 from valveflow_ros.config import PARAMETERS
 from valveflow_ros.records import SegmentKind
-from valveflow_ros.report.comparison import comparison_report
 from valveflow_ros.report.comparison_csv import curves_csv, parameters_csv, segments_csv
 from valveflow_ros.report.comparison_data import LABELS, METHODS, PREDICTIONS, Compared
+from valveflow_ros.report.comparison_tables import mse_cell
 from valveflow_ros.report.comparison_words import data_words, finding_words
 from valveflow_ros.report.numbers import decimals, plain
+from valveflow_ros.report.words import input_unit_plain
 
 
 def compared(
@@ -81,7 +82,7 @@ def _two(
 
 
 def texts(data: Compared) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the content of the JSON, and the files of the result by name."""
+    """Return the content of the JSON, and the files for programs by name."""
     content = {
         **to_json(data.result),
         'learnt_from': data.source,
@@ -94,7 +95,6 @@ def texts(data: Compared) -> tuple[dict[str, Any], dict[str, str]]:
         'parameters.csv': parameters_csv(data),
         'segments.csv': segments_csv(data.result.judgement, data.predictions),
         'curves.csv': curves_csv(data),
-        'report.html': comparison_report(data),
     }
 
 
@@ -132,7 +132,8 @@ def _parameters(data: Compared) -> str:
                     decimals(float(line.intercepts[j]), 2),
                 ]
             )
-    return columns(rows, ['curve', 'u (% MPa^m)', 'slope (MW per u)', 'intercept (MW)'])
+    unit = input_unit_plain(data.result.characteristic.pressure_exponent)
+    return columns(rows, ['curve', f'u ({unit})', 'slope (MW per u)', 'intercept (MW)'])
 
 
 def _errors(data: Compared) -> str:
@@ -141,10 +142,10 @@ def _errors(data: Compared) -> str:
         [
             PREDICTIONS[name],
             *(
-                plain(r.judgement.mse(name, k)) if r.judgement.kinds(k) else '-'
+                mse_cell(r.judgement.mse(name, k)) if r.judgement.kinds(k) else '–'
                 for k in (None, SegmentKind.STEADY, SegmentKind.SLOPE)
             ),
-            plain(r.all_rows[name]) if name in r.all_rows else '',
+            mse_cell(r.all_rows[name]) if name in r.all_rows else '–',
         ]
         for name in data.predictions
     ]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, ArgumentTypeError, Namespace
+import math
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from valveflow_ros.cli.console import Console, Outcome
+from valveflow_ros.report.terminal_number import number, whole
 
 _DESCRIPTION = """\
 Write the inverse of a flow characteristic as a table: the integrated input u that gives a
@@ -15,41 +17,6 @@ interpolation is exact; what the table is good for, and where not, is said.
 
 example:
   valveflow compensate --model result/characteristic.json -o table.csv --pressure 16.7"""
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise ArgumentTypeError(f"must be a number, not '{text}'") from None
-
-
-def _pressure(text: str) -> float:
-    value = _number(text)
-    if not 0.05 <= value <= 40.0:
-        raise ArgumentTypeError(f'must be from 0.05 to 40 MPa, not {text}')
-    return value
-
-
-def _points(text: str) -> int:
-    value = int(text) if text.strip().isdigit() else 0
-    if not 2 <= value <= 10_000:
-        raise ArgumentTypeError(f'must be from 2 to 10000, not {text}')
-    return value
-
-
-def _positive(text: str) -> float:
-    value = _number(text)
-    if not 0.0 < value <= 1e9:
-        raise ArgumentTypeError(f'must be above 0, not {text}')
-    return value
-
-
-def _finite(text: str) -> float:
-    value = _number(text)
-    if not -1e9 <= value <= 1e9:
-        raise ArgumentTypeError(f'must be a number, not {text}')
-    return value
 
 
 def arguments(parser: ArgumentParser) -> None:
@@ -64,32 +31,37 @@ def arguments(parser: ArgumentParser) -> None:
         '-o', '--output', metavar='TABLE', type=Path, required=True, help='a .csv or .parquet file'
     )
     parser.add_argument(
-        '--points', metavar='N', type=_points, default=16,
+        '--points', metavar='N', default=16,
+        type=whole('a number of points', 2, 10_000, '--points 16'),
         help='length of the table (default: 16)',
     )  # fmt: skip
     parser.add_argument(
-        '--pressure', metavar='MPA', type=_pressure, action='append', default=[],
+        '--pressure', metavar='MPA', action='append', default=[],
+        type=number('a pressure in MPa', 0.05, 40, '--pressure 16.7'),
         help='add a column with the opening at this main steam pressure; may be repeated',
     )  # fmt: skip
     parser.add_argument(
-        '--max-gain', metavar='G', type=_positive,
+        '--max-gain', metavar='G',
+        type=number('units of u per MW', 0, 1e9, '--max-gain 50', above=True),
         help='units of u per MW beyond which the table is of no use (default: 5 times the '
         'least of the curve)',
     )  # fmt: skip
     parser.add_argument(
-        '--tolerance', metavar='MW', type=_positive, default=0.01,
+        '--tolerance', metavar='MW', default=0.01,
+        type=number('a power in MW', 0, 1e9, '--tolerance 0.01', above=True),
         help='largest error allowed of F(F^-1(x)) and of the table; beyond it nothing is written '
         '(default: 0.01)',
     )  # fmt: skip
-    parser.add_argument('--u-from', metavar='U', type=_finite, help='leave out smaller u')
-    parser.add_argument('--u-to', metavar='U', type=_finite, help='leave out larger u')
+    for way, which, example in (('from', 'smaller', 1100), ('to', 'larger', 2200)):
+        parser.add_argument(
+            f'--u-{way}', metavar='U', help=f'leave {which} values of u out of the table',
+            type=number('a number, a value of u', -math.inf, math.inf, f'--u-{way} {example}'),
+        )  # fmt: skip
     parser.add_argument('--overwrite', action='store_true', help='replace a table that is there')
 
 
 def run(options: Namespace, console: Console) -> Outcome:
     """Read, invert, check, write."""
-    import math
-
     from valveflow_ros.cli.compensation_check import check
     from valveflow_ros.cli.compensation_table import columns_of, outcome, write
     from valveflow_ros.cli.files import check_output

@@ -7,7 +7,7 @@ from pathlib import Path
 from valveflow_ros.cli.console import Outcome
 from valveflow_ros.cli.parameters import read_parameters
 from valveflow_ros.config import PARAMETERS, Settings, Value
-from valveflow_ros.errors import InputError, ParameterError
+from valveflow_ros.errors import InputError, ParameterError, counted
 
 
 def check(file: Path) -> Outcome:
@@ -26,7 +26,9 @@ def check(file: Path) -> Outcome:
     changed = {
         name: settings[name] for name in settings if settings[name] != PARAMETERS[name].default
     }
-    lines = [f'{file}: the monitor takes it; {len(given)} parameters, {_many(len(changed))}.']
+    lines = [
+        f'{file}: the monitor takes it; {counted(len(given), "parameter")}, {_many(len(changed))}.'
+    ]
     lines += [f'  {name}: {_shown(name, value)}, default {_shown(name, PARAMETERS[name].default)}'
               for name, value in changed.items()]  # fmt: skip
     return Outcome('\n'.join(lines), {'file': str(file), 'good': True, 'changed': changed})

@@ -11,7 +11,7 @@ from valveflow_ros.cli.parameter_options import add_parameters
 from valveflow_ros.cli.report_files import (
     add_report_files,
     check_report_files,
-    with_report_files,
+    with_report,
 )
 
 _DESCRIPTION = """\
@@ -35,7 +35,7 @@ def arguments(parser: ArgumentParser) -> None:
     parser.add_argument('log', metavar='LOG', type=Path, help='the log to read')
     parser.add_argument(
         '-o', '--output', metavar='DIR', type=Path, required=True,
-        help='folder for the results, made if absent',
+        help='folder for the results, made if absent; the report of another verb there is kept',
     )  # fmt: skip
     parser.add_argument(
         '--model', metavar='FILE', type=Path,
@@ -52,7 +52,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     mapping = read_mapping(options.column, options.constant)
     console.progress(0.0, 'starting')
     from valveflow_ros.cli.diagnosing import diagnosed_in, outcome, read_model, texts
-    from valveflow_ros.cli.files import check_folder, write_texts
+    from valveflow_ros.cli.files import check_folder
     from valveflow_ros.cli.log_input import open_input
     from valveflow_ros.cli.model_file import check_exponent
     from valveflow_ros.cli.parameters import read_parameters
@@ -70,5 +70,4 @@ def run(options: Namespace, console: Console) -> Outcome:
     found = diagnosed_in(log, model, given, options.log, console)
     console.progress(0.95, 'writing the report')
     page = diagnosis_page(found.page)
-    written = write_texts(options.output, texts(found, page))
-    return with_report_files(outcome(found, written), options, page)
+    return with_report(options, texts(found), page, lambda written: outcome(found, written))

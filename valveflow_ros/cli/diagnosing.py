@@ -32,12 +32,12 @@ from valveflow_ros.diagnosis.result import NAMED, NOTHING, UNEXPLAINED, Diagnosi
 from valveflow_ros.diagnosis.views import Views, views
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import SIGNALS, IntArray, SampleTable
-from valveflow_ros.report.diagnosis import Diagnosed, diagnosis_page
+from valveflow_ros.report.diagnosis import Diagnosed
 from valveflow_ros.report.diagnosis_words import cells
 from valveflow_ros.report.numbers import decimals
-from valveflow_ros.report.page import Page
 from valveflow_ros.report.words import held_words
 
+_BLIND = 'cannot be judged'
 _VERDICTS = {
     NAMED: 'cause found', NOTHING: 'nothing is wrong', UNEXPLAINED: 'something is unexplained',
 }  # fmt: skip
@@ -125,7 +125,16 @@ def diagnosed_in(
     found = replace(found, notes=(*log.contents.warnings, *notes, *found.notes))
     ends = int(rows.table.time_ns[0]), int(rows.table.time_ns[-1])
     return Result(
-        Diagnosed(source.name, *ends, found, signatures, answers, maps, history_in(log.contents)),
+        Diagnosed(
+            source.name,
+            *ends,
+            found,
+            signatures,
+            answers,
+            maps,
+            history_in(log.contents),
+            exponent,
+        ),
         exponent,
         earlier,
     )
@@ -188,14 +197,13 @@ def _complete(table: SampleTable) -> bool:
     )
 
 
-def texts(found: Result, report: Page | None = None) -> dict[str, str]:
-    """Return the files of the result by name."""
+def texts(found: Result) -> dict[str, str]:
+    """Return the files for programs by name."""
     d, page = found.page.diagnosis, found.page
     extended = model_json(d.final, found.exponent, page.start_ns, d.reference, found.on_top_of)
     return {
         'diagnosis.json': json.dumps(to_json(d), indent=2, allow_nan=False) + '\n',
         'extended_model.json': json.dumps(extended, indent=2, allow_nan=False) + '\n',
-        'report.html': (report or diagnosis_page(page)).to_html(),
     }
 
 
@@ -210,8 +218,16 @@ def outcome(found: Result, written: Mapping[str, Path]) -> Outcome:
 
 def _text(found: Result, written: Mapping[str, Path]) -> str:
     d = found.page.diagnosis
-    rows = [[c.name, key, *cells(e)] for c in d.causes for key, e in c.parameters.items()]
-    judged = [f'  {name}: {why}' for name, why in d.rejected if 'cannot be judged' in why]
+    rows = [
+        [c.name, key, *cells(e, found.exponent)]
+        for c in d.causes
+        for key, e in c.parameters.items()
+    ]
+    judged = [
+        f'  {name}: {why.removeprefix(_BLIND).removeprefix(": ").strip()}'
+        for name, why in d.rejected
+        if why.startswith(_BLIND)
+    ]
     parts = [
         f'{found.page.source}: {_VERDICTS[d.verdict]}. {d.sentence}',
         columns(rows, ['cause', 'parameter', 'value', '95 % interval']) if rows else '',

@@ -7,7 +7,7 @@ import os
 from argparse import Action, ArgumentParser, Namespace
 from pathlib import Path
 
-from valveflow_ros.cli.files import check_folder
+from valveflow_ros.cli.files import check_folder, try_folder
 from valveflow_ros.errors import RecordingError
 
 # Files that a verb writes; every other FILE is read.
@@ -64,3 +64,4 @@ def _writable(path: Path) -> None:
         raise RecordingError(path, f"cannot be written: there is no folder '{path.parent}'")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise RecordingError(path, f'cannot be written ({os.strerror(errno.EACCES).lower()})')
+    try_folder(folder, 'choose another place for it')

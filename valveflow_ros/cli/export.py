@@ -43,7 +43,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     from valveflow_ros.cli.parameters import read_parameters, settings_for
     from valveflow_ros.cli.report_words import rejected_words
     from valveflow_ros.errors import DataError
-    from valveflow_ros.report.numbers import count, duration, moment
+    from valveflow_ros.report.numbers import counted, duration, moment
 
     given = read_parameters(None, options.pairs)
     check_output(options.output, TABLES, source=options.log, overwrite=options.overwrite)
@@ -63,9 +63,10 @@ def run(options: Namespace, console: Console) -> Outcome:
     console.progress(0.7, 'writing')
     write_log(table, options.output, overwrite=options.overwrite)
     first, last = int(table.time_ns[0]), int(table.time_ns[-1])
+    step = duration(settings.real('sample_period'))
     text = (
-        f'Wrote {count(len(table))} rows, one every {duration(settings.real("sample_period"))}, '
-        f'{moment(first)} to {moment(last)}, to {options.output}.\n{rejected_words(counts)}'
+        f'Wrote {counted(len(table), "row")}, one every {step}, {moment(first)} to '
+        f'{moment(last)}, to {options.output}.\n{rejected_words(counts)}'
     )
     data = {
         'table': str(options.output),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from valveflow_ros.errors import RecordingError
@@ -34,7 +34,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         draft.unlink(missing_ok=True)
 
 
-def write_texts(folder: Path, texts: Mapping[str, str | bytes]) -> dict[str, Path]:
+def write_texts(folder: Path, texts: Mapping[str, str] | Mapping[str, bytes]) -> dict[str, Path]:
     """Write files of a folder, made if absent: all of them, or none is replaced.
 
     Raises
@@ -75,6 +75,35 @@ def check_folder(folder: Path) -> None:
         raise RecordingError(place, 'is not a folder; choose another -o DIR')
     if not os.access(place, os.W_OK | os.X_OK):
         raise RecordingError(place, 'may not be written into; choose another -o DIR')
+    try_folder(folder, 'choose another -o DIR')
+
+
+def try_folder(folder: Path, advice: str) -> None:
+    """Write a byte into a folder, made if absent, and take both away again.
+
+    Rights alone do not tell: a disk may be full, and not every place that root may write to
+    takes files.
+
+    Raises
+    ------
+    RecordingError
+        It cannot be made or written into; the sentence ends with the ``advice``.
+    """
+    import tempfile
+
+    absent = [place for place in (folder, *folder.parents) if not place.exists()]
+    what = 'made' if absent else 'written into'
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        what = 'written into'
+        with tempfile.TemporaryFile(dir=folder) as trial:
+            trial.write(b'x')
+    except OSError as error:
+        raise RecordingError(folder, f'cannot be {what} ({_reason(error)}); {advice}') from None
+    finally:
+        for place in absent:
+            with suppress(OSError):
+                place.rmdir()
 
 
 def check_output(
@@ -95,6 +124,7 @@ def check_output(
         raise RecordingError(path, 'is a folder; name a file')
     if not path.absolute().parent.is_dir():
         raise RecordingError(path, f"cannot be written: there is no folder '{path.parent}'")
+    try_folder(path.absolute().parent, 'choose another place for the output')
     if not path.exists():
         return
     if source is not None and source.exists() and path.samefile(source):

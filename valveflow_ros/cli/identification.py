@@ -30,7 +30,6 @@ from valveflow_ros.diagnosis.extended_model import ExtendedModel
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.answer import doubt, explained, opening_gain, temperature_words
-from valveflow_ros.report.identification import identification_page
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.numbers import (
     count,
@@ -42,9 +41,8 @@ from valveflow_ros.report.numbers import (
     plain,
     with_error,
 )
-from valveflow_ros.report.page import Page
 from valveflow_ros.report.quality import rejected
-from valveflow_ros.report.words import held_words
+from valveflow_ros.report.words import held_words, input_unit_plain
 
 
 def found_in(
@@ -121,15 +119,10 @@ def judged(found: Identified, reference: Characteristic) -> Identified:
     return replace(found, shift=shift, reference=reference)
 
 
-def texts(
-    found: Identified, extended: ExtendedModel | None = None, page: Page | None = None
-) -> dict[str, str]:
-    """Return the files of the result by name; an extended model gets the new curve."""
+def texts(found: Identified, extended: ExtendedModel | None = None) -> dict[str, str]:
+    """Return the files for programs by name; an extended model gets the new curve."""
     content = json.dumps(to_json(found.characteristic), indent=2, allow_nan=False)
-    files = {
-        'characteristic.json': content + '\n',
-        'report.html': (page or identification_page(found)).to_html(),
-    }
+    files = {'characteristic.json': content + '\n'}
     if found.shift is not None:
         told = json.dumps(shift_json(found.shift), indent=2, allow_nan=False)
         files['shift.json'] = told + '\n'
@@ -159,7 +152,8 @@ def outcome(found: Identified, written: Mapping[str, Path], log: LogInput) -> Ou
 def _files(written: Mapping[str, Path]) -> str:
     """Name what was written, the page for people first."""
     others = [path.name for name, path in written.items() if name != 'report.html']
-    return f'Wrote {written["report.html"]} and {" and ".join(others)}.'
+    *most, last = [str(written['report.html']), *others]
+    return f'Wrote {", ".join(most)} and {last}.'
 
 
 def _text(found: Identified, written: Mapping[str, Path]) -> str:
@@ -202,7 +196,8 @@ def _pieces(found: Identified) -> str:
                 count(piece.samples),
             ]
         )
-    head = ['piece', 'u (% MPa^m)', 'slope (MW per u)', 'intercept (MW)', 'MW per 1 % opening',
+    unit = input_unit_plain(c.pressure_exponent)
+    head = ['piece', f'u ({unit})', 'slope (MW per u)', 'intercept (MW)', 'MW per 1 % opening',
             'samples']  # fmt: skip
     return columns(rows, head)
 

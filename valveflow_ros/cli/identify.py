@@ -12,7 +12,7 @@ from valveflow_ros.cli.parameter_options import add_parameters
 from valveflow_ros.cli.report_files import (
     add_report_files,
     check_report_files,
-    with_report_files,
+    with_report,
 )
 from valveflow_ros.cli.usage import UsageError
 
@@ -45,7 +45,7 @@ def arguments(parser: ArgumentParser) -> None:
     parser.add_argument('log', metavar='LOG', type=Path, help='the log to read')
     parser.add_argument(
         '-o', '--output', metavar='DIR', type=Path, required=True,
-        help='folder for the results, made if absent',
+        help='folder for the results, made if absent; the report of another verb there is kept',
     )  # fmt: skip
     add_parameters(parser)
     parser.add_argument(
@@ -69,7 +69,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     """Read, watch, fit, write."""
     mapping = read_mapping(options.column, options.constant)
     console.progress(0.0, 'starting')
-    from valveflow_ros.cli.files import check_folder, write_texts
+    from valveflow_ros.cli.files import check_folder
     from valveflow_ros.cli.identification import found_in, judged, outcome, texts
     from valveflow_ros.cli.log_input import open_input
     from valveflow_ros.cli.model_file import check_exponent, read_extended, read_model
@@ -96,5 +96,5 @@ def run(options: Namespace, console: Console) -> Outcome:
         found = judged(found, reference)
     console.progress(0.9, 'writing the report')
     page = identification_page(found)
-    written = write_texts(options.output, texts(found, extended, page))
-    return with_report_files(outcome(found, written, log), options, page)
+    files = texts(found, extended)
+    return with_report(options, files, page, lambda written: outcome(found, written, log))

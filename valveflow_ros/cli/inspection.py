@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from valveflow_ros.cli.log_input import LogInput, steps_of
+from valveflow_ros.cli.log_input import LogInput, steps_of_each
 from valveflow_ros.cli.parameters import settings_for
 from valveflow_ros.cli.plausible import limits
 from valveflow_ros.cli.report_words import columns, rejected_words
@@ -165,24 +165,28 @@ class Inspected:
 
 def inspect(log: LogInput) -> Inspected:
     """Look through a log that was read."""
-    steps = steps_of(log.readings)
+    parts = log.readings.by_signal()
+    steps = steps_of_each(parts)
     settings, _ = settings_for(steps, 0.0, {})
-    counts = fates(log.readings, settings)
+    counts = fates(log.readings, parts, settings)
     facts = [
-        _facts(log, signal, steps.get(signal, float('nan')))
+        _facts(log, signal, parts[signal], steps.get(signal, float('nan')))
         for signal in sorted({*log.contents.signals, *log.constants})
+        if signal in parts
     ]
-    return Inspected(log, [f for f in facts if f.readings], counts)
+    return Inspected(log, facts, counts)
 
 
-def fates(readings: Readings, settings: Settings) -> dict[str, dict[str, int]]:
+def fates(
+    readings: Readings, parts: dict[int, Readings], settings: Settings
+) -> dict[str, dict[str, int]]:
     """Return how many readings of each signal are accepted or rejected, by reason.
 
     Where it can be seen at once that nothing is wrong, the engine need not be asked.
     """
-    if _in_order(readings, settings):
+    if _in_order(readings, parts, settings):
         return {
-            info.topic: {'accepted': int((readings.signal == info.signal).sum())}
+            info.topic: {'accepted': len(parts[info.signal]) if info.signal in parts else 0}
             for info in SIGNALS
         }
     from valveflow_ros.cli.alignment import align
@@ -194,7 +198,7 @@ def fates(readings: Readings, settings: Settings) -> dict[str, dict[str, int]]:
     }
 
 
-def _in_order(readings: Readings, settings: Settings) -> bool:
+def _in_order(readings: Readings, parts: dict[int, Readings], settings: Settings) -> bool:
     """Tell whether every reading is plausible and in order, so that none can be rejected."""
     if not len(readings):
         return True
@@ -204,20 +208,18 @@ def _in_order(readings: Readings, settings: Settings) -> bool:
         return False
     if not (readings.quality < Quality.BAD).all():
         return False
-    for info in SIGNALS:
-        mine = readings.signal == info.signal
-        values, times = readings.value[mine], readings.time_ns[mine]
-        low, high = limits(info.signal, settings)
+    for signal, part in parts.items():
+        low, high = limits(Signal(signal), settings)
         # Comparisons with NaN are false, so NaN is out of order too.
-        if not (((values >= low) & (values <= high)).all() and (np.diff(times) > 0).all()):
+        plausible = part.value.min() >= low and part.value.max() <= high
+        if not (plausible and (np.diff(part.time_ns) > 0).all()):
             return False
     return True
 
 
-def _facts(log: LogInput, signal: Signal, step_s: float) -> SignalFacts:
+def _facts(log: LogInput, signal: Signal, part: Readings, step_s: float) -> SignalFacts:
     info = SIGNALS[signal]
-    mine = log.readings.signal == signal
-    values, times = log.readings.value[mine], log.readings.time_ns[mine]
+    values, times = part.value, part.time_ns
     if (times[1:] < times[:-1]).any():
         times = np.sort(times)
     finite = np.isfinite(values)

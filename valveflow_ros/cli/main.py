@@ -76,6 +76,7 @@ def _stopped(console: Console, stop: Stop) -> int:
 def _command(words: list[str], console: Console) -> int:
     if not words or words[0] in ('-h', '--help', 'help'):
         sys.stdout.write(overview())
+        sys.stdout.flush()
         return DONE
     if words[0] == '--version':
         from valveflow_ros import __version__
@@ -91,6 +92,7 @@ def _command(words: list[str], console: Console) -> int:
     try:
         options = parser.parse_args(words[1:])
     except SystemExit as done:  # --help was asked for
+        sys.stdout.flush()
         return int(done.code or DONE)
     check_paths(words[0], parser, options)
     console.finish(verb.run(options, console))

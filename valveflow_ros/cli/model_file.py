@@ -63,8 +63,7 @@ def read_either(
     RecordingError
         It cannot be read, or is none this version can use.
     """
-    if path.is_dir():
-        path = next((path / name for name in names if (path / name).is_file()), path)
+    path = model_path(path, names)
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise RecordingError(path, 'is too large to be a flow characteristic')
@@ -77,6 +76,13 @@ def read_either(
         raise RecordingError(path, 'is no flow characteristic: it holds no JSON') from None
     except DataError as error:
         raise RecordingError(path, f'cannot be used. {str(error).rstrip(".")}') from None
+
+
+def model_path(path: Path, names: tuple[str, ...] = (_CURVE, _EXTENDED)) -> Path:
+    """Return the file that is meant: of a folder, the first of ``names`` in it."""
+    if not path.is_dir():
+        return path
+    return next((path / name for name in names if (path / name).is_file()), path)
 
 
 def _of_json(raw: object) -> Characteristic | ExtendedModel:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from valveflow_ros.cli.files import check_output, whole_file
+from valveflow_ros.cli.files import check_output, try_folder, whole_file
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import write_samples, write_table
 from valveflow_ros.records import SampleTable
@@ -24,6 +24,8 @@ def check_log(path: Path, *, source: Path | None = None, overwrite: bool = False
         check_output(path, ('.mcap', *TABLES), source=source, overwrite=overwrite)
     elif path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise RecordingError(path, 'exists already and is not empty; choose another folder')
+    else:
+        try_folder(path, 'choose another place for the output')
 
 
 def write_log(

@@ -1,8 +1,9 @@
-"""The files beside a report that are written when asked for: pictures and tables."""
+"""A report and the files beside it: pictures and tables where they are asked for."""
 
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
     from valveflow_ros.report.page import Page
 
 FIGURES, TABLES = 'figures', 'tables'
+_ABOUT = {FIGURES: 'pictures', TABLES: 'tables'}
 
 
 def add_report_files(parser: ArgumentParser) -> None:
@@ -47,34 +49,57 @@ def check_report_files(options: Namespace) -> None:
         check_folder(options.output / TABLES)
 
 
-def write_report_files(options: Namespace, page: Page) -> dict[str, Path]:
-    """Write pictures and tables as asked for; return where by their names."""
-    from valveflow_ros.cli.files import write_texts
-    from valveflow_ros.report.picture_data import figure_csv
+def with_report(
+    options: Namespace,
+    texts: Mapping[str, str],
+    page: Page,
+    told: Callable[[Mapping[str, Path]], Outcome],
+) -> Outcome:
+    """Write the files of a result, its report, and pictures and tables as asked for.
 
-    written: dict[str, Path] = {}
+    What another verb wrote under one of their names is kept under another, and said.
+
+    Parameters
+    ----------
+    texts : mapping of str to str
+        What the verb writes beside its report, by name.
+    page : Page
+    told : callable
+        Makes the words of the end from where the files are.
+
+    Raises
+    ------
+    RecordingError
+        They cannot be written.
+    """
+    from valveflow_ros.cli.files import write_texts
+    from valveflow_ros.cli.keeping import REPORT, keep_others
+
+    content = {**texts, REPORT: page.to_html()}
+    beside = _pictures_and_tables(options, page)
+    kept = keep_others(options.output, page.verb, content)
+    done = told(write_texts(options.output, content))
+    files = dict(done.data['files'])
+    for folder, made in beside.items():
+        written = write_texts(options.output / folder, made)
+        files |= {f'{folder}/{name}': str(path) for name, path in written.items()}
+    data = {**done.data, 'files': files, **({'kept': dict(kept.names)} if kept.names else {})}
+    asked = ' and '.join(f'{_ABOUT[f]} in {options.output / f}' for f in beside)
+    lines = [done.text, f'Wrote {asked}.' if asked else '', kept.words()]
+    return Outcome('\n'.join(line for line in lines if line), data)
+
+
+def _pictures_and_tables(
+    options: Namespace, page: Page
+) -> dict[str, Mapping[str, str] | Mapping[str, bytes]]:
+    """Return what was asked for beside the report: by folder, then by name."""
+    made: dict[str, Mapping[str, str] | Mapping[str, bytes]] = {}
     if options.table:
-        tables = {f'{f.name}.csv': figure_csv(f) for f in page.figures}
-        written |= write_texts(options.output / TABLES, tables)
+        from valveflow_ros.report.picture_data import figure_csv
+
+        made[TABLES] = {f'{f.name}.csv': figure_csv(f) for f in page.figures}
     if options.figures:
         from valveflow_ros.report.drawing import figure_files
 
-        drawn = {k: v for f in page.figures for k, v in figure_files(f).items()}
-        written |= write_texts(options.output / FIGURES, drawn)
-    return written
-
-
-def with_report_files(done: Outcome, options: Namespace, page: Page) -> Outcome:
-    """Write pictures and tables as asked for, and say so at the end."""
-    written = write_report_files(options, page)
-    if not written:
-        return done
-    asked = ' and '.join(
-        f'{what} in {options.output / folder}'
-        for what, folder, wanted in (
-            ('tables', TABLES, options.table), ('pictures', FIGURES, options.figures),
-        )
-        if wanted
-    )  # fmt: skip
-    files = {**done.data['files'], **{name: str(path) for name, path in written.items()}}
-    return Outcome(f'{done.text}\nWrote {asked}.', {**done.data, 'files': files})
+        made[FIGURES] = {k: v for f in page.figures for k, v in figure_files(f).items()}
+    return made

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from valveflow_ros.cli.console import Console, Outcome
+from valveflow_ros.report.terminal_number import number, whole
 
 if TYPE_CHECKING:
     from valveflow_ros.plant.recorder import SimulatedLog
@@ -32,10 +33,14 @@ def arguments(parser: ArgumentParser) -> None:
         '-o', '--output', metavar='LOG', type=Path,
         help='where to write: .mcap, .csv, .parquet, or a folder as ros2 bag makes it',
     )  # fmt: skip
-    parser.add_argument('--days', type=float, default=10.0, help='how long (default 10)')
     parser.add_argument(
-        '--seed', type=int, default=1, help='the same seed gives the same log (default 1)'
-    )
+        '--days', metavar='D', type=number('a number of days', 0, 400, '--days 10', above=True),
+        default=10.0, help='how many days of operation, such as 0.5 (default 10)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--seed', metavar='N', type=whole('a whole number', 0, None, '--seed 1'), default=1,
+        help='the same seed gives the same log (default 1)',
+    )  # fmt: skip
     parser.add_argument(
         '--effect', action='append', default=[], metavar='NAME[:KEY=VALUE,...]',
         help='switch an effect on; may be given several times',

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from typing import Any, NoReturn
 
@@ -17,7 +18,9 @@ class Parser(ArgumentParser):
     """A parser that refuses with `UsageError` and keeps the layout of what we wrote."""
 
     def __init__(self, prog: str) -> None:
-        super().__init__(prog=prog, formatter_class=_Formatter, allow_abbrev=False)
+        super().__init__(prog=prog, formatter_class=_Formatter, allow_abbrev=False, add_help=False)
+        self._positionals.title = 'arguments'
+        self.add_argument('-h', '--help', action='help', help='show this page')
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse; an option that does not exist is told before anything that is missing."""
@@ -39,8 +42,25 @@ class Parser(ArgumentParser):
             *most, last = missing.split(', ')
             text = f'Something is missing: {", ".join(most)}{" and " if most else ""}{last}.'
             raise UsageError(text)
-        text = message[:1].upper() + message[1:]
+        text = _sentence(message)
         raise UsageError(text if text.endswith('.') else f'{text}.')
+
+
+def _sentence(message: str) -> str:
+    """Put what argparse says into words: the option first, then what is wrong with it."""
+    about = re.fullmatch(r'argument (\S+): (.*)', message, re.DOTALL)
+    if about is None:
+        words = message.removeprefix('unrecognized arguments: ')
+        return message[:1].upper() + message[1:] if words == message else (
+            f"There is no place for '{words}' here."
+        )  # fmt: skip
+    name, problem = about[1].rpartition('/')[2], about[2]
+    if problem.startswith('expected one argument'):
+        return f'{name} wants a value after it'
+    choice = re.fullmatch(r'invalid choice: (.*) \(choose from (.*)\)', problem)
+    if choice is not None:
+        return f'{name} must be one of {choice[2].replace(chr(39), "")}, not {choice[1]}'
+    return f'{name} {problem}' if problem.startswith('must ') else f'{name}: {problem}'
 
 
 class _Formatter(RawDescriptionHelpFormatter):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from valveflow_ros.cli.console import Console, Outcome
 from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
 from valveflow_ros.cli.parameter_options import add_parameters
+from valveflow_ros.cli.report_files import add_report_files, check_report_files, with_report
+from valveflow_ros.report.terminal_number import number
 
 _DESCRIPTION = """\
 Hold a characteristic against a log it was not made from: in each steady-state and
@@ -17,16 +19,6 @@ report.html for people, validation.json and segments.csv for programs.
 
 example:
   valveflow validate other.mcap --model result/characteristic.json -o checked"""
-
-
-def _positive(words: str) -> float:
-    try:
-        value = float(words)
-    except ValueError:
-        raise ArgumentTypeError(f"must be a number, not '{words}'") from None
-    if not 0.0 < value <= 1e4:
-        raise ArgumentTypeError(f'must be above 0 and at most 10000 MW, not {words}')
-    return value
 
 
 def arguments(parser: ArgumentParser) -> None:
@@ -41,17 +33,19 @@ def arguments(parser: ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '-o', '--output', metavar='DIR', type=Path, required=True,
-        help='folder for the results, made if absent',
+        help='folder for the results, made if absent; the report of another verb there is kept',
     )  # fmt: skip
     parser.add_argument(
         '--against', metavar='FILE', type=Path,
         help='a second characteristic.json, to see which of the two is better',
     )  # fmt: skip
     parser.add_argument(
-        '--tolerance', metavar='MW', type=_positive,
+        '--tolerance', metavar='MW',
+        type=number('a power in MW', 0, 10_000, '--tolerance 2', above=True),
         help='a mean difference that does not matter (default: the parameter alarm_floor, 1 MW)',
     )  # fmt: skip
     add_parameters(parser)
+    add_report_files(parser)
     add_mapping(parser)
 
 
@@ -59,13 +53,15 @@ def run(options: Namespace, console: Console) -> Outcome:
     """Read, find segments, judge, write."""
     mapping = read_mapping(options.column, options.constant)
     console.progress(0.0, 'starting')
-    from valveflow_ros.cli.files import check_folder, write_texts
+    from valveflow_ros.cli.files import check_folder
     from valveflow_ros.cli.model_file import check_exponent, read_either, read_model
     from valveflow_ros.cli.parameters import read_parameters
     from valveflow_ros.cli.validating import outcome, refuse_two, texts, validated
+    from valveflow_ros.report.comparison_validation import validation_page
 
     given = read_parameters(options.params, options.pairs)
     check_folder(options.output)
+    check_report_files(options)
     model = read_either(options.model)
     against = None if options.against is None else read_model(options.against)
     refuse_two(model, against)
@@ -73,4 +69,6 @@ def run(options: Namespace, console: Console) -> Outcome:
     data = validated(options, model, against, mapping, given, console)
     console.progress(0.9, 'writing the report')
     content, files = texts(data)
-    return outcome(data, content, write_texts(options.output, files))
+    return with_report(
+        options, files, validation_page(data), lambda written: outcome(data, content, written)
+    )

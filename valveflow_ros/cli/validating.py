@@ -10,6 +10,7 @@ from typing import Any
 
 from valveflow_ros.cli.console import Console, Outcome
 from valveflow_ros.cli.mapping import Mapping as Columns
+from valveflow_ros.cli.model_file import model_path
 from valveflow_ros.cli.report_words import columns
 from valveflow_ros.cli.usage import UsageError
 from valveflow_ros.cli.watching import read, see
@@ -24,11 +25,10 @@ from valveflow_ros.report.comparison_validation import (
     LABELS,
     OUTSIDE_FLAG,
     Validated,
-    validation_report,
     verdict_words,
 )
 from valveflow_ros.report.numbers import decimals, interval, percent, plain
-from valveflow_ros.report.words import held_words
+from valveflow_ros.report.words import held_words, input_unit_plain
 
 
 def refuse_two(model: Characteristic | ExtendedModel, against: Characteristic | None) -> None:
@@ -98,12 +98,14 @@ def _held(curve: Characteristic, taken_out: bool, console: Console) -> str:
 
 
 def _name(path: Path, other: Path | None) -> str:
-    """Return a file's name, with its folder where two would read alike."""
-    return str(path) if other is not None and other.name == path.name else path.name
+    """Return a file's name, with its folder where that was named or two would read alike."""
+    file = model_path(path)
+    alike = other is not None and model_path(other).name == file.name
+    return str(file) if alike or file != path else file.name
 
 
 def texts(data: Validated) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the content of the JSON, and the files of the result by name."""
+    """Return the content of the JSON, and the files for programs by name."""
     content = {
         **to_json(data.result),
         'log': data.source,
@@ -115,7 +117,6 @@ def texts(data: Validated) -> tuple[dict[str, Any], dict[str, str]]:
     return content, {
         'validation.json': json.dumps(content, indent=1, allow_nan=False) + '\n',
         'segments.csv': segments_csv(data.result.judgement, tuple(data.result.predictions)),
-        'report.html': validation_report(data),
     }
 
 
@@ -150,7 +151,8 @@ def _pieces(data: Validated) -> str:
         ]
         for k, c in enumerate((v.overall, *v.pieces))
     ]
-    head = ['piece', 'u (% MPa^m)', 'segments', 'measured - predicted (MW)', '95 % (MW)']
+    unit = input_unit_plain(v.characteristic.pressure_exponent)
+    head = ['piece', f'u ({unit})', 'segments', 'measured - predicted (MW)', '95 % (MW)']
     return columns(rows, head)
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from valveflow_ros.cli.console import Console, Outcome
+from valveflow_ros.report.terminal_number import number
 
 _DESCRIPTION = """\
 Show how a monitor is doing, drawn anew once a second: the curve with today's operating point,
@@ -22,16 +23,6 @@ and over ROS 2, in a shell that has it:
 Where the output is no terminal, each change is a line instead."""
 
 
-def _seconds(words: str) -> float:
-    try:
-        value = float(words)
-    except ValueError:
-        raise ArgumentTypeError(f"must be a number of seconds, not '{words}'") from None
-    if not 0.1 <= value <= 3600.0:
-        raise ArgumentTypeError(f'must be from 0.1 to 3600 s, not {words}')
-    return value
-
-
 def arguments(parser: ArgumentParser) -> None:
     """Add description, example and options."""
     parser.description = _DESCRIPTION
@@ -42,7 +33,8 @@ def arguments(parser: ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument('--once', action='store_true', help='print one picture, then stop')
     parser.add_argument(
-        '--interval', metavar='S', type=_seconds, default=1.0,
+        '--interval', metavar='S', default=1.0,
+        type=number('a number of seconds', 0.1, 3600, '--interval 5'),
         help='seconds between two pictures (default 1)',
     )  # fmt: skip
     parser.add_argument(

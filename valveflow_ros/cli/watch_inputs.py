@@ -13,7 +13,7 @@ from valveflow_ros.core.units import UNITS, convert
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.logs.found import Rows
 from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
-from valveflow_ros.report.numbers import count, duration, plain
+from valveflow_ros.report.numbers import counted, duration, plain
 from valveflow_ros.report.terminal_frame import OK, STALE, WARN, HealthView
 
 _SILENT_S = 5.0
@@ -104,6 +104,6 @@ class InputWatch:
             why = (
                 'without a usable value' if value == 'unknown' else f'{value} {info.unit}, refused'
             )
-            told = f'{count(track.rejected)} readings rejected, the last {why}.'
+            told = f'{counted(track.rejected, "reading")} rejected, the last {why}.'
             return HealthView(info.topic, WARN, told)
         return HealthView(info.topic, OK, f'{plain(track.value)} {info.unit}.')

@@ -19,6 +19,8 @@ from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.problem import Samples
 from valveflow_ros.core.refine import Refined
 from valveflow_ros.core.run_length import design_chart
+from valveflow_ros.core.sums import running_average
+from valveflow_ros.errors import counted
 from valveflow_ros.records import ByteArray, FloatArray
 
 _Z95 = 1.959963984540054
@@ -44,14 +46,11 @@ def residual_statistics(
     curve_error_mw : float
         Standard error of the prediction.
     """
-    # It takes a second to load, and a process that only predicts never comes here.
-    from scipy.signal import lfilter
-
     settings = task.settings
     average_s = settings.real('alarm_average')
     rest = residual[weight > 0]
     forget = math.exp(-step_s / average_s)
-    run = lfilter([1.0 - forget], [1.0, -forget], rest)
+    run = running_average(rest, forget)
     settled = run[min(len(run) // 4, int(3.0 * average_s / step_s)) :]
     sd = _MAD_TO_SD * float(np.median(np.abs(settled - np.median(settled))))
     return ResidualStatistics(
@@ -115,8 +114,8 @@ def from_refined(
         )  # fmt: skip
     elif m.pieces != len(static.pieces):
         note = (
-            f'The rule took {len(static.pieces)} pieces; the refined curve has {m.pieces}, since '
-            'pieces too narrow to be moved were joined with others.'
+            f'The rule took {counted(len(static.pieces), "piece")}; the refined curve has '
+            f'{m.pieces}, since pieces too narrow to be moved were joined with others.'
         )
         choice = replace(choice, note=f'{note} {choice.note}'.strip(), confidence={})
     return replace(

@@ -14,6 +14,7 @@ import numpy as np
 
 from valveflow_ros.core.characteristic import Characteristic, Piece, Support
 from valveflow_ros.core.window import WindowContents
+from valveflow_ros.errors import counted
 from valveflow_ros.records import FloatArray, SegmentKind
 
 NOT_REFINED = 'The curve is not refined: '  # how a note on that begins
@@ -104,7 +105,8 @@ def _sentence(number: int, piece: Piece, found: Support) -> str:
     if not found.samples:
         rests = 'rests on no special sample'
     elif not found.levels and not found.slope_response:
-        rests = f'rests on no special segment, only on {found.samples} samples at their ends'
+        few = counted(found.samples, 'sample')
+        rests = f'rests on no special segment, only on {few} at their ends'
     elif not found.levels:
         rests = 'rests on slope responses that hardly move in it'
     else:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import median_filter
 
+from valveflow_ros.errors import counted
 from valveflow_ros.records import SIGNALS, BoolArray, FloatArray, SampleTable, SignalInfo
 
 FLAT_LEAST_S = 30.0
@@ -47,12 +48,13 @@ class Fault:
         if self.name == 'flatline':
             return (
                 f'The record of {what} stands still for up to {self.size:.0f} s at a time; '
-                f'{self.rows} rows were not believed.'
+                f'{counted(self.rows, "row was", "rows were")} not believed.'
             )
         if self.name == 'spikes':
             return (
-                f'The record of {what} has {self.rows} single wild values of about '
-                f'{self.size:.2g} {self.signal.unit}; they were not believed.'
+                f'The record of {what} has {counted(self.rows, "single wild value")} of '
+                f'about {self.size:.2g} {self.signal.unit}; '
+                f'{"it was" if self.rows == 1 else "they were"} not believed.'
             )
         return (
             f'{what} is recorded in steps of {self.size:.2g} {self.signal.unit}, coarser than it '

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from valveflow_ros.errors import RecordingError
+from valveflow_ros.errors import RecordingError, counted
 from valveflow_ros.logs.contents import LogContents, TopicInfo
 from valveflow_ros.logs.found import FileContents, Rows
 from valveflow_ros.logs.gather import gather
@@ -161,15 +161,19 @@ def _file_warnings(file: FileContents, what: str) -> list[str]:
     if file.announced is not None and file.announced > file.messages:
         missing = file.announced - file.messages
         sentences.append(
-            f'The {what} was written with {file.announced} messages, {missing} of them are lost.'
+            f'The {what} was written with {counted(file.announced, "message")}, '
+            f'{missing} of them {"is" if missing == 1 else "are"} lost.'
         )
     if file.orphans:
+        many = 'is on a topic' if file.orphans == 1 else 'are on topics'
         sentences.append(
-            f'{file.orphans} messages of the {what} are on topics that it does not name any more.'
+            f'{counted(file.orphans, "message")} of the {what} {many} that it does not name any '
+            'more.'
         )
     for channel, count in file.misfits.items():
         topic = file.table.channels[channel].topic
-        sentences.append(f"{count} messages on '{topic}' do not fit their type and were left out.")
+        fit = 'does not fit its type and was' if count == 1 else 'do not fit their type and were'
+        sentences.append(f"{counted(count, 'message')} on '{topic}' {fit} left out.")
     return sentences
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from valveflow_ros.errors import counted
 from valveflow_ros.logs.scan import Findings
 
 
@@ -27,7 +28,8 @@ def scan_warnings(findings: Findings, what: str) -> tuple[str, ...]:
         )
     if findings.unchecked:
         sentences.append(
-            f'{findings.unchecked} chunks of the {what} were written without a checksum, '
-            'so damage in them cannot be seen.'
+            f'{counted(findings.unchecked, "chunk")} of the {what} '
+            f'{"was" if findings.unchecked == 1 else "were"} written without a checksum, '
+            'so damage in it cannot be seen.'
         )
     return tuple(sentences)

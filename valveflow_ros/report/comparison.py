@@ -24,12 +24,7 @@ from valveflow_ros.report.comparison_words import data_words, finding_words
 from valveflow_ros.report.dynamics import dynamics_table
 from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.numbers import counted, moment, plain
-from valveflow_ros.report.page import Page, Section, paragraph, table, text
-
-
-def comparison_report(data: Compared) -> str:
-    """Return ``report.html``: one self-contained page that opens without a network."""
-    return comparison_page(data).to_html()
+from valveflow_ros.report.page import Page, Section, folded, paragraph, table, text
 
 
 def comparison_page(data: Compared) -> Page:
@@ -56,7 +51,7 @@ def comparison_page(data: Compared) -> Page:
         f'Made by valveflow {text(__version__)}. Curve <code>{text(c.model_id)}</code>; the same '
         'numbers, unrounded, stand in comparison.json and the tables beside this page.'
     )
-    return Page('Three methods compared', lead, sections, foot)
+    return Page('Three methods compared', lead, sections, foot, 'compare')
 
 
 def _finding(data: Compared) -> Section:
@@ -66,8 +61,8 @@ def _finding(data: Compared) -> Section:
         [
             paragraph(text(first), 'answer'),
             curves_figure(data),
-            *(paragraph(text(sentence)) for sentence in rest),
             pairs_table(data.result.pairs),
+            *(paragraph(text(sentence)) for sentence in rest),
         ],
     )
 
@@ -93,7 +88,7 @@ def _dynamics(data: Compared) -> Section:
     parts: list[str | Figure] = []
     if c.dynamics:
         parts.append(dynamics_table(c.dynamics))
-    parts.append(paragraph(text(f'Hammerstein: {linear_block_words(data)}')))
+    parts.append(paragraph(text(linear_block_words(data))))
     figure = moves_figure(data)
     return Section('Dynamics by load', [*parts, figure] if figure else parts)
 
@@ -120,7 +115,11 @@ def _tuning(data: Compared) -> Section:
     head = ['candidate', '', 'mean squared error (MW²)']
     return Section(
         'How the other two were tuned',
-        [paragraph(text(words)), paragraph(text(_sparse_words(data))), table(head, rows)],
+        [
+            paragraph(text(words)),
+            paragraph(text(_sparse_words(data))),
+            folded(f'The {counted(len(rows), "candidate")}', table(head, rows)),
+        ],
     )
 
 
@@ -132,13 +131,13 @@ def _sparse_words(data: Compared) -> str:
     s = data.result.sparse
     if s is None:
         return data.result.failure
-    terms = ', '.join(
-        f'{name}: {plain(float(x), 4)}'
+    terms = ' '.join(
+        f'{"−" if x < 0.0 else "+"} {plain(abs(float(x)), 4)}{"" if name == "1" else f" {name}"}'
         for name, x in zip(NAMES, s.model.xi, strict=True)
         if x != 0.0
     )
     return (
         f'Sparse identification took the equations in the form "{s.form.kind}" over '
         f'{s.form.window_s:g} s and threshold {plain(s.threshold, 3)} on scaled columns. The '
-        f'model is dy/dt = sum of, in MW/s: {terms}.'
+        f'model, with y in MW: dy/dt = {terms.removeprefix("+ ") or "0"} (MW/s).'
     )

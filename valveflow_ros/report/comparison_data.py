@@ -15,6 +15,8 @@ LABELS = {
     'hammerstein': 'Hammerstein',
     'sparse': 'sparse (SINDy)',
 }
+# In a legend there is little room.
+LEGEND = {**LABELS, 'paper': "the paper's curve"}
 PREDICTIONS = {
     'paper.static': "the paper's curve",
     'proposed.static': 'valveflow, curve',

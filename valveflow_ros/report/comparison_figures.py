@@ -7,7 +7,7 @@ import numpy as np
 from valveflow_ros.core.window import WindowContents
 from valveflow_ros.records import FloatArray
 from valveflow_ros.report.comparison_csv import curves_of
-from valveflow_ros.report.comparison_data import LABELS, METHODS, Compared
+from valveflow_ros.report.comparison_data import LEGEND, METHODS, Compared
 from valveflow_ros.report.downsample import thin
 from valveflow_ros.report.figure import Figure, Spec, rounded, token
 from valveflow_ros.report.words import input_axis
@@ -26,7 +26,7 @@ def line_of(method: str, axis: str = 'y', shown: bool = True) -> Spec:
     """Return what all lines of a method have in common."""
     colour, dash, width = LOOK[method]
     return {
-        'type': 'scatter', 'mode': 'lines', 'name': LABELS[method], 'yaxis': axis,
+        'type': 'scatter', 'mode': 'lines', 'name': LEGEND[method], 'yaxis': axis,
         'line': {'color': token(colour), 'dash': dash, 'width': width},
         'legendgroup': method, 'showlegend': shown,
     }  # fmt: skip
@@ -59,6 +59,7 @@ def _curves(data: Compared, axis: str = 'y') -> list[Spec]:
                 'type': 'scatter', 'mode': 'lines', 'name': 'truth', 'yaxis': axis,
                 'x': rounded(curves['u'], 6), 'y': rounded(curves['truth'], 6),
                 'line': {'color': token('density-2'), 'width': 6},
+                'hovertemplate': 'u %{x:.0f}<br>%{y:.1f} MW',
             }
         )  # fmt: skip
     for method in METHODS:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import datetime, timezone
 
 import numpy as np
 
 from valveflow_ros.compare.judged import JudgedSegment
-from valveflow_ros.records import FloatArray, IntArray, SegmentKind
+from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SegmentKind
 from valveflow_ros.report.comparison_data import Compared
 from valveflow_ros.report.comparison_figures import line_of
 from valveflow_ros.report.figure import Figure, Spec, rounded, token
@@ -16,6 +17,7 @@ from valveflow_ros.report.numbers import counted, plain
 _LENGTH_S = 7200.0
 _MOVE_S = 900.0
 _POINTS = 600
+_HOVER = '%{x|%d %b %H:%M:%S}<br>%{y:.1f} MW'
 _COLOUR = {SegmentKind.STEADY: 'steady', SegmentKind.SLOPE: 'slope'}
 
 
@@ -75,6 +77,7 @@ def _measured(data: Compared, first: int, end: int, axis: str) -> Spec:
         'type': 'scatter', 'mode': 'lines', 'name': 'measured', 'yaxis': axis,
         'x': _times(trial.time_ns, first, end), 'y': rounded(_means(power, first, end), 5),
         'line': {'color': token('data-soft'), 'width': 1.2}, 'legendgroup': 'measured',
+        'hovertemplate': _HOVER,
         'showlegend': axis == 'y',
     }  # fmt: skip
 
@@ -87,7 +90,7 @@ def _predicted(
     return {
         **spec, 'x': _times(data.result.trial.time_ns, first, end),
         'y': rounded(_means(np.where(np.isfinite(values), values, np.nan), first, end), 5),
-        'hovertemplate': '%{x|%d %b %H:%M:%S}<br>%{y:.1f} MW', **changes,
+        'hovertemplate': _HOVER, **changes,
     }  # fmt: skip
 
 
@@ -111,7 +114,11 @@ def stretch_figure(data: Compared, stretch: Stretch) -> Figure:
         for s in stretch.segments
     ]  # fmt: skip
     layout = {
-        'xaxis': {'type': 'date', 'anchor': 'y2', 'title': {'text': 'time (UTC)'}},
+        # Labels that may turn and turn back would never let the margins rest.
+        'xaxis': {
+            'type': 'date', 'anchor': 'y2', 'title': {'text': 'time (UTC)'}, 'tickangle': 0,
+            'nticks': 8,
+        },
         'yaxis': {'domain': [0.53, 1.0], 'title': {'text': 'power (MW)'}},
         'yaxis2': {'domain': [0.0, 0.47], 'title': {'text': 'power (MW)'}, 'matches': 'y'},
         'shapes': shapes, 'showlegend': True,
@@ -168,12 +175,16 @@ def moves_figure(data: Compared) -> Figure | None:
         for trace in mine:
             trace |= {'xaxis': x, 'yaxis': y, 'showlegend': k == 0}
         traces += mine
-        left, right = (0.0, 0.46) if k == 0 else (0.54, 1.0)
-        title = f'{"low" if k == 0 else "high"} power'
+        left, right = (0.0, 0.44) if k == 0 else (0.56, 1.0)
+        load, day = f'{"low" if k == 0 else "high"} power', _day(data, span[0])
         layout[f'xaxis{x[1:]}'] = {
-            'type': 'date', 'domain': [left, right], 'anchor': y, 'title': {'text': title},
+            'type': 'date', 'domain': [left, right], 'anchor': y, 'nticks': 3,
+            'title': {
+                'text': f'{load}<br>{day:%d %b %Y} (UTC)', 'short': f'{load}<br>{day:%d %b}',
+            },
+            'tickformat': '%H:%M', 'tickangle': 0,
         }  # fmt: skip
-        layout[f'yaxis{y[1:]}'] = {'anchor': x, 'title': {'text': 'MW' if k == 0 else ''}}
+        layout[f'yaxis{y[1:]}'] = {'anchor': x, 'title': {'text': 'power (MW)' if k == 0 else ''}}
     caption = (
         '<b>How long the power lags behind the flow.</b> Where one block for all loads answers '
         'too slowly on the left or too quickly on the right, the dynamics differ between loads.'
@@ -182,12 +193,17 @@ def moves_figure(data: Compared) -> Figure | None:
     return Figure('moves', caption, words, traces, layout, height=380)
 
 
+def _day(data: Compared, row: int) -> datetime:
+    second = int(data.result.trial.time_ns[row]) // NS_PER_S
+    return datetime.fromtimestamp(second, tz=timezone.utc)
+
+
 def linear_block_words(data: Compared) -> str:
     """Say what linear block the Hammerstein model has."""
     m = data.result.hammerstein.model
     times = ', '.join(f'{plain(float(t), 3)} s' for t in m.time_constants_s)
     return (
-        f'One linear block for all loads: {counted(len(m.b), "tap")}, '
+        f'The Hammerstein model has one linear block for all loads: {counted(len(m.b), "tap")}, '
         f'{counted(len(m.denominator), "pole")} (time constants {times or "none"}), delay '
         f'{plain(m.delay * m.step_s, 3)} s.'
     )

@@ -74,7 +74,10 @@ def errors_table(data: Compared) -> str:
                     decimals(float(r.truth.knots[j + 1]), 1) if j + 1 < len(line.slopes) else '',
                 ]
             )
-    head = ['method', 'piece', 'slope', 'true', 'intercept (MW)', 'true', 'knee', 'true']
+    head = [
+        'method', 'piece', 'slope', 'true slope', 'intercept (MW)', 'true intercept (MW)', 'knee',
+        'true knee',
+    ]  # fmt: skip
     told = table(head, rows, caption="As in the paper's Table IV.") if rows else ''
     return told + _largest(data)
 
@@ -108,11 +111,13 @@ def totals_table(data: Compared) -> str:
         rows.append(
             [
                 text(PREDICTIONS[name]),
-                _mse(j.mse(name)),
-                _mse(j.mse(name, SegmentKind.STEADY)),
-                _mse(j.mse(name, SegmentKind.SLOPE)),
-                _mse(r.all_rows[name]) if name in r.all_rows else '–',
-                f'{decimals(bias.mean, 3)} ({_p(bias.p_value)})',
+                mse_cell(j.mse(name)),
+                mse_cell(j.mse(name, SegmentKind.STEADY)),
+                mse_cell(j.mse(name, SegmentKind.SLOPE)),
+                mse_cell(r.all_rows[name]) if name in r.all_rows else '–',
+                f'{decimals(bias.mean, 3)} ({_p(bias.p_value)})'
+                if math.isfinite(bias.mean)
+                else '–',
                 f'{paper} of {all_paper}',
                 f'{counted} of {all_counted}',
             ]
@@ -125,7 +130,8 @@ def totals_table(data: Compared) -> str:
     return table(head, rows, caption='Mean squared errors on the data to judge by.')
 
 
-def _mse(value: float) -> str:
+def mse_cell(value: float) -> str:
+    """Write a mean squared error: endless where an answer ran away, a dash where there is none."""
     return plain(value) if math.isfinite(value) else '∞' if math.isinf(value) else '–'
 
 
@@ -141,12 +147,12 @@ def pairs_table(pairs: Sequence[Pair]) -> str:
         [
             _TERMS[p.terms],
             text(LABELS[p.baseline]),
-            _mse(p.mse_ours_mw2),
-            _mse(p.mse_theirs_mw2),
+            mse_cell(p.mse_ours_mw2),
+            mse_cell(p.mse_theirs_mw2),
             _difference(p),
             f'<b>{p.outcome.value}</b>, {_p(p.test.p_value)}',
         ]
-        for p in pairs
+        for p in sorted(pairs, key=lambda p: list(_TERMS).index(p.terms))
     ]
     head = [
         'terms', 'against', 'ours (MW²)', 'theirs (MW²)', 'theirs less ours, 95 % (MW²)',
@@ -163,14 +169,20 @@ def _difference(pair: Pair) -> str:
     return interval(*pair.test.interval())
 
 
+def _ts(each: float, worth: float) -> str:
+    """Return two t values in brackets; nothing where an endless error has none."""
+    if not (math.isfinite(each) or math.isfinite(worth)):
+        return ''
+    return f' ({plain(each, 2)}; {plain(worth, 2)})'
+
+
 def segments_table(data: Compared, segments: Sequence[JudgedSegment]) -> str:
     """Return Table III for some of the segments: mean squared errors and t values."""
     names = [n for n in _SHORT if n in data.predictions]
     rows = []
     for s in segments:
         cells = [
-            f'{_mse(s.scores[n].mse_mw2)} ({plain(s.scores[n].samples.t, 2)}; '
-            f'{plain(s.scores[n].effective.t, 2)})'
+            mse_cell(s.scores[n].mse_mw2) + _ts(s.scores[n].samples.t, s.scores[n].effective.t)
             for n in names
         ]
         number = [f'{KIND[s.kind]} {s.number}', moment(s.start_ns)[5:16], str(len(s.rows))]

@@ -21,7 +21,7 @@ from valveflow_ros.report.numbers import (
     percent,
     plain,
 )
-from valveflow_ros.report.page import Section, notice, page, paragraph, table, text
+from valveflow_ros.report.page import Page, Section, folded, notice, paragraph, table, text
 from valveflow_ros.report.words import input_unit
 
 LABELS = {
@@ -76,7 +76,7 @@ def verdict_words(data: Validated) -> list[str]:
 
 
 def _verdict(v: Validation) -> str:
-    tolerance = f'{plain(v.tolerance_mw, 3)} MW'
+    tolerance = f'{v.tolerance_mw:.3g} MW'
     mean = (
         f'over all segments the power is {_signed(v.overall.test.mean)} MW from what it predicts '
         f'({interval(v.overall.low_mw, v.overall.high_mw)} MW with 95 % confidence)'
@@ -94,9 +94,9 @@ def _verdict(v: Validation) -> str:
         )
     real = '; the difference is real' if v.overall.test.zero_is_rejected() else ''
     return (
-        f'Whether the characteristic holds stays open: {mean}{real}. {_unsettled(v)} cannot be '
-        f'told to lie within {tolerance} or beyond. A longer log, with every load in it, would '
-        'help.'
+        f'Whether the characteristic holds stays open: {mean}{real}. {_unsettled(v)} it cannot be '
+        f'told whether the difference is within {tolerance} or beyond. A longer log, with every '
+        'load in it, would help.'
     )
 
 
@@ -106,8 +106,9 @@ def _unsettled(v: Validation) -> str:
         str(k) for k, c in enumerate(v.pieces, 1) if c.segments and not _within(c, v.tolerance_mw)
     ]
     if not open_ones:
-        return 'The mean over all segments'
-    return f'{"Piece" if len(open_ones) == 1 else "Pieces"} {", ".join(open_ones)}'
+        return 'For the mean over all segments'
+    *most, last = open_ones
+    return f'For pieces {", ".join(most)} and {last}' if most else f'For piece {last}'
 
 
 def _within(check: PieceCheck, tolerance_mw: float) -> bool:
@@ -151,8 +152,8 @@ def _gain(data: Validated) -> str:
     return told + f'{better} is better.'
 
 
-def validation_report(data: Validated) -> str:
-    """Return ``report.html``: one self-contained page that opens without a network."""
+def validation_page(data: Validated) -> Page:
+    """Return the report: the verdict and where it comes from, then the evidence."""
     v = data.result
     first, *rest = verdict_words(data)
     lead = paragraph(text(f'{data.model}, held against {data.source}'), 'where') + paragraph(
@@ -180,7 +181,7 @@ def validation_report(data: Validated) -> str:
         f'Made by valveflow {text(__version__)}. Curve <code>{text(v.characteristic.model_id)}'
         '</code>; the same numbers, unrounded, stand in validation.json and segments.csv.'
     )
-    return page('Does the flow characteristic hold?', lead, sections, foot)
+    return Page('Does the flow characteristic hold?', lead, sections, foot, 'validate')
 
 
 def _told(sentence: str, v: Validation) -> str:
@@ -250,5 +251,7 @@ def segments_table(v: Validation, most: int = 40) -> str:
         'measured − predicted (MW)', 't, each sample', 't, correlation counted',
         'independent values',
     ]  # fmt: skip
-    words = 'The segments that differ most; all of them stand in segments.csv.'
-    return paragraph(words) + table(head, rows)
+    many = counted(len(rows), 'segment')
+    which = f'The {many} that differ most' if len(rows) < len(v.judgement.segments) else many
+    words = 'All segments stand in segments.csv, those that differ most first here.'
+    return paragraph(words) + folded(which, table(head, rows))

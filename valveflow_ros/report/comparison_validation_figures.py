@@ -9,7 +9,6 @@ import numpy as np
 from valveflow_ros.compare.validation import Validation
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.report.figure import Figure, Spec, packed, rounded, token
-from valveflow_ros.report.numbers import plain
 from valveflow_ros.report.words import input_axis
 
 
@@ -17,6 +16,7 @@ def _markers(v: Validation, by_time: bool) -> list[Spec]:
     traces: list[Spec] = []
     looks = ((SegmentKind.STEADY, 'steady', 'steady state'),
              (SegmentKind.SLOPE, 'slope', 'slope response'))  # fmt: skip
+    at = '%{x|%d %b %H:%M}' if by_time else 'u %{x:.0f}'
     for kind, colour, name in looks:
         mine = v.judgement.kinds(kind)
         if by_time:
@@ -29,7 +29,7 @@ def _markers(v: Validation, by_time: bool) -> list[Spec]:
                 'type': 'scatter', 'mode': 'markers', 'name': name, 'x': x,
                 'y': rounded(means, 4),
                 'marker': {'color': token(colour), 'size': 6, 'opacity': 0.75},
-                'hovertemplate': '%{y:.2f} MW<extra>' + name + '</extra>',
+                'hovertemplate': f'{at}<br>%{{y:+.2f}} MW<extra>{name}</extra>',
             }
         )  # fmt: skip
     return traces
@@ -58,6 +58,7 @@ def input_figure(v: Validation) -> Figure:
             'type': 'scatter', 'mode': 'lines', 'name': 'mean of each piece', 'x': rounded(
                 np.array(x), 6
             ), 'y': rounded(np.array(y), 4), 'line': {'color': token('curve'), 'width': 2.4},
+            'hovertemplate': '%{y:+.2f} MW<extra>mean of the piece</extra>',
         },
     ]  # fmt: skip
     layout = {
@@ -67,7 +68,7 @@ def input_figure(v: Validation) -> Figure:
     }  # fmt: skip
     caption = (
         '<b>The points should scatter about zero at every u.</b> Each is the mean of a special '
-        f'segment; the band is ± {plain(v.tolerance_mw, 3)} MW.'
+        f'segment; the band is ± {v.tolerance_mw:.3g} MW.'
     )
     return Figure('by-input', caption, 'Mean difference by input.', traces, layout, 400)
 

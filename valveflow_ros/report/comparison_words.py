@@ -84,7 +84,8 @@ def _as_paper(data: Compared) -> str:
 def _against(pair: Pair) -> str:
     said = f'{LABELS[pair.baseline]} has {_mse(pair.mse_theirs_mw2)}'
     if pair.failed:
-        said = f'{said}, and gives no finite answer in {counted(pair.failed, "segment")}'
+        what = 'half hour' if pair.terms is Terms.ALL_ROWS else 'segment'
+        said += f', and gives no finite answer in {pair.failed} of {counted(pair.judged, what)}'
         return f'{said} (over the others {_tested(pair)})' if _is_tested(pair) else said
     return f'{said} ({_tested(pair)})'
 

@@ -11,7 +11,7 @@ from valveflow_ros.records import FloatArray
 from valveflow_ros.report.downsample import Density, density
 from valveflow_ros.report.figure import Figure, Spec, rounded, token
 from valveflow_ros.report.identified import Identified
-from valveflow_ros.report.numbers import plain
+from valveflow_ros.report.numbers import counted, plain
 from valveflow_ros.report.words import input_axis
 
 _Z95 = 1.959963984540054
@@ -233,7 +233,7 @@ def _description(data: Identified) -> str:
     c = data.characteristic
     ends, values = c.breakpoints, c.values()
     return (
-        f'Flow characteristic of {len(c.pieces)} pieces from u {plain(float(ends[0]))} '
+        f'Flow characteristic of {counted(len(c.pieces), "piece")} from u {plain(float(ends[0]))} '
         f'({plain(float(values[0]))} MW) to u {plain(float(ends[-1]))} '
         f'({plain(float(values[-1]))} MW), over the density of special samples.'
     )

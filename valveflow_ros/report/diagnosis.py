@@ -16,7 +16,7 @@ from valveflow_ros.report.diagnosis_words import cells, times_in_effect, variabl
 from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.history import history_sections
 from valveflow_ros.report.history_data import History
-from valveflow_ros.report.numbers import decimals, moment, percent, plain
+from valveflow_ros.report.numbers import counted, decimals, moment, percent, plain
 from valveflow_ros.report.page import Page, Section, notice, paragraph, table, text
 
 _HOW = (
@@ -37,6 +37,7 @@ class Diagnosed:
     answers: tuple[Answer, ...]
     maps: tuple[ResidualMap, ...] = ()
     history: History | None = None
+    exponent: float = math.nan
 
 
 def diagnosis_report(data: Diagnosed) -> str:
@@ -55,14 +56,14 @@ def diagnosis_page(data: Diagnosed) -> Page:
     lead += paragraph(f'{moment(data.start_ns)} to {moment(data.end_ns)}', 'where')
     ranked = sorted(data.signatures, key=lambda s: -(s.share_before / max(s.share_chance, 1e-9)))
     sections = [
-        _answer(data, ranked), _wrong(data, ranked), _why(data), _model(d), _proof(data),
+        _answer(data, ranked), _wrong(data, ranked), _why(data), _model(data), _proof(data),
         *history_sections(data.history),
     ]  # fmt: skip
     foot = (
         f'Made by valveflow {text(__version__)}. The same numbers, unrounded, stand in '
         'diagnosis.json and extended_model.json beside this page.'
     )
-    return Page(title, lead, sections, foot)
+    return Page(title, lead, sections, foot, 'diagnose')
 
 
 def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
@@ -80,7 +81,7 @@ def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
         ),
     ]
     if ranked:
-        parts.append(signature_figure(ranked[0], data.start_ns, _HOW))
+        parts.append(signature_figure(ranked[0], data.start_ns, _HOW, data.exponent))
     return Section('The answer', parts)
 
 
@@ -111,10 +112,10 @@ def _wrong(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
         told,
         table(['variable', 'simulation', 'extended model', 'by chance (99 %)'], rows),
     ]
-    parts += [signature_figure(s, data.start_ns) for s in ranked[1:]]
+    parts += [signature_figure(s, data.start_ns, exponent=data.exponent) for s in ranked[1:]]
     if data.answers:
         parts.append(answer_figure(data.answers))
-    parts += [map_figure(m, data.start_ns) for m in data.maps]
+    parts += [map_figure(m, data.start_ns, data.exponent) for m in data.maps]
     return Section('1. What is wrong', parts)
 
 
@@ -152,19 +153,20 @@ def _why(data: Diagnosed) -> Section:
     return Section('2. Why', parts)
 
 
-def _parameters(causes: Sequence[NamedCause]) -> list[list[str]]:
+def _parameters(causes: Sequence[NamedCause], exponent: float) -> list[list[str]]:
     return [
-        [text(c.name), text(key), *(text(cell) for cell in cells(e))]
+        [text(c.name), text(key), *(text(cell) for cell in cells(e, exponent))]
         for c in causes
         for key, e in c.parameters.items()
     ]
 
 
-def _model(d: Diagnosis) -> Section:
-    rows = _parameters(d.causes)
+def _model(data: Diagnosed) -> Section:
+    d = data.diagnosis
+    rows = _parameters(d.causes, data.exponent)
     m = d.final.base
     told = paragraph(
-        f'A curve of {m.pieces} pieces, {m.regions} regions of dynamics'
+        f'A curve of {counted(m.pieces, "piece")}, {counted(m.regions, "region")} of dynamics'
         + (f', and {", ".join(text(n) for n in d.final.names)}.' if d.final.names else '.')
     )
     parts: list[str | Figure] = [told]

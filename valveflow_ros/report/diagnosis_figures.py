@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,7 +12,7 @@ from valveflow_ros.diagnosis.signature import Answer, Signature
 from valveflow_ros.records import FloatArray
 from valveflow_ros.report.diagnosis_words import axis_title, axis_titles, points_to, variable
 from valveflow_ros.report.figure import Figure, Spec, rounded, token
-from valveflow_ros.report.numbers import plain
+from valveflow_ros.report.numbers import counted, plain
 from valveflow_ros.report.page import text
 
 _MS = 13  # digits of a time in ms since 1970
@@ -44,19 +45,21 @@ def _band(x: list[float | None], width: FloatArray) -> Spec:
     }  # fmt: skip
 
 
-def hover(variable_name: str) -> str:
+def hover(variable_name: str, exponent: float) -> str:
     """Return what a point of a mean residual says when pointed at."""
     if variable_name == 'time':
         return '%{x|%d %b %H:%M}<br>%{y:+.2f} MW'
-    return f'{axis_title(variable_name)}: %{{x:.4~g}}<br>%{{y:+.2f}} MW'
+    return f'{axis_title(variable_name, exponent)}: %{{x:.4~g}}<br>%{{y:+.2f}} MW'
 
 
-def signature_figure(s: Signature, start_ns: int, how: str = '') -> Figure:
+def signature_figure(
+    s: Signature, start_ns: int, how: str = '', exponent: float = math.nan
+) -> Figure:
     """Return the mean residual against one variable, before and after extending.
 
-    ``how`` says how such a picture is read.
+    ``how`` says how such a picture is read, ``exponent`` is that of u.
     """
-    over: Spec = {'title': axis_titles(s.variable)}
+    over: Spec = {'title': axis_titles(s.variable, exponent)}
     x = rounded(s.middle, 6)
     if s.variable == 'time':
         over, x = TIME_AXIS, moments(start_ns, s.middle)
@@ -70,7 +73,7 @@ def signature_figure(s: Signature, start_ns: int, how: str = '') -> Figure:
         f'{plain(float(s.before.max()), 2)} MW before and {plain(float(s.after.min()), 2)} to '
         f'{plain(float(s.after.max()), 2)} MW after.',
         [_band(x, s.chance),
-         *({**_line(x, values, name, colour, dash), 'hovertemplate': hover(s.variable)}
+         *({**_line(x, values, name, colour, dash), 'hovertemplate': hover(s.variable, exponent)}
            for values, name, colour, dash in (
                (s.before, 'simulation', 'raw', 'dash'),
                (s.after, 'extended model', 'curve', 'solid')))],
@@ -85,7 +88,7 @@ def answer_figure(answers: Sequence[Answer]) -> Figure:
     traces = []
     for a in answers:
         time_s = rounded(a.time_s, 6)
-        way = f'{"opening" if a.up else "closing"}, {a.moves} moves'
+        way = f'{"opening" if a.up else "closing"}, {counted(a.moves, "move")}'
         colour = 'steady' if a.up else 'slope'
         for name, values, dash in (
             ('simulation', a.before, 'dash'), ('extended model', a.after, 'solid'),
@@ -125,7 +128,7 @@ def segments_figure(segments: Sequence[SegmentGain]) -> Figure:
         'segments',
         f'<b>Special segments inside the sealed blocks.</b> {better} of {len(segments)} are '
         'predicted better by the extended model.',
-        f'{len(segments)} segments, {better} of them predicted better.',
+        f'{counted(len(segments), "segment")}, {better} of them predicted better.',
         traces,
         {'xaxis': TIME_AXIS,
          'yaxis': {'title': {'text': 'RMSE (MW)'}}},

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from valveflow_ros.diagnosis.residual_map import ResidualMap
@@ -12,7 +14,7 @@ from valveflow_ros.report.numbers import plain
 from valveflow_ros.report.page import text
 
 
-def map_figure(m: ResidualMap, start_ns: int) -> Figure:
+def map_figure(m: ResidualMap, start_ns: int, exponent: float = math.nan) -> Figure:
     """Return where the simulation is wrong over two variables, and where the extended model is."""
     across, over = rounded(m.across_edges, 6), Spec()
     if m.across == 'time':
@@ -35,10 +37,10 @@ def map_figure(m: ResidualMap, start_ns: int) -> Figure:
         {
             'xaxis': {**over, 'domain': [0.0, 0.46]},
             'xaxis2': {**over, 'domain': [0.54, 1.0], 'anchor': 'y2'},
-            'yaxis': {'title': {'text': axis_title(m.up)}},
+            'yaxis': {'title': {'text': axis_title(m.up, exponent)}},
             # One title for both axes: side by side there is no room for two on a telephone.
             'annotations': [
-                {'text': _below(m.across), 'showarrow': False, 'xref': 'paper', 'x': 0.5,
+                {'text': _below(m.across, exponent), 'showarrow': False, 'xref': 'paper', 'x': 0.5,
                  'xanchor': 'center', 'yref': 'paper', 'y': 0.0, 'yshift': -56}
             ],
             'margin': {'l': 56, 'r': 12, 't': 34, 'b': 70},
@@ -48,8 +50,8 @@ def map_figure(m: ResidualMap, start_ns: int) -> Figure:
     )  # fmt: skip
 
 
-def _below(name: str) -> str:
-    return 'day of the month (UTC)' if name == 'time' else axis_title(name)
+def _below(name: str, exponent: float) -> str:
+    return 'day of the month (UTC)' if name == 'time' else axis_title(name, exponent)
 
 
 def _half(

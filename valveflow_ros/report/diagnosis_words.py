@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from valveflow_ros.diagnosis.estimate import Estimate, dates, told
 from valveflow_ros.report.numbers import UNKNOWN, interval, plain
+from valveflow_ros.report.words import input_unit, input_unit_plain
 
 # What the residual is held against: in a sentence, at an axis, at a narrow one, and what a
 # line that leaves the band there points to.
 _VARIABLES = {
     'u': (
-        'the integrated input u', 'integrated input u (% MPa<sup>m</sup>)', '',
+        'the integrated input u', 'integrated input u ({unit})', '',
         'A bend or a step here points to the shape of the curve.',
     ),
     'pressure given u': (
@@ -32,7 +34,7 @@ _VARIABLES = {
         'A wave here points to cooling water or ambient temperature.',
     ),
     'ramp': (
-        'the ramp rate', 'change of u in 3 min (% MPa<sup>m</sup>)', '',
+        'the ramp rate', 'change of u in 3 min ({unit})', '',
         'A tilt here points to lag and delay, or to a valve that is slower than its command.',
     ),
     'direction': (
@@ -49,15 +51,17 @@ def variable(name: str) -> str:
     return _VARIABLES[name][0] if name in _VARIABLES else name
 
 
-def axis_title(name: str) -> str:
-    """Return what stands at the axis of a variable, as HTML."""
-    return _VARIABLES[name][1] if name in _VARIABLES else name
+def axis_title(name: str, exponent: float) -> str:
+    """Return what stands at the axis of a variable, as HTML; the exponent is that of u."""
+    if name not in _VARIABLES:
+        return name
+    return _VARIABLES[name][1].replace('{unit}', input_unit(exponent))
 
 
-def axis_titles(name: str) -> dict[str, str]:
+def axis_titles(name: str, exponent: float) -> dict[str, str]:
     """Return what stands at an axis, and at a narrow one, as HTML."""
     short = _VARIABLES[name][2] if name in _VARIABLES else ''
-    return {'text': axis_title(name), **({'short': short} if short else {})}
+    return {'text': axis_title(name, exponent), **({'short': short} if short else {})}
 
 
 def points_to(name: str) -> str:
@@ -65,12 +69,13 @@ def points_to(name: str) -> str:
     return _VARIABLES[name][3] if name in _VARIABLES else ''
 
 
-def cells(estimate: Estimate) -> tuple[str, str]:
+def cells(estimate: Estimate, exponent: float) -> tuple[str, str]:
     """Return a parameter with its unit, and its 95 % interval; a time and its own as dates."""
     if estimate.origin_ns is not None:
         at, between = dates(estimate)
         return at, between or UNKNOWN
-    value = f'{plain(estimate.value)} {estimate.unit}'.strip()
+    unit = estimate.unit.replace(input_unit_plain(math.nan), input_unit_plain(exponent))
+    value = f'{plain(estimate.value)} {unit}'.strip()
     return value, interval(estimate.low, estimate.high)
 
 

@@ -93,14 +93,18 @@ def _fill(sheet: Any, figure: Figure, colours: Palette) -> None:
     for (x, y), pane in panes.items():
         _marks(pane, figure, x, y, colours)
         _limits(pane, figure, x, y)
-    first = next(iter(panes.values()))
+        lowest = max(places['row'].get(b, 0) for a, b in panes if a == x)
+        if places['row'].get(y, 0) < lowest:
+            # The axis stands below the last of the panes that share it, as on the page.
+            pane.set_xlabel('')
+            pane.tick_params(labelbottom=False)
+            pane.xaxis.get_offset_text().set_visible(False)
     shown = [p.get_legend_handles_labels() for p in panes.values()]
     pairs = {name: h for handles, names in shown for h, name in zip(handles, names, strict=True)}
     if figure.layout.get('showlegend', len(pairs) > 1) and pairs:
-        first.legend(
-            pairs.values(), pairs.keys(), loc='lower left', bbox_to_anchor=(0.0, 1.0),
-            ncols=4 if max(map(len, pairs)) < _LONG else 2,
-            frameon=False, borderaxespad=0.2,
+        sheet.legend(
+            pairs.values(), pairs.keys(), loc='outside upper left',
+            ncols=4 if max(map(len, pairs)) < _LONG else 2, frameon=False,
         )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -51,6 +52,13 @@ class Figure:
         content = {'data': self.traces, 'layout': {**self.layout, 'height': self.height}}
         text = json.dumps(_clean(content), separators=(',', ':'), allow_nan=False)
         return text.replace('<', '\\u003c').replace('>', '\\u003e').replace('&', '\\u0026')
+
+
+def without_tags(html: str) -> str:
+    """Return HTML without its tags, powers with a caret: ``MPa^(9/8)``; signs stay escaped."""
+    html = re.sub(r'<sup>([^<]*/[^<]*)</sup>', r'^(\1)', html)
+    html = re.sub(r'<sup>([^<]*)</sup>', r'^\1', html)
+    return re.sub(r'<[^>]+>', '', html)
 
 
 def token(name: str) -> str:

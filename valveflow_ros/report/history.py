@@ -157,7 +157,8 @@ def curve_history_figure(history: History) -> Figure:
     )
     last = history.curves[-1]
     words = (
-        f'{len(history.curves)} curves over {span}; the last has {len(last.u) - 1} pieces from '
+        f'{counted(len(history.curves), "curve")} over {span}; the last has '
+        f'{counted(len(last.u) - 1, "piece")} from '
         f'u {plain(float(last.u[0]))} to {plain(float(last.u[-1]))}.'
     )
     traces = [*_power_lines(history, u), _knees(history)]

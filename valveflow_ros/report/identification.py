@@ -58,7 +58,7 @@ def identification_page(data: Identified) -> Page:
         f'Made by valveflow {text(__version__)}. Curve <code>{text(c.model_id)}</code>; the same '
         'numbers, unrounded, stand in characteristic.json beside this page.'
     )
-    return Page(title, lead, sections, foot)
+    return Page(title, lead, sections, foot, 'identify')
 
 
 def _answer(data: Identified) -> Section:

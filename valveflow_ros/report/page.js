@@ -50,7 +50,7 @@
       paper_bgcolor: colour('paper'), plot_bgcolor: colour('paper'),
       font: { family: getComputedStyle(document.body).fontFamily, size: 14, color: colour('ink') },
       margin: { l: 60, r: 12, t: narrow || printing ? 34 : 46, b: 50 }, hovermode: 'closest', dragmode: narrow ? false : 'zoom',
-      legend: { orientation: 'h', x: 0, y: 1.02, xanchor: 'left', yanchor: 'bottom', font: { size: 14 } },
+      legend: { orientation: 'h', x: 0, y: 1.02, xanchor: 'left', yanchor: 'bottom', itemsizing: 'constant', font: { size: 14 } },
       hoverlabel: { bgcolor: colour('panel'), bordercolor: colour('rule'), font: { color: colour('ink') } },
     };
     // There the entries of a legend stand one below the other, and need their own room.

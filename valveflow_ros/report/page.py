@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
 
-from valveflow_ros.report.figure import Figure
+from valveflow_ros import __version__
+from valveflow_ros.report.figure import Figure, without_tags
 from valveflow_ros.report.library import packed_plotly, read_text
 
 # A cell of more signs may be broken on a telephone, and of more still anywhere.
@@ -48,12 +49,15 @@ class Page:
     lead, foot : str
         HTML under the title and at the end.
     sections : list of Section
+    verb : str
+        Whose report it is; the file says so to programs.
     """
 
     title: str
     lead: str
     sections: list[Section]
     foot: str
+    verb: str
 
     @property
     def figures(self) -> list[Figure]:
@@ -62,7 +66,7 @@ class Page:
 
     def to_html(self) -> str:
         """Return the whole file, which opens without a network."""
-        return page(self.title, self.lead, self.sections, self.foot)
+        return _html(self)
 
 
 def text(value: object) -> str:
@@ -123,8 +127,7 @@ def table(
 
 def label(html: str) -> str:
     """Return a column's name for where no HTML can stand."""
-    plain = re.sub(r'<[^>]+>', '', html.replace('<sup>', '^'))
-    return plain.replace('&shy;', '').replace('"', '&quot;')
+    return without_tags(html).replace('&shy;', '').replace('"', '&quot;')
 
 
 def _breaks(html: str) -> str:
@@ -135,33 +138,30 @@ def _breaks(html: str) -> str:
     return ' class="long"' if signs > _NUMBER else ''
 
 
+def folded(title: str, html: str) -> str:
+    """Return ready HTML behind a line that opens it; on paper it stands open."""
+    return f'<details><summary>{title}</summary>{html}</details>'
+
+
 def notice(html: str) -> str:
     """Return a paragraph that must not be overlooked."""
     return f'<p class="notice" role="note">{html}</p>'
 
 
-def page(title: str, lead: str, sections: Sequence[Section], foot: str) -> str:
-    """Return the whole file.
-
-    Parameters
-    ----------
-    title : str
-        Plain text, also the window's title.
-    lead, foot : str
-        HTML under the title and at the end.
-    """
-    body = ''.join(_section(k, s) for k, s in enumerate(sections))
-    figures = [p for s in sections for p in s.parts if isinstance(p, Figure)]
-    drawn = ','.join(f'"{f.name}":{f.to_json()}' for f in figures)
+def _html(page: Page) -> str:
+    body = ''.join(_section(k, s) for k, s in enumerate(page.sections))
+    drawn = ','.join(f'"{f.name}":{f.to_json()}' for f in page.figures)
     library = f'<script id="library" type="text/plain">{packed_plotly()}</script>'
+    title = text(page.title)
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
+        f'<meta name="generator" content="valveflow {text(page.verb)} {text(__version__)}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         '<meta name="color-scheme" content="light dark">'
-        f'<title>{text(title)}</title><link rel="icon" href="data:,">'
+        f'<title>{title}</title><link rel="icon" href="data:,">'
         f'<style>{read_text("style.css")}</style></head>\n<body><main>'
-        f'<header><h1>{text(title)}</h1>{lead}</header>{body}<footer>{foot}</footer></main>\n'
+        f'<header><h1>{title}</h1>{page.lead}</header>{body}<footer>{page.foot}</footer></main>\n'
         f'<script id="figures" type="application/json">{{{drawn}}}</script>\n'
         f'{library}\n<script>{read_text("page.js")}</script></body></html>\n'
     )

@@ -6,7 +6,6 @@ import base64
 import csv
 import io
 import math
-import re
 from collections.abc import Iterator
 from html import unescape
 from itertools import pairwise
@@ -15,13 +14,12 @@ from typing import Any
 import numpy as np
 
 from valveflow_ros.records import FloatArray
-from valveflow_ros.report.figure import Figure, Spec
+from valveflow_ros.report.figure import Figure, Spec, without_tags
 
 
 def plain_text(html: str) -> str:
-    """Return HTML as one line of plain text, powers with a caret."""
-    html = re.sub(r'<sup>(.*?)</sup>', r'^\1', html)
-    return unescape(re.sub(r'<[^>]+>', '', html.replace('<br>', ' '))).strip()
+    """Return HTML as one line of plain text."""
+    return unescape(without_tags(html.replace('<br>', ' '))).strip()
 
 
 def column(trace: Spec, axis: str) -> list[Any]:

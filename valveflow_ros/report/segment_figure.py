@@ -8,7 +8,7 @@ from valveflow_ros.core.segment_residual import SegmentResiduals, segment_residu
 from valveflow_ros.report.figure import Figure, Spec, packed, rounded, token
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.numbers import counted, plain
-from valveflow_ros.report.words import exponent
+from valveflow_ros.report.words import input_unit
 
 _LEAST = 3  # segments that are worth a picture
 
@@ -19,7 +19,7 @@ def segments_figure(data: Identified) -> Figure | None:
     found = segment_residuals(c, data.segments)
     if len(found) < _LEAST:
         return None
-    unit = f'% MPa<sup>{exponent(c.pressure_exponent)}</sup>'
+    unit = input_unit(c.pressure_exponent)
     zero: Spec = {'color': token('muted'), 'width': 1}
     layout: Spec = {
         'xaxis': {'domain': [0.0, 0.47], 'anchor': 'y', 'title': {'text': f'u ({unit})'}},

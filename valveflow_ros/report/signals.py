@@ -7,7 +7,7 @@ from valveflow_ros.report.downsample import envelope, segment_path
 from valveflow_ros.report.figure import Figure, Spec, packed, rounded, token
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.numbers import counted, duration
-from valveflow_ros.report.words import exponent
+from valveflow_ros.report.words import input_unit
 
 _STRETCHES = 5000
 _SEGMENT_POINTS = 4000
@@ -64,9 +64,9 @@ def _buttons(days: float) -> Spec | None:
 
 def signals_figure(data: Identified) -> Figure:
     """Return u and power over time (the paper's Fig. 5)."""
-    power = exponent(data.characteristic.pressure_exponent)
+    unit = input_unit(data.characteristic.pressure_exponent)
     traces = [
-        *_panel(data, data.u, 'y', f'% MPa<sup>{power}</sup>', 0),
+        *_panel(data, data.u, 'y', unit, 0),
         *_panel(data, data.power, 'y2', 'MW', 1),
     ]
     table = data.table
@@ -77,7 +77,7 @@ def signals_figure(data: Identified) -> Figure:
     layout = {
         'xaxis': axis,
         'margin': {'l': 60, 'r': 12, 't': 34, 'b': 96 if buttons else 46},
-        'yaxis': {'domain': [0.54, 1.0], 'title': {'text': f'u (% MPa<sup>{power}</sup>)'}},
+        'yaxis': {'domain': [0.54, 1.0], 'title': {'text': f'u ({unit})'}},
         'yaxis2': {'domain': [0.0, 0.48], 'title': {'text': 'power (MW)'}},
     }
     return Figure('signals', _caption(data), _description(data), traces, layout, height=560)

@@ -148,6 +148,7 @@ def _curve(fields: Fields) -> CurveView:
         (stamp_ns(fields['window_start']), stamp_ns(fields['window_end'])),
         int(fields['samples']), float(fields['rmse_mw']),
         str(fields.get('shift_sentence', '')).strip(),
+        float(fields.get('pressure_exponent', math.nan)),
     )  # fmt: skip
 
 

@@ -25,7 +25,7 @@ def changes(before: Frame, now: Frame) -> list[tuple[str, str]]:
 
 def line(now_ns: int, what: str, told: str) -> str:
     """Return a change as one line."""
-    when = moment(now_ns) if now_ns else 'not yet begun'
+    when = moment(now_ns) if now_ns else 'no data yet'
     return f'{when}  {what}: {told}'
 
 

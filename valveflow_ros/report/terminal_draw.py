@@ -19,6 +19,7 @@ from valveflow_ros.report.terminal_words import (
     sample_words,
     signed,
 )
+from valveflow_ros.report.words import input_unit_plain
 
 _MARGIN = 8  # left of the pictures: a number and its tick
 _LEAST_CURVE, _LEAST_RESIDUAL = 4, 3
@@ -77,7 +78,7 @@ def _shares(left: int, frame: Frame) -> tuple[int, int]:
 
 def _title(frame: Frame, width: int) -> Line:
     unit = clean(frame.unit) or 'valveflow'
-    when = moment(frame.now_ns) if frame.now_ns else 'nothing has come yet'
+    when = moment(frame.now_ns) if frame.now_ns else 'no data yet'
     left = f'{unit}   {when}'
     source = cut(clean(frame.source), max(0, width - cells(left) - 3))
     gap = ' ' * max(1, width - cells(left) - cells(source))
@@ -102,7 +103,7 @@ def _curve(frame: Frame, width: int, rows: int, unicode: bool) -> list[Line]:
     """Return the curve with its breakpoints and the operating point, and the axis below."""
     curve = frame.curve
     points = [] if curve is None else _points(curve)
-    if not points:
+    if curve is None or not points:
         return []
     now = _operating_point(frame.last)
     us = [u for u, _ in points] + ([now[0]] if now else [])
@@ -115,7 +116,7 @@ def _curve(frame: Frame, width: int, rows: int, unicode: bool) -> list[Line]:
     if now is not None:
         canvas.mark(*now, '●')
     marks = {0: f'{high[1]:.0f} MW', rows - 1: f'{low[1]:.0f} MW'}
-    legend = 'u (% MPa^e)   o knee' + ('   ● now' if now else '')
+    legend = f'u ({input_unit_plain(curve.exponent)})   o knee' + ('   ● now' if now else '')
     ends = f'{low[0]:.0f}', f'{high[0]:.0f}'
     middle = cut(legend, max(0, width - _MARGIN - len(ends[0]) - len(ends[1]) - 4))
     axis = f'{ends[0]}{middle:^{max(0, width - _MARGIN - len(ends[0]) - len(ends[1]))}}{ends[1]}'

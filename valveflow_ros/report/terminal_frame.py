@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 # The words of the messages' numbers, as a person says them.
@@ -36,7 +37,7 @@ class CurveView:
     Attributes
     ----------
     breakpoints, values : tuple of float
-        u in % MPa^e and power in MW at the ends of the pieces; empty without a curve.
+        u in % MPa^m and power in MW at the ends of the pieces; empty without a curve.
     state : int
         Place in `CURVE_STATES`.
     cause : str
@@ -48,6 +49,8 @@ class CurveView:
     rmse_mw : float
     shift : str
         The judgement against the reference; empty: none.
+    exponent : float
+        The m of u = V p^m; NaN: not told.
     """
 
     breakpoints: tuple[float, ...]
@@ -59,6 +62,7 @@ class CurveView:
     samples: int
     rmse_mw: float
     shift: str
+    exponent: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)

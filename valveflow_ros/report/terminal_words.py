@@ -94,14 +94,14 @@ def alarms_words(frame: Frame) -> list[Said]:
     """Say which alarms stand, the most urgent first."""
     standing = [alarm for alarm in frame.alarms if alarm.standing]
     if not standing:
-        return [('none', 'good')]
+        return [('None.', 'good')]
     return [alarm_words(a) for a in sorted(standing, key=lambda a: (a.state, a.raised_ns))]
 
 
 def inputs_words(frame: Frame) -> list[Said]:
     """Say what is wrong with inputs, a line each, and the rest in one line."""
     if not frame.inputs:
-        return [('nothing is known of them yet.', 'dim')]
+        return [('Nothing has come from any of them yet.', 'dim')]
     # What is wrong with several at once is one line, such as a gateway that has stopped.
     groups: dict[tuple[int, str], list[str]] = {}
     for item in frame.inputs:
@@ -123,14 +123,14 @@ def health_words(item: HealthView) -> Said:
 def recorder_words(frame: Frame) -> Said:
     """Say how the recorder is."""
     if frame.recorder is None:
-        return 'nothing is known of it yet.', 'dim'
+        return 'Nothing is known of it yet.', 'dim'
     return frame.recorder.sentence, _TONES.get(frame.recorder.level, 'bad')
 
 
 def diagnosis_words(diagnosis: DiagnosisView | None) -> Said:
     """Say what the last diagnosis found."""
     if diagnosis is None:
-        return f'{VERDICTS[0]}.', 'dim'
+        return 'None yet.', 'dim'
     if not diagnosis.verdict and diagnosis.sentence:
         return diagnosis.sentence, 'dim'
     names = f' ({", ".join(diagnosis.causes)})' if diagnosis.causes else ''

@@ -149,7 +149,7 @@ def timeline_figure(history: History) -> Figure:
         'the same time.</b> A bar lasts as long as the alarm is in that state; a sign marks its '
         'beginning, and tells the sentence when pointed at. Where there is no bar, all was normal.'
     )
-    words = f'Time line of {counted(len(names), "alarm")} with {len(history.alarms)} changes.'
+    words = f'Time line of {counted(len(names), "alarm")} with {_changes(len(history.alarms))}.'
     height = 150 + _ROW * max(2, len(rows))
     return Figure('alarms', caption, words, traces, layout, height=height)
 
@@ -169,12 +169,14 @@ def alarms_table(history: History) -> str:
     stood = standing_s(history)
     told = f'Some alarm stood for {duration(stood)} in all.' if stood else 'No alarm ever stood.'
     if len(history.alarms) > len(shown):
-        told += f' The last {len(shown)} changes:'
+        told += f' The last {_changes(len(shown))}:'
     body = table(['time', 'alarm', 'state', 'what it said'], rows, sentences=True)
-    return (
-        paragraph(told)
-        + f'<details><summary>All {len(shown)} changes in words</summary>{body}</details>'
-    )
+    what = 'The change' if len(shown) == 1 else f'All {_changes(len(shown))}'
+    return paragraph(told) + f'<details><summary>{what} in words</summary>{body}</details>'
+
+
+def _changes(number: int) -> str:
+    return counted(number, 'change')
 
 
 def _cells(change: AlarmMoment) -> list[str]:

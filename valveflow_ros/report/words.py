@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from fractions import Fraction
 
 from valveflow_ros.core.characteristic import HeldCause
@@ -19,8 +20,16 @@ def exponent(value: float) -> str:
 
 
 def input_unit(value: float) -> str:
-    """Return the unit of u as HTML."""
-    return f'% MPa<sup>{exponent(value)}</sup>'
+    """Return the unit of u as HTML; m stands for an exponent that is not known."""
+    return f'% MPa<sup>{exponent(value) if math.isfinite(value) else "m"}</sup>'
+
+
+def input_unit_plain(value: float) -> str:
+    """Return the unit of u as plain text: '% MPa^(9/8)'; of an exponent not known, '% MPa^m'."""
+    if not math.isfinite(value):
+        return '% MPa^m'
+    power = exponent(value)
+    return f'% MPa^({power})' if '/' in power else f'% MPa^{power}'
 
 
 def input_title(value: float) -> str:

@@ -21,7 +21,7 @@ from valveflow_ros.ros.secure_start import check_security
 from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.stops import StopFlag
 from valveflow_ros.ros.transport import choose_transport
-from valveflow_ros.ros.usage import usage, wants_help
+from valveflow_ros.ros.usage import show, usage, wants_help
 from valveflow_ros.ros.watchdog import Watchdog
 
 # A look costs the same for one message as for ten, and a plant is in no hurry. Where much
@@ -67,7 +67,7 @@ class _Supervised(MonitorNode):
 def main(args: Sequence[str] | None = None) -> int:
     """Run the monitor until it is asked to stop; return the exit status."""
     if wants_help(args):
-        print(usage(_ABOUT, _EXAMPLE, TABLE))
+        show(usage(_ABOUT, _EXAMPLE, TABLE))
         return 0
     # Recordings, logs and compiled code are nobody else's business, whatever the shell allowed.
     before = os.umask(0o077)

@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from valveflow_ros.config import Settings
-from valveflow_ros.errors import ParameterError, ValveflowError
+from valveflow_ros.errors import ParameterError, ValveflowError, counted
 from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.ros import declare
 from valveflow_ros.ros.diagnostics import Changes, Item, Level, array
@@ -164,7 +164,7 @@ class MonitorNode(LifecycleNode):
         status = session.close()
         if status is not None:
             self.get_logger().info(
-                f'Recorded {status.written} messages to {session.recording.folder}.'
+                f'Recorded {counted(status.written, "message")} to {session.recording.folder}.'
             )
         if status is not None and session.recording.problem:
             self.get_logger().error(session.recording.problem)

@@ -12,6 +12,7 @@ import numpy as np
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.diagnosis_task import DiagnosisContent, DiagnosisTask
 from valveflow_ros.core.fit_task import FitTask
+from valveflow_ros.errors import counted
 from valveflow_ros.ros.diagnosis_message import VERDICTS, diagnosis
 from valveflow_ros.ros.encoding import encode
 
@@ -45,7 +46,7 @@ def objection(task: FitTask, result: object) -> str:
     pieces = result.pieces
     most = task.settings.whole('max_pieces')
     if not 1 <= len(pieces) <= most:
-        return f'The fit gave {len(pieces)} pieces where 1 to {most} are possible.'
+        return f'The fit gave {counted(len(pieces), "piece")} where 1 to {most} are possible.'
     numbers = [x for p in pieces for x in (p.u_from, p.u_to, p.slope, p.intercept)]
     numbers += [x for d in result.dynamics for x in (d.time_constant_s, d.delay_s)]
     numbers += [result.residuals.rmse_mw, result.residuals.average_sd_mw]

@@ -12,8 +12,9 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from valveflow_ros.errors import ValveflowError
+from valveflow_ros.errors import ValveflowError, counted
 from valveflow_ros.logs import open_log
+from valveflow_ros.report.terminal_number import number
 from valveflow_ros.report.terminal_progress import Progress
 from valveflow_ros.ros.playing import Player
 from valveflow_ros.ros.replay_steps import steps_of
@@ -21,6 +22,7 @@ from valveflow_ros.ros.secure_start import check_security
 from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.stops import StopFlag
 from valveflow_ros.ros.transport import choose_transport
+from valveflow_ros.ros.usage import Parser
 from valveflow_ros.ros.verify import verify
 
 # As a shell tells of a process that Ctrl-C has ended.
@@ -29,7 +31,7 @@ _STOPPED = 130
 
 def parser() -> argparse.ArgumentParser:
     """Return the description of the command line."""
-    made = argparse.ArgumentParser(
+    made = Parser(
         prog='replay',
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description='Publish a log on the input topics, with /clock, as a gateway would, or '
@@ -42,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument('log', metavar='LOG', help='.mcap, rosbag2 folder, .csv or .parquet')
     made.add_argument(
         '--rate',
-        type=_rate,
+        type=number('seconds of the log in a second', 0, 1e6, '--rate 600'),
         default=1.0,
         metavar='R',
         help="seconds of the log's own time in a second; 0: as fast as the monitor takes it "
@@ -50,7 +52,7 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument(
         '--wait',
-        type=float,
+        type=number('a number of seconds', 0, 1e6, '--wait 60'),
         default=180.0,
         metavar='S',
         help='how long to wait for a subscriber on every topic; 0: begin at once (default: 180)',
@@ -63,13 +65,6 @@ def parser() -> argparse.ArgumentParser:
         'every recorded output byte for byte',
     )
     return made
-
-
-def _rate(text: str) -> float:
-    rate = float(text)
-    if not 0.0 <= rate <= 1e6:
-        raise argparse.ArgumentTypeError(f'must be from 0 to 1000000, not {text}')
-    return rate
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -91,7 +86,15 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _verify(path: str) -> int:
-    progress = Progress(sys.stderr, sys.stderr.isatty() and os.environ.get('TERM') != 'dumb')
+    bar = sys.stderr.isatty() and os.environ.get('TERM') != 'dumb'
+    if not bar:
+        # A line now and then shows how far it is; the first comes after a while.
+        print(
+            f'Verifying {path}: its inputs are fed to the engine again, and every recorded output '
+            'is compared byte for byte. How far it is will be told now and then.',
+            file=sys.stderr, flush=True,
+        )  # fmt: skip
+    progress = Progress(sys.stderr, bar)
     progress.at(0.0, 'reading the recording')
     try:
         result = verify(path, lambda share: progress.at(share, 'feeding the recording again'))
@@ -99,9 +102,9 @@ def _verify(path: str) -> int:
         progress.end()
     for warning in result.warnings:
         print(warning, file=sys.stderr)
-    print(f'{result.inputs} input messages, {result.rows} samples')
+    print(f'{counted(result.inputs, "input message")}, {counted(result.rows, "sample")}')
     for name, count in result.compared.items():
-        print(f'{name}: {count} messages equal')
+        print(f'{name}: {counted(count, "message")} equal')
     print('identical' if result.identical else f'different: {result.difference}')
     return 0 if result.identical else 1
 
@@ -133,7 +136,7 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
         count = player.play(steps)
         total = sum(player.sent.values())
         end = 'Stopped' if stop else 'Finished'
-        say.info(f'{end} after {count} instants, {total} messages.')
+        say.info(f'{end} after {counted(count, "instant")}, {counted(total, "message")}.')
         return 0
     finally:
         stop.last()

@@ -12,7 +12,7 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from valveflow_ros.errors import ParameterError, ValveflowError
+from valveflow_ros.errors import ParameterError, ValveflowError, counted
 from valveflow_ros.plant.simulator import simulate_parts
 from valveflow_ros.records import SIGNALS, SampleTable, Signal
 from valveflow_ros.ros import simulator_steps as steps
@@ -23,7 +23,7 @@ from valveflow_ros.ros.secure_start import check_security
 from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.stops import StopFlag
 from valveflow_ros.ros.transport import choose_transport
-from valveflow_ros.ros.usage import usage, wants_help
+from valveflow_ros.ros.usage import show, usage, wants_help
 
 _EFFECTS = ParameterDescriptor(
     description='What is wrong with the plant: texts of the form name or name:key=value,... as '
@@ -46,8 +46,8 @@ _EXAMPLE = (
 def main(args: Sequence[str] | None = None) -> int:
     """Simulate and publish; return the exit status."""
     if wants_help(args):
-        print(usage(_ABOUT, _EXAMPLE, steps.TABLE))
-        print(f'  {"effects":28} []\n  {"":28} {_EFFECTS.description}')
+        show(usage(_ABOUT, _EXAMPLE, steps.TABLE))
+        show(f'  {"effects":28} []\n  {"":28} {_EFFECTS.description}')
         return 0
     stop = StopFlag().install()
     try:
@@ -88,10 +88,12 @@ def _run(node: Node, stop: StopFlag) -> int:
     if missing and wait_s > 0 and not stop:
         log.warning(f'Nobody listens to {", ".join(missing)}.')
     wrong = ', '.join(str(effect) for effect in effects) or 'nothing'
-    log.info(f'{days:g} days of plant, seed {seed}; wrong with it: {wrong}.')
+    log.info(f'{counted(days, "day")} of plant, seed {seed}; wrong with it: {wrong}.')
     count = player.play(made)
     end = 'Stopped' if stop else 'Finished'
-    log.info(f'{end} after {count} samples, {sum(player.sent.values())} messages.')
+    log.info(
+        f'{end} after {counted(count, "sample")}, {counted(sum(player.sent.values()), "message")}.'
+    )
     return 0
 
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
+import os
+import re
 import sys
 from collections.abc import Iterable, Sequence
+from typing import NoReturn
 
 from valveflow_ros.config import Parameter
 
@@ -14,6 +18,27 @@ def wants_help(args: Sequence[str] | None) -> bool:
     """Tell whether somebody asked what there is to give."""
     given = sys.argv[1:] if args is None else args
     return any(word in ('-h', '--help') for word in given)
+
+
+def show(text: str) -> None:
+    """Print, also where whoever reads has had enough: ``monitor --help | head``."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        # What is left over is flushed again at the end of the process.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose help may be cut short by whoever reads it."""
+
+    def print_help(self, file: object = None) -> None:
+        """Print the help on stdout."""
+        show(self.format_help().rstrip('\n'))
+
+    def error(self, message: str) -> NoReturn:
+        """Refuse what was typed, in words."""
+        super().error(re.sub(r'^argument (\S+): must ', r'\1 must ', message))
 
 
 def usage(about: str, example: str, rows: Iterable[Parameter]) -> str:

@@ -21,7 +21,7 @@ from valveflow_ros.core.events import Event, JournalEntry, JournalKind
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.offline import JournalReplayer
 from valveflow_ros.diagnosis import model_json
-from valveflow_ros.errors import DataError, RecordingError, ValveflowError
+from valveflow_ros.errors import DataError, RecordingError, ValveflowError, counted
 from valveflow_ros.logs import LogContents, LoggedMessage, open_log
 from valveflow_ros.records import Readings
 from valveflow_ros.ros import conversions, model_file
@@ -238,7 +238,9 @@ def _compare(
     number = result.compared.get(output.name, 0) + 1
     what = f'{output.name} number {number}'
     if then is None:
-        raise _DifferenceError(f'The recording ends before {what}, after {result.rows} rows.')
+        raise _DifferenceError(
+            f'The recording ends before {what}, after {counted(result.rows, "row")}.'
+        )
     if outputs[then.topic] != output.name:
         raise _DifferenceError(
             f'The replay gives {what} where the recording has {outputs[then.topic]}.'

@@ -18,10 +18,12 @@ from rclpy.utilities import remove_ros_args
 
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.report.terminal_board import CURVE, HEALTH
+from valveflow_ros.report.terminal_number import number
 from valveflow_ros.report.terminal_screen import Screen
 from valveflow_ros.ros.secure_start import check_security
 from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.transport import choose_transport
+from valveflow_ros.ros.usage import Parser
 from valveflow_ros.ros.watch_node import WatchNode
 
 _LOOK_S = 0.5
@@ -31,7 +33,7 @@ _FIND_S, _HEAR_S = 5.0, 3.0
 
 def parser() -> argparse.ArgumentParser:
     """Return the description of the command line."""
-    made = argparse.ArgumentParser(
+    made = Parser(
         prog='watch',
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description='Show how a running monitor is doing, drawn anew once a second: the curve '
@@ -44,20 +46,14 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument('--once', action='store_true', help='print one picture, then stop')
     made.add_argument(
-        '--interval', type=_seconds, default=1.0, metavar='S',
+        '--interval', default=1.0, metavar='S',
+        type=number('a number of seconds', 0.1, 3600, '--interval 5'),
         help='seconds between two pictures (default: 1)',
     )  # fmt: skip
     made.add_argument(
         '--json', action='store_true', help='with --once: print the picture as JSON, for programs'
     )
     return made
-
-
-def _seconds(text: str) -> float:
-    value = float(text)
-    if not 0.1 <= value <= 3600.0:
-        raise argparse.ArgumentTypeError(f'must be from 0.1 to 3600 s, not {text}')
-    return value
 
 
 def main(args: Sequence[str] | None = None) -> int:

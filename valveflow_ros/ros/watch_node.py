@@ -71,12 +71,12 @@ class WatchNode(Node):
         if not self.monitor:
             what = self._wanted or 'a monitor'
             return (
-                f'Waiting for {what}. Is it started, with the same ROS_DOMAIN_ID and '
-                'ROS_AUTOMATIC_DISCOVERY_RANGE?'
+                f'Waiting for {what}. If one runs, compare ROS_DOMAIN_ID and '
+                'ROS_AUTOMATIC_DISCOVERY_RANGE here and there: they must be the same.'
             )
         if not self.count_publishers(self.monitor + _CURVE_TOPIC):
             return 'The monitor has gone; this is what it said last.'
-        return '' if self.heard else 'Waiting for its first word.'
+        return '' if self.heard else 'The monitor was found; nothing has come from it yet.'
 
     def _listen(self, monitor: str) -> None:
         self.monitor = monitor

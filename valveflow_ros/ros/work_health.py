@@ -9,6 +9,7 @@ from valveflow_ros.core.alarm_voice import VoicedAlarm
 from valveflow_ros.core.curve_status import CurveStatus
 from valveflow_ros.core.identifiability import weaknesses
 from valveflow_ros.core.monitor import Monitor
+from valveflow_ros.errors import counted
 from valveflow_ros.logs import RecorderState
 from valveflow_ros.ros.diagnostics import Item, Level
 from valveflow_ros.ros.recording import Recording
@@ -23,7 +24,9 @@ def fit_item(monitor: Monitor, worker: FitWorker, last_fit_s: float | None) -> I
     curve = monitor.characteristic
     values = _fit_values(monitor, worker, last_fit_s)
     if worker.failures_in_a_row:
-        sentence = f'{monitor.cause} {worker.failures_in_a_row} failures in a row.'.strip()
+        sentence = (
+            f'{monitor.cause} {counted(worker.failures_in_a_row, "failure")} in a row.'.strip()
+        )
         return Item('fit', Level.ERROR, sentence, values)
     if curve is None:
         refused = monitor.status == CurveStatus.REFUSED
@@ -42,7 +45,7 @@ def fit_item(monitor: Monitor, worker: FitWorker, last_fit_s: float | None) -> I
     if weak:
         more = f' Weak points in all: {len(weak)}.' if len(weak) > 1 else ''
         return Item('fit', Level.WARN, weak[0] + more, values)
-    return Item('fit', Level.OK, f'A curve of {len(curve.pieces)} pieces.', values)
+    return Item('fit', Level.OK, f'A curve of {counted(len(curve.pieces), "piece")}.', values)
 
 
 def _fit_values(
@@ -160,5 +163,10 @@ def recorder_item(recording: Recording) -> Item:
         return Item('recorder', Level.ERROR, f'Not recording: {status.reason}', values)
     if dropped or status.lost:
         missing = dropped + status.lost
-        return Item('recorder', Level.WARN, f'{missing} messages are missing.', values)
+        return Item(
+            'recorder',
+            Level.WARN,
+            f'{counted(missing, "message is", "messages are")} missing.',
+            values,
+        )
     return Item('recorder', Level.OK, 'Recording.', values)

@@ -6,6 +6,7 @@ import numpy as np
 
 from valveflow_ros.diagnosis.cause import Kind, Unknown
 from valveflow_ros.diagnosis.scene import DAY_S, Scene
+from valveflow_ros.errors import counted
 from valveflow_ros.records import FloatArray
 
 TEN_DAYS_S = 10.0 * DAY_S
@@ -43,8 +44,8 @@ def _at_least(scene: Scene, days: float) -> str:
     if scene.days >= 0.98 * days:
         return ''
     return (
-        f'it changes with time, and the record lasts {scene.days:.2g} days; '
-        f'at least {days:g} are needed'
+        f'it changes with time, and the record lasts '
+        f'{counted(float(f"{scene.days:.2g}"), "day")}; at least {days:g} are needed'
     )
 
 
