@@ -247,8 +247,9 @@ _ALARM = (
     Parameter('alarm_shelve_time', 28800.0, 's',
               'An alarm that was put aside comes back by itself after this time.',
               60.0, 604800.0, live=True),
-    Parameter('alarm_suppress_time', 600.0, 's',
-              'The residual alarm is suppressed when it could not be judged for this long.',
+    Parameter('alarm_suppress_time', 3600.0, 's',
+              'The residual alarm is suppressed when it could not be judged for this long; it '
+              'comes back when it could be for alarm_off_delay, or at once if it changes.',
               1.0, 86400.0, live=True),
     Parameter('alarm_flood', 5, '',
               'Most announcements of one alarm in ten minutes; more are counted and held back.',

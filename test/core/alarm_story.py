@@ -22,7 +22,8 @@ class SlowLife:
     def __init__(self, settings):
         self.alarm = NaiveAlarm(settings)  # delays, dead band, latch, acknowledgement
         self.suppress_after = round(settings['alarm_suppress_time'] * S)
-        self.come_back_after = round(settings['alarm_block'] * S)
+        lasting = max(settings['alarm_block'], settings['alarm_off_delay'])
+        self.come_back_after = round(lasting * S)
         self.shelf_time = round(settings['alarm_shelve_time'] * S)
         self.most = settings['alarm_flood']
         self.gap = self.alarm.gap

@@ -184,7 +184,7 @@ def test_bad_data_neither_raise_nor_clear():
     alarm = ResidualAlarm(Settings(QUICK))
     assert fed(alarm, math.nan, 100) == []
     fed(alarm, 9.0, 20, 100)
-    ((_, change),) = fed(alarm, math.nan, 1000, 120)
+    ((_, change),) = fed(alarm, math.nan, 4000, 120)
     assert change.state == AlarmState.SUPPRESSED
     assert alarm.active
 

@@ -161,6 +161,29 @@ def test_flickering_data_do_not_make_it_chatter():
     assert fed(patient, [0.0, *([math.nan] * 29 + [0.0]) * 50]) == []
 
 
+@pytest.mark.parametrize('out_min', [10, 30, 59])
+@pytest.mark.parametrize('before', [0.0, 2.0])
+def test_a_valve_beyond_the_curve_some_times_a_day_is_not_told(out_min, before):
+    """By its own defaults an alarm stays what it is, standing or not; and it sees what comes."""
+    alarm = ResidualAlarm(Settings())
+    came = fed(alarm, [before] * 3600)
+    assert len(came) == (before > 1.0)
+    beyond, within = [math.nan] * (60 * out_min), [before] * 1200
+    assert fed(alarm, [*beyond, *within] * 8, 3600) == []
+    now_s = 3600 + 8 * (len(beyond) + len(within))
+    ((_, change),) = fed(alarm, [*beyond, *[2.0 - before] * 1200], now_s)
+    assert change.state == (RETURNED if before else UNACKNOWLEDGED)
+
+
+def test_what_was_suppressed_comes_back_as_slowly_as_a_condition_goes():
+    alarm = ResidualAlarm(Settings())
+    hour, glimpse = [math.nan] * 3600, [0.0] * 299
+    (dark,) = fed(alarm, [0.0, *(hour + glimpse) * 5])
+    assert dark[1].state == SUPPRESSED
+    ((row, back),) = fed(alarm, [*hour, *[0.0] * 400], 100_000)
+    assert (row, back.state) == (3600 + 300, NORMAL)
+
+
 def test_a_silence_without_rows_suppresses_nothing():
     alarm = ResidualAlarm(Settings({'alarm_suppress_time': 30.0}))
     assert fed(alarm, [0.0] * 10) == []

@@ -131,8 +131,10 @@ def _watch(
 class ResidualAlarm(VoicedAlarm):
     """Judge the evidence that the plant has left the curve: beyond 1 or -1 it has.
 
-    Where the evidence cannot be judged for long, the alarm is suppressed; it comes back when a
-    whole block of the residual was judged, since evidence before that is of old data.
+    Where the evidence cannot be judged for long, the alarm is suppressed. By ISA-18.2 that is no
+    annunciation, and it must not flutter: a valve that runs beyond the curve for some minutes,
+    some times a day, suppresses nothing. The alarm comes back when the evidence could be judged
+    as long as a return of the condition has to last, and at once if the condition turns.
 
     Parameters
     ----------
@@ -160,7 +162,10 @@ class ResidualAlarm(VoicedAlarm):
         self._off_ns = round(settings.real('alarm_off_delay') * NS_PER_S)
         self._gap_ns = round(1.5 * settings.real('sample_period') * NS_PER_S)
         self._dark_ns = round(settings.real('alarm_suppress_time') * NS_PER_S)
-        self._back_ns = round(settings.real('alarm_block') * NS_PER_S)
+        # A return lasts as long as that of the condition, and at least a block: evidence from
+        # before it is of old data.
+        back_s = max(settings.real('alarm_block'), settings.real('alarm_off_delay'))
+        self._back_ns = round(back_s * NS_PER_S)
 
     def feed(
         self,
