@@ -34,15 +34,21 @@ class Ran:
         return content
 
     def refused(self, status: int = 1) -> str:
-        """Assert that it was refused with one sentence; return it."""
+        """Assert that it was refused with one sentence (or a list below one); return it."""
         assert self.status == status, self.err
         assert self.out == ''
         assert 'Traceback' not in self.err
-        last = self.err.rstrip('\n').splitlines()[-1]
-        assert last.startswith('valveflow: ')
-        assert last.endswith(('.', '?', '"')), last
-        assert 'nan' not in last.split()
-        return last
+        lines = self.err.rstrip('\n').splitlines()
+        listed = [k for k, line in enumerate(lines) if line.startswith('valveflow: ')]
+        assert listed, self.err
+        said = lines[listed[-1] :]
+        first = said[0]
+        assert first.endswith(('.', '?', '"') if len(said) == 1 else ('.', ':')), first
+        # What follows is a list, or a command in a line of its own.
+        assert all(line.startswith(('  ', 'Then this', 'Add ')) for line in said[1:]), said
+        text = '\n'.join(said)
+        assert 'nan' not in text.split()
+        return text
 
 
 Run = Callable[..., Ran]

@@ -18,6 +18,7 @@ from valveflow_ros.core.events import FitRequested
 from valveflow_ros.core.fit import fit
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.offline import feed_aligned
+from valveflow_ros.core.unit_table import air_in
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.numbers import duration
@@ -89,8 +90,16 @@ def fitted(log: LogInput, unit_tag: str | None, console: Console) -> Fitted:
 def _units(log: LogInput, found: Fitted) -> None:
     for signal, unit in log.units.items():
         name = f'{SIGNALS[signal].topic}_unit'
-        if unit != PARAMETERS[name].default and signal not in log.constants:
-            found.put(name, unit, f"'{log.name_of(signal)}' of the log is in {unit}")
+        if signal in log.constants or unit == PARAMETERS[name].default:
+            continue
+        said = f"'{log.name_of(signal)}' of the log is in {unit}"
+        if unit in PARAMETERS[name].choices:
+            found.put(name, unit, said)
+            continue
+        if air_in(signal, unit):
+            said += ', a gauge pressure, and the monitor wants it absolute'
+        choices = ', '.join(PARAMETERS[name].choices)
+        found.left.append(f'{name}: {clean(said)}; let the gateway send one of {choices}.')
 
 
 def _steps(log: LogInput, found: Fitted) -> None:

@@ -10,10 +10,12 @@ import numpy as np
 
 from valveflow_ros.cli.console import Console
 from valveflow_ros.cli.historian_facts import Imported, SignalSource, Tally
+from valveflow_ros.cli.historian_open import joined
 from valveflow_ros.cli.historian_order import Ordered
 from valveflow_ros.cli.historian_spool import Spool
 from valveflow_ros.cli.log_input import (
     advice,
+    air_note,
     check_constants,
     names_for,
     refuse_guesses,
@@ -26,6 +28,7 @@ from valveflow_ros.cli.plausible import doubt
 from valveflow_ros.config import Settings
 from valveflow_ros.core.unit_table import convert
 from valveflow_ros.errors import DataError, InputError, RecordingError
+from valveflow_ros.logs.historian_refusal import RefusedError
 from valveflow_ros.logs.reader import TABLE_SUFFIXES
 from valveflow_ros.logs.table_reader import RawBlock, TableReader
 from valveflow_ros.records import (
@@ -56,6 +59,9 @@ class Historian:
         What the person said of it.
     console : Console
         Hears what was understood and what looks wrong.
+    strict : bool
+        Refuse also a column that the person named without its unit, where its values speak
+        against the usual one; otherwise that is a warning.
 
     Raises
     ------
@@ -63,11 +69,14 @@ class Historian:
         It cannot be read, a column is missing, a unit unknown.
     """
 
-    def __init__(self, path: Path, mapping: Mapping, console: Console) -> None:
+    def __init__(
+        self, path: Path, mapping: Mapping, console: Console, *, strict: bool = False
+    ) -> None:
         if path.suffix.lower() not in TABLE_SUFFIXES:
             raise RecordingError(path, 'is no .csv, .xlsx or .parquet table')
         self._console = console
         self._mapping = mapping
+        self._strict = strict
         self._reader = _reader(path, mapping)
         self._constants = {
             info.signal: mapping.constants[info.topic].value
@@ -116,16 +125,26 @@ class Historian:
                 uncertain += _uncertain(block, name)
             if spool is not None:
                 self._keep(block, spool)
-        notes = self._reader.notes()
+        refused: list[RefusedError] = []
+        try:
+            notes = self._reader.notes()
+        except RefusedError as error:
+            refused.append(error)
+            notes = []
         ordered = Ordered.of(np.concatenate(times), self.is_long)
         if ordered.sorted_how:
             notes.append(ordered.sorted_how)
+        airs = (
+            air_note(_BY_COLUMN[name].signal, self._units[name], self._reader.names[name])
+            for name in self._used
+        )
+        notes += [note for note in airs if note]
         for note in notes:
             self._console.say(note)
         if not any(tally.known for tally in tallies.values()):
             path = self._reader.path
             raise DataError(f'{path}: there is no number in any of the columns used.')
-        self._judge(tallies)
+        self._judge(tallies, refused)
         if uncertain:
             self._console.warn(
                 f'{uncertain} values are marked uncertain; a plain recording has no place for '
@@ -186,23 +205,31 @@ class Historian:
                     'constant is used instead.'
                 )
 
-    def _judge(self, tallies: dict[str, Tally]) -> None:
-        """Refuse what was guessed wrongly, and warn of the rest; raises `InputError`."""
+    def _judge(self, tallies: dict[str, Tally], refused: list[RefusedError]) -> None:
+        """Refuse what was guessed wrongly, and warn of the rest; raises `RefusedError`."""
         settings, doubts = Settings(), {}
         for name, tally in tallies.items():
             signal = _BY_COLUMN[name].signal
             found = doubt(signal, tally.sample(), self._units[name], settings)
             if found is not None:
                 doubts[name] = found
-        grounds = {_BY_COLUMN[name].signal for name in self._reader.grounds}
+        guessed = {_BY_COLUMN[name].signal for name in self._reader.grounds}
         names = {_BY_COLUMN[name].signal: theirs for name, theirs in self._reader.names.items()}
-        try:
-            refuse_guesses(self._reader.path, doubts.values(), grounds, names)
-        except InputError:
+        said = {c.name for c in self._mapping.columns.values() if c.unit}
+        unsaid = {signal for signal in names if SIGNALS[signal].topic not in said}
+        for strict, grounds in ((False, guessed), (True, unsaid)):
+            # Who has to come back for one thing is told of the others too.
+            if strict and not (self._strict or refused):
+                break
+            try:
+                refuse_guesses(self._reader.path, doubts.values(), grounds, names)
+            except RefusedError as error:
+                refused[:] = [one for one in refused if not one.last] + [error]
+        if refused:
             # What was understood until then is of use to who has to correct it.
             for sentence in self._reader.understood():
                 self._console.say(sentence)
-            raise
+            raise joined(self._reader.path, refused)
         for name, found in doubts.items():
             self._console.warn(advice(found, self._reader.names[name]))
 
@@ -242,6 +269,7 @@ class Historian:
                         dict(self._reader.words[info.column].most_common(8)),
                         self._reader.empty[info.column],
                         self._reader.grounds.get(info.column, ''),
+                        air_note(info.signal, unit, self._reader.names[info.column]),
                     )
                 )
         return sources

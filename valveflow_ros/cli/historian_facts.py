@@ -21,7 +21,8 @@ class SignalSource:
 
     ``words`` counts what stands in cells in place of numbers, the most frequent
     first; ``empty`` counts cells that are empty or say so; ``ground`` says why the
-    column was chosen, where that had to be found out.
+    column was chosen, where that had to be found out; ``air`` what is added to a gauge
+    pressure.
     """
 
     topic: str
@@ -35,6 +36,7 @@ class SignalSource:
     words: dict[str, int] = field(default_factory=dict)
     empty: int = 0
     ground: str = ''
+    air: str = ''
 
 
 @dataclass(frozen=True, slots=True)

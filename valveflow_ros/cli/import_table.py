@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from argparse import ArgumentParser, Namespace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
+from valveflow_ros.cli.mapping import MAPPING_HELP, Mapping, add_mapping, read_mapping
 from valveflow_ros.cli.usage import UsageError
 
 if TYPE_CHECKING:
@@ -56,18 +58,42 @@ def run(options: Namespace, console: Console) -> Outcome:
     mapping = read_mapping(options.column, options.constant)
     if options.output is None and not options.dry_run:
         raise UsageError('Name the log to write with -o LOG.mcap, or add --dry-run to look only.')
-    from valveflow_ros.cli.historian import Historian
-    from valveflow_ros.cli.historian_spool import Spool
+    from valveflow_ros.cli.historian_command import told
+    from valveflow_ros.cli.historian_open import looked_through
     from valveflow_ros.cli.outputs import check_log
+    from valveflow_ros.errors import InputError
+    from valveflow_ros.logs.historian_refusal import RefusedError
 
     if options.output is not None:
         check_log(options.output, source=options.table, overwrite=options.overwrite)
+
+    def look(said: Mapping) -> Outcome:
+        return _imported(options, said, console)
+
+    try:
+        return looked_through(options.table, look, mapping, partial(_looked, options.table))
+    except RefusedError as refused:
+        raise InputError(told(refused, options)) from None
+
+
+def _looked(table: Path, mapping: Mapping) -> None:
+    """Read a table for what else is open, and say nothing of it."""
+    from valveflow_ros.cli.historian import Historian
+
+    with Path(os.devnull).open('w', encoding='utf-8') as nowhere:
+        Historian(table, mapping, Console(nowhere, nowhere, quiet=True), strict=True).read(None)
+
+
+def _imported(options: Namespace, mapping: Mapping, console: Console) -> Outcome:
+    from valveflow_ros.cli.historian import Historian
+    from valveflow_ros.cli.historian_spool import Spool
+
     console.progress(0.05, 'looking at the table')
     historian = Historian(options.table, mapping, console)
     console.progress(0.1, 'reading')
     if options.dry_run:
         imported, _ = historian.read(None)
-        return _outcome(imported, None)
+        return _outcome(imported, None, historian.is_long)
     spool = Spool(options.output.absolute().parent)
     try:
         imported, ordered = historian.read(spool)
@@ -107,28 +133,33 @@ def _written(
             historian.readings(spool, ordered), historian.signals, path,
             attachments=attachments, overwrite=replace,
         ).path  # fmt: skip
-    return _outcome(imported, place)
+    return _outcome(imported, place, historian.is_long)
 
 
-def _outcome(imported: Imported, written: Path | None) -> Outcome:
+def _outcome(imported: Imported, written: Path | None, long: bool) -> Outcome:
     last = 'Nothing was written (--dry-run).' if written is None else f'Wrote {written}.'
     log = None if written is None else str(written)
-    text = '\n'.join([*_understood(imported), last])
+    text = '\n'.join([*_understood(imported, long), last])
     return Outcome(text, {'log': log, **imported.summary()})
 
 
-def _understood(imported: Imported) -> list[str]:
+def _understood(imported: Imported, long: bool) -> list[str]:
     """Return what a person should check before trusting the log."""
     from valveflow_ros.cli.report_words import columns
     from valveflow_ros.report.numbers import count, counted, duration, moment
 
     first, last = imported.span_ns
+    # In a long table a row is one value of one signal.
+    read = counted(imported.rows_read, 'value' if long else 'row')
+    step = f'one of each signal every {duration(imported.period_s)}' if long else (
+        f'one every {duration(imported.period_s)}'
+    )  # fmt: skip
     lines = [
-        f'Read {count(imported.rows_read)} rows, one every {duration(imported.period_s)}, '
-        f'{moment(first)} to {moment(last)}.',
+        f'Read {read}, {step}, {moment(first)} to {moment(last)}.',
         f'Times: {imported.time_words}; zone: {_zone(imported.time_zone)}.',
         columns(_rows(imported), _HEAD),
     ]
+    lines += [source.air for source in imported.sources if source.air]
     for source in imported.sources:
         told = [f"{count(n)} '{word}'" for word, n in source.words.items()]
         told += [f'{count(source.empty)} empty'] if source.empty and source.words else []
@@ -137,9 +168,10 @@ def _understood(imported: Imported) -> list[str]:
     if imported.ignored:
         lines.append(f'Not used: {", ".join(imported.ignored)}.')
     if imported.duplicates:
+        were = 'was' if imported.duplicates == 1 else 'were'
         lines.append(
             f'{counted(imported.duplicates, "row")} had a time that stood there before and '
-            'were left out; the first of each was kept.'
+            f'{were} left out; the first of each was kept.'
         )
     if imported.gaps:
         longest = imported.gaps[0]

@@ -10,14 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from valveflow_ros.cli.console import Console
+from valveflow_ros.cli.historian_open import looked_through
 from valveflow_ros.cli.mapping import Column, Mapping
 from valveflow_ros.cli.plausible import Doubt, doubt, limits
 from valveflow_ros.cli.usage import UsageError
 from valveflow_ros.config import Settings
-from valveflow_ros.core.unit_table import UNITS, convert
+from valveflow_ros.core.unit_table import UNITS, air_in, convert, known_units
 from valveflow_ros.errors import DataError, InputError
 from valveflow_ros.logs import LogContents, open_log
-from valveflow_ros.logs.historian_match import option
+from valveflow_ros.logs.historian_match import choosing, option
+from valveflow_ros.logs.historian_refusal import THEIRS, RefusedError
 from valveflow_ros.records import SIGNALS, Quality, Readings, Signal
 
 # A column is not the signal it is named after if most of its values cannot be.
@@ -71,6 +73,10 @@ def open_input(path: Path, mapping: Mapping, console: Console) -> LogInput:
     units = {s: unit_for(s, mapping, told) for s in contents.signals}
     constants = {_BY_TOPIC[c.name].signal: c.value for c in mapping.constants.values()}
     check_constants(constants)
+    for signal in sorted(units.keys() - constants.keys()):
+        note = air_note(signal, units[signal], contents.signals[signal])
+        if note:
+            console.say(note)
     readings = _converted(contents.readings, units)
     doubts = _doubts(contents, units, constants)
     refuse_guesses(path, doubts, contents.grounds, contents.signals)
@@ -86,13 +92,17 @@ def open_input(path: Path, mapping: Mapping, console: Console) -> LogInput:
 
 def open_with(path: Path, mapping: Mapping) -> LogContents:
     """Open a log under the names of ``--column``; raises like `open_input`."""
-    columns, strange = names_for(mapping)
-    try:
-        return open_log(path, columns=columns, absent=list(mapping.constants), table=mapping.table)
-    except InputError as error:
-        if not strange:
-            raise
-        raise unknown_unit(strange[0]) from error
+
+    def look(said: Mapping) -> LogContents:
+        columns, strange = names_for(said)
+        try:
+            return open_log(path, columns=columns, absent=list(said.constants), table=said.table)
+        except InputError as error:
+            if not strange:
+                raise
+            raise unknown_unit(strange[0]) from error
+
+    return looked_through(path, look, mapping)
 
 
 def names_for(mapping: Mapping) -> tuple[dict[str, str], list[Column]]:
@@ -108,7 +118,7 @@ def names_for(mapping: Mapping) -> tuple[dict[str, str], list[Column]]:
 
 def unknown_unit(column: Column) -> UsageError:
     """Return the error for a unit nobody knows."""
-    known = ', '.join(UNITS[_BY_TOPIC[column.name].signal])
+    known = ', '.join(known_units(_BY_TOPIC[column.name].signal))
     return UsageError(
         f"Unit '{column.unit}' is unknown for {column.name}: use one of {known} "
         f"(and the log has nothing called '{column.whole}')."
@@ -116,7 +126,7 @@ def unknown_unit(column: Column) -> UsageError:
 
 
 def _is_known(column: Column) -> bool:
-    return not column.unit or column.unit in UNITS[_BY_TOPIC[column.name].signal]
+    return not column.unit or column.unit in known_units(_BY_TOPIC[column.name].signal)
 
 
 def unit_for(signal: Signal, mapping: Mapping, told: dict[Signal, str] | None = None) -> str:
@@ -153,6 +163,17 @@ def units_told(contents: LogContents) -> dict[Signal, str]:
     }
 
 
+def air_note(signal: Signal, unit: str, theirs: str) -> str:
+    """Return the sentence on what is added to a gauge pressure, empty for other units."""
+    air = air_in(signal, unit)
+    if not air:
+        return ''
+    return (
+        f"'{theirs}' is a gauge pressure ({unit}); {air:.6g} {unit.removesuffix('g')} of air, the "
+        'standard atmosphere, are added to make it absolute.'
+    )
+
+
 def check_constants(constants: dict[Signal, float]) -> None:
     """Refuse constants that the engine would reject at each row.
 
@@ -176,45 +197,54 @@ def check_constants(constants: dict[Signal, float]) -> None:
 def refuse_guesses(
     path: object, doubts: Iterable[Doubt], grounds: Container[Signal], names: dict[Signal, str]
 ) -> None:
-    """Refuse a column that was found by its name and whose values speak against it.
+    """Refuse the columns that were found by their names and whose values speak against it.
 
     Raises
     ------
-    InputError
-        With the option that would help.
+    RefusedError
+        With the options that would help.
     """
+    problems, remedies = [], []
     for found in doubts:
         if found.signal in grounds and (found.looks_like or found.impossible > _MOST):
             theirs = names[found.signal]
             topic = SIGNALS[found.signal].topic
             said = advice(found, theirs)
+            remedy = choosing(topic, theirs, found.looks_like)
             if not found.looks_like:
                 chosen = option(topic, theirs, SIGNALS[found.signal].unit)
                 said += f' If it is that signal all the same, add {chosen}; if not, name the right'
-                said += f' one with --column {topic}=THEIRS[:unit]'
+                said += f' one with --column {topic}={THEIRS}[:unit]'
+                remedy = choosing(topic, THEIRS)
             said = said.removeprefix(f'{topic}: ')
-            raise InputError(f"{path}: '{theirs}' reads like {topic}, but {said}.")
+            problems.append(f"'{theirs}' reads like {topic}, but {said}")
+            remedies.append(remedy)
+    if problems:
+        raise RefusedError(path, problems, remedies, last=True)
 
 
 def advice(found: Doubt, theirs: str) -> str:
     """Return the sentence about a doubtful signal, with the exact option that helps."""
     if not found.looks_like:
         return found.sentence
-    topic = SIGNALS[found.signal].topic
-    quoted = f"'{topic}={theirs}:{found.looks_like}'"
-    plain = quoted[1:-1]
-    return f'{found.sentence} If so, add --column {quoted if " " in theirs else plain}'
+    chosen = option(SIGNALS[found.signal].topic, theirs, found.looks_like)
+    return f'{found.sentence} If so, add {chosen}'
 
 
 def steps_of(readings: Readings) -> dict[Signal, float]:
     """Return the median time between readings of each signal that has several, in s."""
+    return steps_of_each(readings.by_signal())
+
+
+def steps_of_each(parts: dict[int, Readings]) -> dict[Signal, float]:
+    """Return the same of readings that are taken apart already."""
     steps: dict[Signal, float] = {}
-    for info in SIGNALS:
-        times = readings.time_ns[readings.signal == info.signal]
-        gaps = np.diff(times)
-        gaps = gaps[gaps > 0]
+    for signal, part in parts.items():
+        gaps = np.diff(part.time_ns)
+        if gaps.min(initial=1) <= 0:
+            gaps = gaps[gaps > 0]
         if len(gaps):
-            steps[info.signal] = float(np.median(gaps)) / 1e9
+            steps[Signal(signal)] = float(np.median(gaps)) / 1e9
     return steps
 
 

@@ -111,7 +111,8 @@ def _about(name: str) -> Callable[[str], About]:
 MAPPING_HELP = """\
 names and units (the usual unit first):
   valve_opening             %, fraction
-  main_steam_pressure       MPa, kPa, Pa, bar, psi; absolute
+  main_steam_pressure       MPa, kPa, Pa, bar, psi; absolute. MPag, kPag, barg, psig are gauge:
+                            0.101325 MPa of air is added
   main_steam_temperature    degC, K, degF
   generated_power           MW, kW, W
   valve_command             %, fraction; optional
@@ -167,8 +168,6 @@ def _split(option: str, text: str) -> tuple[str, str]:
 
 
 def _column(text: str) -> Column:
-    from valveflow_ros.core.unit_table import UNITS
-
     name, whole = _split('column', text)
     if name in _TIMES:
         return Column(name, whole, '', whole)
@@ -176,8 +175,7 @@ def _column(text: str) -> Column:
     theirs, colon, unit = whole.rpartition(':')
     if not colon or not theirs or not unit.strip():
         return Column(_topic(signal), whole, '', whole)
-    known = {spelling.lower(): spelling for spelling in UNITS[signal]}
-    unit = known.get(unit.strip().lower(), unit.strip())
+    unit = _unit(signal, unit)
     return Column(_topic(signal), theirs.strip(), unit, whole)
 
 
@@ -198,10 +196,20 @@ def _constant(text: str) -> Constant:
         raise UsageError(f'--constant {name}: the value must be finite.')
     if colon:
         try:
-            value = float(convert(signal, unit, np.array([value]))[0])
+            value = float(convert(signal, _unit(signal, unit), np.array([value]))[0])
         except InputError as error:
             raise UsageError(f'--constant {name}: {error}') from None
     return Constant(_topic(signal), value, rest)
+
+
+def _unit(signal: Signal, text: str) -> str:
+    """Return the project's name of a unit, the text itself if it spells none."""
+    from valveflow_ros.core.unit_table import known_units
+    from valveflow_ros.logs.historian_units import unit_named
+
+    written = text.strip()
+    known = {spelling.lower(): spelling for spelling in known_units(signal)}
+    return known.get(written.lower()) or unit_named(signal, written) or written
 
 
 def _signal(name: str, option: str) -> Signal:

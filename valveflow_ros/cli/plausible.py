@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.unit_table import UNITS
+from valveflow_ros.core.unit_table import UNITS, unit_of
 from valveflow_ros.records import SIGNALS, FloatArray, Signal
 
 # What the signals of a steam unit in operation usually read, in engine units.
@@ -56,13 +56,13 @@ def doubt(signal: Signal, written: FloatArray, unit: str, settings: Settings) ->
     written : float64 (n,)
         As they stand in the log.
     unit : str
-        The unit they are taken to have, one of `UNITS`.
+        The unit they are taken to have.
     """
     written = written[np.isfinite(written)]
     if not len(written):
         return None
     low, high = limits(signal, settings)
-    taken = UNITS[signal][unit]
+    taken = unit_of(signal, unit)
     values = written * taken.scale + taken.offset
     impossible = float(((values < low) | (values > high)).mean())
     looks_like = _better_unit(signal, written, unit, (low, high))
@@ -91,12 +91,12 @@ def _better_unit(
     low, high = _USUAL[signal]
 
     def usual(name: str) -> bool:
-        other = UNITS[signal][name]
+        other = unit_of(signal, name)
         values = written * other.scale + other.offset
         inside = (values >= allowed[0]) & (values <= allowed[1])
         return low <= middle * other.scale + other.offset <= high and bool(inside.mean() > 0.95)
 
-    own = UNITS[signal][unit]
+    own = unit_of(signal, unit)
     if usual(unit):
         return ''
     for name, other in UNITS[signal].items():

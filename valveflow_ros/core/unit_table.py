@@ -19,6 +19,9 @@ class Unit:
 
 
 _PSI_PA = 6894.757293168361  # NIST SP 811, table B.8
+_KGF_CM2_PA = 98066.5  # NIST SP 811, table B.8
+# What is added to a gauge pressure: the standard atmosphere (ISO 2533), at the level of the sea.
+AIR_MPA = 0.101325
 
 _OPENING = {'%': Unit(1.0), 'percent': Unit(1.0), 'fraction': Unit(100.0)}
 _PRESSURE = {
@@ -43,6 +46,31 @@ UNITS: dict[Signal, dict[str, Unit]] = {
     Signal.VALVE_COMMAND: _OPENING,
 }
 
+# Understood where a person or a file names them, and never guessed: nothing in the values tells
+# whether a pressure is gauge or absolute.
+FURTHER: dict[Signal, dict[str, Unit]] = {
+    Signal.MAIN_STEAM_PRESSURE: {
+        'barg': Unit(0.1, AIR_MPA),
+        'MPag': Unit(1.0, AIR_MPA),
+        'kPag': Unit(1e-3, AIR_MPA),
+        'psig': Unit(_PSI_PA * 1e-6, AIR_MPA),
+        'kg/cm2': Unit(_KGF_CM2_PA * 1e-6),
+        'mbar': Unit(1e-4),
+    },
+    Signal.GENERATED_POWER: {'GW': Unit(1e3)},
+}
+
+
+def known_units(signal: Signal) -> dict[str, Unit]:
+    """Return every unit that a signal of a log may have."""
+    return {**UNITS[signal], **FURTHER.get(signal, {})}
+
+
+def air_in(signal: Signal, name: str) -> float:
+    """Return what is added to a gauge pressure, in the unit it is in; 0 for any other unit."""
+    unit = unit_of(signal, name)
+    return unit.offset / unit.scale if unit.offset == AIR_MPA else 0.0
+
 
 def unit_of(signal: Signal, name: str) -> Unit:
     """Look a unit up by its name; capitals do not matter.
@@ -52,13 +80,11 @@ def unit_of(signal: Signal, name: str) -> Unit:
     InputError
         The unit is not one this signal can have; the sentence lists those it can.
     """
-    known = UNITS[signal]
-    for spelling, unit in known.items():
+    for spelling, unit in known_units(signal).items():
         if spelling.lower() == name.strip().lower():
             return unit
-    raise InputError(
-        f"Unit '{name}' is unknown for {SIGNALS[signal].topic}: use one of {', '.join(known)}."
-    )
+    known = ', '.join(UNITS[signal])
+    raise InputError(f"Unit '{name}' is unknown for {SIGNALS[signal].topic}: use one of {known}.")
 
 
 def convert(signal: Signal, name: str, values: FloatArray) -> FloatArray:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from valveflow_ros.errors import InputError, RecordingError
+from valveflow_ros.logs.historian_refusal import RefusedError, Remedy
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -70,9 +71,9 @@ def look_at_sheet(path: Path, wanted: str, most: int) -> tuple[str, list[list[st
         raise RecordingError(path, 'is a workbook without a table')
     if len(tables) > 1:
         several = ' and '.join(f"'{name}'" for name in tables)
-        raise InputError(
-            f"{path} has tables in the sheets {several}; choose with --sheet '{tables[0]}'."
-        )
+        sheet = Remedy('sheet', tables[0])
+        problem = f'there are tables in the sheets {several}; choose with {sheet}'
+        raise RefusedError(path, problem, [sheet])
     return tables[0], found[tables[0]]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from valveflow_ros.errors import InputError
+from valveflow_ros.logs.historian_refusal import RefusedError, Remedy
 
 # Formats of pandas, tried in this order on what the one before did not read.
 _CLOCKS_24 = (' %H:%M:%S', ' %H:%M:%S.%f', ' %H:%M', '')
@@ -117,9 +117,11 @@ def _day_first(
     if second_large and not first_large:
         return False
     both = 'day, month and year' if first_large else 'day and month'
-    raise InputError(
-        f"{where}: in '{example}' {both} cannot be told apart, here and in all rows looked at; "
-        'add --date-order dmy (day first) or --date-order mdy (month first).'
+    raise RefusedError(
+        where,
+        f"in '{example}' {both} cannot be told apart, here and in all rows looked at; "
+        'add --date-order dmy (day first) or --date-order mdy (month first)',
+        [Remedy('date-order', 'dmy')],
     )
 
 

@@ -76,12 +76,21 @@ def separator_of(lines: list[str]) -> str:
     """
     best, score = ',', 0.0
     for mark in _SEPARATORS:
-        sizes = Counter(len(row) for row in csv.reader(lines, delimiter=mark) if row)
+        # Line by line: a quote that is not closed would make one of all that follow.
+        sizes = Counter(size for line in lines if (size := len(cells_of(line, mark))))
         size, count = max(sizes.items(), key=lambda item: (item[1], item[0]), default=(1, 0))
         share = count / max(1, sum(sizes.values()))
         if size > 1 and share > 1.2 * score:
             best, score = mark, share
     return best
+
+
+def cells_of(line: str, separator: str) -> list[str]:
+    """Return the cells of a line; all of it is one where it cannot be parted."""
+    try:
+        return next(csv.reader([line], delimiter=separator), [])
+    except csv.Error:
+        return [line]
 
 
 def heading(rows: list[list[str]]) -> Heading:

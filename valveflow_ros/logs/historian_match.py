@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 import zoneinfo
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from valveflow_ros.errors import InputError
 from valveflow_ros.logs.historian_layout import Heading
+from valveflow_ros.logs.historian_refusal import THEIRS, RefusedError, Remedy
 from valveflow_ros.logs.historian_units import Spelling, is_foreign, spelling, split_unit
 from valveflow_ros.logs.historian_words import CLEAR, EXACT, LIKELY, TAG, folded, marks
 from valveflow_ros.records import SIGNALS, Signal
@@ -20,6 +21,13 @@ _TIME_WORDS = re.compile(
 )
 _DATE_WORDS = re.compile(r'^(?:date|datum|day|tag)$')
 _CLOCK_WORDS = re.compile(r'^(?:time|zeit|uhrzeit|clock|time of day)$')
+_LOCAL = {
+    **dict.fromkeys(('CET', 'MEZ', 'CEST', 'MESZ'), 'Europe/Berlin'),
+    'EET': 'Europe/Helsinki', 'WET': 'Europe/Lisbon', 'BST': 'Europe/London',
+    **dict.fromkeys(('EST', 'EDT'), 'America/New_York'),
+    **dict.fromkeys(('CST', 'CDT'), 'America/Chicago'),
+    **dict.fromkeys(('PST', 'PDT'), 'America/Los_Angeles'),
+}  # fmt: skip
 _GROUNDS = {EXACT: '', CLEAR: 'by its name', LIKELY: 'by its name', TAG: 'by its tag'}
 
 
@@ -47,10 +55,32 @@ class Chosen:
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """What the columns of a table stand for."""
+    """What the columns of a table stand for, and what is open.
 
-    signals: dict[Signal, Chosen] = field(default_factory=dict)
-    problems: tuple[str, ...] = ()
+    Attributes
+    ----------
+    signals : dict
+        What was found.
+    absent : dict
+        Columns that the person named and that are not there.
+    several : tuple of str
+        A sentence for each signal that several columns could be.
+    missing : tuple of str
+        Contract names of the signals that no column could be.
+    remedies : tuple of Remedy
+        An option for each of `several`.
+    """
+
+    signals: dict[Signal, Chosen]
+    absent: dict[Signal, str]
+    several: tuple[str, ...]
+    missing: tuple[str, ...]
+    remedies: tuple[Remedy, ...]
+
+    @property
+    def open(self) -> bool:
+        """Tell whether something is left to be said."""
+        return bool(self.absent or self.several or self.missing)
 
 
 class Matcher:
@@ -95,23 +125,18 @@ class Matcher:
         return same[0] if same else None
 
     def match(self, wanted: Mapping[Signal, str], spared: Collection[Signal]) -> Match:
-        """Return what was found for each signal, and a sentence for each that was not.
+        """Return what was found for each signal, and what is open about the others.
 
         Raises
         ------
         InputError
-            If a column that the person named is not there.
+            If several columns have the same name.
         """
-        chosen: dict[Signal, Chosen] = {}
-        for signal, theirs in wanted.items():
-            place = self.find(theirs)
-            if place is None:
-                raise self.missing(theirs, SIGNALS[signal].column)
-            chosen[signal] = Chosen(place, self.names[place], self.unit_of(place))
+        chosen, absent = self._named(wanted)
         marked = self._marked({c.place for c in chosen.values()})
-        problems = []
+        several, missing, remedies = [], [], []
         for info in SIGNALS:
-            if info.signal in chosen:
+            if info.signal in chosen or info.signal in absent:
                 continue
             best, mark = self._best(info.signal, marked)
             # A constant is to take the place of the signal, whatever the names suggest.
@@ -126,34 +151,57 @@ class Matcher:
                     f"{self.path}: there are several {self.what}s called '{self.names[best[0]]}'."
                 )
             elif best and info.required:
-                problems.append(self._several(info.topic, best))
+                several.append(self._several(info.topic, best))
+                remedies.append(Remedy('column', f'{info.topic}={self.names[best[0]]}'))
             elif info.required and info.signal not in spared:
-                problems.append(f"no {self.what} '{info.column}', and none that reads like it")
-        return Match(chosen, tuple(problems))
+                missing.append(info.column)
+        return Match(chosen, absent, tuple(several), tuple(missing), tuple(remedies))
 
-    def refusal(self, problems: Collection[str]) -> InputError:
-        """Return one sentence for everything that could not be decided."""
-        missing = [p.split("'")[1] for p in problems if p.startswith('no ')]
-        several = [p for p in problems if not p.startswith('no ')]
-        parts = list(several)
-        if missing:
-            have = ', '.join(name for name in self.names[:40])
-            absent = ', '.join(f"'{name}'" for name in missing)
-            topics = {info.column: info.topic for info in SIGNALS}
-            options = ' '.join(f'--column {topics.get(n, n)}=THEIRS[:unit]' for n in missing)
+    def _named(
+        self, wanted: Mapping[Signal, str]
+    ) -> tuple[dict[Signal, Chosen], dict[Signal, str]]:
+        """Return the columns that the person named, and those of them that are not there."""
+        chosen: dict[Signal, Chosen] = {}
+        absent: dict[Signal, str] = {}
+        for signal, theirs in wanted.items():
+            place = self.find(theirs)
+            if place is None:
+                absent[signal] = theirs
+            else:
+                chosen[signal] = Chosen(place, self.names[place], self.unit_of(place))
+        return chosen, absent
+
+    def refusal(self, found: Match, no_time: bool) -> RefusedError:
+        """Return one error for everything that could not be decided."""
+        topics = {info.column: info.topic for info in SIGNALS}
+        named = [f"'{theirs}'" for theirs in found.absent.values()]
+        missing = [*found.missing, *([TIME] if no_time else [])]
+        parts = list(found.several)
+        remedies = list(found.remedies)
+        absent = [SIGNALS[s].topic for s in found.absent] + [topics.get(n, n) for n in missing]
+        if absent:
+            told = ', '.join([*named, *(f"'{name}'" for name in missing)])
+            unit = '' if absent == [TIME] else '[:unit]'
+            options = ' '.join(f'--column {name}={THEIRS}{unit}' for name in absent)
+            constant = ', or give --constant NAME=VALUE for what hardly changes'
             parts.append(
-                f'there is no {self.what} {absent}; the {self.what}s are: {have}. Name yours with '
-                f'{options}, or give --constant NAME=VALUE for what hardly changes'
+                f'there is no {self.what} {told}; the {self.what}s are: {self._have()}. Name '
+                f'yours with {options}{constant if found.missing else ""}'
             )
-        return InputError(f'{self.path}: {"; ".join(parts)}.')
+            remedies += [Remedy('column', f'{name}={THEIRS}') for name in absent]
+        return RefusedError(self.path, '; '.join(parts), remedies)
 
-    def missing(self, theirs: str, name: str) -> InputError:
-        """Return the error for a column that the person named and that is not there."""
-        have = ', '.join(self.names[:40])
-        return InputError(
-            f"{self.path}: there is no {self.what} '{theirs}'; the {self.what}s are: {have}. "
-            f'Name theirs with --column {name}=THEIRS[:unit].'
+    def missing(self, theirs: str, name: str) -> RefusedError:
+        """Return the error for a column of times that the person named and that is not there."""
+        return RefusedError(
+            self.path,
+            f"there is no {self.what} '{theirs}'; the {self.what}s are: {self._have()}. "
+            f'Name yours with --column {name}={THEIRS}',
+            [Remedy('column', f'{name}={THEIRS}')],
         )
+
+    def _have(self) -> str:
+        return ', '.join(name for name in self.names[:40])
 
     def unit_of(self, place: int) -> Spelling | None:
         """Return the unit that the file names for a column."""
@@ -186,9 +234,12 @@ class Matcher:
 
 def option(topic: str, theirs: str, unit: str = '') -> str:
     """Return the option that chooses a column, as it can be pasted into a shell."""
-    value = f'{topic}={theirs}' + (f':{unit}' if unit else '')
-    plain = re.fullmatch(r'[\w.:/=%+-]+', value) is not None
-    return f'--column {value}' if plain else f"--column '{value}'"
+    return str(choosing(topic, theirs, unit))
+
+
+def choosing(topic: str, theirs: str, unit: str = '') -> Remedy:
+    """Return the option that chooses a column."""
+    return Remedy('column', f'{topic}={theirs}' + (f':{unit}' if unit else ''))
 
 
 def time_columns(heading: Heading) -> tuple[int | None, int | None]:
@@ -222,10 +273,13 @@ def zone_in(name: str) -> str:
     return found[1] if named else ''
 
 
-def local_zone_in(name: str) -> str:
-    """Return a zone's abbreviation in a name that does not say whether summer time is kept."""
-    found = re.search(r'\b(CET|MEZ|CEST|MESZ|EET|WET|BST|EST|EDT|CST|CDT|PST|PDT)\b', name)
-    return found[1] if found else ''
+def local_zone_in(name: str) -> tuple[str, str]:
+    """Return a zone's abbreviation in a name, and a place where it is used.
+
+    It does not say whether summer time is kept.
+    """
+    found = re.search(rf'\b({"|".join(_LOCAL)})\b', name)
+    return (found[1], _LOCAL[found[1]]) if found else ('', '')
 
 
 def _without_zone(name: str) -> str:

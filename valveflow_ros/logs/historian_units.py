@@ -16,8 +16,6 @@ DIMENSIONS = {
     Signal.GENERATED_POWER: POWER,
     Signal.VALVE_COMMAND: OPENING,
 }
-_BAR_OF_AIR = 1.01325  # the standard atmosphere, ISO 2533
-_PSI_OF_AIR = 14.695949
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,31 +28,21 @@ class Spelling:
         What it measures.
     unit : str
         The name the project knows it by.
-    scale, shift : float
-        ``value in unit = scale * (value as written + shift)``: gauge pressures
-        are made absolute, units of our grandfathers turned into known ones.
     written : str
         As it stands in the file.
     """
 
     dimension: str
     unit: str
-    scale: float = 1.0
-    shift: float = 0.0
     written: str = ''
-
-    @property
-    def plain(self) -> bool:
-        """Tell whether the values stand in the unit as they are."""
-        return self.scale == 1.0 and self.shift == 0.0
 
 
 def _spellings() -> dict[str, Spelling]:
     known: dict[str, Spelling] = {}
 
-    def put(dimension: str, unit: str, words: str, scale: float = 1.0, shift: float = 0.0) -> None:
+    def put(dimension: str, unit: str, words: str) -> None:
         for word in words.split():
-            known[word] = Spelling(dimension, unit, scale, shift)
+            known[word] = Spelling(dimension, unit)
 
     put(OPENING, '%', '% percent pct prozent proz perc %open %auf %offen')
     put(OPENING, 'fraction', 'fraction p.u. pu anteil')
@@ -63,19 +51,19 @@ def _spellings() -> dict[str, Spelling]:
     put(PRESSURE, 'Pa', 'pa pascal paabs')
     put(PRESSURE, 'bar', 'bar bara bar(a) barabs bar_a bar-a')
     put(PRESSURE, 'psi', 'psi psia psi(a) psiabs lb/in2 lbf/in2')
-    put(PRESSURE, 'bar', 'barg bar(g) barü barue bar(ü) bar(ue) bar_g bar-g', 1.0, _BAR_OF_AIR)
-    put(PRESSURE, 'MPa', 'mpag mpa(g)', 1.0, 0.1 * _BAR_OF_AIR)
-    put(PRESSURE, 'kPa', 'kpag kpa(g)', 1.0, 100.0 * _BAR_OF_AIR)
-    put(PRESSURE, 'psi', 'psig psi(g)', 1.0, _PSI_OF_AIR)
-    put(PRESSURE, 'bar', 'kg/cm2 kg/cm² kgf/cm2 kgf/cm² kp/cm2 kp/cm² ata', 0.980665)
-    put(PRESSURE, 'bar', 'mbar hpa', 1e-3)
+    put(PRESSURE, 'barg', 'barg bar(g) barü barue bar(ü) bar(ue) bar_g bar-g bargauge')
+    put(PRESSURE, 'MPag', 'mpag mpa(g) mpa_g mpa-g mpagauge')
+    put(PRESSURE, 'kPag', 'kpag kpa(g) kpa_g kpa-g kpagauge')
+    put(PRESSURE, 'psig', 'psig psi(g) psi_g psi-g psigauge')
+    put(PRESSURE, 'kg/cm2', 'kg/cm2 kg/cm² kgf/cm2 kgf/cm² kp/cm2 kp/cm² ata')
+    put(PRESSURE, 'mbar', 'mbar hpa')
     put(TEMPERATURE, 'degC', '°c degc deg.c ºc c cel celsius gradc grad deg_c ℃ ˚c')
     put(TEMPERATURE, 'K', 'k kelvin degk °k')
     put(TEMPERATURE, 'degF', '°f degf deg.f ºf f fahrenheit deg_f ℉ ˚f')
     put(POWER, 'MW', 'mw mwe mwel mw(e) mw(el) mw_e mw_el megawatt mwbrutto mwnetto mwgross mwnet')
     put(POWER, 'kW', 'kw kwe kwel kilowatt')
     put(POWER, 'W', 'w watt')
-    put(POWER, 'MW', 'gw gwe', 1e3)
+    put(POWER, 'GW', 'gw gwe')
     return known
 
 
@@ -135,7 +123,13 @@ def spelling(text: str) -> Spelling | None:
     found = SPELLINGS.get(_squeezed(text))
     if found is None:
         return None
-    return Spelling(found.dimension, found.unit, found.scale, found.shift, text.strip())
+    return Spelling(found.dimension, found.unit, text.strip())
+
+
+def unit_named(signal: Signal, text: str) -> str:
+    """Return the unit of this signal that a text spells, empty if it spells none."""
+    found = spelling(text)
+    return found.unit if found is not None and found.dimension == DIMENSIONS[signal] else ''
 
 
 def is_foreign(text: str) -> bool:

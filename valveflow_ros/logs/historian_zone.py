@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from valveflow_ros.errors import InputError
+from valveflow_ros.logs.historian_refusal import RefusedError, Remedy
 from valveflow_ros.records import IntArray
 
 if TYPE_CHECKING:
@@ -120,10 +121,12 @@ class LocalClock:
         first = pd.Timestamp(stamps[wrong].iloc[0])
         before = pd.Timestamp(first - pd.Timedelta(hours=3)).tz_localize(self._zone)
         offset = before.strftime('%z')
-        return InputError(
-            f'{self._where}: {first:%Y-%m-%d %H:%M:%S} does not exist in {self._name}, where the '
-            'clock was set forward then; the clock of the file was not. '
-            f'Use --time-zone {offset[:3]}:{offset[3:]}.'
+        zone = Remedy('time-zone', f'{offset[:3]}:{offset[3:]}')
+        return RefusedError(
+            self._where,
+            f'{first:%Y-%m-%d %H:%M:%S} does not exist in {self._name}, where the '
+            f'clock was set forward then; the clock of the file was not. Use {zone}',
+            [zone],
         )
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,6 +12,7 @@ from typing import TYPE_CHECKING
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.logs.historian_layout import (
     Heading,
+    cells_of,
     decimal_mark,
     encoding_of,
     heading,
@@ -110,7 +109,7 @@ class TableFile:
                 # From pandas 4 on the exact way of reading decimals is the only one.
                 warnings.simplefilter('ignore', DeprecationWarning)
                 frames = pd.read_csv(
-                    Lines(self.path, source.stream, self.encoding),
+                    Lines(self.path, source.stream, self.encoding, self.separator),
                     sep=self.separator,
                     decimal=marks.decimal,
                     header=0,
@@ -176,7 +175,7 @@ def _look_at_text(source: Source, path: Path, head: bytes, options: TableOptions
     separator = told[4:5] if told.lower().startswith('sep=') and len(told) == 5 else ''
     first = 1 if separator else 0
     separator = separator or separator_of([line for line in lines if line.strip()])
-    rows = [[] if k < first else _cells(line, separator) for k, line in enumerate(lines)]
+    rows = [[] if k < first else cells_of(line, separator) for k, line in enumerate(lines)]
     top = heading(rows)
     if not any(name for name in top.names):
         raise RecordingError(path, 'is a table without a header')
@@ -207,15 +206,8 @@ def _peeks(source: Source, encoding: str, separator: str, start: int) -> list[li
         # What was cut at both ends is no whole row.
         lines = text.splitlines()[1:]
         at_end = place + _PEEK_BYTES >= source.size
-        rows += [_cells(line, separator) for line in (lines if at_end else lines[:-1])[-3:]]
+        rows += [cells_of(line, separator) for line in (lines if at_end else lines[:-1])[-3:]]
     return rows
-
-
-def _cells(line: str, separator: str) -> list[str]:
-    try:
-        return next(csv.reader(io.StringIO(line), delimiter=separator), [])
-    except csv.Error:
-        return [line]
 
 
 def _marks(rows: list[list[str]], separator: str, options: TableOptions) -> Marks | None:

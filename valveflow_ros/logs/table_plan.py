@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from valveflow_ros.errors import InputError
 from valveflow_ros.logs.historian_layout import decimal_mark
 from valveflow_ros.logs.historian_long import LongForm, long_form, tags_of
 from valveflow_ros.logs.historian_match import (
@@ -18,6 +17,7 @@ from valveflow_ros.logs.historian_match import (
     zone_in,
 )
 from valveflow_ros.logs.historian_quality import quality_column, quality_columns, understands
+from valveflow_ros.logs.historian_refusal import RefusedError, Remedy
 from valveflow_ros.logs.names import signal_of, signals_of
 from valveflow_ros.logs.table_cells import QUALITY_SUFFIX, Marks
 from valveflow_ros.logs.table_file import look_at
@@ -78,11 +78,8 @@ class TablePlan:
         self.long = self._long(by_signal)
         matcher = self._matcher(taken)
         found = matcher.match(by_signal, signals_of(absent))
-        problems = list(found.problems)
-        if time is None:
-            problems.append(f"no column '{TIME}'")
-        if problems or time is None:
-            raise matcher.refusal(sorted(problems, key=lambda p: p.endswith(f"'{TIME}'")))
+        if found.open or time is None:
+            raise matcher.refusal(found, no_time=time is None)
         self.time = time
         self.chosen: dict[str, Chosen] = {
             SIGNALS[signal].column: chosen for signal, chosen in sorted(found.signals.items())
@@ -161,10 +158,12 @@ class TablePlan:
             cells = self.cells(place)
             if decimal_mark(cells, self.file.separator) is None:
                 example = next(c for c in cells if ',' in c)
-                raise InputError(
-                    f"{self.path}: '{example}' in the column '{theirs}' may be a large number or "
-                    'one with decimals; add --decimal comma if the comma is the decimal mark, or '
-                    '--decimal point if it parts the thousands.'
+                raise RefusedError(
+                    self.path,
+                    f"'{example}' in the column '{theirs}' may be a large number or one with "
+                    'decimals; add --decimal comma if the comma is the decimal mark, or '
+                    '--decimal point if it parts the thousands',
+                    [Remedy('decimal', 'comma')],
                 )
         return Marks()
 
@@ -176,12 +175,14 @@ class TablePlan:
             samples = [joined(row[self.date], row[self.time]) for row in rows
                        if max(self.date, self.time) < len(row)]  # fmt: skip
         clock = TimeReader(samples, str(self.path), name, self.options, zone_in(name))
-        abbreviated = local_zone_in(name)
+        abbreviated, place = local_zone_in(name)
         if abbreviated and not clock.zone:
-            raise InputError(
-                f"{self.path}: the times of the column '{name}' are local, and {abbreviated} does "
-                'not say whether the clock is set forward in summer: add --time-zone with the '
-                'place, such as Europe/Berlin, or the offset, such as +01:00.'
+            raise RefusedError(
+                self.path,
+                f"the times of the column '{name}' are local, and {abbreviated} does not say "
+                'whether the clock is set forward in summer: add --time-zone with the place, such '
+                f'as {place}, or the offset, such as +01:00',
+                [Remedy('time-zone', place)],
             )
         return clock
 

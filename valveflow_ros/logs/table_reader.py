@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from valveflow_ros.logs.historian_long import LongForm
-from valveflow_ros.logs.historian_match import Chosen
 from valveflow_ros.logs.historian_quality import foreign_quality, understands
-from valveflow_ros.logs.historian_units import Spelling
 from valveflow_ros.logs.table_cells import Column, to_numbers, to_quality
 from valveflow_ros.logs.table_options import AS_SEEN, TableOptions
 from valveflow_ros.logs.table_plan import TablePlan
@@ -122,7 +120,7 @@ class TableReader:
             time_ns = self._read_times(frame)
             values, quality = {}, {}
             for name, chosen in self._plan.chosen.items():
-                values[name] = self._numbers(name, chosen, frame[chosen.place])
+                values[name] = self._numbers(name, frame[chosen.place])
                 if name in self._plan.quality:
                     cells = frame[self._plan.quality[name]]
                     own = self.names[name] == name
@@ -158,9 +156,6 @@ class TableReader:
                     f"{one if n == 1 else are} as missing; the first is '{text}' in row {row + 1}."
                 )
         notes += self._quality_notes()
-        for name, chosen in self._plan.chosen.items():
-            if chosen.unit is not None and not chosen.unit.plain:
-                notes.append(_converted_note(self.names[name], chosen.unit))
         if self.bad_times:
             notes.append(
                 f'{self.bad_times} rows have no readable time and were left out, the first is '
@@ -212,13 +207,10 @@ class TableReader:
             self.bad_times += int(bad.sum())
         return time_ns
 
-    def _numbers(self, name: str, chosen: Chosen, cells: pd.Series[Any]) -> FloatArray:
+    def _numbers(self, name: str, cells: pd.Series[Any]) -> FloatArray:
         column = to_numbers(cells, self._plan.marks)
         self._count(name, column, self.rows, cells)
-        unit = chosen.unit
-        if unit is None or unit.plain:
-            return column.values
-        return unit.scale * (column.values + unit.shift)
+        return column.values
 
     def _count(self, name: str, column: Column, start: int, cells: pd.Series[Any]) -> None:
         self.words[name].update(column.words)
@@ -239,7 +231,7 @@ class TableReader:
                 mine = (tags == chosen.theirs).fillna(False).to_numpy(dtype=bool)
                 place = np.flatnonzero(mine)
                 values[name] = np.full(len(frame), np.nan)
-                values[name][place] = self._numbers(name, chosen, frame[form.value].iloc[place])
+                values[name][place] = self._numbers(name, frame[form.value].iloc[place])
                 present[name] = mine
                 if coded:
                     codes = np.full(len(frame), int(Quality.GOOD), dtype=np.uint8)
@@ -254,12 +246,3 @@ class TableReader:
                     {name: codes[keep] for name, codes in quality.items()},
                     {name: there[keep] for name, there in present.items()},
                 )
-
-
-def _converted_note(theirs: str, unit: Spelling) -> str:
-    if unit.shift:
-        return (
-            f"'{theirs}' is a gauge pressure ({unit.written}); {unit.shift:g} {unit.unit} of air "
-            'were added to make it absolute.'
-        )
-    return f"'{theirs}' in {unit.written} was multiplied by {unit.scale:g} to {unit.unit}."

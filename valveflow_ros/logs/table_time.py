@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from valveflow_ros.errors import InputError
 from valveflow_ros.logs.historian_dates import DateStyle, date_style, english, tidied
+from valveflow_ros.logs.historian_refusal import RefusedError, Remedy
 from valveflow_ros.logs.historian_zone import LocalClock, zone_of
 from valveflow_ros.logs.table_numbers import as_numbers, descending, is_excel, scale
 from valveflow_ros.logs.table_options import AS_SEEN, TableOptions
@@ -121,10 +122,12 @@ class TimeReader:
             )
         if 0 < len(self._set_back) <= _FEW and not self._other_steps_back:
             when = np.datetime64(self._set_back[0], 'ns').astype('datetime64[s]')
-            raise InputError(
-                f'{self.where}: the times go back by an hour after {when}, as those of a local '
+            raise RefusedError(
+                self.where,
+                f'the times go back by an hour after {when}, as those of a local '
                 'clock do in autumn; add --time-zone with the place, such as --time-zone '
-                'Europe/Berlin (or --time-zone UTC if they are UTC all the same).'
+                'Europe/Berlin (or --time-zone UTC if they are UTC all the same)',
+                [Remedy('time-zone', 'Europe/Berlin')],
             )
         notes = [*self.notes]
         if self._clock is not None and self._clock.folded:
