@@ -173,6 +173,9 @@ def test_a_topic_without_any_time_points_to_the_clock() -> None:
     scene = Scene()
     scene.tallies['valve_opening'].without_time = scene.tallies['valve_opening'].received
     scene.says(Level.ERROR, 'is /clock published?')
+    scene.tallies['valve_opening'].without_time = 0
+    scene.tallies['valve_opening'].waiting = scene.tallies['valve_opening'].received
+    scene.says(Level.ERROR, 'is /clock published?')
 
 
 def test_the_message_follows_rep_107() -> None:

@@ -12,7 +12,7 @@ from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
 from valveflow_ros.ros.conversions import to_time
 from valveflow_ros.ros.encoding import encode
 from valveflow_ros.ros.inputs import INPUT_ORDER, PLANT_SAMPLE, Decoder, header_time_ns
-from valveflow_ros.ros.intake import Arrival, Intake
+from valveflow_ros.ros.intake import MOST_EARLY, Arrival, Intake
 from valveflow_ros.ros.stamps import ClockTrack, LogClock
 from valveflow_ros.ros.taking import DEPTH, Taken
 from valveflow_ros.ros.tallies import Tally
@@ -203,6 +203,42 @@ def test_the_last_look_holds_nothing_back() -> None:
     assert intake.collect(0.0, NOW, last=True) == []
 
 
+def test_what_is_sent_before_the_first_clock_waits_for_it_and_stands_before_its_time() -> None:
+    clock = Queue()
+    queues, intake = intake_of(['valve_opening', 'generated_power', PLANT_SAMPLE], clock)
+    for k in range(4):
+        queues['valve_opening'].put(float64_bytes(k), T0 + k * NS_PER_S)
+    queues[PLANT_SAMPLE].put(encode(sample(T0 + 7, valve_opening=50.0)), T0 + 1)
+    # What has a time of its own does not wait for a clock.
+    assert [a.name for a in intake.collect(0.0, NOW) + intake.collect(9.0, NOW)] == [PLANT_SAMPLE]
+    assert intake.tallies['valve_opening'].waiting == 4
+    shown = 90 * NS_PER_S
+    queues['generated_power'].put(float64_bytes(5.0), T0 + 11 * NS_PER_S)
+    clock.put(clock_bytes(shown), T0 + 10 * NS_PER_S)
+    clock.put(clock_bytes(shown + 1), T0 + 12 * NS_PER_S)
+    found = intake.collect(9.1, NOW + 20 * NS_PER_S)
+    assert [a.data for a in found[:4]] == [float64_bytes(k) for k in range(4)]
+    assert [a.time_ns for a in found] == [*(shown - (10 - k) * NS_PER_S for k in range(4)), shown]
+    assert [a.log_ns for a in found] == sorted(a.log_ns for a in found)
+    tally = intake.tallies['valve_opening']
+    assert (tally.waiting, tally.before_clock, tally.without_time) == (0, 4, 0)
+    assert len(intake.rows(found)) == 5
+
+
+def test_not_too_many_wait_for_a_clock_that_never_comes() -> None:
+    queues, intake = intake_of(['valve_opening'], Queue())
+    found = []
+    for k in range(MOST_EARLY + 2000):
+        queues['valve_opening'].put(float64_bytes(k), T0 + k)
+        if k % 500 == 499:
+            found += intake.collect(float(k), NOW)
+    found += intake.collect(float(k), NOW)
+    assert intake.tallies['valve_opening'].waiting == MOST_EARLY
+    found += intake.collect(2.0 * k, NOW, last=True)
+    assert [a.data for a in found] == [float64_bytes(k) for k in range(MOST_EARLY + 2000)]
+    assert {a.time_ns for a in found} == {0}
+
+
 def test_what_has_no_time_is_logged_counted_and_not_fed() -> None:
     clock = Queue()
     queues, intake = intake_of(['valve_opening', PLANT_SAMPLE], clock)
@@ -274,6 +310,17 @@ def test_a_sample_gives_a_reading_a_signal_the_optional_one_first() -> None:
 def test_a_command_that_is_not_sent_is_no_reading() -> None:
     rows = Decoder(Settings()).rows(PLANT_SAMPLE, encode(sample(T0, valve_opening=1.0)), T0)
     assert Signal.VALVE_COMMAND not in {row[1] for row in rows}
+
+
+def test_what_came_first_is_known_only_as_long_as_it_is_kept() -> None:
+    track = ClockTrack()
+    assert (track.first_ns, track.lead_ns(5)) == (0, 0)
+    for k in range(100_000):
+        track.note(10 + k, 1000 + k)
+        assert track.lead_ns(10 + k) == 0
+        if k < 100:
+            assert (track.first_ns, track.lead_ns(3)) == (1000, 7)
+    assert track.lead_ns(3) == 0
 
 
 @given(st.lists(st.tuples(st.integers(0, 1000), st.integers(1, 10**6)), max_size=60))

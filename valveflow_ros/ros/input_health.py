@@ -99,6 +99,8 @@ class InputHealth:
             'Messages with irregular numbers': tally.irregular,
             'Messages that cannot be read': tally.malformed,
             'Messages without a time': tally.without_time,
+            'Messages sent before the first /clock': tally.before_clock,
+            'Messages that wait for the first /clock': tally.waiting,
         }
         values |= {f'Readings {reason.replace("_", " ")}': counts[reason] for reason in REASONS}
         return Item(f'input {info.topic}', level, sentence, values)
@@ -129,7 +131,7 @@ class InputHealth:
             )
         if rejected:
             return Level.WARN, f'{rejected} new readings were rejected. {self._why(info, counts)}'
-        if tally.without_time and tally.without_time == tally.received:
+        if tally.without_time + tally.waiting == tally.received:
             return Level.ERROR, f'{topic} comes without a time; is /clock published?'
         if lost:
             return Level.WARN, f'{lost} messages of {topic} were lost on the way.'

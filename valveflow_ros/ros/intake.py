@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import NamedTuple, Protocol
 
 from rosgraph_msgs.msg import Clock
 
-from valveflow_ros.ros.inputs import INPUT_ORDER, Decoder, Row, header_time_ns
+from valveflow_ros.ros.inputs import INPUT_ORDER, PLANT_SAMPLE, Decoder, Row, header_time_ns
 from valveflow_ros.ros.stamps import ClockTrack, LogClock
 from valveflow_ros.ros.taking import DEPTH, Taken
 from valveflow_ros.ros.tallies import Tally
@@ -15,6 +16,8 @@ from valveflow_ros.ros.tallies import Tally
 __all__ = ['Arrival', 'Clock', 'Intake']
 
 _MOST_CLOCKS = 16 * DEPTH
+# So many plain values wait for the first /clock; half a minute of a plant at 100 Hz.
+MOST_EARLY = 16 * DEPTH
 _PATIENCE_S = 0.03
 _CLOCK_PATIENCE_S = 0.2
 # A message may get its receipt time a moment before it can be taken.
@@ -72,6 +75,11 @@ class Intake:
     the next one. With a /clock a value waits until a clock message is there that
     was sent after it, so that none sent before it can still be on its way; if
     none comes, it does not wait for long.
+
+    What is sent before the very first clock message has no time yet. It waits for
+    that message and is put before its time by as much as it was sent earlier: so
+    nothing is logged at a time of 1970. Beyond `MOST_EARLY` the oldest wait no
+    longer and are logged without a time, which is 0, and not fed.
     """
 
     def __init__(
@@ -92,6 +100,7 @@ class Intake:
         self._watch = watch
         self._track = ClockTrack()
         self._held: list[_Held] = []
+        self._early: deque[_Held] = deque()
         self.tallies = {name: Tally() for name in self._sources}
         self.clock_tally = Tally()
 
@@ -117,12 +126,14 @@ class Intake:
             for taken in found:
                 tally.note_number(taken.sequence)
                 received_ns = taken.received_ns or now_ns
-                self._held.append(_Held(received_ns, INPUT_ORDER[name], now_s, name, taken))
+                held = _Held(received_ns, INPUT_ORDER[name], now_s, name, taken)
+                self._hold(held)
             if len(found) >= DEPTH:
                 # More is waiting there, received after the last of these.
-                until_ns = min(until_ns, self._held[-1].received_ns)
+                until_ns = min(until_ns, received_ns)
         if self._clock is not None:
             self._follow_clock(self._clock, now_s)
+            self._let_go(last)
         if not self._held:
             return []
         # By topic within one receipt time; a topic's own messages stay in their order.
@@ -133,6 +144,22 @@ class Intake:
             count = next(waiting, count)
         ready, self._held = self._held[:count], self._held[count:]
         return [self._arrival(held) for held in ready]
+
+    def _hold(self, held: _Held) -> None:
+        """Keep a message for its turn; a plain value also for the first clock message."""
+        if self._clock is None or self._track.newest_ns or held.name == PLANT_SAMPLE:
+            self._held.append(held)
+            return
+        self._early.append(held)
+        self.tallies[held.name].waiting += 1
+
+    def _let_go(self, last: bool) -> None:
+        """End the wait for the first clock message: it has come, or too many wait."""
+        most = 0 if last or self._track.newest_ns else MOST_EARLY
+        while len(self._early) > most:
+            held = self._early.popleft()
+            self.tallies[held.name].waiting -= 1
+            self._held.append(held)
 
     def _due(self, held: _Held, until_ns: int, now_s: float) -> bool:
         waited_s = now_s - held.taken_s
@@ -168,10 +195,19 @@ class Intake:
     def _arrival(self, held: _Held) -> Arrival:
         received_ns, name, taken = held.received_ns, held.name, held.taken
         if self._clock is not None:
-            time_ns = self._track.at(taken.source_ns)
+            time_ns = self._clock_time(name, taken)
         elif self._by_receipt:
             time_ns = received_ns
         else:
             time_ns = taken.source_ns or received_ns
         time_ns = max(0, self._decoder.time_ns(name, taken.data, time_ns))
         return Arrival(name, taken.data, self._log_clock.stamp(received_ns), time_ns)
+
+    def _clock_time(self, name: str, taken: Taken) -> int:
+        """Return what the clock showed when a message was sent, 0 while that is not known."""
+        lead_ns = self._track.lead_ns(taken.source_ns)
+        if not lead_ns:
+            return self._track.at(taken.source_ns)
+        if name != PLANT_SAMPLE:
+            self.tallies[name].before_clock += 1
+        return max(0, self._track.first_ns - lead_ns)

@@ -38,11 +38,23 @@ class ClockTrack:
     def __init__(self) -> None:
         self._sent_ns: list[int] = []
         self._clock_ns: list[int] = []
+        self._trimmed = False
 
     @property
     def newest_ns(self) -> int:
         """Return when the newest clock message was sent, 0 before the first."""
         return self._sent_ns[-1] if self._sent_ns else 0
+
+    @property
+    def first_ns(self) -> int:
+        """Return what the first clock message showed, 0 before it."""
+        return self._clock_ns[0] if self._clock_ns else 0
+
+    def lead_ns(self, sent_ns: int) -> int:
+        """Return how long before the first clock message something was sent, 0 if after it."""
+        if self._trimmed or not self._sent_ns:
+            return 0
+        return max(0, self._sent_ns[0] - sent_ns)
 
     def note(self, sent_ns: int, clock_ns: int) -> None:
         """Take a message of /clock."""
@@ -50,6 +62,7 @@ class ClockTrack:
         self._sent_ns.insert(at, sent_ns)
         self._clock_ns.insert(at, clock_ns)
         if len(self._sent_ns) > 2 * _CLOCKS_KEPT:
+            self._trimmed = True
             del self._sent_ns[:_CLOCKS_KEPT]
             del self._clock_ns[:_CLOCKS_KEPT]
 

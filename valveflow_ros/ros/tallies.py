@@ -26,6 +26,8 @@ class Tally:
         Numbers that went back: a publisher started anew, or there are two.
     malformed, without_time : int
         Messages recorded and not used.
+    waiting, before_clock : int
+        Messages that wait for the first /clock now, and those that were sent before it.
     """
 
     received: int = 0
@@ -34,6 +36,8 @@ class Tally:
     irregular: int = 0
     malformed: int = 0
     without_time: int = 0
+    waiting: int = 0
+    before_clock: int = 0
     last_s: float | None = None
     period_s: float | None = None
     _number: int = 0
