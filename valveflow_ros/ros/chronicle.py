@@ -14,6 +14,7 @@ from valveflow_ros.core.events import (
     JournalKind,
     ReferenceSet,
 )
+from valveflow_ros.errors import counted
 from valveflow_ros.ros.diagnostics import Level
 
 _STANDING = (AlarmState.UNACKNOWLEDGED, AlarmState.RETURNED_UNACKNOWLEDGED)
@@ -27,10 +28,12 @@ def line_of(event: Event) -> tuple[Level, str] | None:
         return level, f'alarm {event.name}, {words}: {event.sentence}'
     if isinstance(event, CurveAdopted):
         curve = event.characteristic
-        knees = ', '.join(f'{u:.0f}' for u in curve.breakpoints[1:-1]) or 'none'
+        knees = ', '.join(f'{u:.0f}' for u in curve.breakpoints[1:-1])
+        knees = f'knees at u = {knees}' if knees else 'no knee'
         return Level.OK, (
-            f'new curve {curve.model_id}: {len(curve.pieces)} pieces, knees at u = {knees}, '
-            f'{curve.source.samples} special samples'
+            f'new curve {curve.model_id}: {counted(len(curve.pieces), "piece")}, '
+            f'{knees}, '
+            f'{counted(curve.source.samples, "special sample")}'
         )
     if isinstance(event, ReferenceSet):
         return Level.OK, f'the reference is now curve {event.characteristic.model_id}'

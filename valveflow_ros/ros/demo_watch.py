@@ -1,9 +1,8 @@
-"""What the demo sees on the topics, told in plain words."""
+"""What the demo sees on the topics."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
@@ -12,42 +11,39 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 from valveflow_msgs.msg import Alarm, Diagnosis, FlowCharacteristic
 
+from valveflow_ros.records import NS_PER_S
 from valveflow_ros.ros.conversions import from_time
+from valveflow_ros.ros.demo_story import Story
 
 _MONITOR = '/valveflow_monitor'
 _LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _BEFORE_ACKNOWLEDGING_S = 0.2
 _STATES = {
-    Alarm.NORMAL: 'cleared',
-    Alarm.UNACKNOWLEDGED: 'ALARM',
-    Alarm.ACKNOWLEDGED: 'acknowledged',
+    Alarm.NORMAL: 'the unit follows the curve again; the alarm is cleared',
+    Alarm.ACKNOWLEDGED: 'acknowledged, by the service acknowledge_alarms',
     Alarm.RETURNED_UNACKNOWLEDGED: 'the alarm has gone by itself',
-    Alarm.SHELVED: 'put aside',
-    Alarm.SUPPRESSED: 'cannot be judged',
 }
-
 _VERDICTS = {
-    Diagnosis.NOTHING: 'nothing is wrong',
-    Diagnosis.UNEXPLAINED: 'unexplained',
+    Diagnosis.NOTHING: 'nothing found',
+    Diagnosis.UNEXPLAINED: 'something that it cannot name',
 }
 
 
 class Watch(Node):
-    """Listens to the monitor, tells what happens, acknowledges alarms.
+    """Listens to the monitor and acknowledges alarms.
 
     Parameters
     ----------
     start_ns : int
         Time of the plant's first sample.
-    tell : callable
-        Takes a line for a person.
+    story : Story
+        Chooses what is told.
     """
 
-    def __init__(self, start_ns: int, tell: Callable[[str], None]) -> None:
+    def __init__(self, start_ns: int, story: Story) -> None:
         super().__init__('valveflow_demo')
         self._start_ns = start_ns
-        self._tell = tell
-        self._begun_s = time.monotonic()
+        self._story = story
         self._acknowledge_at_s: float | None = None
         self._answer: Future | None = None
         self.curves: list[FlowCharacteristic] = []
@@ -67,11 +63,6 @@ class Watch(Node):
         self._client = self.create_client(Trigger, f'{_MONITOR}/acknowledge_alarms')
         self._diagnose = self.create_client(Trigger, f'{_MONITOR}/diagnose')
 
-    def plant_time(self, time_ns: int) -> str:
-        """Return a time as the plant's day and hour."""
-        minutes = max(0, (time_ns - self._start_ns) // 60_000_000_000)
-        return f'day {1 + minutes // 1440} {minutes // 60 % 24:02d}:{minutes % 60:02d}'
-
     def work(self) -> None:
         """Do what is due: acknowledge an alarm that somebody has had time to read."""
         if self._acknowledge_at_s is None or time.monotonic() < self._acknowledge_at_s:
@@ -84,42 +75,34 @@ class Watch(Node):
     def ask_for_diagnosis(self) -> None:
         """Have the monitor diagnose all that it has seen; the health says when it has done so."""
         self.asked = True
-        answer = self._diagnose.call_async(Trigger.Request())
-        answer.add_done_callback(lambda future: self._tell_answer('diagnose', future))
+        self._diagnose.call_async(Trigger.Request())
 
     def _on_diagnosis(self, message: Diagnosis) -> None:
         if message.verdict == Diagnosis.UNKNOWN and not message.model_id:
             return
         self.diagnoses.append(message)
-        until = self.plant_time(from_time(message.header.stamp))
-        names = ', '.join(cause.name for cause in message.causes)
-        word = f'named {names}' if names else _VERDICTS.get(message.verdict, 'unknown')
-        self._tell(
-            f'              diagnosis of the data until {until}: {word}. {message.sentence}'
-        )
+        names = tuple(cause.name for cause in message.causes)
+        word = _VERDICTS.get(message.verdict, 'unknown')
+        self._story.diagnosed(from_time(message.header.stamp), names, word, message.sentence)
 
     def _on_curve(self, message: FlowCharacteristic) -> None:
-        when = self.plant_time(from_time(message.window_end))
+        when_ns = from_time(message.window_end)
         if message.status != FlowCharacteristic.FRESH:
-            if message.cause:
-                self._tell(f'{when}  {message.cause}')
+            if message.cause and not self.curves:
+                self._story.waits(when_ns or self._start_ns, message.cause)
             return
-        knees = ', '.join(f'{u:.0f}' for u in message.breakpoints[1:-1]) or 'none'
         if self.curves and self.curves[-1].model_id == message.model_id:
             return
-        first = 'first curve' if not self.curves else 'refit'
         self.curves.append(message)
-        seconds = time.monotonic() - self._begun_s
-        self._tell(
-            f'{when}  {first} ({seconds:.0f} s from the start): {message.pieces} pieces, '
-            f'knees at u = {knees}, {message.samples} special samples, '
-            f'rmse {message.rmse_mw:.2f} MW'
-        )
+        self._story.curve(when_ns, message.breakpoints[1:-1])
 
     def _on_alarm(self, message: Alarm) -> None:
         self.alarms.append(message)
-        when = self.plant_time(from_time(message.header.stamp))
-        self._tell(f'{when}  {_STATES.get(message.state, "alarm")}: {message.sentence}')
+        when_ns = from_time(message.header.stamp)
+        if message.state == Alarm.UNACKNOWLEDGED:
+            self._story.came(when_ns, message.name, message.occurrence, message.sentence)
+        elif message.state in _STATES and message.previous_state != Alarm.SUPPRESSED:
+            self._story.went_on(when_ns, _STATES[message.state])
         if message.state in (Alarm.UNACKNOWLEDGED, Alarm.RETURNED_UNACKNOWLEDGED):
             self._acknowledge_at_s = time.monotonic() + _BEFORE_ACKNOWLEDGING_S
 
@@ -129,6 +112,7 @@ class Watch(Node):
             if status.name.endswith(' fit'):
                 values = {item.key: item.value for item in status.values}
                 self.samples = int(values.get('Samples taken', '0'))
+                self._story.reached(self._start_ns + self.samples * NS_PER_S)
                 refitting = values.get('Refit under way for (s)', 'unknown') != 'unknown'
             elif status.name.endswith(' diagnosis'):
                 values = {item.key: item.value for item in status.values}
@@ -137,11 +121,5 @@ class Watch(Node):
         self.health_seen += 1
 
     def _on_answer(self, future: Future) -> None:
-        response = self._tell_answer('acknowledge_alarms', future)
-        self.acknowledged += int(response is not None and response.success)
-
-    def _tell_answer(self, service: str, future: Future) -> Trigger.Response | None:
         response: Trigger.Response | None = future.result()
-        if response is not None:
-            self._tell(f'              service {service} answers: {response.message}')
-        return response
+        self.acknowledged += int(response is not None and response.success)
