@@ -103,6 +103,18 @@ def test_every_path_of_foxglove_leads_to_a_field():
     assert wanted <= plotted
 
 
+def test_foxglove_draws_over_the_time_of_the_recording():
+    """A replay has stamps of another day; over those its plots would be empty."""
+    for panel in foxglove()['configById'].values():
+        for path in panel.get('paths', ()):
+            assert path['timestampMethod'] == 'receiveTime'
+
+
+def test_every_panel_of_foxglove_is_titled_in_lichtblick_too():
+    for panel in foxglove()['configById'].values():
+        assert panel['foxglovePanelTitle'] == panel['lichtblickPanelTitle']
+
+
 def test_the_curve_of_foxglove_is_drawn_over_its_own_breakpoints():
     curve = foxglove()['configById']['Plot!curve']
     assert curve['xAxisVal'] == 'currentCustom'
@@ -128,8 +140,6 @@ def series_of_plotjuggler() -> set[str]:
         for curve in plot.iter('curve'):
             if plot.get('mode') == 'TimeSeries':
                 names.add(curve.attrib['name'])
-            elif 'curve_x' in curve.attrib:
-                names |= {curve.attrib['curve_x'], curve.attrib['curve_y']}
     return names
 
 
@@ -144,15 +154,24 @@ def test_every_series_of_plotjuggler_is_a_number_of_a_message():
 def test_the_script_of_plotjuggler_draws_the_curve_of_the_message():
     root = plotjuggler()
     (script,) = root.iter('script')
-    name = 'valveflow: valve curve'
-    assert f'ScatterXY.new("{name}")' in script.attrib['global']
-    drawn = [c for plot in root.iter('plot') for c in plot.iter('curve') if c.get('name') == name]
-    assert len(drawn) == 1
-    code = script.attrib['function']
-    assert f'"{NODE}/characteristic"' in code
-    for field, sliced in (('breakpoints', True), ('values', True), ('pieces', False)):
-        assert f'/{field}' in code
-        found('characteristic', [(field, sliced)])
+    made = set(re.findall(r'ScatterXY\.new\("([^"]+)"\)', script.attrib['global']))
+    drawn = [c.attrib['name'] for c in root.iterfind(".//plot[@mode='XYPlot']/curve")]
+    assert sorted(drawn) == sorted(made)
+    code = script.attrib['global']
+    for topic, fields in (
+        ('characteristic', {'breakpoints': True, 'values': True, 'pieces': False}),
+        ('prediction', {'integrated_input': False, 'measured_mw': False}),
+    ):
+        assert f'"{NODE}/{topic}"' in code
+        for field, sliced in fields.items():
+            assert f'/{field}' in code
+            found(topic, [(field, sliced)])
+
+
+def test_no_plot_of_plotjuggler_pairs_series_itself():
+    """It drops NaN, and then refuses to pair two series that do not have the same times."""
+    for curve in plotjuggler().iter('curve'):
+        assert 'curve_x' not in curve.attrib
 
 
 def test_sizes_and_topics_of_plotjuggler_add_up():
