@@ -4,6 +4,9 @@
 # make test-slow   set-up, then the tests marked slow, also those that make test leaves out
 # make lint    set-up, then ruff and mypy           (make format rewrites the layout)
 # make bench   set-up, then what is fast, measured
+# make bench-gate  set-up, then this tree's speed against an earlier one's, by ratios (BASE=COMMIT; minutes)
+# make mutation   set-up, then small mistakes in recorder, recovery and state: which do the tests notice?
+# make repeat   set-up, then the quick tests of recorder, recovery and state, N=200 times
 # make torture   set-up, then kills, faults, flips, fuzz, signals and a year of soak, counted (hours)
 # make study   how good curve, choice, segments, shifts, alarm and baselines are (hours)
 # make study-diagnosis   how often the diagnosis names the right cause, and none where there is none (hours)
@@ -15,7 +18,7 @@
 
 SHELL := bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow lint format bench torture study study-diagnosis certify-partition lock clean
+.PHONY: help setup demo test test-slow lint format bench bench-gate mutation repeat torture study study-diagnosis certify-partition lock clean
 
 export PYTHON
 ENV := source ./env.sh &&
@@ -54,6 +57,15 @@ format: setup
 
 bench: setup
 	@$(ENV) for name in $(BENCHMARKS); do python -m benchmarks.$$name || exit 1; done
+
+bench-gate: setup
+	@$(ENV) python -m benchmarks.regression $(if $(BASE),--base $(BASE))
+
+mutation: setup
+	@$(ENV) python -m benchmarks.mutation $(if $(SEED),--seed $(SEED))
+
+repeat: setup
+	@$(ENV) python -m benchmarks.repeats --count $(or $(N),200)
 
 torture: setup
 	@$(ENV) python -m benchmarks.torture

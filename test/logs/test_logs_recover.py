@@ -1,4 +1,5 @@
 import os
+import shutil
 import subprocess
 import sys
 
@@ -24,13 +25,25 @@ os._exit(0)
 """
 
 
-def died_writing(folder):
-    """Leave what a process leaves that ends without a word."""
+@pytest.fixture(scope='module')
+def dead(tmp_path_factory):
+    """Return what a process left that ended without a word."""
+    folder = tmp_path_factory.mktemp('dead') / 'log'
     here = os.path.dirname(__file__)
     paths = os.pathsep.join([os.path.dirname(os.path.dirname(here)), *sys.path])
     environment = {**os.environ, 'PYTHONPATH': paths}
     command = [sys.executable, '-c', DIE_WRITING, here, str(folder)]
     subprocess.run(command, check=True, env=environment)
+    return folder
+
+
+@pytest.fixture
+def folder(dead, tmp_path):
+    """Return a folder with that in it."""
+    return shutil.copytree(dead, tmp_path / 'log')
+
+
+def left_in(folder):
     return folder / f'{folder.name}_0.mcap.part'
 
 
@@ -91,9 +104,8 @@ def test_an_output_that_cannot_be_written_is_one_sentence(tmp_path):
         recover(path, tmp_path / 'file' / 'out.mcap')
 
 
-def test_leftovers_of_the_dead_are_finished(tmp_path):
-    folder = tmp_path / 'log'
-    part = died_writing(folder)
+def test_leftovers_of_the_dead_are_finished(folder):
+    part = left_in(folder)
     assert part.exists()
     (folder / 'log_7.mcap.part').write_bytes(b'')
     [report] = recover_leftovers(folder)
@@ -110,9 +122,7 @@ def test_leftovers_of_the_dead_are_finished(tmp_path):
     assert recover_leftovers(folder) == ()
 
 
-def test_the_name_within_the_recovered_file_is_its_own(tmp_path):
-    folder = tmp_path / 'log'
-    died_writing(folder)
+def test_the_name_within_the_recovered_file_is_its_own(folder):
     recover_leftovers(folder)
     text = open_log(folder / 'log_0.mcap').metadata['rosbag2']['serialized_metadata']
     assert yaml.safe_load(text)['relative_file_paths'] == ['log_0.mcap']
@@ -128,9 +138,8 @@ def test_a_living_recorder_is_left_alone(tmp_path):
     assert len(recover_leftovers(tmp_path / 'log')) == 1
 
 
-def test_a_crash_between_the_two_steps_of_a_recovery_loses_nothing(tmp_path):
-    folder = tmp_path / 'log'
-    part = died_writing(folder)
+def test_a_crash_between_the_two_steps_of_a_recovery_loses_nothing(folder):
+    part = left_in(folder)
     copy = part.read_bytes()
     recover_leftovers(folder)
     part.write_bytes(copy)
@@ -140,9 +149,8 @@ def test_a_crash_between_the_two_steps_of_a_recovery_loses_nothing(tmp_path):
     assert len(open_log(folder).readings) == 400
 
 
-def test_what_cannot_be_recovered_stays_and_does_not_stop_a_recorder(tmp_path):
-    folder = tmp_path / 'log'
-    part = died_writing(folder)
+def test_what_cannot_be_recovered_stays_and_does_not_stop_a_recorder(folder):
+    part = left_in(folder)
     raw = bytearray(part.read_bytes()[:3000])
     for place in range(200, len(raw), 50):
         raw[place] ^= 255
@@ -156,10 +164,9 @@ def test_what_cannot_be_recovered_stays_and_does_not_stop_a_recorder(tmp_path):
     assert part.read_bytes() == raw
 
 
-def test_a_part_whose_only_chunk_was_begun_goes(tmp_path):
+def test_a_part_whose_only_chunk_was_begun_goes(folder):
     """What was never whole was never counted as written; a damaged chunk stays for its owner."""
-    folder = tmp_path / 'log'
-    part = died_writing(folder)
+    part = left_in(folder)
     raw = part.read_bytes()
     first = next(begin for op, begin, _ in records(raw + bytes(8)) if op == Op.CHUNK)
     for size in (9, 40, first, first + 5, first + 60, first + 300):

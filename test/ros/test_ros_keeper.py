@@ -188,37 +188,48 @@ def test_a_state_waits_for_the_recording_and_a_full_disk_is_told(tmp_path: Path)
     folder.close()
 
 
+# Loaded once; each line it reads begins a writer of its own and tells its number.
 _WRITES = """
-import sys, itertools
+import itertools, os, sys
 import numpy as np
 from pathlib import Path
 from valveflow_ros.core.state_bytes import to_bytes
 from valveflow_ros.ros.state_folder import StateFolder
-folder = StateFolder(Path(sys.argv[1]))
-for k in itertools.count(1):
-    folder.write(to_bytes({'number': k, 'rows': np.full(200_000, k)}))
-    print(k, flush=True)
+for line in iter(sys.stdin.readline, ''):
+    child = os.fork()
+    if child:
+        os.waitpid(child, 0)
+        os.write(1, b'ended\\n')
+        continue
+    folder = StateFolder(Path(line[:-1]))
+    os.write(1, b'%d\\n' % os.getpid())
+    for k in itertools.count(1):
+        folder.write(to_bytes({'number': k, 'rows': np.full(200_000, k)}))
+        os.write(1, b'%d\\n' % k)
 """
 
 
 def test_killed_at_any_moment_it_is_the_old_or_the_new_state(tmp_path: Path) -> None:
     chance = np.random.default_rng(1)
-    for _ in range(8):
-        writer = subprocess.Popen(
-            [sys.executable, '-c', _WRITES, str(tmp_path)], stdout=subprocess.PIPE
-        )
-        assert writer.stdout is not None
-        first = int(writer.stdout.readline())
-        time.sleep(float(chance.uniform(0.0, 0.15)))
-        os.kill(writer.pid, signal.SIGKILL)
-        told = [first, *map(int, writer.stdout.read().split())]
-        writer.wait()
-        folder = StateFolder(tmp_path)
-        state = from_bytes(folder.read() or b'')
-        folder.close()
-        assert state['number'] in (told[-1], told[-1] + 1)
-        assert (state['rows'] == state['number']).all()
-        assert not list(tmp_path.glob('.*.tmp'))
+    with subprocess.Popen(
+        [sys.executable, '-c', _WRITES], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as nursery:
+        assert nursery.stdin is not None
+        assert nursery.stdout is not None
+        for _ in range(8):
+            nursery.stdin.write(f'{tmp_path}\n')
+            nursery.stdin.flush()
+            writer, first = int(nursery.stdout.readline()), int(nursery.stdout.readline())
+            time.sleep(float(chance.uniform(0.0, 0.15)))
+            os.kill(writer, signal.SIGKILL)
+            told = [first, *map(int, iter(nursery.stdout.readline, 'ended\n'))]
+            folder = StateFolder(tmp_path)
+            state = from_bytes(folder.read() or b'')
+            folder.close()
+            assert state['number'] in (told[-1], told[-1] + 1)
+            assert (state['rows'] == state['number']).all()
+            assert not list(tmp_path.glob('.*.tmp'))
+        nursery.stdin.close()
 
 
 def test_a_state_written_while_another_is_being_written_waits_for_it(tmp_path: Path) -> None:

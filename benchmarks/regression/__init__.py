@@ -1,0 +1,1 @@
+"""Compares the speed of this tree with that of an earlier one."""

@@ -1,0 +1,94 @@
+"""Run the quick tests of recorder, recovery and state again and again, to find one that wavers.
+
+    python -m benchmarks.repeats [--count 200] [--minutes M] [--seed N]
+
+Each time in a new process and in another order of the files, with the machine as it is. Writes to
+benchmarks/results/repeats.json how often, which test failed and how, and in which order the files
+stood then. The exit status is 1 if any did, or if there was no time for one run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import random
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from benchmarks.mutation.__main__ import TESTS
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULT = ROOT / 'benchmarks' / 'results' / 'repeats.json'
+FILES = sorted({name for names in TESTS.values() for name in names})
+_SUMMARY = re.compile(r'^(?:FAILED|ERROR) (\S+)(?: - (.*))?$', re.MULTILINE)
+_COUNT = re.compile(r'(\d+) passed')
+_LONGEST_S = 1800.0
+
+
+def once(order: list[str]) -> tuple[int, float, list[dict[str, Any]]]:
+    """Run the files in this order; return how many tests passed, the seconds and the failures."""
+    begun_s = time.monotonic()
+    command = [sys.executable, '-m', 'pytest', '-q', '--tb=short', '-p', 'no:cacheprovider']
+    try:
+        done = subprocess.run(
+            [*command, *order], cwd=ROOT, capture_output=True, text=True, timeout=_LONGEST_S,
+            check=False,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return 0, _LONGEST_S, [{'test': '', 'why': 'no end', 'order': order}]
+    seconds = time.monotonic() - begun_s
+    failed = [{'test': t, 'why': why, 'order': order} for t, why in _SUMMARY.findall(done.stdout)]
+    if done.returncode and not failed:
+        failed = [{'test': '', 'why': done.stdout[-500:] + done.stderr[-500:], 'order': order}]
+    passed = _COUNT.search(done.stdout)
+    return int(passed[1]) if passed else 0, seconds, failed
+
+
+def main() -> int:
+    """Run it."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument('--count', type=int, default=200)
+    parser.add_argument('--minutes', type=float, default=600.0, help='begin no more after these')
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--output', type=Path, default=RESULT)
+    given = parser.parse_args()
+    chance, end_s = random.Random(given.seed), time.monotonic() + 60.0 * given.minutes
+    passed: list[int] = []
+    seconds: list[float] = []
+    failures: list[dict[str, Any]] = []
+    loads: list[float] = []
+    while len(seconds) < given.count and time.monotonic() < end_s:
+        loads.append(os.getloadavg()[0])
+        found = once(chance.sample(FILES, len(FILES)))
+        passed.append(found[0])
+        seconds.append(found[1])
+        failures += [{'run': len(seconds), **failure} for failure in found[2]]
+        print(f'{len(seconds)}: {found[0]} passed in {found[1]:.0f} s', *found[2], flush=True)
+    content = {
+        'command': f'python -m benchmarks.repeats --count {given.count} --seed {given.seed}',
+        'wanted': given.count, 'done': len(seconds), 'files': FILES,
+        'tests_each': max(passed, default=0), 'passed': sum(passed),
+        'failed': len(failures), 'failures': failures,
+        'seconds_each': round(median(seconds), 1) if seconds else 0.0,
+        'machine': {'cpus': os.cpu_count(), 'platform': platform.platform(),
+                    'python': platform.python_version(),
+                    'load': [round(x, 1) for x in (min(loads, default=0), max(loads, default=0))]},
+    }  # fmt: skip
+    given.output.write_text(json.dumps(content, indent=1) + '\n', 'utf-8')
+    print(
+        f'{len(seconds)} of {given.count} runs, {sum(passed)} tests passed, {len(failures)} failed'
+    )
+    return 1 if failures or not seconds else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
