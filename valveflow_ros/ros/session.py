@@ -221,7 +221,10 @@ class Session:
 
     def record(self, topic: str, data: bytes, time_ns: int) -> None:
         """Record a message that no engine event stands behind."""
-        self.recording.write(topic, data, self._log_clock.stamp(time.time_ns()), time_ns)
+        log_ns = self._log_clock.stamp(time.time_ns())
+        # What is said before the first row belongs to no time of the plant; a viewer that goes by
+        # this time would else begin in 1970.
+        self.recording.write(topic, data, log_ns, time_ns or log_ns)
 
     def close(self) -> RecorderStatus | None:
         """End everything; the recording is a finished file afterwards."""
