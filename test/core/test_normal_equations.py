@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from valveflow_ros.core.whitening import innovation_sum as square_sum
+from valveflow_ros.core.normal_kernel import square_sum
 from valveflow_ros.core.whitening import normal_equations, whitened
 
 
@@ -38,3 +38,14 @@ def test_a_block_holds_the_rows_of_its_time():
     table = np.ones((12, 1))
     _, scores, _ = normal_equations(table, residual, weight, np.empty(0), 3)
     assert scores[:, 0].tolist() == [0 + 1 + 2 + 3, 4 + 5 + 6 + 7, 8 + 9 + 10 + 11]
+
+
+@pytest.mark.parametrize('rows', [0, 1, 4, 5, 6])
+def test_fewer_rows_than_the_memory_give_nothing(rows):
+    ar = np.full(5, 0.1)
+    residual, weight = np.ones(rows), np.ones(rows, dtype=np.uint8)
+    sums, scores, count = normal_equations(np.ones((rows, 2)), residual, weight, ar, 3)
+    assert count == max(0, rows - 5)
+    assert square_sum(residual, weight, ar) == pytest.approx(0.25 * count)
+    assert sums == pytest.approx(np.full((3, 3), 0.25 * count))
+    assert scores.sum() == pytest.approx(0.5 * count)

@@ -18,6 +18,7 @@ from valveflow_ros.core.model import RegionalModel
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.noise import WARM_UP, WINDOW
 from valveflow_ros.core.offline import feed_aligned
+from valveflow_ros.core.threads import ahead
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import SIGNALS, Readings, SampleTable, SpecialSegment
 from valveflow_ros.report.numbers import duration
@@ -69,7 +70,7 @@ def watch(
     segments: list[SpecialSegment] = []
     resets = 0
     blocks = aligned_blocks(aligner, readings, progress, 'finding segments')
-    for aligned in corrected(blocks, corrector):
+    for aligned in ahead(corrected(blocks, corrector)):
         if len(aligned.resets):
             resets += len(aligned.resets)
             tables.clear()

@@ -56,20 +56,14 @@ def _whole_before(weight: ByteArray, first: int, order: int) -> int:
 
 
 @kernel
-def square_sum(
-    residual: FloatArray, weight: ByteArray, ar: FloatArray, first: int, end: int
-) -> float:
-    """Return the sum of squared innovations of ``residual`` (m,) under ``ar`` (k,).
-
-    Only those of the rows from ``first`` to ``end``; what is before them is looked at.
-    """
-    order = ar.size
-    first = max(first, order)
-    run = _whole_before(weight, first, order)
+def square_sum(residual: FloatArray, weight: ByteArray, ar: FloatArray) -> float:
+    """Return the sum of squared innovations of ``residual`` (m,) under ``ar`` (k,)."""
+    order, end = ar.size, residual.size
+    run = _whole_before(weight, min(order, end), order)
     out = np.empty(_BLOCK)
     # Four sums, so that none of them waits for the one before.
     sums = np.zeros(4)
-    for t in range(first, end, _BLOCK):
+    for t in range(order, end, _BLOCK):
         n = min(_BLOCK, end - t)
         _innovations(residual, t, n, 1, ar, out)
         for i in range(n):
@@ -124,7 +118,7 @@ def normal_sums(
     m, columns = jacobian.shape
     order, blocks = ar.size, scores.shape[0]
     first = max(first, order)
-    run = _whole_before(weight, first, order)
+    run = _whole_before(weight, min(first, m), order)
     rows = 0
     flat = jacobian.reshape(m * columns)
     white, innovation = np.empty(_BLOCK * columns), np.empty(_BLOCK)

@@ -9,10 +9,9 @@ import numpy as np
 
 from valveflow_ros.core.answer_kernel import answer_residual
 from valveflow_ros.core.model import RegionalModel
-from valveflow_ros.core.normal_kernel import normal_sums
+from valveflow_ros.core.normal_kernel import normal_sums, square_sum
 from valveflow_ros.core.tangent_kernel import tangents
 from valveflow_ros.core.threads import cores, runs, share
-from valveflow_ros.core.whitening import innovation_sum
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
 # What reacts to the power within the rows averaged, as a load controller does, would be
@@ -24,6 +23,7 @@ _FORGOTTEN = 40.0
 # A stretch has this many means at least, and eight times what comes before it. How the rows are
 # cut depends on them and the model alone, so that the bits do not depend on the machine.
 _STRETCH = 8192
+_FEW = 4
 _LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4, 0.2, 0.1, 0.05)
 
 
@@ -111,14 +111,20 @@ class Problem:
                 model.levels, taps, self.settle, s.group, begin, first, end, residual, weight,
             )  # fmt: skip
 
-        share(stretch, self._stretches(model), self._threads)
+        # An answer takes so little that more and shorter stretches would cost more than they gain.
+        share(stretch, self._stretches(model, least=-(-s.means // _FEW)), self._threads)
         return residual, weight
 
-    def tangents(self, model: RegionalModel) -> tuple[FloatArray, FloatArray, ByteArray]:
-        """Return residual (m,), Jacobian of the prediction (m, P) and weight (m,)."""
+    def tangents(
+        self, model: RegionalModel, also: int = 0
+    ) -> tuple[FloatArray, FloatArray, ByteArray]:
+        """Return residual (m,), Jacobian of the prediction (m, P) and weight (m,).
+
+        There is room for some columns more behind the others, ``also``, not yet written.
+        """
         s = self.samples
         residual = np.empty(s.means)
-        jacobian = np.empty((s.means, 3 * model.pieces - 1 + 2 * model.regions))
+        jacobian = np.empty((s.means, 3 * model.pieces - 1 + 2 * model.regions + also))
         weight = np.empty(s.means, dtype=np.uint8)
 
         def stretch(begin: int, first: int, end: int) -> None:
@@ -172,17 +178,19 @@ class Problem:
     def cost(self, model: RegionalModel, ar: FloatArray) -> float:
         """Return the sum of squared innovations."""
         residual, weight = self.answer(model)
-        return innovation_sum(residual, weight, ar)
+        return float(square_sum(residual, weight, ar))
 
-    def _stretches(self, model: RegionalModel, also: int = 0) -> list[tuple[int, int, int]]:
+    def _stretches(
+        self, model: RegionalModel, also: int = 0, least: int = 0
+    ) -> list[tuple[int, int, int]]:
         """Cut the means into stretches: where the filters begin, the first that counts, the end.
 
-        So many means before the first are to be right, ``also``.
+        So many means before the first are to be right, ``also``; a stretch has ``least`` means.
         """
         s = self.samples
         memory_s = _FORGOTTEN * float(model.time_constants.max()) + float(model.delays.max())
         lead = math.ceil((memory_s / s.step_s + self.settle + 3) / s.group) + also
-        length = max(_STRETCH, 8 * lead)
+        length = max(_STRETCH, 8 * lead, least)
         return [(max(0, first - lead), first, end) for first, end in runs(s.means, length)]
 
 

@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import os
+import queue
 import threading
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Generator, Iterable, Iterator
+from typing import Any, TypeVar
+
+T = TypeVar('T')
+_END = object()
+# How often a thread that waits for room looks whether it is still wanted.
+_LOOK_S = 0.2
 
 
 def cores() -> int:
@@ -28,7 +34,8 @@ def share(work: Callable[..., Any], tasks: Iterable[tuple[int, ...]], threads: i
     pool behind that a fork would break. A task's error is raised here once all
     threads have stopped.
     """
-    todo = iter(tasks)
+    waiting = list(tasks)
+    todo = iter(waiting)
     lock = threading.Lock()
     errors: list[BaseException] = []
 
@@ -43,7 +50,9 @@ def share(work: Callable[..., Any], tasks: Iterable[tuple[int, ...]], threads: i
             except BaseException as error:  # noqa: BLE001 - raised again below
                 errors.append(error)
 
-    helpers = [threading.Thread(target=loop, daemon=True) for _ in range(threads - 1)]
+    helpers = [
+        threading.Thread(target=loop, daemon=True) for _ in range(min(threads, len(waiting)) - 1)
+    ]
     for helper in helpers:
         helper.start()
     loop()
@@ -51,3 +60,48 @@ def share(work: Callable[..., Any], tasks: Iterable[tuple[int, ...]], threads: i
         helper.join()
     if errors:
         raise errors[0]
+
+
+def ahead(items: Iterator[T], depth: int = 2) -> Iterator[T]:
+    """Return the same items, made in a thread while the last ones are worked on.
+
+    At most ``depth`` of them wait. Where there is one core, they are made when asked for. An
+    error comes where it would have come; who stops early stops the thread.
+    """
+    return items if cores() < 2 else _made_ahead(items, depth)
+
+
+def _made_ahead(items: Iterator[T], depth: int) -> Generator[T, None, None]:
+    made: queue.Queue[Any] = queue.Queue(depth)
+    unwanted = threading.Event()
+
+    def hand_over(item: object, error: BaseException | None = None) -> bool:
+        while not unwanted.is_set():
+            try:
+                made.put((item, error), timeout=_LOOK_S)
+            except queue.Full:
+                continue
+            return True
+        return False
+
+    def make() -> None:
+        try:
+            for item in items:
+                if not hand_over(item):
+                    return
+        except BaseException as error:  # noqa: BLE001 - raised again where it is waited for
+            hand_over(_END, error)
+        else:
+            hand_over(_END)
+
+    threading.Thread(target=make, daemon=True).start()
+    try:
+        while True:
+            item, error = made.get()
+            if error is not None:
+                raise error
+            if item is _END:
+                return
+            yield item
+    finally:
+        unwanted.set()

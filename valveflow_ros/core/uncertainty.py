@@ -54,14 +54,15 @@ def covariance_of(
     more than independent innovations would let them. The levels count as
     parameters, by differences: time constants and delays lean on them.
     """
-    residual, jacobian, weight = problem.tangents(model)
-    packed = len(free)
-    if with_levels:
-        jacobian = np.column_stack([jacobian, _level_tangents(problem, model)])
-        free = np.append(free, np.ones(len(model.levels), dtype=bool))
-    moved = free & (np.abs(jacobian).max(axis=0) > 0.0)
-    blocks = _blocks(problem)
-    sums, scores, rows = normal_equations(jacobian[:, moved], residual, weight, ar, blocks)
+    packed, levels = len(free), len(model.levels) if with_levels else 0
+    residual, jacobian, weight = problem.tangents(model, also=levels)
+    if levels:
+        _level_tangents(problem, model, jacobian[:, packed:])
+        free = np.append(free, np.ones(levels, dtype=bool))
+    sums, scores, rows = normal_equations(jacobian, residual, weight, ar, _blocks(problem))
+    moved = free & (np.diag(sums)[:-1] > 0.0)
+    used = np.flatnonzero(np.append(moved, True))
+    sums, scores = sums[np.ix_(used, used)], np.ascontiguousarray(scores[:, moved])
     scale = np.sqrt(np.maximum(np.diag(sums)[:-1], 1e-300))
     inverse = np.linalg.pinv(sums[:-1, :-1] / np.outer(scale, scale), hermitian=True)
     inverse = inverse / np.outer(scale, scale)
@@ -79,7 +80,7 @@ def covariance_of(
         covariance[:packed, :packed],
         np.sqrt(np.diag(covariance)[packed:]),
         float(np.sqrt(max(variance, 0.0))),
-        _prediction_error(jacobian[:, moved], weight, covariance[np.ix_(moved, moved)]),
+        _prediction_error(jacobian, weight, np.where(np.outer(moved, moved), covariance, 0.0)),
     )
 
 
@@ -96,16 +97,14 @@ def _blocks(problem: Problem) -> int:
     return max(1, min(_MOST_BLOCKS, problem.samples.means // rows))
 
 
-def _level_tangents(problem: Problem, model: RegionalModel) -> FloatArray:
-    """Return the answer's change per MW of each level, shape (m, I - 1)."""
-    columns = np.empty((problem.samples.means, len(model.levels)))
+def _level_tangents(problem: Problem, model: RegionalModel, columns: FloatArray) -> None:
+    """Write the answer's change per MW of each level, shape (m, I - 1)."""
     for k in range(len(model.levels)):
         half = np.zeros(len(model.levels))
         half[k] = 0.5 * _LEVEL_STEP_MW
         low, _ = problem.answer(model.with_levels(model.levels - half))
         high, _ = problem.answer(model.with_levels(model.levels + half))
         columns[:, k] = (low - high) / _LEVEL_STEP_MW
-    return columns
 
 
 def bend_certainty(problem: Problem, model: RegionalModel, ar: FloatArray) -> FloatArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from valveflow_ros.core.normal_kernel import normal_sums, square_sum
+from valveflow_ros.core.normal_kernel import normal_sums
 from valveflow_ros.core.regional_kernel import lagged_products, whiten
 from valveflow_ros.core.threads import cores, runs, share
 from valveflow_ros.records import ByteArray, FloatArray
@@ -73,18 +73,6 @@ def normal_equations(
 
     share(add, [(k, *part) for k, part in enumerate(parts)], cores())
     return sums.sum(axis=0), scores.sum(axis=0), int(rows.sum())
-
-
-def innovation_sum(residual: FloatArray, weight: ByteArray, ar: FloatArray) -> float:
-    """Return the sum of squared innovations of ``residual`` (m,) under ``ar`` (k,)."""
-    parts = runs(len(residual), _STRETCH)
-    sums = np.zeros(len(parts))
-
-    def add(k: int, first: int, end: int) -> None:
-        sums[k] = square_sum(residual, weight, ar, first, end)
-
-    share(add, [(k, *part) for k, part in enumerate(parts)], cores())
-    return float(sums.sum())
 
 
 def whitened(columns: FloatArray, weight: ByteArray, ar: FloatArray) -> FloatArray:
