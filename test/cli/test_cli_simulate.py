@@ -72,8 +72,8 @@ def test_effects_are_listed_with_their_parameters(run):
     [
         (['-o', 'x.xlsx'], 'must end in .mcap or .csv or .parquet'),
         (['-o', 'none/x.mcap'], 'there is no folder'),
-        (['-o', 'x.mcap', '--days', '0'], 'more than 0'),
-        (['-o', 'x.mcap', '--days', 'nan'], 'more than 0'),
+        (['-o', 'x.mcap', '--days', '0'], 'above 0'),
+        (['-o', 'x.mcap', '--days', 'nan'], 'above 0'),
         (['-o', 'x.mcap', '--seed', '-1'], '0 or more'),
         (['-o', 'x.mcap', '--effect', 'gain_drif'], "Did you mean 'gain_drift'"),
         (['-o', 'x.mcap', '--effect', 'gain_drift:h=1'], "no parameter 'h'"),

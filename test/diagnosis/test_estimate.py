@@ -67,7 +67,7 @@ def test_long_intervals_are_told_coarsely(half, said):
 def test_what_is_no_time_has_no_date():
     with pytest.raises(ValueError, match='no time'):
         dates(Estimate(1.0, 0.5, 1.5, '%'))
-    assert cells(Estimate(1.0, 0.5, 1.5, '%')) == ('1.000 %', '0.5 to 1.5')
+    assert cells(Estimate(1.0, 0.5, 1.5, '%'), 1.125) == ('1.000 %', '0.5 to 1.5')
 
 
 @pytest.mark.parametrize('name', STEPS)
@@ -91,8 +91,8 @@ def test_numbers_stay_numbers_and_say_what_they_count_from():
         'value': 3.5, 'low': 3.4, 'high': 3.7,
         'unit': 'days since 2025-03-01 00:00:00 UTC', 'origin_ns': ORIGIN_NS,
     }  # fmt: skip
-    assert cells(onset(3.4, 3.7)) == dates(onset(3.4, 3.7))
-    assert cells(onset(math.nan, math.nan)) == ('2025-03-04 12:00 UTC', 'unknown')
+    assert cells(onset(3.4, 3.7), 1.125) == dates(onset(3.4, 3.7))
+    assert cells(onset(math.nan, math.nan), 1.125) == ('2025-03-04 12:00 UTC', 'unknown')
 
 
 def test_what_is_switched_in_and_out_has_times_of_its_own():

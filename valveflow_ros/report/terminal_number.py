@@ -29,7 +29,9 @@ def number(
         It raises `ArgumentTypeError` that goes on after the option's name: 'must be a number
         of days above 0 and at most 400, such as --days 10; 'ten' is no number'.
     """
-    between = f' above {low:g} and at most {high:g}' if above else f' from {low:g} to {high:g}'
+    # No powers of ten: a person reads 1000000 rather than 1e+06.
+    first, last = f'{low:.15g}', f'{high:.15g}'
+    between = f' above {first} and at most {last}' if above else f' from {first} to {last}'
     if math.isinf(low) and math.isinf(high):
         between = ''
 

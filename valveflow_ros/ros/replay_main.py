@@ -44,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument('log', metavar='LOG', help='.mcap, rosbag2 folder, .csv or .parquet')
     made.add_argument(
         '--rate',
-        type=number('seconds of the log in a second', 0, 1e6, '--rate 600'),
+        type=number('a number of seconds of the log in each second', 0, 1e6, '--rate 600'),
         default=1.0,
         metavar='R',
         help="seconds of the log's own time in a second; 0: as fast as the monitor takes it "
