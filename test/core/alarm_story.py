@@ -64,15 +64,16 @@ class SlowLife:
 
     def look(self, value, watched, turned):
         if value != value:
-            self.seeing = 0
+            self.seeing = max(self.seeing - watched, 0)
             self.blind += watched
-            self.suppressed = self.suppressed or self.blind >= self.suppress_after
+            if not self.suppressed and self.blind >= self.suppress_after:
+                self.suppressed, self.seeing = True, 0
             return
-        self.blind = 0
-        if self.suppressed:
-            self.seeing += watched
-            if turned or self.seeing >= self.come_back_after:
-                self.suppressed, self.seeing = False, 0
+        self.seeing = min(self.seeing + watched, self.come_back_after)
+        enough = self.seeing == self.come_back_after
+        self.blind = 0 if enough else max(self.blind - watched, 0)
+        if self.suppressed and (turned or enough):
+            self.suppressed, self.blind = False, 0
 
     def off_the_shelf(self):
         self.shelf_left = None

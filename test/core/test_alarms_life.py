@@ -152,13 +152,24 @@ def test_what_waits_is_told_by_who_takes_over():
 
 
 def test_flickering_data_do_not_make_it_chatter():
-    """A second of data now and then brings nobody back, nor do holes shorter than the time."""
+    """A second of data now and then brings nobody back, nor do holes as long as the sight."""
     given = {'alarm_suppress_time': 30.0, 'alarm_block': 10.0}
     alarm = ResidualAlarm(Settings(given))
     (change,) = [c for _, c in fed(alarm, [0.0, *([math.nan] * 40 + [0.0] * 9) * 50])]
     assert change.state == SUPPRESSED
     patient = ResidualAlarm(Settings(given))
-    assert fed(patient, [0.0, *([math.nan] * 29 + [0.0]) * 50]) == []
+    assert fed(patient, [0.0, *([math.nan] * 29 + [0.0] * 29) * 50]) == []
+
+
+def test_a_row_now_and_then_decides_nothing():
+    """Who sees one row a minute is blind; who misses one a minute sees, and a fault stands."""
+    alarm = ResidualAlarm(Settings())
+    (change,) = [c for _, c in fed(alarm, [0.0, *([math.nan] * 59 + [0.0]) * 300])]
+    assert change.state == SUPPRESSED
+    alarm = ResidualAlarm(Settings())
+    came = fed(alarm, [2.0] * 3600 + [math.nan] * 3700 + ([2.0] * 59 + [math.nan]) * 300)
+    states = [change.state for _, change in came]
+    assert states == [UNACKNOWLEDGED, SUPPRESSED, UNACKNOWLEDGED]
 
 
 @pytest.mark.parametrize('out_min', [10, 30, 59])

@@ -63,21 +63,22 @@ def _sight(
 ) -> int:
     """Follow how long the alarm has been blind, or could see again; return what that brings.
 
-    Time that nobody watched does not count, so that a silence alone suppresses nothing.
+    Each takes back from the other, so that a single row on either side decides nothing; who has
+    seen for long enough has not been blind. Time that nobody watched does not count: a silence
+    alone suppresses nothing.
     """
     if not judged:
-        memory[_SIGHT] = 0
+        memory[_SIGHT] = max(0, memory[_SIGHT] - watched_ns)
         memory[_BLIND] += watched_ns
         if memory[_DARK] == 0 and memory[_BLIND] >= dark_ns:
-            memory[_DARK] = 1
+            memory[_DARK], memory[_SIGHT] = 1, 0
             return _DARKENED
         return 0
-    memory[_BLIND] = 0
-    if memory[_DARK] == 0:
-        return 0
-    memory[_SIGHT] += watched_ns
-    if memory[_SIGHT] >= back_ns or turned:
-        memory[_DARK] = memory[_SIGHT] = 0
+    memory[_SIGHT] = min(memory[_SIGHT] + watched_ns, back_ns)
+    seen = memory[_SIGHT] >= back_ns
+    memory[_BLIND] = 0 if seen else max(0, memory[_BLIND] - watched_ns)
+    if memory[_DARK] != 0 and (seen or turned):
+        memory[_DARK] = memory[_BLIND] = 0
         return _SEEING
     return 0
 
@@ -134,7 +135,8 @@ class ResidualAlarm(VoicedAlarm):
     Where the evidence cannot be judged for long, the alarm is suppressed. By ISA-18.2 that is no
     annunciation, and it must not flutter: a valve that runs beyond the curve for some minutes,
     some times a day, suppresses nothing. The alarm comes back when the evidence could be judged
-    as long as a return of the condition has to last, and at once if the condition turns.
+    as long as a return of the condition has to last, less what could not, and at once if the
+    condition turns.
 
     Parameters
     ----------
