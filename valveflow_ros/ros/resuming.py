@@ -93,6 +93,11 @@ def earlier_run(
     return made
 
 
+def _said_at(message: LoggedMessage) -> int:
+    """Return the time of the plant an output belongs to; 0 before the first row, see `Session`."""
+    return 0 if message.publish_time_ns == message.log_time_ns else message.publish_time_ns
+
+
 def retrace(
     engine: LiveEngine,
     speaker: Outputs,
@@ -122,9 +127,7 @@ def retrace(
     DataError
         The journal cannot be read.
     """
-    told = Counter(
-        (outputs[m.topic], m.publish_time_ns) for m in earlier.tail if m.topic in outputs
-    )
+    told = Counter((outputs[m.topic], _said_at(m)) for m in earlier.tail if m.topic in outputs)
     # A diagnosis takes a minute, and is asked for again.
     journal = [
         e for e in _journal(earlier.tail, outputs) if e.kind != JournalKind.DIAGNOSED

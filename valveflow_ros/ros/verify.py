@@ -245,7 +245,7 @@ def _compare(
         raise _DifferenceError(
             f'The replay gives {what} where the recording has {outputs[then.topic]}.'
         )
-    if output.time_ns and then.publish_time_ns != output.time_ns:
+    if then.publish_time_ns != (output.time_ns or then.log_time_ns):
         raise _DifferenceError(f'{what.capitalize()} belongs to another time in the recording.')
     if then.data != output.data:
         kind = OUTPUTS[output.name].message_type
