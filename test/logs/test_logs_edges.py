@@ -4,9 +4,18 @@ import lz4.frame
 import pytest
 import zstandard
 from damage import records
-from log_files import FLOAT64, START_NS, STOCK, float64, read_back, write_chunks
+from log_files import (
+    FLOAT64,
+    START_NS,
+    STOCK,
+    float64,
+    read_back,
+    write_chunks,
+    write_messages,
+)
 
 from valveflow_ros.errors import RecordingError
+from valveflow_ros.records import SIGNALS
 from valveflow_ros.logs import Decoder, RecordingWriter, open_log, recover
 from valveflow_ros.logs.chunk_builder import ChunkBuilder
 from valveflow_ros.logs.compression import Unpacker
@@ -172,3 +181,17 @@ def test_a_line_break_in_a_name_does_not_end_the_sentence(tmp_path):
         open_log(tmp_path / 'line\nbreak.mcap')
     assert '\n' not in str(caught.value)
     assert 'line?break.mcap' in str(caught.value)
+
+
+def test_values_that_never_got_a_time_are_left_out_and_counted(tmp_path):
+    """So a monitor records what came before the first /clock; it does not use it either."""
+    topics = {f'/{info.topic}': FLOAT64 for info in SIGNALS if info.required}
+    rows = [
+        (topic, float64(float(k)), START_NS + k, 0 if k < 3 else START_NS + k)
+        for k in range(10)
+        for topic in topics
+    ]
+    log = open_log(write_messages(tmp_path, topics, rows))
+    assert log.readings.time_ns.min() == START_NS + 3
+    assert len(log.readings) == 7 * len(topics) == len(log.log_time_ns)
+    assert any(f'{3 * len(topics)} values recorded without a time' in w for w in log.warnings)

@@ -12,7 +12,7 @@ from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
 from valveflow_ros.ros.conversions import to_time
 from valveflow_ros.ros.encoding import encode
 from valveflow_ros.ros.inputs import INPUT_ORDER, PLANT_SAMPLE, Decoder, header_time_ns
-from valveflow_ros.ros.intake import MOST_EARLY, Arrival, Intake
+from valveflow_ros.ros.intake import EARLY_S, MOST_EARLY, Arrival, Intake
 from valveflow_ros.ros.stamps import ClockTrack, LogClock
 from valveflow_ros.ros.taking import DEPTH, Taken
 from valveflow_ros.ros.tallies import Tally
@@ -210,13 +210,13 @@ def test_what_is_sent_before_the_first_clock_waits_for_it_and_stands_before_its_
         queues['valve_opening'].put(float64_bytes(k), T0 + k * NS_PER_S)
     queues[PLANT_SAMPLE].put(encode(sample(T0 + 7, valve_opening=50.0)), T0 + 1)
     # What has a time of its own does not wait for a clock.
-    assert [a.name for a in intake.collect(0.0, NOW) + intake.collect(9.0, NOW)] == [PLANT_SAMPLE]
+    assert [a.name for a in intake.collect(0.0, NOW) + intake.collect(4.0, NOW)] == [PLANT_SAMPLE]
     assert intake.tallies['valve_opening'].waiting == 4
     shown = 90 * NS_PER_S
     queues['generated_power'].put(float64_bytes(5.0), T0 + 11 * NS_PER_S)
     clock.put(clock_bytes(shown), T0 + 10 * NS_PER_S)
     clock.put(clock_bytes(shown + 1), T0 + 12 * NS_PER_S)
-    found = intake.collect(9.1, NOW + 20 * NS_PER_S)
+    found = intake.collect(4.1, NOW + 20 * NS_PER_S)
     assert [a.data for a in found[:4]] == [float64_bytes(k) for k in range(4)]
     assert [a.time_ns for a in found] == [*(shown - (10 - k) * NS_PER_S for k in range(4)), shown]
     assert [a.log_ns for a in found] == sorted(a.log_ns for a in found)
@@ -231,12 +231,24 @@ def test_not_too_many_wait_for_a_clock_that_never_comes() -> None:
     for k in range(MOST_EARLY + 2000):
         queues['valve_opening'].put(float64_bytes(k), T0 + k)
         if k % 500 == 499:
-            found += intake.collect(float(k), NOW)
-    found += intake.collect(float(k), NOW)
+            found += intake.collect(1e-6 * k, NOW)
+    found += intake.collect(1.0, NOW)
     assert intake.tallies['valve_opening'].waiting == MOST_EARLY
-    found += intake.collect(2.0 * k, NOW, last=True)
+    found += intake.collect(2.0, NOW, last=True)
     assert [a.data for a in found] == [float64_bytes(k) for k in range(MOST_EARLY + 2000)]
     assert {a.time_ns for a in found} == {0}
+
+
+def test_nothing_waits_long_for_a_clock_that_never_comes() -> None:
+    queues, intake = intake_of(['valve_opening'], Queue())
+    found = []
+    for k in range(100):
+        queues['valve_opening'].put(float64_bytes(k), T0 + k)
+        found += intake.collect(float(k), NOW + k)
+        assert len(found) >= k - EARLY_S - 1.0
+    assert [a.data for a in found] == [float64_bytes(k) for k in range(len(found))]
+    assert intake.rows(found) == []
+    assert intake.tallies['valve_opening'].without_time == len(found)
 
 
 def test_what_has_no_time_is_logged_counted_and_not_fed() -> None:

@@ -55,10 +55,8 @@ def read_recording(
         what = 'file' if len(paths) == 1 else f'file {Path(file.path).name}'
         warnings += [*scan_warnings(file.findings, what), *_file_warnings(file, what)]
     warnings += _choice_warnings(types, chosen, stamped, name)
-    readings, log_time_ns = _readings(files, chosen)
-    return _contents(
-        name, files, types, chosen, stamped, (readings, log_time_ns), warnings, unchecked
-    )
+    found, told = _timed(_readings(files, chosen))
+    return _contents(name, files, types, chosen, stamped, found, warnings + told, unchecked)
 
 
 def _contents(
@@ -196,6 +194,24 @@ def _choice_warnings(
             'all of them were read.'
         )
     return sentences
+
+
+def _timed(found: tuple[Readings, IntArray]) -> tuple[tuple[Readings, IntArray], list[str]]:
+    """Leave out values that never got a time, which a monitor records and does not use either.
+
+    Where none has one, whoever wrote the file gives none, and that is another matter.
+    """
+    readings, log_time = found
+    if not len(readings) or readings.time_ns.min() > 0 or readings.time_ns.max() <= 0:
+        return found, []
+    timed = readings.time_ns > 0
+    kept = Readings(
+        readings.time_ns[timed], readings.signal[timed], readings.value[timed],
+        readings.quality[timed],
+    )  # fmt: skip
+    lost = counted(len(readings) - len(kept), 'value')
+    told = f'{lost} recorded without a time, as before the first /clock, left out.'
+    return (kept, log_time[timed]), [told]
 
 
 def _readings(files: list[FileContents], chosen: dict[str, Signal]) -> tuple[Readings, IntArray]:

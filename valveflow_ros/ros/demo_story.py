@@ -49,7 +49,7 @@ class Story:
         self._tell = tell
         self._begun = False
         self._last = ''
-        self._occurrence = 0
+        self._occurrences: dict[str, int] = {}
         self._named: tuple[str, ...] = ()
         self.curves = 0
         self.raised: list[int] = []
@@ -83,9 +83,9 @@ class Story:
         """Tell that an alarm came, or came again."""
         self.reached(time_ns)
         # One that could not be judged for a while and stands again is not a new one.
-        if occurrence == self._occurrence:
+        if occurrence == self._occurrences.get(name):
             return
-        self._occurrence = occurrence
+        self._occurrences[name] = occurrence
         self.raised.append(time_ns)
         if len(self.raised) == 1:
             self._say(time_ns, f'ALARM {name}: {sentence}')

@@ -16,8 +16,9 @@ from valveflow_ros.ros.tallies import Tally
 __all__ = ['Arrival', 'Clock', 'Intake']
 
 _MOST_CLOCKS = 16 * DEPTH
-# So many plain values wait for the first /clock; half a minute of a plant at 100 Hz.
+# So many plain values wait for the first /clock, and so long: what waits is not on disk yet.
 MOST_EARLY = 16 * DEPTH
+EARLY_S = 5.0
 _PATIENCE_S = 0.03
 _CLOCK_PATIENCE_S = 0.2
 # A message may get its receipt time a moment before it can be taken.
@@ -77,9 +78,9 @@ class Intake:
     none comes, it does not wait for long.
 
     What is sent before the very first clock message has no time yet. It waits for
-    that message and is put before its time by as much as it was sent earlier: so
-    nothing is logged at a time of 1970. Beyond `MOST_EARLY` the oldest wait no
-    longer and are logged without a time, which is 0, and not fed.
+    that message, and is put before its time by as much as it was sent earlier. After
+    `EARLY_S`, or where more than `MOST_EARLY` wait, the oldest wait no longer and
+    are logged without a time, which is 0, and not fed.
     """
 
     def __init__(
@@ -133,7 +134,7 @@ class Intake:
                 until_ns = min(until_ns, received_ns)
         if self._clock is not None:
             self._follow_clock(self._clock, now_s)
-            self._let_go(last)
+            self._let_go(now_s, last)
         if not self._held:
             return []
         # By topic within one receipt time; a topic's own messages stay in their order.
@@ -153,10 +154,12 @@ class Intake:
         self._early.append(held)
         self.tallies[held.name].waiting += 1
 
-    def _let_go(self, last: bool) -> None:
-        """End the wait for the first clock message: it has come, or too many wait."""
+    def _let_go(self, now_s: float, last: bool) -> None:
+        """End the wait for the first clock message: it has come, or they waited long enough."""
         most = 0 if last or self._track.newest_ns else MOST_EARLY
-        while len(self._early) > most:
+        while self._early and (
+            len(self._early) > most or now_s - self._early[0].taken_s > EARLY_S
+        ):
             held = self._early.popleft()
             self.tallies[held.name].waiting -= 1
             self._held.append(held)
