@@ -87,7 +87,9 @@ def main() -> int:
     print(
         f'{len(seconds)} of {given.count} runs, {sum(passed)} tests passed, {len(failures)} failed'
     )
-    return 1 if failures or not seconds else 0
+    # A run that counts fewer tests than another has not run all of them.
+    whole = len(seconds) >= given.count and len(set(passed)) == 1
+    return 0 if whole and not failures else 1
 
 
 if __name__ == '__main__':

@@ -154,6 +154,7 @@ def run(given: argparse.Namespace) -> dict[str, Any]:
     begun_s = time.monotonic()
     found = run_all(given)
     words = ['--seed', str(given.seed), '--count', str(given.count)]
+    words += ['--minutes', f'{given.minutes:g}'] if given.minutes else []
     words += ['--modules', *given.modules] if given.modules else []
     return {
         'command': ' '.join(['python -m benchmarks.mutation', *words]),

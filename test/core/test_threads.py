@@ -14,6 +14,13 @@ def on_cores(request, monkeypatch):
     return request.param
 
 
+@pytest.mark.parametrize(('told', 'most'), [('1', 1), ('', 64), ('0', 1), ('nonsense', 64)])
+def test_numbas_limit_is_ours(monkeypatch, told, most):
+    monkeypatch.setattr(threads.os, 'sched_getaffinity', lambda _: set(range(64)), raising=False)
+    monkeypatch.setenv('NUMBA_NUM_THREADS', told)
+    assert threads.cores() == most
+
+
 def numbers(n, seen, wrong_at=None):
     for k in range(n):
         seen.append(threading.current_thread())

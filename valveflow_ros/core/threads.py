@@ -15,10 +15,14 @@ _LOOK_S = 0.2
 
 
 def cores() -> int:
-    """Return how many cores this process may use."""
-    if hasattr(os, 'sched_getaffinity'):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    """Return how many cores this process may use.
+
+    ``NUMBA_NUM_THREADS`` sets a limit, as it does to the compiler's own threads: a monitor's
+    worker leaves all cores but one to others.
+    """
+    have = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()
+    told = os.environ.get('NUMBA_NUM_THREADS', '')
+    return max(1, min(have or 1, int(told) if told.isdecimal() else have or 1))
 
 
 def runs(count: int, length: int) -> list[tuple[int, int]]:

@@ -35,7 +35,15 @@ def fit_ar(residual: FloatArray, weight: ByteArray, order: int = ORDER) -> Float
 
 
 def yule_walker(products: FloatArray) -> FloatArray:
-    """Solve for the coefficients whose process has these mean products at lags 0 to k, (k,)."""
+    """Solve for the coefficients whose process has these mean products at lags 0 to k, (k,).
+
+    Raises
+    ------
+    LinAlgError
+        There is no solution, or a product is not finite.
+    """
+    if not np.isfinite(products).all():
+        raise np.linalg.LinAlgError('the residual is not finite')
     lags = np.arange(len(products) - 1)
     # So few that the solver made for such matrices gains nothing, and takes long to load.
     return np.asarray(np.linalg.solve(products[np.abs(lags[:, None] - lags)], products[1:]))
