@@ -24,14 +24,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from valveflow_ros.cli.alignment import align
+from valveflow_ros.cli import engine
 from valveflow_ros.cli.log_input import steps_of
 from valveflow_ros.cli.parameters import settings_for
 from valveflow_ros.cli.report_words import columns
-from valveflow_ros.core.events import FitRequested, SegmentClosed
-from valveflow_ros.core.fit import fit
-from valveflow_ros.core.monitor import Monitor
-from valveflow_ros.core.offline import feed_rows
 from valveflow_ros.logs import open_log, write_samples
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.spec import EffectSpec
@@ -81,22 +77,16 @@ def identify(path: Path, watch: Stopwatch) -> dict[str, Any]:
     readings = contents.readings
     span_s = float(np.ptp(readings.time_ns)) / 1e9
     settings, _ = settings_for(steps_of(readings), span_s, {})
-    table, _, counts = watch.measure(
-        'align', lambda: align(readings, settings), lambda a: f'{len(a[0]):,} rows'
-    )
-    monitor = Monitor(settings)
-    events = watch.measure(
-        'engine, streaming', lambda: feed_rows(monitor, table), lambda _: 'segments and window'
-    )
-    rate = len(table) / watch.rows[-1]['wall_s']
-    watch.rows[-1]['what'] = f'{rate / 1e6:.2f} million rows/s'
-    task = next(e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
+    seen = watch.measure(
+        'rows and segments', lambda: engine.watch(readings, settings),
+        lambda w: f'{len(w.table):,} rows, {len(w.segments)} segments',
+    )  # fmt: skip
+    rate = len(seen.table) / watch.rows[-1]['wall_s']
     curve = watch.measure(
-        'fit', lambda: fit(task),
+        'fit', lambda: engine.identify(seen),
         lambda c: f'{len(c.pieces)} pieces from {c.source.samples:,} special samples',
     )  # fmt: skip
-    segments = tuple(e.segment for e in events if isinstance(e, SegmentClosed))
-    found = Identified(path.name, curve, table, segments, counts, settings)
+    found = Identified(path.name, curve, seen.table, seen.segments, seen.counts, settings)
     report = watch.measure(
         'report', lambda: identification_report(found), lambda r: f'{len(r) / 1e6:.2f} MB'
     )

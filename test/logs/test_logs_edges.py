@@ -15,7 +15,6 @@ from log_files import (
 )
 
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.records import SIGNALS
 from valveflow_ros.logs import Decoder, RecordingWriter, open_log, recover
 from valveflow_ros.logs.chunk_builder import ChunkBuilder
 from valveflow_ros.logs.compression import Unpacker
@@ -24,6 +23,7 @@ from valveflow_ros.logs.limits import Limits
 from valveflow_ros.logs.part_file import PartFile
 from valveflow_ros.logs.topic_book import REPEAT_CHUNKS, TableSchedule
 from valveflow_ros.logs.topic_table import TopicTable
+from valveflow_ros.records import SIGNALS
 
 PACKED = zstandard.ZstdCompressor().compress(bytes(100))
 UNSIZED = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(100))

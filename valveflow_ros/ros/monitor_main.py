@@ -20,7 +20,7 @@ from valveflow_ros.ros.monitor_node import MonitorNode
 from valveflow_ros.ros.secure_start import check_security
 from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.stops import StopFlag
-from valveflow_ros.ros.transport import choose_transport
+from valveflow_ros.ros.transport import ask_again, choose_transport
 from valveflow_ros.ros.usage import show, usage, wants_help
 from valveflow_ros.ros.watchdog import Watchdog
 
@@ -101,6 +101,7 @@ def _main(args: Sequence[str] | None) -> int:
 def _run(stop: StopFlag) -> int:
     watchdog = Watchdog()
     node = _Supervised(stop, watchdog)
+    ask_again()
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:

@@ -14,6 +14,7 @@ import os
 from collections.abc import MutableMapping
 from pathlib import Path
 
+import rclpy
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from rclpy.utilities import get_rmw_implementation_identifier
 
@@ -54,6 +55,34 @@ def choose_transport(
     if profile is not None and not any(environ.get(name) for name in _OTHERWISE):
         environ.update(dict.fromkeys(_PROFILES, str(profile)))
         environ[_RANGE] = 'SYSTEM_DEFAULT'
+
+
+def ask_again(middleware: str | None = None) -> None:
+    """Let all nodes of the domain say at once, once more, that they are there.
+
+    Whoever hears of a new participant answers within a millisecond; but Fast DDS (2.14) announces
+    a participant before its sockets are read, so on one host the answer is lost, and the next
+    one comes with the period of 3 s. A second participant, made when the first one listens and
+    taken away again, brings the answers a second time. Call it when the node has been made.
+
+    Parameters
+    ----------
+    middleware : str, optional
+        The name of the ROS middleware, the one in use by default; others need no such help.
+    """
+    middleware = get_rmw_implementation_identifier() if middleware is None else middleware
+    if middleware not in _FAST_DDS:
+        return
+    context = rclpy.Context()
+    context.init(args=[])
+    try:
+        # The underscore keeps it out of lists of nodes.
+        rclpy.create_node(
+            f'_knock_{os.getpid()}', context=context, enable_rosout=False,
+            start_parameter_services=False,
+        ).destroy_node()  # fmt: skip
+    finally:
+        context.try_shutdown()
 
 
 def _profile() -> Path | None:
