@@ -44,6 +44,7 @@ def test_the_json_is_the_contract(diagnosed):
 
 def test_the_extended_model_can_be_read(diagnosed):
     raw = json.loads((diagnosed / 'out' / 'extended_model.json').read_text())
+    assert raw['written_by'] == 'diagnose'
     model, exponent, _, _ = model_from_json(raw)
     assert model.base.pieces >= 2
     assert exponent == 1.125

@@ -45,6 +45,7 @@ def test_the_extended_model_gets_the_new_curve(identified):
     curve = json.loads((identified / 'held' / 'characteristic.json').read_text())
     extended = json.loads((identified / 'held' / 'extended_model.json').read_text())
     assert extended['curve']['knots'][1:] == [p['u_to'] for p in curve['pieces']]
+    assert extended['written_by'] == 'identify'
     given = extended_json(**HELD)
     for key in ('causes', 'reference', 'start_ns', 'pressure_exponent'):
         assert extended[key] == given[key]

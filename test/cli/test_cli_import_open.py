@@ -10,9 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from valveflow_ros.cli import import_table
 from valveflow_ros.cli.config_fit import Fitted, _units
-from valveflow_ros.cli.historian_open import answered
-from valveflow_ros.cli.mapping import read_mapping
+from valveflow_ros.cli.console import Console
+from valveflow_ros.cli.historian_open import LOOKING_ON, answered
+from valveflow_ros.cli.mapping import About, read_mapping
+from valveflow_ros.cli.usage import Parser, add_common
 from valveflow_ros.core.unit_table import AIR_MPA, convert, unit_of
 from valveflow_ros.errors import InputError
 from valveflow_ros.logs import open_log
@@ -100,6 +103,46 @@ def test_two_columns_and_their_unit_are_one_option(run, table, tmp_path):
     assert 'with the first of each choice' in said
     assert sum('generated_power' in word for word in last_command(said)) == 1
     assert run(*last_command(said)).status == 0
+
+
+def test_a_suggested_command_holds_with_values_that_begin_with_a_dash(
+    run, table, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    table.rename(tmp_path / '-x.csv')
+    said = run('import', './-x.csv', '-o', './-x.mcap', '--time-zone=-05:00').refused()
+    words = last_command(said)
+    assert words[:4] == ['import', './-x.csv', '-o', './-x.mcap']
+    parser = Parser('valveflow import')
+    import_table.arguments(parser)
+    add_common(parser)
+    parsed = parser.parse_args(words[1:])
+    assert (parsed.table.name, parsed.output.name) == ('-x.csv', '-x.mcap')
+    assert About('time_zone', '-05:00') in parsed.column
+    assert run(*words).status == 0
+    readings = open_log(tmp_path / '-x.mcap').readings
+    first = np.datetime64('2026-02-01T05:00:00', 'ns').astype(np.int64)
+    assert readings.time_ns.min() == first
+
+
+@pytest.mark.parametrize(('option', 'value'), [
+    ('sheet', '-Data'), ('sheet', "- it's"), ('time-zone', '-05:00'), ('date-order', 'dmy'),
+    ('column', 'generated_power=-MW:kW'),
+])  # fmt: skip
+def test_an_option_that_is_suggested_is_read_back(option, value):
+    parser = Parser('valveflow import')
+    import_table.arguments(parser)
+    words = shlex.split(str(Remedy(option, value)))
+    (said,) = parser.parse_args(['x.csv', *words]).column
+    assert said == (value if option == 'column' else About(option.replace('-', '_'), value))
+
+
+@pytest.mark.parametrize('verb', ['import', 'info'])
+def test_looking_on_shows_that_it_is_at_work(run, table, monkeypatch, verb):
+    told = []
+    monkeypatch.setattr(Console, 'progress', lambda _, share, what: told.append(what))
+    run(verb, table, *(['--dry-run'] if verb == 'import' else [])).refused()
+    assert LOOKING_ON in told
 
 
 def test_the_other_verbs_name_all_options_in_one_line(run, table, tmp_path):

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import json
+from argparse import Namespace
+
 import pytest
 
+from valveflow_ros.cli.console import Outcome
+from valveflow_ros.cli.file_marks import signed, writer
 from valveflow_ros.cli.files import write_texts
 from valveflow_ros.cli.keeping import REPORT, keep_others, renamed
-from valveflow_ros.report.page import Page
+from valveflow_ros.cli.report_files import _others_pictures, with_report
+from valveflow_ros.compare import comparison_json, validation_json
+from valveflow_ros.core import characteristic_json, shift_json
+from valveflow_ros.diagnosis import diagnosis_json
+from valveflow_ros.errors import RecordingError
+from valveflow_ros.report.page import Figure, Page, Section
 
+MODEL = 'extended_model.json'
 VERBS = ('identify', 'diagnose', 'compare', 'validate')
 
 
@@ -65,8 +76,101 @@ def test_segments_of_compare_and_validate_do_not_replace_each_other(tmp_path):
     assert write(tmp_path, 'validate', **{'segments.csv': ours}).names == {}
 
 
-def test_the_model_of_a_diagnosis_is_not_lost_to_identify(tmp_path):
-    write(tmp_path, 'diagnose', **{'extended_model.json': 'causes'})
-    kept = write(tmp_path, 'identify', **{'extended_model.json': 'a new curve'})
-    assert kept.names['extended_model.json'] == 'extended_model_diagnose.json'
-    assert (tmp_path / 'extended_model_diagnose.json').read_text() == 'causes'
+def model_of(verb, words='x'):
+    content = {'format': 'valveflow/extended_model', 'version': 1, 'words': words}
+    return json.dumps(signed(content, verb) if verb else content, indent=2)
+
+
+def test_the_model_of_a_diagnosis_is_not_lost_whatever_report_stands_there(tmp_path):
+    causes = model_of('diagnose', 'causes')
+    write(tmp_path, 'diagnose', **{MODEL: causes})
+    write(tmp_path, 'compare')
+    kept = write(tmp_path, 'identify', **{MODEL: model_of('identify', 'a curve')})
+    assert kept.names == {REPORT: 'report_compare.html', MODEL: 'extended_model_diagnose.json'}
+    assert 'The extended_model.json that was there is now extended_model_diagnose' in kept.words()
+    assert (tmp_path / 'extended_model_diagnose.json').read_text() == causes
+    kept = write(tmp_path, 'diagnose', **{MODEL: model_of('diagnose', 'new causes')})
+    assert kept.names[MODEL] == 'extended_model_identify.json'
+    assert 'a curve' in (tmp_path / 'extended_model_identify.json').read_text()
+    assert write(tmp_path, 'diagnose', **{MODEL: causes}).names == {}
+
+
+def test_a_model_that_does_not_say_whose_it_is_is_kept(tmp_path):
+    for words in ('first', 'second'):
+        (tmp_path / MODEL).write_text(model_of('', words))
+        write(tmp_path, 'diagnose', **{MODEL: model_of('diagnose')})
+    for words, tail in (('first', ''), ('second', '_2')):
+        assert words in (tmp_path / f'extended_model_before{tail}.json').read_text()
+
+
+@pytest.mark.parametrize('name', [
+    'segments.csv', 'parameters.csv', 'curves.csv', 'comparison.json', MODEL,
+])  # fmt: skip
+def test_a_file_of_a_person_is_kept_whatever_its_name(tmp_path, name):
+    (tmp_path / name).write_text('mine')
+    copy = renamed(name, 'before')
+    (tmp_path / copy).write_text('mine too')
+    kept = write(tmp_path, 'compare', **{name: 'x'})
+    assert kept.names[name] == renamed(name, 'before_2')
+    assert f'The {name} that was there is now' in kept.words()
+    assert (tmp_path / copy).read_text() == 'mine too'
+    assert (tmp_path / renamed(name, 'before_2')).read_text() == 'mine'
+
+
+def test_a_page_of_a_person_under_the_name_of_a_copy_stays(tmp_path):
+    (tmp_path / 'report_identify.html').write_text('mine')
+    assert write(tmp_path, 'identify', 'curve').words() == ''
+    assert write(tmp_path, 'diagnose').names == {REPORT: 'report_identify_2.html'}
+    assert (tmp_path / 'report_identify.html').read_text() == 'mine'
+    assert 'curve' in (tmp_path / 'report_identify_2.html').read_text()
+    write(tmp_path, 'identify', 'newer curve')
+    write(tmp_path, 'diagnose')
+    assert 'newer curve' in (tmp_path / 'report_identify_2.html').read_text()
+
+
+def test_what_cannot_be_read_is_not_replaced(tmp_path, monkeypatch):
+    (tmp_path / 'segments.csv').write_text('mine')
+    monkeypatch.setattr('pathlib.Path.read_bytes', _denied)
+    with pytest.raises(RecordingError, match='cannot be read to keep it'):
+        write(tmp_path, 'compare', **{'segments.csv': 'x'})
+    assert (tmp_path / 'segments.csv').read_text() == 'mine'
+
+
+def _denied(path):
+    raise PermissionError(13, 'Permission denied', str(path))
+
+
+@pytest.mark.parametrize(('form', 'verb'), [
+    (characteristic_json, 'identify'), (shift_json, 'identify'), (diagnosis_json, 'diagnose'),
+    (comparison_json, 'compare'), (validation_json, 'validate'),
+])  # fmt: skip
+def test_every_file_for_programs_tells_its_verb(tmp_path, form, verb):
+    path = tmp_path / 'some.json'
+    for indent in (1, 2):
+        path.write_text(json.dumps({'format': form.FORMAT, 'version': 1}, indent=indent))
+        assert writer(path) == verb
+
+
+def test_pictures_that_showed_something_else_are_named(tmp_path):
+    made = {'tables': {'history.csv': 'a', 'curve.csv': 'b'}, 'figures': {'alarms.png': b'c'}}
+    assert _others_pictures(tmp_path, made) == ''
+    for folder, files in made.items():
+        write_texts(tmp_path / folder, files)
+    assert _others_pictures(tmp_path, made) == ''
+    made['tables'] = {'history.csv': 'new', 'curve.csv': 'new'}
+    told = _others_pictures(tmp_path, made)
+    assert told == 'tables/history.csv: what was there showed something else and is replaced.'
+
+
+def test_a_verb_says_whose_pictures_it_replaced(tmp_path):
+    options = Namespace(output=tmp_path, table=True, figures=False)
+
+    def written(verb, y):
+        trace = {'type': 'scatter', 'mode': 'lines', 'name': 'a', 'x': [0, 1], 'y': [0, y]}
+        figure = Figure('history', 'A caption.', 'Words.', [trace], {}, 300)
+        page = Page('Title', '', [Section('A section', [figure])], '', verb)
+        return with_report(options, {}, page, lambda _: Outcome('Done.', {'files': {}})).text
+
+    assert 'replaced' not in written('identify', 1)
+    assert 'replaced' not in written('diagnose', 1)
+    assert 'tables/history.csv: what was there showed something else' in written('identify', 2)

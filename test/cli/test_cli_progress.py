@@ -103,6 +103,17 @@ def test_time_goes_on_by_itself():
     assert err.getvalue().endswith('\r\x1b[K')
 
 
+def test_nothing_is_drawn_after_the_end(shown):
+    progress, err, clock = shown()
+    progress.at(0.5, 'working')
+    progress.end()
+    told = err.getvalue()
+    clock.now += 10.0
+    progress.at(0.6, 'more')
+    progress.tick()
+    assert err.getvalue() == told
+
+
 def test_a_stream_without_blocks_gets_a_bar_it_can_show(shown, monkeypatch):
     err = io.TextIOWrapper(io.BytesIO(), encoding='ascii')
     monkeypatch.setattr(Progress, '_start', lambda self: None)

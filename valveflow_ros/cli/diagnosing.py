@@ -12,6 +12,7 @@ import numpy as np
 
 from valveflow_ros.cli import engine
 from valveflow_ros.cli.console import Console, Outcome
+from valveflow_ros.cli.file_marks import signed
 from valveflow_ros.cli.first_run import SENTENCE, is_first_run
 from valveflow_ros.cli.log_input import LogInput, steps_of
 from valveflow_ros.cli.model_file import read_either
@@ -200,7 +201,8 @@ def _complete(table: SampleTable) -> bool:
 def texts(found: Result) -> dict[str, str]:
     """Return the files for programs by name."""
     d, page = found.page.diagnosis, found.page
-    extended = model_json(d.final, found.exponent, page.start_ns, d.reference, found.on_top_of)
+    model = model_json(d.final, found.exponent, page.start_ns, d.reference, found.on_top_of)
+    extended = signed(model, 'diagnose')
     return {
         'diagnosis.json': json.dumps(to_json(d), indent=2, allow_nan=False) + '\n',
         'extended_model.json': json.dumps(extended, indent=2, allow_nan=False) + '\n',

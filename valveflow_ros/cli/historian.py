@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from valveflow_ros.cli.console import Console
+from valveflow_ros.cli.constant_signals import check_constants, with_constants
 from valveflow_ros.cli.historian_facts import Imported, SignalSource, Tally
 from valveflow_ros.cli.historian_open import joined
 from valveflow_ros.cli.historian_order import Ordered
@@ -16,12 +17,10 @@ from valveflow_ros.cli.historian_spool import Spool
 from valveflow_ros.cli.log_input import (
     advice,
     air_note,
-    check_constants,
     names_for,
     refuse_guesses,
     unit_for,
     unknown_unit,
-    with_constants,
 )
 from valveflow_ros.cli.mapping import Mapping
 from valveflow_ros.cli.plausible import doubt

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from argparse import Namespace
+from pathlib import Path
 
 from valveflow_ros.cli.historian_open import subject
 from valveflow_ros.cli.mapping import About, read_mapping
@@ -29,12 +31,18 @@ def told(refused: RefusedError, options: Namespace) -> str:
 def command(refused: RefusedError, options: Namespace) -> str:
     """Return the command as it was given, with the options that were missing."""
     new = {_canonical(remedy) for remedy in refused.remedies}
-    words = ['valveflow', 'import', quoted(str(options.table))]
+    words = ['valveflow', 'import', _place(options.table)]
     if options.output is not None:
-        words += ['-o', quoted(str(options.output))]
+        words += ['-o', _place(options.output)]
     words += [f'--{name.replace("_", "-")}' for name in _FLAGS if getattr(options, name, False)]
     words += [str(old) for old in _given(options) if _canonical(old) not in new]
     return ' '.join([*words, refused.options])
+
+
+def _place(path: Path) -> str:
+    """Return a path as a shell takes it, and as no option."""
+    told = str(path)
+    return quoted(f'.{os.sep}{told}' if told.startswith('-') else told)
 
 
 def _given(options: Namespace) -> list[Remedy]:

@@ -23,6 +23,8 @@ _USUAL = {
     'valve_command': 50.0,
 }
 _MOST_LOOKS = 12
+# Each further look may read the whole table.
+LOOKING_ON = 'looking for what else the table leaves open'
 
 
 def looked_through(
@@ -40,7 +42,7 @@ def looked_through(
     mapping : Mapping
         What the person said.
     again : callable, optional
-        Looks as `look` does, and says nothing meanwhile.
+        Looks as `look` does; of what it understands it says nothing, only that it is at work.
 
     Raises
     ------

@@ -11,6 +11,7 @@ from typing import Any
 
 from valveflow_ros.cli import engine
 from valveflow_ros.cli.console import Console, Outcome
+from valveflow_ros.cli.file_marks import signed
 from valveflow_ros.cli.first_run import SENTENCE, is_first_run
 from valveflow_ros.cli.log_input import LogInput, steps_of
 from valveflow_ros.cli.manual_test import advice_for, found_in_step_test, refusal
@@ -128,8 +129,8 @@ def texts(found: Identified, extended: ExtendedModel | None = None) -> dict[str,
         files['shift.json'] = told + '\n'
     if extended is not None and found.characteristic.dynamics:
         anew = Extended(found.characteristic.model, extended.model.active)
-        told = json.dumps(model_json.to_json(replace(extended, model=anew)), indent=2)
-        files['extended_model.json'] = told + '\n'
+        model = signed(model_json.to_json(replace(extended, model=anew)), 'identify')
+        files['extended_model.json'] = json.dumps(model, indent=2) + '\n'
     return files
 
 

@@ -71,15 +71,19 @@ def run(options: Namespace, console: Console) -> Outcome:
         return _imported(options, said, console)
 
     try:
-        return looked_through(options.table, look, mapping, partial(_looked, options.table))
+        return looked_through(
+            options.table, look, mapping, partial(_looked, options.table, console)
+        )
     except RefusedError as refused:
         raise InputError(told(refused, options)) from None
 
 
-def _looked(table: Path, mapping: Mapping) -> None:
-    """Read a table for what else is open, and say nothing of it."""
+def _looked(table: Path, console: Console, mapping: Mapping) -> None:
+    """Read a table for what else is open, and say nothing of what is understood."""
     from valveflow_ros.cli.historian import Historian
+    from valveflow_ros.cli.historian_open import LOOKING_ON
 
+    console.progress(0.1, LOOKING_ON)
     with Path(os.devnull).open('w', encoding='utf-8') as nowhere:
         Historian(table, mapping, Console(nowhere, nowhere, quiet=True), strict=True).read(None)
 

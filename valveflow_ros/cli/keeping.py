@@ -1,29 +1,24 @@
-"""Results of another verb in the same folder: kept under names that say whose they are."""
+"""What stands in a folder of results already: kept, unless the same verb wrote it."""
 
 from __future__ import annotations
 
-import re
+import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from valveflow_ros.cli.file_marks import writer
 from valveflow_ros.cli.files import write_texts
+from valveflow_ros.errors import RecordingError
 
 REPORT = 'report.html'
-# Several verbs write a file of that name; every other name belongs to one of them.
-_SEGMENTS, _EXTENDED = 'segments.csv', 'extended_model.json'
-_SHARED = REPORT, _SEGMENTS, _EXTENDED
-_MADE_BY = re.compile(rb'<meta name="generator" content="valveflow ([a-z]+) ')
-_COLUMNS = {'compare': b',proposed.', 'validate': b',curve.'}
-# The head of our pages and the columns of our tables stand well within.
-_HEAD = 4096
-# A page that is not ours, or of a version that did not say.
+# A file that is not ours, or of a version that did not say.
 _UNKNOWN = 'before'
 
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """What another verb had written, and where it stands now.
+    """What another verb or somebody else had written, and where it stands now.
 
     Attributes
     ----------
@@ -52,7 +47,7 @@ class Kept:
 
 
 def keep_others(folder: Path, verb: str, names: Collection[str]) -> Kept:
-    """Copy what another verb wrote under names that ``verb`` is about to take.
+    """Copy what ``verb`` is about to replace and has not surely written itself.
 
     Parameters
     ----------
@@ -66,18 +61,21 @@ def keep_others(folder: Path, verb: str, names: Collection[str]) -> Kept:
     Raises
     ------
     RecordingError
-        A copy cannot be written; nothing has been replaced then.
+        A copy cannot be made; nothing has been replaced then.
     """
     kept: dict[str, str] = {}
-    for name in (n for n in _SHARED if n in names and (folder / n).is_file()):
-        writer = _writer(folder, name)
-        if writer == verb or (not writer and name != REPORT):
+    # The report is named first.
+    for name in sorted(names, key=lambda n: n != REPORT):
+        if not (folder / name).is_file():
             continue
-        kept[name] = renamed(name, writer) if writer else _free(folder)
-        write_texts(folder, {kept[name]: (folder / name).read_bytes()})
+        theirs = writer(folder / name)
+        if theirs == verb:
+            continue
+        kept[name] = _free(folder, name, theirs, names)
+        write_texts(folder, {kept[name]: _content(folder / name)})
     own = renamed(REPORT, verb)
-    old = own if (folder / own).is_file() else ''
-    return Kept(kept, _writer(folder, REPORT) if REPORT in kept else '', old)
+    old = own if writer(folder / own) == verb else ''
+    return Kept(kept, writer(folder / REPORT) if REPORT in kept else '', old)
 
 
 def renamed(name: str, mark: str) -> str:
@@ -86,26 +84,25 @@ def renamed(name: str, mark: str) -> str:
     return f'{path.stem}_{mark}{path.suffix}'
 
 
-def _writer(folder: Path, name: str) -> str:
-    """Return the verb that wrote a file of ours, empty if that cannot be told."""
-    if name == _EXTENDED:
-        return 'diagnose' if _writer(folder, REPORT) == 'diagnose' else ''
-    try:
-        with (folder / name).open('rb') as file:
-            head = file.read(_HEAD)
-    except OSError:
-        return ''
-    if name == REPORT:
-        found = _MADE_BY.search(head)
-        return found[1].decode() if found else ''
-    first = head.partition(b'\n')[0]
-    return next((verb for verb, mark in _COLUMNS.items() if mark in first), '')
-
-
-def _free(folder: Path) -> str:
-    """Return a name under which no report stands yet."""
-    name, number = renamed(REPORT, _UNKNOWN), 1
-    while (folder / name).exists():
+def _free(folder: Path, name: str, verb: str, taken: Collection[str]) -> str:
+    """Return a name for a copy: one that is free, or holds an older copy of the same verb."""
+    mark = verb or _UNKNOWN
+    new, number = renamed(name, mark), 1
+    while new in taken or (os.path.lexists(folder / new) and not _same(folder / new, verb)):
         number += 1
-        name = renamed(REPORT, f'{_UNKNOWN}_{number}')
-    return name
+        new = renamed(name, f'{mark}_{number}')
+    return new
+
+
+def _same(path: Path, verb: str) -> bool:
+    return bool(verb) and path.is_file() and writer(path) == verb
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(
+            path, f'cannot be read to keep it ({reason}); choose another -o DIR'
+        ) from None

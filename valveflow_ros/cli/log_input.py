@@ -10,17 +10,18 @@ from pathlib import Path
 import numpy as np
 
 from valveflow_ros.cli.console import Console
-from valveflow_ros.cli.historian_open import looked_through
+from valveflow_ros.cli.constant_signals import check_constants, with_constants
+from valveflow_ros.cli.historian_open import LOOKING_ON, looked_through
 from valveflow_ros.cli.mapping import Column, Mapping
-from valveflow_ros.cli.plausible import Doubt, doubt, limits
+from valveflow_ros.cli.plausible import Doubt, doubt
 from valveflow_ros.cli.usage import UsageError
 from valveflow_ros.config import Settings
 from valveflow_ros.core.unit_table import UNITS, air_in, convert, known_units
-from valveflow_ros.errors import DataError, InputError
+from valveflow_ros.errors import InputError
 from valveflow_ros.logs import LogContents, open_log
 from valveflow_ros.logs.historian_match import choosing, option
 from valveflow_ros.logs.historian_refusal import THEIRS, RefusedError
-from valveflow_ros.records import SIGNALS, Quality, Readings, Signal
+from valveflow_ros.records import SIGNALS, Readings, Signal
 
 # A column is not the signal it is named after if most of its values cannot be.
 _MOST = 0.5
@@ -64,7 +65,7 @@ def open_input(path: Path, mapping: Mapping, console: Console) -> LogInput:
     RecordingError, InputError, DataError
         The log cannot be read, a column is missing, a unit unknown.
     """
-    contents = open_with(path, mapping)
+    contents = open_with(path, mapping, console)
     for sentence in contents.warnings:
         console.warn(sentence)
     for sentence in contents.understood:
@@ -90,7 +91,7 @@ def open_input(path: Path, mapping: Mapping, console: Console) -> LogInput:
     return LogInput(contents, with_constants(readings, constants), units, constants, doubts)
 
 
-def open_with(path: Path, mapping: Mapping) -> LogContents:
+def open_with(path: Path, mapping: Mapping, console: Console) -> LogContents:
     """Open a log under the names of ``--column``; raises like `open_input`."""
 
     def look(said: Mapping) -> LogContents:
@@ -102,7 +103,11 @@ def open_with(path: Path, mapping: Mapping) -> LogContents:
                 raise
             raise unknown_unit(strange[0]) from error
 
-    return looked_through(path, look, mapping)
+    def again(said: Mapping) -> LogContents:
+        console.progress(0.02, LOOKING_ON)
+        return look(said)
+
+    return looked_through(path, look, mapping, again)
 
 
 def names_for(mapping: Mapping) -> tuple[dict[str, str], list[Column]]:
@@ -172,26 +177,6 @@ def air_note(signal: Signal, unit: str, theirs: str) -> str:
         f"'{theirs}' is a gauge pressure ({unit}); {air:.6g} {unit.removesuffix('g')} of air, the "
         'standard atmosphere, are added to make it absolute.'
     )
-
-
-def check_constants(constants: dict[Signal, float]) -> None:
-    """Refuse constants that the engine would reject at each row.
-
-    Raises
-    ------
-    UsageError
-    """
-    settings = Settings()
-    for signal, value in constants.items():
-        low, high = limits(signal, settings)
-        if not low <= value <= high:
-            info = SIGNALS[signal]
-            others = ', '.join(list(UNITS[signal])[1:])
-            raise UsageError(
-                f'--constant {info.topic}: {value:g} {info.unit} is impossible ({low:g} to '
-                f'{high:g} {info.unit}); for another unit write {info.topic}=VALUE:UNIT with one '
-                f'of {others}.'
-            )
 
 
 def refuse_guesses(
@@ -267,35 +252,3 @@ def _doubts(
     judged = [s for s in sorted(contents.signals) if s not in constants]
     found = [doubt(s, readings.value[readings.signal == s], units[s], settings) for s in judged]
     return [d for d in found if d is not None]
-
-
-def with_constants(readings: Readings, constants: dict[Signal, float]) -> Readings:
-    """Put each constant beside every reading of a measured signal.
-
-    Raises
-    ------
-    DataError
-        If no signal is measured.
-    """
-    if not constants:
-        return readings
-    kept = ~np.isin(readings.signal, [int(s) for s in constants])
-    readings = Readings(
-        readings.time_ns[kept], readings.signal[kept], readings.value[kept],
-        readings.quality[kept],
-    )  # fmt: skip
-    measured = [i.signal for i in SIGNALS if i.required and i.signal not in constants]
-    lead = next((s for s in measured if (readings.signal == s).any()), None)
-    if lead is None:
-        raise DataError('Every signal is a constant or missing; nothing is left to learn from.')
-    beside = np.flatnonzero(readings.signal == lead)
-    for signal, value in sorted(constants.items()):
-        n = len(beside)
-        readings = Readings(
-            np.insert(readings.time_ns, beside, readings.time_ns[beside]),
-            np.insert(readings.signal, beside, np.full(n, int(signal), dtype=np.int8)),
-            np.insert(readings.value, beside, np.full(n, value)),
-            np.insert(readings.quality, beside, np.full(n, int(Quality.GOOD), dtype=np.uint8)),
-        )
-        beside = beside + np.arange(1, n + 1)
-    return readings

@@ -88,7 +88,8 @@ def add_mapping(parser: ArgumentParser) -> None:
     about = parser.add_argument_group('how a table is written, where it does not show it itself')
     about.add_argument(
         '--time-zone', dest='column', action='append', type=_about('time_zone'), metavar='ZONE',
-        help='zone of times that name none, such as Europe/Berlin or +01:00 (default: UTC)',
+        help='zone of times that name none, such as Europe/Berlin or +01:00; west of '
+        'Greenwich with an equals sign, --time-zone=-05:00 (default: UTC)',
     )  # fmt: skip
     about.add_argument(
         '--date-order', dest='column', action='append', type=_about('date_order'),

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 FIGURES, TABLES = 'figures', 'tables'
 _ABOUT = {FIGURES: 'pictures', TABLES: 'tables'}
+# What a monitor recorded is shown by each verb that reads its log.
+_OF_ANY_VERB = ('history', 'alarms')
 
 
 def add_report_files(parser: ArgumentParser) -> None:
@@ -78,6 +80,7 @@ def with_report(
     content = {**texts, REPORT: page.to_html()}
     beside = _pictures_and_tables(options, page)
     kept = keep_others(options.output, page.verb, content)
+    replaced = _others_pictures(options.output, beside) if REPORT in kept.names else ''
     done = told(write_texts(options.output, content))
     files = dict(done.data['files'])
     for folder, made in beside.items():
@@ -85,8 +88,34 @@ def with_report(
         files |= {f'{folder}/{name}': str(path) for name, path in written.items()}
     data = {**done.data, 'files': files, **({'kept': dict(kept.names)} if kept.names else {})}
     asked = ' and '.join(f'{_ABOUT[f]} in {options.output / f}' for f in beside)
-    lines = [done.text, f'Wrote {asked}.' if asked else '', kept.words()]
+    lines = [done.text, f'Wrote {asked}.' if asked else '', kept.words(), replaced]
     return Outcome('\n'.join(line for line in lines if line), data)
+
+
+def _others_pictures(
+    folder: Path, beside: Mapping[str, Mapping[str, str] | Mapping[str, bytes]]
+) -> str:
+    """Return a line on what several verbs draw, if it was drawn of something else.
+
+    Of one log all verbs draw them alike.
+    """
+    other = [
+        f'{part}/{name}'
+        for part, made in beside.items()
+        for name, content in made.items()
+        if Path(name).stem in _OF_ANY_VERB and _differs(folder / part / name, content)
+    ]
+    if not other:
+        return ''
+    return f'{", ".join(other)}: what was there showed something else and is replaced.'
+
+
+def _differs(path: Path, content: str | bytes) -> bool:
+    new = content if isinstance(content, bytes) else content.encode()
+    try:
+        return path.read_bytes() != new
+    except OSError:
+        return False
 
 
 def _pictures_and_tables(

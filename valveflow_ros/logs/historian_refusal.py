@@ -21,7 +21,9 @@ class Remedy(NamedTuple):
 
     def __str__(self) -> str:
         """Return it as it can be pasted into a shell."""
-        return f'--{self.option} {quoted(self.value)}'
+        # A value that begins with a dash would be taken for an option.
+        between = '=' if self.value.startswith('-') else ' '
+        return f'--{self.option}{between}{quoted(self.value)}'
 
 
 class RefusedError(InputError):

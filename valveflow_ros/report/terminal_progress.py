@@ -56,6 +56,8 @@ class Progress:
     def at(self, share: float, what: str) -> None:
         """Take note of how far it has come, as a share of 1, and what is done now."""
         with self._lock:
+            if self._done.is_set():
+                return
             now = self._clock()
             if self._begun_s is None:
                 self._begun_s = now
@@ -94,8 +96,8 @@ class Progress:
 
     def end(self) -> None:
         """Take the bar away for good."""
-        self._done.set()
         with self._lock:
+            self._done.set()
             self._begun_s = None
             self.clear()
 
