@@ -11,6 +11,7 @@ from rosbags.highlevel import AnyReader
 
 from valveflow_ros.errors import DataError, RecordingError
 from valveflow_ros.logs import open_log, write_samples
+from valveflow_ros.logs.historian_units import of_gauge, spelling
 from valveflow_ros.logs.importing import strictly_increasing
 from valveflow_ros.records import SIGNALS, SampleTable, table_to_readings
 
@@ -124,3 +125,26 @@ def test_readings_are_the_same_from_any_kind_of_file(tmp_path):
     assert np.array_equal(first.time_ns, second.time_ns)
     assert np.array_equal(first.value, second.value, equal_nan=True)
     assert not same_readings(first, second), 'a table knows which values are missing'
+
+
+@pytest.mark.parametrize(
+    ('told', 'unit', 'expected'),
+    [
+        ('Frischdampfdruck (Überdruck)', 'bar', 'barg'),
+        ('Main steam pressure gauge', 'MPa', 'MPag'),
+        ('main_steam_pressure_gauge_bar', 'bar', 'barg'),
+        ('Druck rel.', 'kPa', 'kPag'),
+        ('Frischdampfdruck (Ü)', 'bar', 'barg'),
+        ('steam gage pressure', 'psi', 'psig'),
+        ('Frischdampfdruck', 'bar', 'bar'),
+        ('Frischdampfdruck relativ', 'bara', 'bar'),
+        ('pressure, gauge range, absolute', 'bar', 'bar'),
+        ('Brennstoffdruck Brüden', 'bar', 'bar'),
+        ('Dampfdruck Ü', 'barg', 'barg'),
+        ('Temperatur rel.', '°C', 'degC'),
+    ],
+)
+def test_a_gauge_is_known_by_the_words_beside_its_unit(told, unit, expected):
+    found = of_gauge(spelling(unit), told)
+    assert found.unit == expected
+    assert found.written == unit

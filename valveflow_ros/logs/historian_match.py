@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from valveflow_ros.errors import InputError
 from valveflow_ros.logs.historian_layout import Heading
 from valveflow_ros.logs.historian_refusal import THEIRS, RefusedError, Remedy
-from valveflow_ros.logs.historian_units import Spelling, is_foreign, spelling, split_unit
+from valveflow_ros.logs.historian_units import Spelling, is_foreign, of_gauge, spelling, split_unit
 from valveflow_ros.logs.historian_words import CLEAR, EXACT, LIKELY, TAG, folded, marks
 from valveflow_ros.records import SIGNALS, Signal
 
@@ -205,7 +205,9 @@ class Matcher:
 
     def unit_of(self, place: int) -> Spelling | None:
         """Return the unit that the file names for a column."""
-        return spelling(self._units[place]) if self._units[place] else None
+        if not self._units[place]:
+            return None
+        return of_gauge(spelling(self._units[place]), f'{self.names[place]} {self._about[place]}')
 
     def _marked(self, used: Collection[int]) -> list[dict[Signal, float]]:
         found: list[dict[Signal, float]] = []

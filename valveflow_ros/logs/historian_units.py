@@ -51,7 +51,7 @@ def _spellings() -> dict[str, Spelling]:
     put(PRESSURE, 'Pa', 'pa pascal paabs')
     put(PRESSURE, 'bar', 'bar bara bar(a) barabs bar_a bar-a')
     put(PRESSURE, 'psi', 'psi psia psi(a) psiabs lb/in2 lbf/in2')
-    put(PRESSURE, 'barg', 'barg bar(g) barü barue bar(ü) bar(ue) bar_g bar-g bargauge')
+    put(PRESSURE, 'barg', 'barg bar(g) barü barue bar(ü) bar(ue) bar_ü bar-ü bar_g bar-g bargauge')
     put(PRESSURE, 'MPag', 'mpag mpa(g) mpa_g mpa-g mpagauge')
     put(PRESSURE, 'kPag', 'kpag kpa(g) kpa_g kpa-g kpagauge')
     put(PRESSURE, 'psig', 'psig psi(g) psi_g psi-g psigauge')
@@ -85,6 +85,12 @@ _TRAILING = re.compile(
 )
 _APART = re.compile(r'^(?P<name>.+?)\s+(?P<unit>\S+)$')
 _LAST_WORD = re.compile(r'^(?P<name>.+?)[\s_.]+(?P<unit>[^\s_.]+)$')
+# Pressures that may be either, and what they are called where they are those of a gauge.
+_OF_GAUGE = {'bar': 'barg', 'mpa': 'MPag', 'kpa': 'kPag', 'psi': 'psig'}
+_GAUGE_WORD = re.compile(
+    r'(?<![a-zäöü])(gauge|gage|überdruck|ueberdruck|manometer|relativ|relative|rel|ü)(?![a-zäöü])'
+)
+_ABSOLUTE_WORD = re.compile(r'(?<![a-zäöü])(abs|absolut|absolute|absolutdruck)(?![a-zäöü])')
 # As the last word of a name these are no units: 'PT_100_A', 'Level_C', 'Turbine K'.
 _NOT_AS_A_WORD = frozenset(['c', 'k', 'f', 'w', 'pa', 'grad', 'pu', 'a', 'v', 'h', 's', 'm', 't'])
 
@@ -124,6 +130,24 @@ def spelling(text: str) -> Spelling | None:
     if found is None:
         return None
     return Spelling(found.dimension, found.unit, text.strip())
+
+
+def of_gauge(found: Spelling | None, told: str) -> Spelling | None:
+    """Return a unit as that of a gauge where words beside it say so: 'Überdruck [bar]'.
+
+    Parameters
+    ----------
+    found : Spelling or None
+        The unit as it is written, which says neither gauge nor absolute.
+    told : str
+        Name and description of the column.
+    """
+    if found is None or _squeezed(found.written) not in _OF_GAUGE:
+        return found
+    words = told.lower()
+    if not _GAUGE_WORD.search(words) or _ABSOLUTE_WORD.search(words):
+        return found
+    return Spelling(found.dimension, _OF_GAUGE[_squeezed(found.written)], found.written)
 
 
 def unit_named(signal: Signal, text: str) -> str:

@@ -108,9 +108,10 @@ def _files_of(folder: Path) -> tuple[list[Path], list[str]]:
     own = [folder / name for name in listed if name in whole]
     own += [path for path in found if path not in own and _stem(path.name) in stems]
     others = [path.name for path in found if path not in own]
-    if others:
-        names_text = ', '.join(others)
-        warnings.append(f'{names_text}: not named in {METADATA_NAME}, not read.')
+    if others and own:
+        warnings.append(f'{", ".join(others)}: not named in {METADATA_NAME}, not read.')
+    elif others:
+        warnings.append(f'{METADATA_NAME} names none of the files that are there; all are read.')
     return own or found, warnings
 
 

@@ -42,14 +42,27 @@ def input_axis(value: float) -> dict[str, str]:
     return {'text': input_title(value), 'short': f'u ({input_unit(value)})'}
 
 
+# Causes whose change is counted from the mean of the record, see `diagnosis.catalogue`.
+_FROM_THE_MEAN = frozenset((
+    'curve_step', 'gain_drift', 'gain_step', 'input_drift', 'input_step', 'intervals',
+    'output_offset_drift',
+))  # fmt: skip
+
+
 def held_words(held: tuple[HeldCause, ...]) -> str:
     """Say which causes were taken out of the rows; nothing where none were."""
     if not held:
         return ''
     names = ', '.join(_held(h) for h in held)
+    if any(h.name in _FROM_THE_MEAN for h in held):
+        curve = (
+            'What changes with time is counted from its mean over the record it was found in: the '
+            'curve is that of this mean, neither that of before nor that of after. '
+        )
+    else:
+        curve = f'The curve is that of the unit without {"it" if len(held) == 1 else "them"}. '
     return (
-        f'Held, and taken out of opening and power before anything else: {names}. The curve is '
-        f'that of the unit without {"it" if len(held) == 1 else "them"}. '
+        f'Held, and taken out of opening and power before anything else: {names}. {curve}'
         + ' '.join(h.sentence for h in held)
     )
 
