@@ -167,6 +167,7 @@ def _text(found: Identified, written: Mapping[str, Path]) -> str:
         _pieces(found),
         _breakpoints(c),
         _dynamics(c),
+        'Behind ± stands one standard error; 95 % lie within 1.96 of them.',
         f'Found in {counted(c.source.steady, "steady-state segment")} and '
         f'{counted(c.source.slope_response, "slope-response segment")}, '
         f'{counted(c.source.samples, "sample")}. Typical difference '

@@ -235,7 +235,7 @@ class Demo:
             f'The last curve before the fault (data until {moment(from_time(found.window_end))}), '
             'and the truth, which only the simulated plant knows:'
         )
-        tell('  piece   slope found [MW per % MPa^(9/8)]     true     knee found (95 %)     true')
+        tell('  piece   slope, 95 % [MW per % MPa^(9/8)]     true     knee found (95 %)     true')
         for k in range(max(found.pieces, len(true.slopes))):
             line = f'  {k + 1:>5}   '
             if k < found.pieces:
