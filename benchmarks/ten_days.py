@@ -121,7 +121,8 @@ def main() -> int:
         found = identify(path, watch)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
     about = {
-        'command': ' '.join(['python -m benchmarks.ten_days', *sys.argv[1:]]), 'days': asked.days, 'seed': asked.seed, 'effects': asked.effect, 'mcap_bytes': size,
+        'command': ' '.join(['python -m benchmarks.ten_days', *sys.argv[1:]]),
+        'days': asked.days, 'seed': asked.seed, 'effects': asked.effect, 'mcap_bytes': size,
         'total_wall_s': watch.total('wall_s'), 'total_cpu_s': watch.total('cpu_s'),
         'peak_memory_mib': peak, 'load_average': os.getloadavg()[0], 'cpus': os.cpu_count(),
         'python': platform.python_version(), 'machine': platform.machine(),
