@@ -30,7 +30,11 @@ def test_help_that_nobody_reads_to_its_end_is_no_accident(module):
 @pytest.mark.parametrize(
     ('parser', 'words', 'said'),
     [
-        (replay_main.parser, ['x.mcap', '--rate', 'fast'], '--rate must be a number of seconds of the log'),
+        (
+            replay_main.parser,
+            ['x.mcap', '--rate', 'fast'],
+            '--rate must be a number of seconds of the log',
+        ),
         (replay_main.parser, ['x.mcap', '--wait', 'nan'], "such as --wait 60; 'nan' is not"),
         (watch_main.parser, ['--interval', '0'], "from 0.1 to 3600, such as --interval 5; '0' is"),
         (
