@@ -5,17 +5,19 @@ from __future__ import annotations
 import html
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from report_stories import diagnosed, diagnosis
 
 from valveflow_ros.core.characteristic import HeldCause
+from valveflow_ros.diagnosis import catalogue
 from valveflow_ros.diagnosis.result import NOTHING
 from valveflow_ros.report.diagnosis import diagnosis_page
 from valveflow_ros.report.diagnosis_words import axis_titles, points_to
 from valveflow_ros.report.numbers import decimals
 from valveflow_ros.report.picture_data import plain_text
-from valveflow_ros.report.words import held_words
+from valveflow_ros.report.words import _FROM_THE_MEAN, held_words
 
 
 def words_of(text):
@@ -98,3 +100,16 @@ def test_a_held_cause_is_told_without_a_number_of_days():
     assert 'gain_step (g = 0.0057)' in told
     assert 't0_days' not in told
     assert 'From 2023-11-16 on.' in told
+
+
+def test_causes_counted_from_the_mean_are_those_of_the_catalogue_that_change_with_time():
+    counted = set()
+    for module in Path(catalogue.__file__).parent.glob('[!_]*.py'):
+        taken = re.search(r'catalogue\._time import (.+)', module.read_text('utf-8'))
+        if taken and {'change', 'ramp', 'since'} & set(taken[1].split(', ')):
+            counted.add(module.stem)
+    assert counted == _FROM_THE_MEAN
+    step = HeldCause('input_step', (('g', 0.03),), 'From then on.')
+    assert 'curve is that of this mean' in held_words((step,))
+    assert 'without it' not in held_words((step,))
+    assert 'without it' in held_words((HeldCause('stiction', (('s', 0.3),), 'It sticks.'),))
