@@ -25,7 +25,11 @@ LOCKED_S = 5
 
 
 def wanted(place: str) -> bool:
-    return HOLD.exists() and HOLD.read_text() == place
+    # The file may go at any moment, also between a look for it and a look into it.
+    try:
+        return HOLD.read_text() == place
+    except FileNotFoundError:
+        return False
 
 
 def hold_up(place: str) -> None:

@@ -46,6 +46,11 @@ class Plant:
         subscribe(FlowCharacteristic, f'{MONITOR}/characteristic', self.curves.append, LATCHED)
         self._player = Player(self.node, [PLANT_SAMPLE], 0.0, False, lambda: False)
 
+    def listeners(self) -> set[bytes]:
+        """Return who takes our samples; one that was killed stays among them for a while."""
+        found = self.node.get_subscriptions_info_by_topic(PLANT_SAMPLE)
+        return {bytes(each.endpoint_gid) for each in found}
+
     def play(self, start: int, end: int) -> None:
         assert not self._player.wait_for_listeners(240.0)
         self._player.play(stamped_steps([LOG.part(start, end)], False, 'unit'))
@@ -159,10 +164,14 @@ def test_a_second_monitor_on_the_same_state_is_refused_and_the_first_goes_on(
     # However young it is, another one goes on from there.
     plant.play(0, 600)
     plant.quiet(2.5)
+    known = plant.listeners()
     os.kill(first.pid, signal.SIGKILL)
     first.wait()
     third = start(processes, tmp_path)
     plant.until(lambda: goes_on(processes, third), 'the sentence', 240.0)
+    # The one that is gone would count as a listener too; and the new one has to know of us.
+    plant.until(lambda: plant.listeners() - known, 'the new listener')
+    plant.quiet(1.0)
     plant.play(600, 700)
     plant.quiet(1.0)
     third.send_signal(signal.SIGTERM)

@@ -311,7 +311,7 @@ def held_up_everywhere(processes: Processes, supervisor: Supervisor, tmp_path: P
     assert any('WATCHDOG_USEC=600000000' in text for text in supervisor.texts())
     assert any('WATCHDOG_USEC=400000\n' in text for text in supervisor.texts())
     for place in ('loop', 'poll', 'writer', 'interpreter'):
-        goes_on(supervisor)
+        goes_on(supervisor, monitor, processes)
         hold, held = tmp_path / hurt_monitor.HOLD, tmp_path / hurt_monitor.HELD
         hold.write_text(place)
         wait_until(lambda: held.exists() and held.read_text() == place, place, 30.0)  # noqa: B023
@@ -323,16 +323,23 @@ def held_up_everywhere(processes: Processes, supervisor: Supervisor, tmp_path: P
         assert len(supervisor.pings()) == before, place
         hold.unlink()
         held.unlink()
-    goes_on(supervisor)
+    goes_on(supervisor, monitor, processes)
     monitor.send_signal(signal.SIGTERM)
     assert monitor.wait(20.0) == 0, processes.output(monitor)
     assert any(text.startswith('STOPPING=1') for text in supervisor.texts())
 
 
-def goes_on(supervisor: Supervisor) -> None:
+def goes_on(
+    supervisor: Supervisor, monitor: subprocess.Popen[bytes], processes: Processes
+) -> None:
     """Require several pings from now on."""
     since_s = time.monotonic()
-    wait_until(lambda: len(supervisor.pings(since_s)) >= 4, 'four pings', 60.0)
+
+    def pinged() -> bool:
+        assert monitor.poll() is None, processes.output(monitor)
+        return len(supervisor.pings(since_s)) >= 4
+
+    wait_until(pinged, 'four pings', 60.0)
 
 
 # The unit
