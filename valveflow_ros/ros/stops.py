@@ -8,17 +8,34 @@ from types import FrameType
 _ASKED_TO_STOP = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
+class Stopped(BaseException):
+    """A signal came where it may cut what runs."""
+
+
 class StopFlag:
     """Set by SIGINT, SIGTERM or SIGHUP; asking twice changes nothing."""
 
     def __init__(self) -> None:
         self._by: int | None = None
+        self._cuts = False
 
     def install(self) -> StopFlag:
         """Take over the signals of this process."""
         for number in _ASKED_TO_STOP:
             signal.signal(number, self._note)
         return self
+
+    def cut(self, on: bool) -> None:
+        """Let signals raise `Stopped`, or no more: for work that leaves nothing to be finished.
+
+        Raises
+        ------
+        Stopped
+            One has come already.
+        """
+        self._cuts = on
+        if on and self:
+            raise Stopped
 
     def last(self) -> None:
         """Hear nothing more: the process ends already, and its last steps are not to be cut."""
@@ -40,3 +57,6 @@ class StopFlag:
 
     def _note(self, number: int, _frame: FrameType | None) -> None:
         self._by = number
+        if self._cuts:
+            self._cuts = False
+            raise Stopped

@@ -14,7 +14,6 @@ import os
 from collections.abc import MutableMapping
 from pathlib import Path
 
-import rclpy
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from rclpy.utilities import get_rmw_implementation_identifier
 
@@ -25,7 +24,8 @@ _SOCKETS = 'UDPv4?sockets_size=4MB'
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 # With one of these the middleware looks for more than this host in ways of its own.
 _OTHERWISE = ('ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER')
-_FAST_DDS = ('rmw_fastrtps_cpp', 'rmw_fastrtps_dynamic_cpp')
+# Those to which this applies.
+FAST_DDS = ('rmw_fastrtps_cpp', 'rmw_fastrtps_dynamic_cpp')
 
 
 def choose_transport(
@@ -46,7 +46,7 @@ def choose_transport(
     """
     environ = os.environ if environ is None else environ
     middleware = get_rmw_implementation_identifier() if middleware is None else middleware
-    if middleware not in _FAST_DDS or any(environ.get(n) for n in (_TRANSPORTS, *_PROFILES)):
+    if middleware not in FAST_DDS or any(environ.get(n) for n in (_TRANSPORTS, *_PROFILES)):
         return
     if environ.get(_RANGE, '').upper() != 'LOCALHOST':
         environ[_TRANSPORTS] = _SOCKETS
@@ -55,34 +55,6 @@ def choose_transport(
     if profile is not None and not any(environ.get(name) for name in _OTHERWISE):
         environ.update(dict.fromkeys(_PROFILES, str(profile)))
         environ[_RANGE] = 'SYSTEM_DEFAULT'
-
-
-def ask_again(middleware: str | None = None) -> None:
-    """Let all nodes of the domain say at once, once more, that they are there.
-
-    Whoever hears of a new participant answers within a millisecond; but Fast DDS (2.14) announces
-    a participant before its sockets are read, so on one host the answer is lost, and the next
-    one comes with the period of 3 s. A second participant, made when the first one listens and
-    taken away again, brings the answers a second time. Call it when the node has been made.
-
-    Parameters
-    ----------
-    middleware : str, optional
-        The name of the ROS middleware, the one in use by default; others need no such help.
-    """
-    middleware = get_rmw_implementation_identifier() if middleware is None else middleware
-    if middleware not in _FAST_DDS:
-        return
-    context = rclpy.Context()
-    context.init(args=[])
-    try:
-        # The underscore keeps it out of lists of nodes.
-        rclpy.create_node(
-            f'_knock_{os.getpid()}', context=context, enable_rosout=False,
-            start_parameter_services=False,
-        ).destroy_node()  # fmt: skip
-    finally:
-        context.try_shutdown()
 
 
 def _profile() -> Path | None:
