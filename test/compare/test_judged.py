@@ -20,6 +20,7 @@ from valveflow_ros.compare.verdict import (
 )
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import SegmentKind
+from valveflow_ros.report.comparison_tables import pairs_table
 
 pytestmark = pytest.mark.skipif(
     os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
@@ -144,6 +145,10 @@ def test_a_simulation_that_runs_away_counts_against_it(curve, data):
     pairs = pairs_on_segments(j, made)
     pair = next(p for p in pairs if p.theirs == 'sparse.dynamic')
     assert pair.outcome is Outcome.BETTER
+    # What makes it better stands beside the verdict.
+    assert pair.failed == 20
+    assert 'theirs has no finite answer in 20 of 30; the others: p' in pairs_table(pairs)
+    assert 'no finite answer' not in pairs_table([p for p in pairs if p.theirs != pair.theirs])
     mse, rows = everywhere(trial, made)
     assert mse['sparse.dynamic'] == np.inf
     assert next(p for p in rows if p.baseline == 'sparse').failed > 0

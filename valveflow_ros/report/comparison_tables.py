@@ -150,7 +150,7 @@ def pairs_table(pairs: Sequence[Pair]) -> str:
             mse_cell(p.mse_ours_mw2),
             mse_cell(p.mse_theirs_mw2),
             _difference(p),
-            f'<b>{p.outcome.value}</b>, {_p(p.test.p_value)}',
+            _verdict(p),
         ]
         for p in sorted(pairs, key=lambda p: list(_TERMS).index(p.terms))
     ]
@@ -163,6 +163,15 @@ def pairs_table(pairs: Sequence[Pair]) -> str:
         'segments. Otherwise like against like, and ours is valveflow.'
     )
     return paragraph(words) + table(head, rows)
+
+
+def _verdict(pair: Pair) -> str:
+    """Return who is better and what that rests on: without answers of theirs not on the test."""
+    tested = _p(pair.test.p_value)
+    if pair.failed:
+        told = f'theirs has no finite answer in {pair.failed} of {pair.judged}'
+        tested = f'{told}; the others: {tested}'
+    return f'<b>{pair.outcome.value}</b>, {tested}'
 
 
 def _difference(pair: Pair) -> str:
