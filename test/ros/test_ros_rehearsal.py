@@ -20,8 +20,10 @@ def test_a_task_behind_a_rehearsal_is_computed_by_the_same_process() -> None:
     with worker('good') as made:
         first = made.pid
         made.rehearse(TASK)
+        assert made.rehearsing
         made.submit(TASK)
         (outcome,) = wait_until(made.poll, 'the outcome')
+        assert not made.rehearsing
         assert isinstance(outcome.result, Characteristic)
         assert made.busy_s is None
         # Whether its answer came before or after, it is nobody's.
@@ -38,6 +40,8 @@ def test_death_in_a_rehearsal_is_no_outcome_and_the_process_is_replaced() -> Non
             assert made.poll() == []
             time.sleep(0.02)
         assert made.starts == 2
+        # Who waits for its end is not kept waiting.
+        assert not made.rehearsing
         assert made.failures_in_a_row == 1
 
 

@@ -2,8 +2,8 @@
 
 Fast DDS (2.14) announces a participant before its own sockets are read. Who is on the same host
 answers within a millisecond, the answer is lost, and the next one comes with the period of 3 s:
-two of five processes hear of a neighbour that late. So the process shows itself first, with a
-node that does nothing, and loads and compiles afterwards. Where nobody has answered after a
+almost half of the processes hear of a neighbour that late. So the process shows itself first,
+with a node that does nothing, and loads and compiles meanwhile. Where nobody has answered after a
 moment, it takes the node back and shows itself anew, for who has heard of it before does not
 answer again.
 """
@@ -23,25 +23,24 @@ from rclpy.utilities import get_rmw_implementation_identifier
 
 from valveflow_ros.ros.transport import FAST_DDS
 
-# Whose answer was heard is known by name within 75 ms, and within 170 ms while this process is
-# busy with loading.
+# Whose answer was heard is known by name after 0.1 to 0.2 s.
 _ANSWER_S = 0.25
 _LOOK_S = 0.01
-# With two of five answers lost, one start in forty is still alone after that many.
-_TRIES = 4
+# With almost one of two answers lost, one start in 200 is still alone after that many.
+_TRIES = 6
 
 
 class Presence:
     """Takes part in the domain as soon as it is made; the default context is up from then on.
 
-    Others are looked for in a thread of its own, which ends by itself after less than a second.
+    Others are looked for in a thread of its own, which ends by itself after a second or two.
 
     Parameters
     ----------
     args : sequence of str, optional
         The arguments for `rclpy.init`; those of the process by default.
     tries : int, optional
-        How often to show itself as long as nobody is heard of. Without it once, or four times
+        How often to show itself as long as nobody is heard of. Without it once, or six times
         where the middleware is Fast DDS.
 
     Raises
@@ -73,7 +72,7 @@ class Presence:
         self._thread.join()
         if self._error is not None:
             raise self._error
-        return self._known()
+        return bool(self._known())
 
     def end(self) -> None:
         """Take the node away; the context stays, and with another node the participant too."""
@@ -113,23 +112,38 @@ class Presence:
         self.tries += 1
 
     def _seek(self, tries: int) -> None:
+        met: set[str] = set()
+        answered = 0
         try:
-            while not self._heard() and self.tries < tries and not self._enough.is_set():
+            while True:
+                found = self._heard(met)
+                answered += bool(found)
+                # One alone may be one of two that answered; once more it hardly is.
+                whole = found >= met and len(found) + answered > 2
+                met |= found
+                if whole or self.tries >= tries or self._enough.is_set():
+                    return
                 self._leave()
                 self._enter()
         except Exception as error:  # noqa: BLE001 - told by `settle`
             self._error = error
 
-    def _heard(self) -> bool:
-        """Wait a moment for others; tell whether any are known."""
+    def _heard(self, met: set[str]) -> set[str]:
+        """Wait a moment for those met before, or for anybody; return who is known."""
         end_s = time.monotonic() + _ANSWER_S
-        while not (known := self._known()) and time.monotonic() < end_s:
+        while not (met and self._known() >= met) and time.monotonic() < end_s:
             if self._enough.wait(_LOOK_S):
                 break
-        return known
+        return self._known()
 
-    def _known(self) -> bool:
-        return self._node is not None and len(self._node.get_node_names()) > 1
+    def _known(self) -> set[str]:
+        """Return the others by their full names."""
+        if self._node is None:
+            return set()
+        own = self._node.get_fully_qualified_name()
+        found = (f'{space.rstrip("/")}/{name}' for name, space in
+                 self._node.get_node_names_and_namespaces())  # fmt: skip
+        return {name for name in found if name != own}
 
     def _leave(self) -> None:
         if self._node is not None:

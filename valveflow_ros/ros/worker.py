@@ -74,6 +74,7 @@ class Worker:
         self._sending = threading.Lock()
         self._pause_s = _FIRST_PAUSE_S
         self._start_at_s = 0.0
+        self.rehearsing = False
         self.starts = 0
         self.failures_in_a_row = 0
 
@@ -130,6 +131,7 @@ class Worker:
         A task that is submitted meanwhile is begun afterwards, in the same process.
         """
         if self._process is not None:
+            self.rehearsing = True
             self._post(self._process, _REHEARSAL, task)
 
     def poll(self) -> list[Outcome]:
@@ -184,9 +186,11 @@ class Worker:
             return
         for number, result in results:
             running = self._running
-            if running is not None and number == _REHEARSAL:
-                # The time it waited for the rehearsal to end is not the task's.
-                running.begun_s = self._clock()
+            if number == _REHEARSAL:
+                self.rehearsing = False
+                if running is not None:
+                    # The time it waited for the rehearsal to end is not the task's.
+                    running.begun_s = self._clock()
             if running is None or running.number != number:
                 continue
             believed = self._believed(running.task, result)
@@ -242,6 +246,7 @@ class Worker:
     def _end(self) -> str:
         """Kill the process and return what became of it, in words."""
         process, self._process, self._reader = self._process, None, None
+        self.rehearsing = False
         if process is None:
             return ''
         with contextlib.suppress(ProcessLookupError):
