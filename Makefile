@@ -1,6 +1,6 @@
 # make setup   .venv and install/, from pinned wheels; quick when nothing changed
 # make demo    set-up, then a simulated plant, the monitor, an alarm and a recording
-# make test    set-up, then every test              (PYTEST_ARGS='-k partition' for some)
+# make test    set-up, then every test on all cores (PYTEST_ARGS='-k partition' for some, PARALLEL= for one by one)
 # make test-slow   set-up, then the tests marked slow, also those that make test leaves out
 # make lint    set-up, then ruff and mypy           (make format rewrites the layout)
 # make bench   set-up, then what is fast, measured
@@ -24,6 +24,8 @@ export PYTHON
 ENV := source ./env.sh &&
 VALVEFLOW_DEMO ?= bash -c 'source env.sh && python -m valveflow_ros.ros.demo --output demo_output'
 PYTEST_ARGS ?=
+# A file's tests stay together: they share what is dear to make.
+PARALLEL ?= -n logical --maxprocesses 4 --dist loadfile
 # Checked as strictly as mypy can; ros/ is not, because rclpy carries no annotations.
 STRICT := $(wildcard $(addprefix valveflow_ros/,errors.py records.py config.py \
   core plant logs report cli compare diagnosis) tools)
@@ -41,7 +43,7 @@ demo: setup
 	@$(VALVEFLOW_DEMO)
 
 test: setup
-	@$(ENV) VALVEFLOW_REQUIRE_ROS=1 python -m pytest $(PYTEST_ARGS)
+	@$(ENV) VALVEFLOW_REQUIRE_ROS=1 python -m pytest $(PARALLEL) $(PYTEST_ARGS)
 
 test-slow: setup
 	@$(ENV) VALVEFLOW_REQUIRE_ROS=1 VALVEFLOW_SLOW=1 python -m pytest -m slow $(PYTEST_ARGS)
