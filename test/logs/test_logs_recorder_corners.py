@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import gc
 import os
 import struct
 import threading
@@ -341,6 +342,8 @@ def test_a_part_removed_between_making_and_locking_is_made_again(
         assert not free
     file.discard()
     removed[0], wanted = 0, 1000
+    # What earlier tests left to the collector may go at any moment.
+    gc.collect()
     descriptors = len(os.listdir('/proc/self/fd'))
     with pytest.raises(FileNotFoundError):
         PartFile(tmp_path / 'a.mcap')
@@ -354,6 +357,8 @@ def test_a_part_that_cannot_be_locked_leaves_no_descriptor_behind(
         raise OSError(errno.ENOLCK, 'No locks available')
 
     monkeypatch.setattr(part_file.fcntl, 'flock', broken)
+    # What earlier tests left to the collector may go at any moment.
+    gc.collect()
     before = len(os.listdir('/proc/self/fd'))
     with pytest.raises(OSError, match='No locks available'):
         PartFile(tmp_path / 'a.mcap')
