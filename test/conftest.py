@@ -57,6 +57,13 @@ def leased_domain() -> Iterator[int]:
     pytest.fail(f'all {DOMAINS} ROS domains are held by other tests on this machine')
 
 
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """On several cores begin with the files that take long, so that none is left at the end."""
+    if hasattr(config, 'workerinput'):
+        long = {item.path for item in items if item.get_closest_marker('slow')}
+        items.sort(key=lambda item: item.path not in long)
+
+
 @pytest.fixture
 def ros_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, str]]:
     """Give the test a ROS domain of its own that stays on this machine.
