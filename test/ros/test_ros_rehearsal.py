@@ -59,3 +59,22 @@ def test_the_wait_for_a_rehearsal_is_not_counted_as_the_tasks() -> None:
     finally:
         made.close()
     assert outcome.seconds == 0.0
+
+
+def test_what_waits_behind_a_rehearsal_is_not_ended_for_taking_long() -> None:
+    """It may compile for minutes, once; but not for ever."""
+    now = [0.0]
+    made = FitWorker(120.0, 'hurt_jobs:hangs', clock=lambda: now[0])
+    made.start()
+    try:
+        made.rehearse(TASK)
+        made.submit(TASK)
+        now[0] = 500.0
+        assert made.poll() == []
+        assert (made.rehearsing, made.starts) == (True, 1)
+        now[0] = 700.0
+        (outcome,) = made.poll()
+        assert outcome.result == 'The fit process could not be made ready and was ended.'
+        assert not made.rehearsing
+    finally:
+        made.close()

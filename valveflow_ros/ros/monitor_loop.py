@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import time
 
-import rclpy
+from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 
@@ -29,8 +29,8 @@ _LONGEST_START_S = 600.0
 class _Supervised(MonitorNode):
     """The node, telling its supervisor when it is to be patient."""
 
-    def __init__(self, stop: StopFlag, watchdog: Watchdog) -> None:
-        super().__init__(lambda: bool(stop))
+    def __init__(self, stop: StopFlag, watchdog: Watchdog, context: Context) -> None:
+        super().__init__(lambda: bool(stop), context=context)
         self._watchdog = watchdog
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -48,10 +48,12 @@ class _Supervised(MonitorNode):
 
 def run(stop: StopFlag, presence: Presence) -> int:
     """Watch until it is asked to stop; return the exit status."""
+    if stop:
+        return 0
     watchdog = Watchdog()
-    node = _Supervised(stop, watchdog)
+    node = _Supervised(stop, watchdog, presence.settle())
     presence.end()
-    executor = SingleThreadedExecutor()
+    executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     try:
         watchdog.status('Loading and compiling.')
@@ -83,7 +85,7 @@ def _loop(
     node: _Supervised, executor: SingleThreadedExecutor, stop: StopFlag, watchdog: Watchdog
 ) -> None:
     spin_s = 0.0
-    while not stop and not node.finalized and rclpy.ok():
+    while not stop and not node.finalized and node.context.ok():
         begun_s = time.monotonic()
         found = node.step()
         if begun_s >= spin_s:

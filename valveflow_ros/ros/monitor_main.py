@@ -7,8 +7,6 @@ import os
 import sys
 from collections.abc import Sequence
 
-import rclpy
-
 from valveflow_ros.config import TABLE
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.ros.presence import Presence
@@ -51,14 +49,11 @@ def _main(args: Sequence[str] | None) -> int:
     except Exception as error:  # noqa: BLE001 - rclpy raises what its C++ gave it
         return _complain(f'ROS could not be started: {one_line(error)}')
     try:
-        with presence:
-            # Compiler and libraries take a second, in which the others of the domain get to know
-            # this process. A signal need not wait for them: nothing has been begun.
-            stop.cut(True)
+        # Compiler and libraries take a second, in which the others of the domain get to know
+        # this process. A signal need not wait for them: nothing has been begun.
+        with stop.cutting():
             work = importlib.import_module('valveflow_ros.ros.monitor_loop')
-            presence.settle()
-            stop.cut(False)
-            return int(work.run(stop, presence))
+        return int(work.run(stop, presence))
     except Stopped:
         return 0
     except ValveflowError as error:
@@ -67,7 +62,7 @@ def _main(args: Sequence[str] | None) -> int:
         return _complain(f'The monitor failed unexpectedly: {with_place(error)}')
     finally:
         stop.last()
-        rclpy.try_shutdown()
+        presence.close()
 
 
 def _complain(sentence: str) -> int:

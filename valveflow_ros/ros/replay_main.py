@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import rclpy
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from valveflow_ros.errors import ValveflowError, counted
@@ -16,7 +17,6 @@ from valveflow_ros.logs import open_log
 from valveflow_ros.report.terminal_number import number
 from valveflow_ros.report.terminal_progress import Progress
 from valveflow_ros.ros.playing import Player
-from valveflow_ros.ros.presence import Presence
 from valveflow_ros.ros.replay_steps import steps_of
 from valveflow_ros.ros.secure_start import check_security
 from valveflow_ros.ros.sentences import one_line, with_place
@@ -116,12 +116,11 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     log = open_log(options.log)
     names, steps = steps_of(log)
     try:
-        with Presence(arguments) as presence:
-            presence.settle()
-            node = Node('replay')
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # noqa: BLE001 - rclpy raises what its C++ gave it
         print(f'valveflow replay: ROS could not be started: {one_line(error)}', file=sys.stderr)
         return 1
+    node = Node('replay')
     say = node.get_logger()
     try:
         for warning in log.warnings:

@@ -36,6 +36,11 @@ class InsecureError(InputError):
         super().__init__(f'Not started, because security is demanded ({_ENABLE}): {problem}.')
 
 
+def security_wanted(environ: Mapping[str, str]) -> bool:
+    """Tell whether security is asked for, in whatever words."""
+    return environ.get(_ENABLE, '').lower() not in _NO
+
+
 def check_security(
     args: Sequence[str] | None = None, environ: Mapping[str, str] | None = None
 ) -> None:
@@ -55,10 +60,9 @@ def check_security(
         middleware that cannot give it.
     """
     environ = os.environ if environ is None else environ
-    wish = environ.get(_ENABLE, '')
-    if wish.lower() in _NO:
+    if not security_wanted(environ):
         return
-    problem = _words(wish, environ) or _middleware()
+    problem = _words(environ[_ENABLE], environ) or _middleware()
     if problem:
         raise InsecureError(problem)
     _try_out(args)

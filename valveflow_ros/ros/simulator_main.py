@@ -10,6 +10,7 @@ from typing import cast
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from valveflow_ros.errors import ParameterError, ValveflowError, counted
 from valveflow_ros.plant.simulator import simulate_parts
@@ -18,7 +19,6 @@ from valveflow_ros.ros import simulator_steps as steps
 from valveflow_ros.ros.declare import declare, unknown_overrides
 from valveflow_ros.ros.inputs import PLANT_SAMPLE
 from valveflow_ros.ros.playing import Player, Step
-from valveflow_ros.ros.presence import Presence
 from valveflow_ros.ros.secure_start import check_security
 from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.stops import StopFlag
@@ -53,13 +53,12 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         choose_transport()
         check_security(args)
-        with Presence(args) as presence:
-            presence.settle()
-            node = Node('plant_simulator')
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except ValveflowError as error:
         return _complain(str(error))
     except Exception as error:  # noqa: BLE001 - rclpy raises what its C++ gave it
         return _complain(f'ROS could not be started: {one_line(error)}')
+    node = Node('plant_simulator')
     try:
         return _run(node, stop)
     except ValveflowError as error:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 _ASKED_TO_STOP = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -25,17 +27,22 @@ class StopFlag:
             signal.signal(number, self._note)
         return self
 
-    def cut(self, on: bool) -> None:
-        """Let signals raise `Stopped`, or no more: for work that leaves nothing to be finished.
+    @contextmanager
+    def cutting(self) -> Iterator[None]:
+        """Let signals raise `Stopped` inside: for work that leaves nothing to be finished.
 
         Raises
         ------
         Stopped
-            One has come already.
+            One came, or had come before.
         """
-        self._cuts = on
-        if on and self:
+        if self:
             raise Stopped
+        self._cuts = True
+        try:
+            yield
+        finally:
+            self._cuts = False
 
     def last(self) -> None:
         """Hear nothing more: the process ends already, and its last steps are not to be cut."""

@@ -28,8 +28,6 @@ from valveflow_ros.records import NS_PER_S, SampleTable, SegmentKind, Signal, ta
 from valveflow_ros.ros.worker import FitWorker
 
 _LONGEST_S = 300.0
-# Compiled before, our part is loaded in half a second; compiling it takes twenty.
-_LOADED_S = 3.0
 _ROWS = 6000
 _STRETCH = 600
 _FEW = 32
@@ -92,8 +90,8 @@ def warm_up(settings: Settings, worker: FitWorker, stop: Callable[[], bool], wai
     stop : callable
         Tells whether to give up waiting.
     wait : bool
-        Wait for a worker that has to compile: without a curve nothing can be said before its
-        first fit. Who has a curve goes on at once.
+        Wait for the worker too: without a curve nothing can be said before its first fit. Who
+        has a curve goes on at once.
     """
     begun = time.monotonic()
     task = made_up_task(settings)
@@ -111,8 +109,6 @@ def warm_up(settings: Settings, worker: FitWorker, stop: Callable[[], bool], wai
     aligner = Aligner(settings)
     Monitor(settings).feed(aligner.feed(table_to_readings(table)).table)
     _predict(settings, made_up_curve(settings), c)
-    # What loaded its part need not wait for who loads the other: samples are taken meanwhile.
-    wait = wait and time.monotonic() - begun > _LOADED_S
     while wait and worker.rehearsing and not stop() and time.monotonic() - begun < _LONGEST_S:
         time.sleep(0.02)
         worker.poll()

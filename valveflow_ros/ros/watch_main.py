@@ -13,13 +13,13 @@ from typing import Any
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.report.terminal_board import CURVE, HEALTH
 from valveflow_ros.report.terminal_number import number
 from valveflow_ros.report.terminal_screen import Screen
-from valveflow_ros.ros.presence import Presence
 from valveflow_ros.ros.secure_start import check_security
 from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.transport import choose_transport
@@ -66,9 +66,7 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         choose_transport()
         check_security(arguments)
-        with Presence(arguments) as presence:
-            presence.settle()
-            node = WatchNode(options.node)
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except ValveflowError as error:
         return _complain(str(error))
     except KeyboardInterrupt:
@@ -76,7 +74,7 @@ def main(args: Sequence[str] | None = None) -> int:
     except Exception as error:  # noqa: BLE001 - rclpy raises what its C++ gave it
         return _complain(f'ROS could not be started: {one_line(error)}')
     try:
-        return _run(node, options)
+        return _run(options)
     except KeyboardInterrupt:
         # How one stops looking.
         return 0
@@ -90,7 +88,8 @@ def main(args: Sequence[str] | None = None) -> int:
         rclpy.try_shutdown()
 
 
-def _run(node: WatchNode, options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
+    node = WatchNode(options.node)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:

@@ -31,6 +31,7 @@ from valveflow_ros.ros.trades import DIAGNOSIS, DIAGNOSIS_JOB, FIT, FIT_JOB, Tra
 _FIRST_PAUSE_S = 0.5
 _LONGEST_PAUSE_S = 60.0
 _MOST_ANSWER = 16 << 20  # bytes; a curve takes some ten thousand
+_LONGEST_REHEARSAL_S = 600.0
 _REHEARSAL = 0  # the number of a task that nobody waits for
 # One core is what the machine can spare, and one thread adds up in one order only.
 _ONE_THREAD = dict.fromkeys(
@@ -74,7 +75,7 @@ class Worker:
         self._sending = threading.Lock()
         self._pause_s = _FIRST_PAUSE_S
         self._start_at_s = 0.0
-        self.rehearsing = False
+        self._rehearsing_since_s: float | None = None
         self.starts = 0
         self.failures_in_a_row = 0
 
@@ -87,6 +88,11 @@ class Worker:
     def busy_s(self) -> float | None:
         """Return how long the task at hand has been running, None without one."""
         return None if self._running is None else self._clock() - self._running.begun_s
+
+    @property
+    def rehearsing(self) -> bool:
+        """Tell whether a rehearsal has not come to its end yet."""
+        return self._rehearsing_since_s is not None
 
     def start(self, outcomes: list[Outcome] | None = None) -> None:
         """Start the process; call it from the thread that lives as long as the monitor.
@@ -131,7 +137,7 @@ class Worker:
         A task that is submitted meanwhile is begun afterwards, in the same process.
         """
         if self._process is not None:
-            self.rehearsing = True
+            self._rehearsing_since_s = self._clock()
             self._post(self._process, _REHEARSAL, task)
 
     def poll(self) -> list[Outcome]:
@@ -148,6 +154,13 @@ class Worker:
         if self._reader is not None and self._reader.ended:
             status = self._end()
             self._failed(f'The {word} process ended unexpectedly ({status}).', outcomes)
+        elif (since_s := self._rehearsing_since_s) is not None:
+            # It may be compiling. What waits behind it has not begun.
+            if self._clock() - since_s > _LONGEST_REHEARSAL_S:
+                self._end()
+                self._failed(
+                    f'The {word} process could not be made ready and was ended.', outcomes
+                )
         elif self.busy_s is not None and self.busy_s > self._timeout_s:
             self._end()
             self._failed(
@@ -187,7 +200,7 @@ class Worker:
         for number, result in results:
             running = self._running
             if number == _REHEARSAL:
-                self.rehearsing = False
+                self._rehearsing_since_s = None
                 if running is not None:
                     # The time it waited for the rehearsal to end is not the task's.
                     running.begun_s = self._clock()
@@ -246,7 +259,7 @@ class Worker:
     def _end(self) -> str:
         """Kill the process and return what became of it, in words."""
         process, self._process, self._reader = self._process, None, None
-        self.rehearsing = False
+        self._rehearsing_since_s = None
         if process is None:
             return ''
         with contextlib.suppress(ProcessLookupError):
