@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -44,12 +45,19 @@ class Plant:
         subscribe = self.node.create_subscription
         subscribe(Alarm, f'{MONITOR}/alarms', self.alarms.append, LATCHED)
         subscribe(FlowCharacteristic, f'{MONITOR}/characteristic', self.curves.append, LATCHED)
+        self.known = False
+        subscribe(DiagnosticArray, '/diagnostics', self._note, 10)
         self._player = Player(self.node, [PLANT_SAMPLE], 0.0, False, lambda: False)
 
     def listeners(self) -> set[bytes]:
         """Return who takes our samples; one that was killed stays among them for a while."""
         found = self.node.get_subscriptions_info_by_topic(PLANT_SAMPLE)
         return {bytes(each.endpoint_gid) for each in found}
+
+    def _note(self, health: DiagnosticArray) -> None:
+        """Note whether the monitor knows of us."""
+        told = [v.value for s in health.status for v in s.values if v.key == 'Publishers']
+        self.known = self.known or any(count != '0' for count in told)
 
     def play(self, start: int, end: int) -> None:
         assert not self._player.wait_for_listeners(240.0)
@@ -171,7 +179,8 @@ def test_a_second_monitor_on_the_same_state_is_refused_and_the_first_goes_on(
     plant.until(lambda: goes_on(processes, third), 'the sentence', 240.0)
     # The one that is gone would count as a listener too; and the new one has to know of us.
     plant.until(lambda: plant.listeners() - known, 'the new listener')
-    plant.quiet(1.0)
+    plant.known = False
+    plant.until(lambda: plant.known, 'the monitor knowing the plant')
     plant.play(600, 700)
     plant.quiet(1.0)
     third.send_signal(signal.SIGTERM)
