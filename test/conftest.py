@@ -28,6 +28,10 @@ hypothesis.settings.load_profile('valveflow')
 
 # Above 101 a domain's ports run into those that Linux hands out to anybody.
 DOMAINS = 101
+# Processes of one run take turns of their own, so that none comes upon what another one's nodes
+# have just left.
+WORKER = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0')[2:])
+WORKERS = int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1'))
 _turn = itertools.count(os.getpid())
 
 
@@ -40,7 +44,7 @@ def leased_domain() -> Iterator[int]:
     known to its domain for a while.
     """
     for _ in range(DOMAINS):
-        domain = next(_turn) % DOMAINS + 1
+        domain = next(_turn) % (DOMAINS // WORKERS) * WORKERS + WORKER + 1
         path = Path(tempfile.gettempdir(), f'valveflow-ros-domain-{domain}.lock')
         try:
             handle = os.open(path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o666)

@@ -76,7 +76,8 @@ def test_neighbours_are_known_and_as_little_is_left_as_of_a_plain_start(
     finally:
         neighbour.destroy_node()
     # The one node of ours that is left is the real one, by the name it was given.
-    assert names == ['neighbour', 'renamed']
+    assert {'neighbour', 'renamed'} <= set(names)
+    assert not [name for name in names if name.startswith(('_valveflow', 'joined'))]
     assert not up
     # Contexts of ROS that were shut down leave nothing; the one in use may be another one.
     assert after[0] - plain[0] in (0, 1)
