@@ -267,4 +267,5 @@ def _missed(count: int) -> str:
 
 
 def _utc(time_ns: int) -> str:
-    return f'{np.datetime64(time_ns, "ns").astype("datetime64[m]")} UTC'.replace('T', ' ')
+    minute = str(np.datetime64(time_ns, 'ns').astype('datetime64[m]'))
+    return f'{minute.replace("T", " ")} UTC'
