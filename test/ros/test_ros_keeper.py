@@ -18,6 +18,7 @@ from valveflow_ros.core.events import CurveAdopted
 from valveflow_ros.core.state_bytes import from_bytes, to_bytes
 from valveflow_ros.errors import DataError, RecordingError
 from valveflow_ros.ros.continuity import Continuity
+from valveflow_ros.ros.diagnostics import Level
 from valveflow_ros.ros.keeper import Keeper, folder_of
 from valveflow_ros.ros.live import LiveEngine
 from valveflow_ros.ros.outcome import Outcome
@@ -84,6 +85,8 @@ def test_a_state_of_other_parameters_is_used_only_where_they_do_not_matter(
     keeper = Keeper(settings(tmp_path, **more))
     assert (keeper.saved is None) == bool(words)
     assert words in keeper.sentence
+    # It waits for a run that it fits.
+    assert not keeper.lost
     keeper.close()
 
 
@@ -148,8 +151,22 @@ def test_a_state_that_is_not_whole_is_a_sentence_and_never_an_exception(
     keeper = Keeper(settings(tmp_path))
     assert keeper.saved is None
     assert keeper.sentence.startswith('The state saved by an earlier run is not used. ')
+    assert 'alarms and reference of before are gone' in keeper.sentence
     assert keeper.sentence.endswith('.')
+    assert keeper.lost
     keeper.close()
+
+
+def test_a_damaged_state_is_seen_in_the_health_until_the_next_start(tmp_path: Path) -> None:
+    written(tmp_path)
+    path = tmp_path / 'state_unit' / STATE
+    path.write_bytes(path.read_bytes()[:-1])
+    for level, words in ((Level.WARN, 'is not used.'), (Level.OK, 'is saved in its time.')):
+        ours = Continuity(settings(tmp_path), {}, {}, lambda level, sentence: None)
+        item = ours.item()
+        assert item.level == level
+        assert words in item.sentence
+        ours.close()
 
 
 def test_every_single_cut_and_many_flips_are_noticed() -> None:

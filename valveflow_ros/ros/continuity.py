@@ -150,6 +150,10 @@ class Continuity:
         if not keeper.on:
             nothing = 'Nothing is kept (parameters keep_state, state_directory).'
             return Item('state', Level.OK, nothing)
+        if keeper.lost:
+            # Nobody would see it otherwise: what stood is not there to be shown. Until the next
+            # start, which goes on from this run.
+            return Item('state', Level.WARN, keeper.sentence, values)
         return Item('state', Level.OK, 'The state is saved in its time.', values)
 
     def close(self) -> None:

@@ -65,6 +65,7 @@ class Keeper:
     def __init__(self, settings: Settings) -> None:
         self.saved: State | None = None
         self.sentence = ''
+        self.lost = False
         self._period_s = settings.real('state_period')
         self._written_s = time.monotonic()
         # At the start too: with any state, however empty, the recording after it is fed again.
@@ -89,13 +90,23 @@ class Keeper:
         saved_s = self._writer.saved_s if self.on else None
         return None if saved_s is None else time.monotonic() - saved_s
 
-    def drop(self, reason: str) -> None:
-        """Use nothing of what was saved."""
+    def drop(self, reason: str, whole: bool = False) -> None:
+        """Use nothing of what was saved.
+
+        Parameters
+        ----------
+        reason : str
+        whole : bool
+            Whether another run can use it.
+        """
         self.saved = None
-        self.sentence = (
-            f'The state saved by an earlier run is not used. {reason} It stays beside the new '
-            'one, and a run that it fits takes it up again.'
-        )
+        self.lost = not whole
+        then = (
+            'It stays beside the new one, and a run that it fits takes it up again.' if whole else
+            'It stays beside the new one. Window, standing alarms and reference of before are '
+            'gone; curves of before stand there as curve_*.json, for reference_file.'
+        )  # fmt: skip
+        self.sentence = f'The state saved by an earlier run is not used. {reason} {then}'
         if self._folder is not None:
             self._folder.set_aside()
 
@@ -196,7 +207,7 @@ class Keeper:
             with contextlib.suppress(ValveflowError, KeyError, TypeError):
                 self.saved = _fitting(folder.read(folder.aside), settings)
             if self.saved is None:
-                self.drop(str(error))
+                self.drop(str(error), whole=True)
             else:
                 folder.take_back()
         except (ValveflowError, KeyError, TypeError) as error:
