@@ -21,6 +21,7 @@ _ABOUT = {
     'reference': 'the curve against its reference',
     'recorder': 'is everything on disk',
     'state': 'is there a state to go on with after a restart',
+    'name': 'only where another node of the domain bears the name of this one',
 }
 
 

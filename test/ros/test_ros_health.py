@@ -44,8 +44,10 @@ class Scene:
             tally.note_arrival(1, at - k * period)
             tally.note_number(tally.received + 1)
 
-    def item(self, topic: str = 'valve_opening', listening: float = 100.0) -> Item:
-        items = self.health.items(self.tallies, self.counts, self.publishers, NOW + 0.5, listening)
+    def item(
+        self, topic: str = 'valve_opening', listening: float = 100.0, at: float = NOW + 0.5
+    ) -> Item:
+        items = self.health.items(self.tallies, self.counts, self.publishers, at, listening)
         (found,) = [item for item in items if item.name == f'input {topic}']
         return found
 
@@ -114,6 +116,36 @@ def test_two_publishers_are_named() -> None:
     scene = Scene()
     scene.publishers['valve_opening'] = Publishers(2)
     scene.says(Level.WARN, '/plant/valve_opening has 2 publishers')
+
+
+def test_a_signal_that_comes_in_two_ways_is_named() -> None:
+    scene = Scene()
+    scene.publishers[PLANT_SAMPLE] = Publishers(1)
+    scene.says(Level.WARN, '/plant/valve_opening and /plant/plant_sample are both published')
+    # The command may come beside samples that do not hold it.
+    scene.says(Level.OK, 'Hz', 'valve_command')
+    scene.publishers[PLANT_SAMPLE] = Publishers(0, ('std_msgs/msg/String',))
+    scene.says(Level.OK, 'Hz')
+
+
+def test_an_input_of_which_nothing_can_be_used_is_as_good_as_silent() -> None:
+    scene = Scene()
+    counts = scene.counts['valve_opening']
+    counts['accepted'] = 5
+    scene.says(Level.OK, 'Hz')
+    for second in range(1, 30):
+        scene.hear('valve_opening', NOW + second)
+        counts['impossible'] += 1
+        level, words = (
+            (Level.WARN, '1 new readings were rejected.') if second <= 10
+            else (Level.ERROR, f'Nothing usable has come for {second} s. So far: impossible ')
+        )  # fmt: skip
+        scene.says(level, words, at=NOW + 0.5 + second)
+    # One good one among them is enough.
+    counts['accepted'] += 1
+    counts['impossible'] += 1
+    scene.hear('valve_opening', NOW + 30)
+    scene.says(Level.WARN, 'rejected', at=NOW + 30.5)
 
 
 def test_losses_are_said_once_and_counted_on() -> None:
@@ -207,6 +239,18 @@ def test_only_changes_get_into_the_log_and_not_too_often() -> None:
     assert changes.pick([ill], 2.0) == []
     assert changes.pick([well], 3.0) == []
     assert changes.pick([ill], 4.0) == []
+    assert changes.pick([well], 40.0) == [well]
+
+
+def test_a_failure_gets_into_the_log_however_short_it_is_and_not_again_and_again() -> None:
+    changes = Changes(quiet_s=30.0)
+    well, ill = Item('a', Level.OK, 'Well.'), Item('a', Level.WARN, 'Ill.')
+    dead = Item('a', Level.ERROR, 'Dead.')
+    assert changes.pick([ill], 0.0) == [ill]
+    assert changes.pick([dead], 1.0) == [dead]
+    for second in range(2, 30, 2):
+        assert changes.pick([well], second) == []
+        assert changes.pick([dead], second + 1.0) == []
     assert changes.pick([well], 40.0) == [well]
 
 

@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 
 from valveflow_ros.config import TABLE
 from valveflow_ros.logs import open_log
-from valveflow_ros.ros import simulator_steps
+from valveflow_ros.ros import monitor_node, simulator_steps
 from valveflow_ros.ros.monitor_node import MonitorNode
 
 pytestmark = pytest.mark.ros
@@ -102,6 +102,23 @@ def test_the_whole_life(context: Any, tmp_path: Path) -> None:
             )
         assert monitor.trigger_shutdown() == DONE
         assert monitor.finalized
+    finally:
+        stage.close()
+
+
+def test_another_node_of_the_same_name_is_told(
+    context: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(monitor_node, '_LOOK_AROUND_S', 0.05)
+    stage = Stage(context, tmp_path)
+    try:
+        stage.monitor.trigger_configure()
+        assert stage.sentence(' name') == ''
+        twin = Node('valveflow_monitor', context=context, start_parameter_services=False)
+        wait_until(lambda: stage.sentence(' name'), 'the name', 20.0)
+        assert stage.sentence(' name').startswith('2 nodes are called /valveflow_monitor: ')
+        twin.destroy_node()
+        wait_until(lambda: not stage.sentence(' name'), 'its end', 20.0)
     finally:
         stage.close()
 

@@ -79,7 +79,9 @@ class Changes:
         for item in items:
             before = self._levels.get(item.name, Level.OK)
             recent = now_s - self._said_s.get(item.name, -self._quiet_s) < self._quiet_s
-            if item.level == before or recent:
+            # A failure is told at once; that it went and came again is not, for that long.
+            worse = item.level == Level.ERROR
+            if item.level == before or (recent and not worse):
                 continue
             self._levels[item.name] = item.level
             self._said_s[item.name] = now_s

@@ -17,6 +17,8 @@ from valveflow_ros.ros.tallies import Tally
 
 _REJECTED = tuple(reason for reason in REASONS if reason not in ('accepted', 'late'))
 _PATIENCE_S = 5.0
+# Rejected for so long, an input is as good as silent.
+_BLIND_S = 10.0
 
 
 @dataclass(slots=True)
@@ -38,6 +40,7 @@ class InputHealth:
     _ranges: list[tuple[float, float]] = field(default_factory=list)
     _rejected: dict[str, int] = field(default_factory=dict)
     _lost: dict[str, int] = field(default_factory=dict)
+    _usable: dict[str, tuple[int, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Look the ranges up once; they are not live."""
@@ -88,6 +91,10 @@ class InputHealth:
         name = _speaking(info.topic, tallies, publishers)
         tally, seen = tallies[name], publishers.get(name, Publishers())
         level, sentence = self._judge(info, name, tally, seen, counts, now_s, listening_s)
+        if level <= Level.WARN and info.required and self._twice(info.topic, publishers):
+            both = f'{self.topics[info.topic]} and {self.topics[PLANT_SAMPLE]}'
+            level = Level.WARN
+            sentence = f'{both} are both published; their values are mixed. Stop one of them.'
         values: dict[str, object] = {
             'Topic': self.topics[name],
             'Actual frequency (Hz)': tally.rate_hz(),
@@ -130,7 +137,12 @@ class InputHealth:
                 f'{topic} has {seen.right} publishers; their values are mixed. Stop all but one.'
             )
         if rejected:
-            return Level.WARN, f'{rejected} new readings were rejected. {self._why(info, counts)}'
+            why = self._why(info, counts)
+            blind_s = now_s - self._used(info.topic, counts['accepted'], now_s)
+            if blind_s > _BLIND_S:
+                return Level.ERROR, f'Nothing usable has come for {blind_s:.0f} s. {why}'
+            return Level.WARN, f'{rejected} new readings were rejected. {why}'
+        self._used(info.topic, counts['accepted'], now_s)
         if tally.without_time + tally.waiting == tally.received:
             return Level.ERROR, f'{topic} comes without a time; is /clock published?'
         if lost:
@@ -172,6 +184,19 @@ class InputHealth:
         if fitting:
             text += f' Is {info.topic}_unit {" or ".join(fitting)} rather than {named}?'
         return text
+
+    def _used(self, key: str, count: int, now_s: float) -> float:
+        """Return when a reading was used last, as far as that is known."""
+        before, since_s = self._usable.get(key, (-1, now_s))
+        if count != before:
+            since_s = now_s
+        self._usable[key] = (count, since_s)
+        return since_s
+
+    @staticmethod
+    def _twice(topic: str, publishers: Mapping[str, Publishers]) -> bool:
+        """Tell whether a signal comes on its own topic and on the stamped one."""
+        return all(publishers.get(n, Publishers()).right for n in (topic, PLANT_SAMPLE))
 
     @staticmethod
     def _new(before: dict[str, int], key: str, count: int) -> int:

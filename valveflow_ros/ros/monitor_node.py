@@ -24,6 +24,7 @@ from valveflow_ros.ros.sentences import with_place
 from valveflow_ros.ros.session import DIAGNOSTICS, Session
 
 _SUCCESS = TransitionCallbackReturn.SUCCESS
+_LOOK_AROUND_S = 5.0
 _NOT_RUNNING = 'The monitor is not active; activate it first.'
 
 
@@ -67,6 +68,7 @@ class MonitorNode(LifecycleNode):
         self.finalized = False
         self._next_diagnostics_s = 0.0
         self._changes = Changes()
+        self._look_around_s, self._alike = 0.0, 1
         self.settings = Settings(declare.declare(self))
         for sentence in declare.unknown_overrides(self):
             self.get_logger().warning(f'{sentence} It is ignored.')
@@ -195,7 +197,7 @@ class MonitorNode(LifecycleNode):
         if session is None:
             items = [Item('fit', Level.STALE, 'The monitor is not configured.')]
         else:
-            items = session.items()
+            items = [*session.items(), *self.namesakes(now_s)]
         now_ns = time.time_ns()
         data = encode(array(items, self.settings.text('unit_tag'), now_ns))
         self._health.publish(data)
@@ -208,6 +210,21 @@ class MonitorNode(LifecycleNode):
             alike.setdefault((item.level, item.sentence), []).append(item.name)
         for (level, sentence), names in alike.items():
             self._log(level, f'{", ".join(names)}: {sentence}')
+
+    def namesakes(self, now_s: float) -> list[Item]:
+        """Return an item if another node of the domain bears this one's name, else nothing."""
+        if now_s >= self._look_around_s:
+            self._look_around_s = now_s + _LOOK_AROUND_S
+            own = (self.get_name(), self.get_namespace())
+            self._alike = sum(found == own for found in self.get_node_names_and_namespaces())
+        if self._alike < 2:
+            return []
+        sentence = (
+            f'{self._alike} nodes are called {self.get_fully_qualified_name()}: topics are mixed, '
+            'and a service or a parameter reaches all of them. Give each a namespace or a '
+            'ROS_DOMAIN_ID of its own.'
+        )
+        return [Item('name', Level.ERROR, sentence, {'Nodes of this name': self._alike})]
 
     def _log(self, level: Level, text: str) -> None:
         # One call each: rclpy ties a severity to the place it is called from.
