@@ -2,6 +2,9 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
+import threading
 import time
 import weakref
 from collections.abc import Iterator
@@ -203,21 +206,28 @@ def test_a_late_answer_to_an_older_task_is_not_taken_for_the_newer_one() -> None
         assert isinstance(outcome.result, str)
 
 
+# A fork of the tests' own process, with its many threads, may find a lock that nobody gives back.
+_PARENT = """
+import subprocess
+import sys
+import threading
+import time
+from valveflow_ros.ros.warmup import made_up_task
+from valveflow_ros.config import Settings
+from valveflow_ros.ros.worker import FitWorker
+made = FitWorker(120.0, 'hurt_jobs:hangs')
+made.start()
+made.submit(made_up_task(Settings()))
+print(made.pid, flush=True)
+time.sleep(600.0)
+"""
+
+
 def test_the_process_ends_with_its_parent() -> None:
-    reader, writer = os.pipe()
-    parent = os.fork()
-    if parent == 0:  # pragma: no cover - another process
-        made = FitWorker(120.0, 'hurt_jobs:hangs')
-        made.start()
-        made.submit(TASK)
-        os.write(writer, str(made.pid).encode())
-        time.sleep(60.0)
-        os._exit(0)
-    child = psutil.Process(int(os.read(reader, 20)))
-    os.close(reader)
-    os.close(writer)
-    os.kill(parent, signal.SIGKILL)
-    os.waitpid(parent, 0)
+    with subprocess.Popen([sys.executable, '-c', _PARENT], stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        child = psutil.Process(int(parent.stdout.readline()))
+        parent.kill()
     wait_until(
         lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE, 'its end', 20.0
     )
@@ -230,14 +240,17 @@ def test_frames_survive_any_cutting() -> None:
     os.set_blocking(reader, False)
     frames = FrameReader(reader)
     found: list[State] = []
-    pid = os.fork()
-    if pid == 0:  # pragma: no cover - another process
+
+    def write() -> None:
         for item in items:
             send(writer, item)
-        os._exit(0)
-    os.close(writer)
+        os.close(writer)
+
+    # More than a pipe holds, so that it is written and read by turns.
+    thread = threading.Thread(target=write)
+    thread.start()
     wait_until(lambda: found.extend(frames.ready()) or frames.ended, 'the end of the pipe')
-    os.waitpid(pid, 0)
+    thread.join()
     os.close(reader)
     assert len(found) == len(items)
     assert (found[0], found[2]) == (items[0], items[2])
