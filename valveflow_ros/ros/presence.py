@@ -5,7 +5,7 @@ answers within a millisecond, the answer is lost, and the next one comes with th
 about half of all neighbours are heard of that late. So a process shows itself as soon as it can,
 and five times at once, as five participants with a node that does nothing; compiler and libraries
 load meanwhile. Then it goes on as the one that has heard of most neighbours. Whom that one missed
-it hears of 3 s after the start at the latest, not 3 s after everything is loaded.
+it hears of with the neighbour's period, counted from the start and not from when all is loaded.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from rclpy.utilities import get_default_context, get_rmw_implementation_identifi
 from valveflow_ros.ros.secure_start import security_wanted
 from valveflow_ros.ros.transport import FAST_DDS
 
-# Each takes ten milliseconds. With half of the answers lost, all five miss a neighbour once in
-# thirty starts.
+# Each after the first takes ten milliseconds. In ten starts beside one neighbour at least one of
+# the five heard it each time, and one to five did.
 _AT_ONCE = 5
 # The underscore keeps it out of lists of nodes.
 _NAME = '_valveflow_starting'
