@@ -1,8 +1,9 @@
 """Run the quick tests of recorder, recovery and state again and again, to find one that wavers.
 
-    python -m benchmarks.repeats [--count 200] [--minutes M] [--seed N]
+    python -m benchmarks.repeats [--count 200] [--minutes M] [--seed N] [--lanes L]
 
-Each time in a new process and in another order of the files, with the machine as it is. Writes to
+Each time in a new process and in another order of the files, with the machine as it is; with
+lanes, that many beside each other, which also shows who cannot bear a neighbour. Writes to
 benchmarks/results/repeats.json how often, which test failed and how, and in which order the files
 stood then. The exit status is 1 if any did, or if there was no time for one run.
 """
@@ -18,6 +19,7 @@ import re
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -60,21 +62,31 @@ def main() -> int:
     parser.add_argument('--minutes', type=float, default=600.0, help='begin no more after these')
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--output', type=Path, default=RESULT)
+    parser.add_argument('--lanes', type=int, default=1, help='runs beside each other')
     given = parser.parse_args()
     chance, end_s = random.Random(given.seed), time.monotonic() + 60.0 * given.minutes
+    orders = [chance.sample(FILES, len(FILES)) for _ in range(given.count)]
     passed: list[int] = []
     seconds: list[float] = []
     failures: list[dict[str, Any]] = []
     loads: list[float] = []
-    while len(seconds) < given.count and time.monotonic() < end_s:
-        loads.append(os.getloadavg()[0])
-        found = once(chance.sample(FILES, len(FILES)))
-        passed.append(found[0])
-        seconds.append(found[1])
-        failures += [{'run': len(seconds), **failure} for failure in found[2]]
-        print(f'{len(seconds)}: {found[0]} passed in {found[1]:.0f} s', *found[2], flush=True)
+
+    def run(order: list[str]) -> tuple[float, tuple[int, float, list[dict[str, Any]]]] | None:
+        return (os.getloadavg()[0], once(order)) if time.monotonic() < end_s else None
+
+    with ThreadPoolExecutor(given.lanes) as pool:
+        for done in pool.map(run, orders):
+            if done is None:
+                break
+            load, found = done
+            loads.append(load)
+            passed.append(found[0])
+            seconds.append(found[1])
+            failures += [{'run': len(seconds), **failure} for failure in found[2]]
+            print(f'{len(seconds)}: {found[0]} passed in {found[1]:.0f} s', *found[2], flush=True)
     content = {
-        'command': f'python -m benchmarks.repeats --count {given.count} --seed {given.seed}',
+        'command': f'python -m benchmarks.repeats --count {given.count} --seed {given.seed}'
+                   f' --lanes {given.lanes}',
         'wanted': given.count, 'done': len(seconds), 'files': FILES,
         'tests_each': max(passed, default=0), 'passed': sum(passed),
         'failed': len(failures), 'failures': failures,
