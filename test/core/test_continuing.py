@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import (
     QUICK_MONITOR,
+    START_NS,
     examples,
     first_difference,
     plant_table,
@@ -17,13 +18,14 @@ from streams import (
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.align import Aligner
+from valveflow_ros.core.events import FitRequested
 from valveflow_ros.core.monitor import Monitor
-from valveflow_ros.core.offline import feed_rows
+from valveflow_ros.core.offline import CLOCK_BACK, feed_rows
 from valveflow_ros.core.refits import Refits
 from valveflow_ros.core.shift_alarm import ShiftAlarm
 from valveflow_ros.core.state_bytes import from_bytes, to_bytes
 from valveflow_ros.errors import DataError
-from valveflow_ros.records import Readings, table_to_readings
+from valveflow_ros.records import NS_PER_S, Readings, table_to_readings
 
 SETTINGS = Settings(QUICK_MONITOR)
 N = 700
@@ -50,6 +52,37 @@ def test_a_monitor_taken_up_again_says_the_same(seed, harms, cut):
     events += feed_rows(second, table.part(cut, n))
     assert first_difference(story(expected), story(events)) == ''
     assert to_bytes(second.snapshot()) == to_bytes(whole.snapshot())
+
+
+@pytest.mark.parametrize('cut', [N, N + 10, N + 30, N + 31, N + 60])
+def test_a_leap_ahead_that_is_taken_back_costs_no_row_whenever_it_is_taken_up(cut):
+    settings = SETTINGS.changed({'window_days': 0.03})
+    parts = [
+        plant_table(3, N),
+        plant_table(4, 30, start_ns=START_NS + 40 * 86400 * NS_PER_S),
+        plant_table(5, 100, start_ns=START_NS + (N + 30) * NS_PER_S),
+    ]
+
+    def run(taken_up):
+        monitor, events = Monitor(settings), []
+        for k, part in enumerate(parts):
+            for row in range(len(part)):
+                events += feed_rows(monitor, part.part(row, row + 1))
+                if taken_up and monitor.rows == cut:
+                    monitor = again(monitor, Monitor(settings))
+            if k == 1:
+                events += monitor.restart(CLOCK_BACK)
+                if taken_up and monitor.rows == cut:
+                    monitor = again(monitor, Monitor(settings))
+        return monitor, events
+
+    (whole, expected), (other, events) = run(False), run(True)
+    assert first_difference(story(expected), story(events)) == ''
+    assert to_bytes(other.snapshot()) == to_bytes(whole.snapshot())
+    (request,) = [e for e in other.request_fit() if isinstance(e, FitRequested)]
+    assert request.task.contents.time_ns.tolist() == [
+        *parts[0].time_ns.tolist(), *parts[2].time_ns.tolist(),
+    ]  # fmt: skip
 
 
 @examples(15)

@@ -377,18 +377,35 @@ def test_the_evidence_is_the_share_of_the_fixed_limit_or_what_the_chart_of_the_c
 # --- restarts and settings ------------------------------------------------------------------
 
 
-def test_after_a_restart_curve_and_alarm_stay_and_the_window_is_empty():
+@pytest.mark.parametrize('back_s', [20, 200, 2 * N])
+def test_a_clock_that_goes_back_costs_the_rows_it_had_passed_and_no_more(back_s):
     monitor, _ = with_curve()
-    curve = monitor.characteristic
+    curve, before = monitor.characteristic, monitor.special_segments()
     (entry,) = monitor.restart(CLOCK_BACK)
     assert (entry.kind, entry.text, entry.rows) == (JournalKind.RESET, CLOCK_BACK, N)
     assert monitor.characteristic is curve
     assert (monitor.status, monitor.cause) == (CurveStatus.STALE, CLOCK_BACK)
-    assert (monitor.segments, monitor.special_samples) == (0, 0)
-    events = feed_rows(monitor, plant_table(5, N))
+    assert monitor.special_segments() == before
+    first_ns = monitor.last_ns - back_s * NS_PER_S
+    more = plant_table(5, N, start_ns=first_ns)
+    monitor.feed(more.part(0, 1))
+    kept = monitor.special_segments()
+    assert kept[: len(before)] == tuple(s for s in before if s.end_ns < first_ns)
+    assert all(s.end_ns < first_ns for s in kept)
+    events = feed_rows(monitor, more.part(1, N))
     assert monitor.status == CurveStatus.FRESH
-    assert len(of_type(events, CurveAdopted)) >= 1
+    assert of_type(events, CurveAdopted)
     assert monitor.rows == 2 * N
+    (_, request) = monitor.request_fit() if not monitor.fit_pending else (None, None)
+    held = request.task.contents
+    table = plant_table(0, N)
+    assert held.time_ns.tolist() == [
+        *(t for t in table.time_ns.tolist() if t < first_ns),
+        *more.time_ns.tolist(),
+    ]
+    # A segment's rows are those of its time, whatever was let go between.
+    for (a, b, _), found in zip(held.spans.tolist(), monitor.special_segments(), strict=True):
+        assert (held.time_ns[a], held.time_ns[b - 1]) == (found.start_ns, found.end_ns)
 
 
 def test_a_restart_refuses_the_fit_that_is_running():

@@ -280,6 +280,45 @@ def test_a_clock_set_back_restarts_the_engine_once_at_the_right_row(cut):
     same(told, events)
 
 
+def held(monitor):
+    """Return times and segments of what a fit would see."""
+    task = next(e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
+    return task.contents.time_ns.tolist(), monitor.special_segments()
+
+
+@examples(15)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([-3e8, -7200.0, -60.0, 60.0, 3600.0, 1e5, 2.6e6]),
+    st.integers(1, 30),
+)
+def test_a_clock_that_is_wrong_for_seconds_costs_no_more_than_its_own_step(seed, off_s, seconds):
+    """Stamps of a gateway that has not heard the time yet, or was told a wrong one."""
+    table = plant_table(seed, N)
+    settings = SETTINGS.changed({'window_days': 1.0, 'refit_period': 0.0})
+    readings = table_to_readings(table)
+    border = len(readings) * 4 // 7
+    slip = 5 * seconds  # five signals a row
+    time_ns = readings.time_ns.copy()
+    time_ns[border : border + slip] += round(off_s * NS_PER_S)
+    wrong = Readings(time_ns, readings.signal, readings.value, readings.quality)
+    monitor, true = Monitor(settings), Monitor(settings)
+    for part, to in ((wrong, monitor), (readings, true)):
+        aligner = Aligner(settings)
+        for aligned in align_all(aligner, part):
+            feed_aligned(to, aligned)
+    times, segments = held(monitor)
+    begun = readings.time_ns[border]
+    # Stamps that went back for long enough were believed: what they had passed is gone.
+    most_s = min(-off_s, 86400.0) if off_s < 0 and slip >= 20 else 0.0
+    safe_ns = begun - round((most_s + settings.settle_s + 60.0) * NS_PER_S)
+    expected, before = held(true)
+    assert [t for t in times if t < safe_ns] == [t for t in expected if t < safe_ns]
+    assert [s for s in segments if s.end_ns < safe_ns] == [s for s in before if s.end_ns < safe_ns]
+    assert times == sorted(set(times))
+    assert max(times) == table.time_ns[-1]
+
+
 @pytest.mark.parametrize('late', [0, 25])
 def test_a_recording_with_a_clock_set_back_is_repeated_from_its_readings(late):
     """The journal knows the restart; the replay's aligner finds it too, and must not count."""

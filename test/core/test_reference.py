@@ -25,11 +25,10 @@ from valveflow_ros.core.characteristic_json import from_json, to_json
 from valveflow_ros.core.events import CurveAdopted, JournalEntry, JournalKind, ReferenceSet
 from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.offline import CLOCK_BACK, JournalReplayer, feed_rows
-from valveflow_ros.core.reference import ReferenceKeeper
 from valveflow_ros.core.shift import PieceShift, Shift
 from valveflow_ros.core.shift_alarm import ShiftAlarm
 from valveflow_ros.errors import DataError
-from valveflow_ros.records import NS_PER_S, SegmentKind, SpecialSegment
+from valveflow_ros.records import NS_PER_S
 
 # The residual alarm is out of the way: it would stop refits before the curve can move.
 SETTINGS = Settings({**QUICK_MONITOR, 'alarm_limit': 1000.0, 'shift_confidence': 0.99})
@@ -200,20 +199,6 @@ def test_near_the_limit_it_does_not_come_and_go():
     assert told(alarm, judged(2.0, 2e-2)) == [AlarmState.RETURNED_UNACKNOWLEDGED]
 
 
-def test_the_keeper_forgets_segments_with_the_window():
-    keeper = ReferenceKeeper(Settings({'window_days': 1.0}))
-    for hour in range(60):
-        at = START_NS + hour * 3600 * NS_PER_S
-        keeper.add(
-            SpecialSegment(hour, SegmentKind.STEADY, at, at + 600 * NS_PER_S, 600, 1.0, 1.0, 0.0,
-                           0.0, 1.0, 1.0, 0.0, 540.0)
-        )  # fmt: skip
-    assert len(keeper.segments) == 24
-    assert keeper.segments[0].number == 36
-    keeper.restart()
-    assert keeper.segments == ()
-
-
 def at(shift, u_from, u_to):
     """Return the judgement as one of another piece."""
     return replace(shift, pieces=(replace(shift.pieces[0], u_from=u_from, u_to=u_to),))
@@ -230,15 +215,6 @@ def test_it_stands_while_what_moved_is_out_of_the_window():
     assert alarm.ranges == ((1010.0, 1190.0),)
     assert told(alarm, at(calm, 1005.0, 1400.0)) == [AlarmState.RETURNED_UNACKNOWLEDGED]
     assert alarm.ranges == ()
-
-
-def test_a_segment_longer_than_the_window_is_not_kept():
-    keeper = ReferenceKeeper(Settings({'window_days': 1.0}))
-    keeper.add(
-        SpecialSegment(1, SegmentKind.STEADY, START_NS, START_NS + 86400 * NS_PER_S, 86400, 1.0,
-                       1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 540.0)
-    )  # fmt: skip
-    assert keeper.segments == ()
 
 
 def test_a_curve_that_cannot_be_compared_says_why():

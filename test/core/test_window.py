@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -26,7 +28,9 @@ def rows_after(last_ns, n, gap_s=0):
 
 
 actions = st.lists(
-    st.tuples(st.integers(0, 200), st.sampled_from([0, 0, 0, 5, 300])), min_size=1, max_size=25
+    st.tuples(st.integers(0, 200), st.sampled_from([0, 0, 0, 5, 300, -3, -90, -1000])),
+    min_size=1,
+    max_size=25,
 )
 
 
@@ -36,6 +40,15 @@ class NaiveWindow:
     def __init__(self, window_s):
         self.window_s = window_s
         self.rows, self.segments = [], []
+
+    def cut(self, time_ns):
+        """Keep the rows before a time, of the last ones that a window without gaps would hold."""
+        known = self.rows[-max(16, self.window_s + 1) :]
+        gone = len(self.rows) - len(known)
+        self.rows = [row for row in known if row[0] < time_ns]
+        stay = [s for s in self.segments if s.first_row >= gone and s.segment.end_ns < time_ns]
+        self.segments = [replace(s, first_row=s.first_row - gone, end_row=s.end_row - gone)
+                         for s in stay]  # fmt: skip
 
     def contents(self):
         if not self.rows:
@@ -56,27 +69,31 @@ def test_after_every_append_the_window_holds_what_the_slow_truth_holds(plan, win
     rng = np.random.default_rng(seed)
     fast, slow = RollingWindow(window_s, 1.0), NaiveWindow(window_s)
     last = START_NS
+    counted = 0
     for n, gap in plan:
         time_ns = rows_after(last, n, gap)
         columns = rng.normal(0.0, 1.0, (3, n))
+        if n and gap < 0:
+            fast.cut(int(time_ns[0]))
+            slow.cut(int(time_ns[0]))
+        counted += n
         columns[0, rng.random(n) < 0.1] = np.nan
         fast.append(time_ns, *columns)
         slow.rows += list(zip(time_ns.tolist(), *columns.tolist(), strict=True))
         if n:
             last = int(time_ns[-1])
         if n > 20:
-            end = len(slow.rows)
-            found = segment(len(slow.segments) + 1, end - 15, end - 5, int(time_ns[-15]),
-                            SegmentKind(int(rng.integers(1, 3))))  # fmt: skip
-            fast.add_segment(found)
-            slow.segments.append(found)
+            end, kind = len(slow.rows), SegmentKind(int(rng.integers(1, 3)))
+            fast.add_segment(segment(1, counted - 15, counted - 5, int(time_ns[-15]), kind))
+            slow.segments.append(segment(1, end - 15, end - 5, int(time_ns[-15]), kind))
         rows, spans = slow.contents()
         held = fast.contents()
         assert held.time_ns.tolist() == [r[0] for r in rows]
         for c, column in enumerate((held.u, held.power_mw, held.temperature_degc), start=1):
             assert np.array_equal(column, [r[c] for r in rows], equal_nan=True)
         assert held.spans.tolist() == spans
-        assert fast.rows_seen == len(slow.rows)
+        assert fast.rows_seen == counted
+        assert fast.segments == len(spans) == len(fast.special_segments())
         assert held.special_rows().tolist() == [k for a, b, _ in spans for k in range(a, b)]
         for kind in SegmentKind:
             assert held.count(kind) == sum(s[2] == kind for s in spans)
@@ -89,7 +106,7 @@ def test_the_tail_is_the_newest_rows(plan, wanted):
     seen = []
     last = START_NS
     for n, gap in plan:
-        time_ns = rows_after(last, n, gap)
+        time_ns = rows_after(last, n, abs(gap))
         window.append(time_ns, np.arange(n) + len(seen), np.zeros(n), np.zeros(n))
         seen += list(range(len(seen), len(seen) + n))
         last = int(time_ns[-1]) if n else last

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from valveflow_ros.config import Settings
 from valveflow_ros.core.align import Aligner
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.corrector import Corrector
-from valveflow_ros.core.events import FitRequested, JournalEntry, JournalKind, SegmentClosed
+from valveflow_ros.core.events import FitRequested
 from valveflow_ros.core.fit import fit, outline
 from valveflow_ros.core.fit_task import FitTask
 from valveflow_ros.core.model import RegionalModel
@@ -34,7 +35,7 @@ class Watched:
     Attributes
     ----------
     table : SampleTable
-        The rows in the engine's window; after the clock went back only those that follow.
+        The rows in the engine's window, without those that the clock had passed when it went back.
     segments : tuple of SpecialSegment
     counts : dict
         ``{topic: {reason: readings}}``.
@@ -67,20 +68,14 @@ def watch(
     """
     aligner, monitor = Aligner(settings), Monitor(settings)
     tables: list[SampleTable] = []
-    segments: list[SpecialSegment] = []
     resets = 0
     blocks = aligned_blocks(aligner, readings, progress, 'finding segments')
     for aligned in ahead(corrected(blocks, corrector)):
-        if len(aligned.resets):
-            resets += len(aligned.resets)
-            tables.clear()
-        last = int(aligned.resets[-1]) if len(aligned.resets) else 0
-        tables.append(aligned.table.part(last, len(aligned.table)))
-        for event in feed_aligned(monitor, aligned):
-            if isinstance(event, SegmentClosed):
-                segments.append(event.segment)
-            elif isinstance(event, JournalEntry) and event.kind == JournalKind.RESET:
-                segments.clear()
+        resets += len(aligned.resets)
+        borders = [0, *aligned.resets.tolist(), len(aligned.table)]
+        for start, end in pairwise(borders):
+            _append(tables, aligned.table.part(start, end))
+        feed_aligned(monitor, aligned)
     table, counts = SampleTable.concatenate(tables), aligner.counts()
     check_signals(table, counts)
     if not monitor.segments:
@@ -89,10 +84,20 @@ def watch(
     # A log longer than the window is longer than what the fit sees.
     first = int(task.contents.time_ns[0])
     held = table.part(int(np.searchsorted(table.time_ns, first)), len(table))
-    inside = tuple(s for s in segments if s.start_ns >= first)
     if corrector is not None:
         task = replace(task, held=corrector.held)
-    return Watched(held, inside, counts, task, resets)
+    return Watched(held, monitor.special_segments(), counts, task, resets)
+
+
+def _append(tables: list[SampleTable], table: SampleTable) -> None:
+    """Append rows; where the clock went back they take the place of those it had passed."""
+    while len(table) and tables and tables[-1].time_ns[-1] >= table.time_ns[0]:
+        last = tables.pop()
+        before = last.part(0, int(np.searchsorted(last.time_ns, table.time_ns[0])))
+        if len(before):
+            tables.append(before)
+    if len(table):
+        tables.append(table)
 
 
 def identify(watched: Watched, progress: Progress = quiet) -> Characteristic:

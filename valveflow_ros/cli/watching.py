@@ -84,7 +84,7 @@ def see(
         raise DataError(f'{source}: {error}') from None
     told = (*log.contents.warnings, *(d.sentence for d in log.doubts), *notes)
     if watched.clock_resets:
-        back = f'{source}: the clock went back; only what follows the last time counts.'
+        back = f'{source}: the clock went back; the rows it had passed are left out.'
         console.warn(back)
         told = (*told, back)
     return Seen(source, settings, watched, told)

@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 from valveflow_ros.config import Settings
 from valveflow_ros.core.align_kernel import (
     BEHIND_CONFIRMED,
+    CLOCK_AT_FIRST,
     NEVER,
+    NEWEST,
     REASONS,
     Rows,
     Rules,
@@ -82,11 +84,12 @@ class Aligner(ArrayMemory):
             lateness_ns=round(settings.real('lateness') * NS_PER_S),
             hold_ns=round(settings.real('hold_limit') * NS_PER_S),
             jump_ns=round(max(settings.real('clock_jump'), 3.0 * period) * NS_PER_S),
+            window_ns=round(86400.0 * settings.real('window_days') * NS_PER_S),
             spare=math.ceil(settings.real('lateness') / period) + 3,
         )
         spare = self._rules.spare
         self._state = State(
-            clock=np.array([NEVER, NEVER, 0, -1, 0], dtype=np.int64),
+            clock=np.array(CLOCK_AT_FIRST, dtype=np.int64),
             newest_ns=np.full(N_SIGNALS, NEVER, dtype=np.int64),
             held_ns=np.full(N_SIGNALS, NEVER, dtype=np.int64),
             held=np.full(N_SIGNALS, np.nan),
@@ -109,6 +112,11 @@ class Aligner(ArrayMemory):
     def finish(self) -> Aligned:
         """Close the rows up to the newest stamp; for the end of a file."""
         return self._run(Readings.of([]), final=True)
+
+    @property
+    def newest_ns(self) -> int:
+        """Return the newest stamp taken, 0 before the first."""
+        return max(0, int(self._state.clock[NEWEST]))
 
     def counts(self) -> dict[str, dict[str, int]]:
         """Return what became of the readings: ``{topic: {reason: count}}``."""

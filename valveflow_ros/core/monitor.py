@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.alarm_desk import Act, AlarmDesk
@@ -32,7 +33,7 @@ from valveflow_ros.core.segmenter import NoiseLevel, Segmented, Segmenter
 from valveflow_ros.core.state import Continuing, State
 from valveflow_ros.core.window import RollingWindow
 from valveflow_ros.errors import DataError
-from valveflow_ros.records import SampleTable
+from valveflow_ros.records import SampleTable, SpecialSegment
 
 BY_HAND = 'asked for by hand'
 
@@ -64,6 +65,7 @@ class Monitor:
         self._force = CurveInForce(settings)
         self._rows = 0
         self._last_ns = 0
+        self._went_back = False
         self.judged = Judged(0, math.nan, math.nan)
         self._refits = Refits()
         self.reference = ReferenceKeeper(settings)
@@ -109,6 +111,10 @@ class Monitor:
     def special_samples(self) -> int:
         """Return the number of samples in those segments."""
         return self._window.special_samples
+
+    def special_segments(self) -> tuple[SpecialSegment, ...]:
+        """Return the special segments in the window, in order of time."""
+        return self._window.special_segments()
 
     def noise(self) -> NoiseLevel:
         """Return the noise levels the thresholds stand on."""
@@ -158,7 +164,9 @@ class Monitor:
         if not self._refits.settle(request_ns):
             return []
         self._force.adopt(characteristic, self._window)
-        shift, changes = self.reference.judge(characteristic, self._last_ns, self.settings)
+        shift, changes = self.reference.judge(
+            characteristic, self._window.special_segments(), self._last_ns, self.settings
+        )
         entry = self._journal(JournalKind.FIT_ADOPTED, request_ns, characteristic.model_id, '')
         return [CurveAdopted(characteristic, shift), entry, *changes]
 
@@ -229,15 +237,17 @@ class Monitor:
         return [ReferenceSet(curve), entry, *changes]
 
     def restart(self, reason: str) -> list[Event]:
-        """Forget the rows after the clock went back; curve and alarm stay."""
+        """Begin anew after the clock went back; curve, alarm and the rows before it stay.
+
+        The rows and segments that the clock had passed are let go with the next row, whose time
+        tells which those are.
+        """
         pending = self._refits.pending_ns
         events: list[Event] = [] if pending is None else self.refuse(pending, reason)
         self._correction.restart()
-        self._segmenter = Segmenter(self.settings, self._refits.segments_seen)
-        self._window = RollingWindow.of(self.settings)
+        self._went_back = True
         events += self.diagnosing.restart(reason)
         self._refits.restart()
-        self.reference.restart()
         self._force.restart(reason)
         return [*events, self._journal(JournalKind.RESET, 0, '', reason)]
 
@@ -249,7 +259,12 @@ class Monitor:
 
     def snapshot(self) -> State:
         """Return what is remembered; see `core.state`."""
-        own = {'rows': self._rows, 'last_ns': self._last_ns, 'judged': list(self.judged)}
+        own = {
+            'rows': self._rows,
+            'last_ns': self._last_ns,
+            'went_back': self._went_back,
+            'judged': list(self.judged),
+        }
         return {**{name: part.snapshot() for name, part in self._parts().items()}, **own}
 
     def restore(self, saved: State) -> None:
@@ -265,6 +280,7 @@ class Monitor:
         for name, part in self._parts().items():
             part.restore(saved[name])
         self._rows, self._last_ns = saved['rows'], saved['last_ns']
+        self._went_back = saved['went_back']
         self.judged = Judged(*saved['judged'])
 
     def _parts(self) -> dict[str, Continuing]:
@@ -289,6 +305,8 @@ class Monitor:
         )
         n = segmented.rows
         rows = rows.part(0, n)
+        if self._went_back:
+            segmented = self._let_go(int(rows.time_ns[0]), segmented)
         self._window.append(
             rows.time_ns, rows.u, rows.power_mw, rows.temperature_degc, rows.opening_percent,
             rows.command_percent,
@@ -301,6 +319,18 @@ class Monitor:
         self._say(block, segmented, events)
         return n, bool(segmented.found)
 
+    def _let_go(self, time_ns: int, segmented: Segmented) -> Segmented:
+        """Let go of the rows that the clock had passed when it went back to a time."""
+        self._went_back = False
+        moved = self._window.cut(time_ns)
+        found = []
+        for row, segment in segmented.found:
+            if segment.end_row > self._rows:
+                found.append((row, segment))
+            elif segment.segment.end_ns < time_ns:  # it was open, but what closed it came later
+                found.append((row, segment.moved(moved)))
+        return replace(segmented, found=found)
+
     def _say(self, block: PredictionBlock, segmented: Segmented, events: list[Event]) -> None:
         """Append what the rows brought; a segment can only have closed at the last of them."""
         events.append(block)
@@ -311,7 +341,6 @@ class Monitor:
     def _close(self, segmented: Segmented, events: list[Event]) -> None:
         for _, found in segmented.found:
             self._window.add_segment(found)
-            self.reference.add(found.segment)
             self._refits.segments_seen += 1
             events.append(SegmentClosed(found.segment))
 

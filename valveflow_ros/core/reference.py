@@ -2,52 +2,36 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections.abc import Sequence
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.alarms import AlarmChange
 from valveflow_ros.core.characteristic import Characteristic
 from valveflow_ros.core.characteristic_json import from_json, to_json
-from valveflow_ros.core.segment_state import segment_of, segment_values
 from valveflow_ros.core.shift import Shift, ShiftLimits, judge_shift
 from valveflow_ros.core.shift_alarm import ShiftAlarm
 from valveflow_ros.core.state import State
 from valveflow_ros.errors import DataError
-from valveflow_ros.records import NS_PER_S, SpecialSegment
+from valveflow_ros.records import SpecialSegment
 
 
 class ReferenceKeeper:
-    """Keep the reference, the window's segments and the alarm on a shift.
+    """Keep the reference and the alarm on a shift.
 
     Parameters
     ----------
     settings : Settings
-        ``window_days`` bounds how far back segments are kept.
     """
 
     def __init__(self, settings: Settings) -> None:
-        self._window_ns = round(86400.0 * settings.real('window_days') * NS_PER_S)
-        self._segments: deque[SpecialSegment] = deque()
         self.curve: Characteristic | None = None
         self.shift: Shift | None = None
         self.problem = ''
         self.alarm = ShiftAlarm(settings)
 
-    @property
-    def segments(self) -> tuple[SpecialSegment, ...]:
-        """Return the segments of the window, in order of time."""
-        return tuple(self._segments)
-
-    def add(self, segment: SpecialSegment) -> None:
-        """Remember a segment that has closed; forget those that have left the window."""
-        self._segments.append(segment)
-        while self._segments and self._segments[0].start_ns <= segment.end_ns - self._window_ns:
-            self._segments.popleft()
-
     def snapshot(self) -> State:
         """Return what is remembered; see `core.state`. The last judgement is not."""
         return {
-            'segments': [segment_values(segment) for segment in self._segments],
             'curve': None if self.curve is None else to_json(self.curve),
             'problem': self.problem,
             'alarm': self.alarm.snapshot(),
@@ -55,14 +39,9 @@ class ReferenceKeeper:
 
     def restore(self, saved: State) -> None:
         """Go on from a state; raises `DataError` if it does not fit."""
-        self._segments = deque(segment_of(values) for values in saved['segments'])
         self.curve = None if saved['curve'] is None else from_json(saved['curve'])
         self.problem = saved['problem']
         self.alarm.restore(saved['alarm'])
-
-    def restart(self) -> None:
-        """Forget the segments after the clock went back; reference and alarm stay."""
-        self._segments.clear()
 
     def set(self, curve: Characteristic, time_ns: int, settings: Settings) -> list[AlarmChange]:
         """Judge against ``curve`` from the next adoption on.
@@ -83,15 +62,28 @@ class ReferenceKeeper:
         return self.alarm.end('There is a new reference.', time_ns, curve.model_id, settings)
 
     def judge(
-        self, current: Characteristic, time_ns: int, settings: Settings
+        self,
+        current: Characteristic,
+        segments: Sequence[SpecialSegment],
+        time_ns: int,
+        settings: Settings,
     ) -> tuple[Shift | None, list[AlarmChange]]:
-        """Judge a curve that was adopted; None without a reference it can be compared with."""
+        """Judge a curve that was adopted; None without a reference it can be compared with.
+
+        Parameters
+        ----------
+        current : Characteristic
+        segments : sequence of SpecialSegment
+            Those of the window, in order of time.
+        time_ns : int
+        settings : Settings
+        """
         self.shift, self.problem = None, ''
         if self.curve is None:
             return None, []
         limits = ShiftLimits(settings.real('shift_confidence'), settings.real('shift_least'))
         try:
-            self.shift = judge_shift(self.curve, current, self.segments, limits)
+            self.shift = judge_shift(self.curve, current, segments, limits)
         except DataError as error:
             self.problem = str(error)
             return None, self.alarm.unjudged(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,10 @@ class FoundSegment:
     segment: SpecialSegment
     first_row: int
     end_row: int
+
+    def moved(self, rows: int) -> FoundSegment:
+        """Return it with larger numbers of rows."""
+        return replace(self, first_row=self.first_row + rows, end_row=self.end_row + rows)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +75,6 @@ class Segmenter:
     ----------
     settings : Settings
         Block length, transient, thresholds.
-    numbered : int
-        Number of the last segment before the first found here.
 
     Notes
     -----
@@ -80,7 +82,7 @@ class Segmenter:
     the same kinds, bit for bit.
     """
 
-    def __init__(self, settings: Settings, numbered: int = 0) -> None:
+    def __init__(self, settings: Settings) -> None:
         period = settings.real('sample_period')
         rows = max(1, round(settings.real('block') / period))
         block_s = rows * period
@@ -114,7 +116,7 @@ class Segmenter:
         self._blocks = np.zeros((3, room))
         self._histograms = np.zeros((2, BINS))
         self._found = np.zeros(kernel.SEG_SIZE)
-        self._number = numbered
+        self._number = 0
 
     @property
     def longest_rows(self) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from valveflow_ros.core.segment_state import found_of, found_values
 from valveflow_ros.core.segmenter import FoundSegment
 from valveflow_ros.core.state import State
 from valveflow_ros.errors import DataError
-from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SegmentKind
+from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SegmentKind, SpecialSegment
 
 _FIRST_ROOM = 16384
 
@@ -81,7 +82,9 @@ class RollingWindow:
         self._data = np.empty((5, self._room))
         self._end = 0
         self._base = 0
+        # A leap ahead may be taken back: segments it put outside stay while their rows do.
         self._segments: deque[FoundSegment] = deque()
+        self._outside = 0
 
     @classmethod
     def of(cls, settings: Settings) -> RollingWindow:
@@ -100,12 +103,16 @@ class RollingWindow:
     @property
     def segments(self) -> int:
         """Return the number of special segments inside the window."""
-        return len(self._segments)
+        return len(self._segments) - self._outside
+
+    def special_segments(self) -> tuple[SpecialSegment, ...]:
+        """Return the special segments inside the window, in order of time."""
+        return tuple(s.segment for s in islice(self._segments, self._outside, None))
 
     @property
     def special_samples(self) -> int:
         """Return the number of samples in those segments."""
-        return sum(s.segment.samples for s in self._segments)
+        return sum(segment.samples for segment in self.special_segments())
 
     @property
     def span_s(self) -> float:
@@ -124,7 +131,7 @@ class RollingWindow:
         opening_percent: FloatArray | None = None,
         command_percent: FloatArray | None = None,
     ) -> None:
-        """Append rows; rows that have left the window are forgotten."""
+        """Append rows, later than all there are; those that have left the window are forgotten."""
         done = 0
         while done < len(time_ns):
             if self._end == self._room:
@@ -145,6 +152,25 @@ class RollingWindow:
         """Remember a special segment that has closed."""
         self._segments.append(found)
 
+    def cut(self, time_ns: int) -> int:
+        """Let go of the rows from a time on, and of the segments that reach into them.
+
+        What a leap ahead had put outside the window, and is among its last rows, is inside again.
+        Returns by how much the numbers of the rows that stay grow, so that those of the rows to
+        come follow them.
+        """
+        held = self._held()
+        end = int(np.searchsorted(self._time_ns[held], time_ns, side='left'))
+        gone = int(self._end - held.start - end)
+        for column in (self._time_ns, *self._data):
+            column[:end] = column[held][:end].copy()
+        self._base += held.start + gone
+        self._end = end
+        stay = [s for s in self._segments if s.segment.end_ns < time_ns]
+        self._segments = deque(segment.moved(gone) for segment in stay)
+        self._count()
+        return gone
+
     def tail(self, rows: int) -> tuple[IntArray, FloatArray, FloatArray]:
         """Return copies of time, ``u`` and power of the last ``rows`` rows, or of all held."""
         part = slice(max(0, self._end - rows), self._end)
@@ -158,7 +184,7 @@ class RollingWindow:
         offset = self._base + first
         spans = [
             (s.first_row - offset, s.end_row - offset, int(s.segment.kind))
-            for s in self._segments
+            for s in islice(self._segments, self._outside, None)
             if s.first_row >= offset
         ]
         command = self._data[4, first : self._end]
@@ -174,15 +200,14 @@ class RollingWindow:
         )
 
     def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`. Rows that have left the window are not."""
-        first = self._first()
-        rows = slice(first, self._end)
+        """Return what is remembered; see `core.state`."""
+        rows = self._held()
         command = self._data[4, rows]
         return {
             'time_ns': self._time_ns[rows].copy(),
             'rows': self._data[:4, rows].copy(),
             'command': command.copy() if np.isfinite(command).any() else np.empty(0),
-            'base': self._base + first,
+            'base': self._base + rows.start,
             'segments': [found_values(s) for s in self._segments],
         }
 
@@ -194,6 +219,11 @@ class RollingWindow:
         self._end, self._base = 0, int(saved['base'])
         self.append(time_ns, rows[0], rows[1], rows[2], rows[3], command if len(command) else None)
         self._segments = deque(found_of(values) for values in saved['segments'])
+        self._count()
+
+    def _held(self) -> slice:
+        """Return the places of the last rows, as many as a full window has."""
+        return slice(max(0, self._end - self._rows), self._end)
 
     def _first(self) -> int:
         """Return the place of the oldest row inside the window."""
@@ -221,12 +251,17 @@ class RollingWindow:
         self._end = self._rows
 
     def _forget(self) -> None:
-        """Let go of segments that began before the window or whose rows are gone."""
-        if not self._end:
-            return
-        oldest = int(self._time_ns[self._end - 1]) - self._window_ns
-        while self._segments and (
-            self._segments[0].segment.start_ns <= oldest
-            or self._segments[0].first_row < self._base
-        ):
+        """Let go of segments whose rows are gone, and pass over those before the window."""
+        first = self._base + self._held().start
+        while self._segments and self._segments[0].first_row < first:
             self._segments.popleft()
+            self._outside = max(0, self._outside - 1)
+        if self._end:
+            oldest = int(self._time_ns[self._end - 1]) - self._window_ns
+            while self.segments and self._segments[self._outside].segment.start_ns <= oldest:
+                self._outside += 1
+
+    def _count(self) -> None:
+        """Count anew what lies outside."""
+        self._outside = 0
+        self._forget()
