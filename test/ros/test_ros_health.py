@@ -15,7 +15,7 @@ from std_msgs.msg import Float32, Float64
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.align import REASONS
-from valveflow_ros.records import SIGNALS, Signal
+from valveflow_ros.records import NS_PER_S, SIGNALS, Signal
 from valveflow_ros.ros.demo_processes import ros_arguments
 from valveflow_ros.ros.diagnostics import Changes, Item, Level, array
 from valveflow_ros.ros.graph import Publishers
@@ -45,9 +45,15 @@ class Scene:
             tally.note_number(tally.received + 1)
 
     def item(
-        self, topic: str = 'valve_opening', listening: float = 100.0, at: float = NOW + 0.5
+        self,
+        topic: str = 'valve_opening',
+        listening: float = 100.0,
+        at: float = NOW + 0.5,
+        newest_ns: int = 0,
     ) -> Item:
-        items = self.health.items(self.tallies, self.counts, self.publishers, at, listening)
+        items = self.health.items(
+            self.tallies, self.counts, self.publishers, at, listening, newest_ns
+        )
         (found,) = [item for item in items if item.name == f'input {topic}']
         return found
 
@@ -67,6 +73,57 @@ def test_a_healthy_input_says_its_rate() -> None:
     assert values['Age of the newest message (s)'] == pytest.approx(0.5)
     assert values['Publishers'] == 1
     assert {f'Readings {reason.replace("_", " ")}' for reason in REASONS} <= set(values)
+
+
+def reading_at(off_s: float, number: int = int(Signal.VALVE_OPENING)) -> list[Any]:
+    return [(time.time_ns() + round(off_s * NS_PER_S), number, 50.0, 0)]
+
+
+@pytest.mark.parametrize('off_s', [20.0, 3600.0, 1e7])
+def test_stamps_ahead_of_the_machines_clock_are_told_once_for_each_look(off_s: float) -> None:
+    scene = Scene()
+    scene.health.note('valve_opening', reading_at(off_s))
+    scene.health.note('valve_opening', reading_at(0.0))
+    scene.says(Level.WARN, "ahead of this machine's clock")
+    scene.health.note('valve_opening', reading_at(0.0))
+    scene.says(Level.OK, '1 Hz.')
+
+
+@pytest.mark.parametrize('off_s', [10.0, 0.0, -3600.0, -1e9])
+def test_stamps_of_a_recording_or_a_little_off_are_no_matter(off_s: float) -> None:
+    scene = Scene()
+    scene.health.note('valve_opening', reading_at(off_s))
+    scene.says(Level.OK, '1 Hz.')
+
+
+def test_where_there_is_a_clock_the_machines_own_says_nothing() -> None:
+    health = InputHealth(Settings(), TOPICS, by_host=False)
+    scene = Scene()
+    scene.health = health
+    health.note('valve_opening', reading_at(1e6))
+    scene.says(Level.OK, '1 Hz.')
+
+
+@pytest.mark.parametrize(
+    ('off_s', 'words'),
+    [
+        (-7200.0, 'The last stamp is 2 h behind the newest one used.'),
+        (86400.0, 'The last stamp is 1 d ahead of the newest one used.'),
+    ],
+)
+def test_stamps_that_are_not_believed_are_told_by_how_far_they_are_off(
+    off_s: float, words: str
+) -> None:
+    scene = Scene()
+    scene.health.by_host = False
+    newest_ns = time.time_ns()
+    scene.health.note('valve_opening', [(newest_ns + round(off_s * NS_PER_S), 0, 50.0, 0)])
+    scene.counts['valve_opening']['time_outlier'] = 4
+    scene.says(Level.WARN, words, newest_ns=newest_ns)
+    scene.counts['valve_opening']['time_outlier'] = 8
+    scene.counts['valve_opening']['accepted'] = 0
+    scene.hear('valve_opening', at=NOW + 20.0)
+    scene.says(Level.ERROR, words, newest_ns=newest_ns, at=NOW + 20.0)
 
 
 def test_a_wrong_type_is_named_whatever_else_is_true() -> None:

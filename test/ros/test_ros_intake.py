@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from valveflow_msgs.msg import PlantSample
 
@@ -369,13 +370,51 @@ def test_numbers_before_the_first_are_no_losses() -> None:
     assert (tally.lost, tally.missed_at_start) == (0, 7)
 
 
-def test_two_publishers_are_irregular_and_no_loss() -> None:
-    tally = Tally()
-    for k in range(50):
-        tally.note_number(1000 + k)
-        tally.note_number(1 + k)
-    assert tally.lost == 0
-    assert tally.irregular == 50
+@settings(max_examples=200, deadline=None)
+@given(
+    st.integers(1, 5000), st.integers(1, 5000), st.floats(0.0, 1.0), st.integers(1, 40),
+    st.integers(0, 2**32 - 1),
+)  # fmt: skip
+def test_two_publishers_never_invent_a_loss(
+    first: int, second: int, share: float, seconds: int, seed: int
+) -> None:
+    """Nothing is lost; whoever sends, at whatever rate, in whatever bursts."""
+    rng = np.random.default_rng(seed)
+    tally, numbers = Tally(), [first, second]
+    for _ in range(seconds):
+        for who in (rng.random(int(rng.integers(0, 30))) < share).astype(int):
+            tally.note_number(numbers[who])
+            numbers[who] += 1
+        tally.note_publishers(2)
+        assert tally.lost == 0
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.integers(0, 20), st.integers(0, 30), st.integers(0, 2**32 - 1))
+def test_losses_are_counted_again_when_one_publisher_is_left(
+    alone: int, both: int, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    tally, numbers = Tally(), [1, 900]
+    for _ in range(alone):
+        tally.note_number(numbers[0])
+        numbers[0] += 1 + int(rng.integers(0, 2))
+    before = tally.lost
+    tally.note_publishers(1)
+    for who in rng.integers(0, 2, both):
+        tally.note_number(numbers[who])
+        numbers[who] += 1
+    tally.note_publishers(2)
+    assert tally.lost == before
+    tally.note_publishers(1)
+    tally.note_publishers(1)
+    tally.note_number(numbers[0])
+    assert tally.lost == before
+    tally.note_publishers(1)
+    tally.note_publishers(1)
+    tally.note_number(numbers[0] + 1)
+    tally.note_number(numbers[0] + 5)
+    assert tally.lost == before + 3
 
 
 def test_a_restarted_publisher_is_one_irregularity() -> None:
@@ -383,6 +422,13 @@ def test_a_restarted_publisher_is_one_irregularity() -> None:
     for number in (5, 6, 7, 1, 2, 3):
         tally.note_number(number)
     assert (tally.irregular, tally.lost) == (1, 0)
+    tally.note_publishers(1)
+    tally.note_number(number + 9)
+    assert tally.lost == 0, 'it may be another one that goes'
+    tally.note_publishers(1)
+    tally.note_number(number + 19)
+    tally.note_number(number + 22)
+    assert tally.lost == 2
 
 
 @pytest.mark.parametrize(('period', 'limit'), [(0.01, 2.0), (1.0, 2.5), (30.0, 75.0)])

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from valveflow_ros.config import Settings
@@ -13,6 +14,7 @@ from valveflow_ros.records import SIGNALS, SignalInfo
 from valveflow_ros.ros.diagnostics import Item, Level
 from valveflow_ros.ros.graph import Publishers
 from valveflow_ros.ros.inputs import PLANT_SAMPLE, Row, plausible_range, plausible_units
+from valveflow_ros.ros.stamp_health import StampHealth
 from valveflow_ros.ros.tallies import Tally
 
 _REJECTED = tuple(reason for reason in REASONS if reason not in ('accepted', 'late'))
@@ -31,23 +33,31 @@ class InputHealth:
         Contract name to full topic name.
     mismatched : set of str
         Contract names on which a publisher's quality of service did not match.
+    by_host : bool
+        Whether this machine's clock tells the time of the plant; false with a /clock.
     """
 
     settings: Settings
     topics: Mapping[str, str]
     mismatched: set[str] = field(default_factory=set)
+    by_host: bool = True
     _impossible: dict[str, tuple[str, float]] = field(default_factory=dict)
     _ranges: list[tuple[float, float]] = field(default_factory=list)
     _rejected: dict[str, int] = field(default_factory=dict)
     _lost: dict[str, int] = field(default_factory=dict)
     _usable: dict[str, tuple[int, float]] = field(default_factory=dict)
+    _outliers: dict[str, int] = field(default_factory=dict)
+    _stamps: StampHealth = field(init=False)
+    _newest_ns: int = 0
 
     def __post_init__(self) -> None:
         """Look the ranges up once; they are not live."""
         self._ranges = [plausible_range(info.signal, self.settings) for info in SIGNALS]
+        self._stamps = StampHealth(self.settings.real('clock_jump'), self.by_host)
 
-    def note(self, name: str, rows: Iterable[Row]) -> None:
-        """Remember the last impossible value of each signal, to name it."""
+    def note(self, name: str, rows: Sequence[Row]) -> None:
+        """Remember the stamps, and the last impossible value of each signal, to name it."""
+        self._stamps.note(rows, time.time_ns())
         for _, number, value, _ in rows:
             low, high = self._ranges[number]
             if not low <= value <= high and math.isfinite(value):
@@ -60,6 +70,7 @@ class InputHealth:
         publishers: Mapping[str, Publishers],
         now_s: float,
         listening_s: float,
+        newest_ns: int = 0,
     ) -> list[Item]:
         """Return an item for each signal.
 
@@ -73,7 +84,10 @@ class InputHealth:
             What the graph says, by the contract's names of the topics.
         now_s, listening_s : float
             Time by a clock that never goes back, and for how long we have listened.
+        newest_ns : int
+            The newest stamp that is used.
         """
+        self._newest_ns = newest_ns
         return [
             self._item(info, tallies, counts[info.topic], publishers, now_s, listening_s)
             for info in SIGNALS
@@ -125,6 +139,7 @@ class InputHealth:
         topic = self.topics[name]
         rejected = self._new(self._rejected, info.topic, _rejected(counts))
         lost = self._new(self._lost, info.topic, tally.lost)
+        ahead = self._stamps.ahead(info.topic)
         if seen.wrong_types:
             kinds = ' and '.join(seen.wrong_types)
             return Level.ERROR, f'{topic} is published as {kinds}, which the monitor cannot take.'
@@ -145,6 +160,8 @@ class InputHealth:
         self._used(info.topic, counts['accepted'], now_s)
         if tally.without_time + tally.waiting == tally.received:
             return Level.ERROR, f'{topic} comes without a time; is /clock published?'
+        if ahead:
+            return Level.WARN, ahead
         if lost:
             return Level.WARN, f'{lost} messages of {topic} were lost on the way.'
         return Level.OK, f'{_hertz(tally.rate_hz())}.'
@@ -169,6 +186,9 @@ class InputHealth:
     def _why(self, info: SignalInfo, counts: Mapping[str, int]) -> str:
         found = self._impossible.pop(info.topic, None)
         if found is None:
+            far = self._stamps.far(info.topic, self._newest_ns)
+            if self._new(self._outliers, info.topic, counts['time_outlier']) and far:
+                return far
             reasons = [f'{r.replace("_", " ")} {counts[r]}' for r in _REJECTED if counts[r]]
             return f'So far: {", ".join(reasons)}.'
         name, value = found

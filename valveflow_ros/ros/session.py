@@ -89,7 +89,8 @@ class Session:
             raise
         self._takers: list[Taker] = []
         self._intake: Intake | None = None
-        self._health = InputHealth(settings, self.inputs)
+        by_host = not node.get_parameter('use_sim_time').value
+        self._health = InputHealth(settings, self.inputs, by_host=by_host)
         self._seen: dict[str, graph.Publishers] = {}
         self._looked_s = self._listening_since_s = 0.0
         self._begun = False
@@ -202,9 +203,11 @@ class Session:
                 types = {topic.name: topic.type_name for topic in INPUTS}
                 wanted = {name: (topic, types[name]) for name, topic in self.inputs.items()}
                 self._seen = graph.publishers(self._node, wanted)
+                for name, seen in self._seen.items():
+                    self._intake.tallies[name].note_publishers(seen.right)
             items += self._health.items(
                 self._intake.tallies, self.engine.aligner.counts(), self._seen,
-                now_s, now_s - self._listening_since_s,
+                now_s, now_s - self._listening_since_s, self.engine.aligner.newest_ns,
             )  # fmt: skip
         items.append(work_health.fit_item(monitor, self.worker, self.engine.last_fit_s))
         items.append(work_health.alarm_item(monitor))

@@ -19,7 +19,7 @@ class Tally:
         Messages taken.
     lost : int
         Messages the publisher sent and the middleware did not deliver, by gaps in
-        the publisher's numbering.
+        the publisher's numbering; not counted while there is more than one publisher.
     missed_at_start : int
         Messages sent before the first one that came; most were sent before we listened.
     irregular : int
@@ -41,7 +41,10 @@ class Tally:
     last_s: float | None = None
     period_s: float | None = None
     _number: int = 0
-    _wary: bool = False
+    _mixed: bool = False
+    _anew: bool = False
+    _irregular_before: int = 0
+    _lost_before: int = 0
 
     def note_number(self, number: int) -> None:
         """Take the publisher's number of a message; 0 where the middleware gives none."""
@@ -52,13 +55,24 @@ class Tally:
             self.missed_at_start = number - 1
         elif number <= self._number:
             self.irregular += 1
-            # Coming back to the other publisher's numbers is no loss.
-            self._wary = True
-        else:
-            if not self._wary:
-                self.lost += number - self._number - 1
-            self._wary = False
-        self._number = number
+            self._mixed = True
+        elif not self._mixed and not self._anew:
+            self.lost += number - self._number - 1
+        self._number, self._anew = number, False
+
+    def note_publishers(self, count: int) -> None:
+        """Take how many publish the topic now.
+
+        Each numbers its own messages, and a message does not tell whose it is: what is lost of
+        two cannot be told. It is counted again when one is left and its numbers go forward.
+        """
+        if count > 1:
+            # Since the last look the numbers of two may have been taken for those of one.
+            self.lost = min(self.lost, self._lost_before)
+        self._lost_before = self.lost
+        mixed = count > 1 or self.irregular > self._irregular_before
+        self._anew = self._anew or (self._mixed and not mixed)
+        self._mixed, self._irregular_before = mixed, self.irregular
 
     def note_arrival(self, count: int, now_s: float) -> None:
         """Take the time at which ``count`` messages were found."""

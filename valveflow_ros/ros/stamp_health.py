@@ -1,0 +1,55 @@
+"""How the stamps of the inputs stand against the rows and against this machine's clock."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from valveflow_ros.records import NS_PER_S, SIGNALS
+from valveflow_ros.report.numbers import duration
+from valveflow_ros.ros.inputs import Row
+
+
+class StampHealth:
+    """Remembers the stamps of each signal from one look to the next.
+
+    Parameters
+    ----------
+    clock_jump_s : float
+        By how much a stamp may be off.
+    by_host : bool
+        Whether this machine's clock tells the time of the plant; false with a /clock.
+    """
+
+    def __init__(self, clock_jump_s: float, by_host: bool = True) -> None:
+        self._jump_ns = round(clock_jump_s * NS_PER_S)
+        self._by_host = by_host
+        self._last_ns: dict[str, int] = {}
+        self._lead_ns: dict[str, int] = {}
+
+    def note(self, rows: Iterable[Row], host_ns: int) -> None:
+        """Take the readings of a message and what this machine's clock shows."""
+        for time_ns, number, _, _ in rows:
+            topic = SIGNALS[number].topic
+            self._last_ns[topic] = time_ns
+            self._lead_ns[topic] = max(time_ns - host_ns, self._lead_ns.get(topic, -(2**62)))
+
+    def ahead(self, topic: str) -> str:
+        """Return by how much the stamps since the last look were ahead; empty if they were not.
+
+        A stamp that is behind may be that of a recording which is played; none can be ahead.
+        """
+        lead_ns = self._lead_ns.pop(topic, 0)
+        if not self._by_host or lead_ns <= self._jump_ns:
+            return ''
+        most = duration(lead_ns / NS_PER_S)
+        return f"Stamps are up to {most} ahead of this machine's clock; set both by one server."
+
+    def far(self, topic: str, newest_ns: int) -> str:
+        """Return how far the last stamp is from the newest that counts; empty if it is near."""
+        off_ns = self._last_ns.get(topic, newest_ns) - newest_ns
+        if abs(off_ns) <= self._jump_ns:
+            return ''
+        off = duration(abs(off_ns) / NS_PER_S)
+        if off_ns > 0:
+            return f'The last stamp is {off} ahead of the newest one used.'
+        return f'The last stamp is {off} behind the newest one used.'
