@@ -8,6 +8,8 @@ from typing import Any
 
 SENTENCE = 'The engine is compiled for this machine now, once; that takes about a minute.'
 _ENGINE = 'valveflow_ros.core.'
+# Some are only ever compiled into others, or for tests.
+_FEW = 0.05
 
 
 def is_first_run() -> bool:
@@ -17,8 +19,20 @@ def is_first_run() -> bool:
     """
     from valveflow_ros.core import monitor  # noqa: F401 - what is asked about must be loaded
 
+    return _cold_share() > 0.5
+
+
+def must_compile_to_fit() -> bool:
+    """Tell whether more than a few functions of engine and fit have to be compiled for a fit."""
+    from valveflow_ros.core import fit, monitor  # noqa: F401 - what is asked about must be loaded
+
+    return _cold_share() > _FEW
+
+
+def _cold_share() -> float:
+    """Return which part of the engine's functions that are loaded is not in the cache."""
     known = [cold for dispatcher in _compiled() if (cold := _is_cold(dispatcher)) is not None]
-    return bool(known) and 2 * sum(known) > len(known)
+    return sum(known) / len(known) if known else 0.0
 
 
 def _compiled() -> Iterator[Any]:

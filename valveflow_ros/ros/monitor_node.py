@@ -119,9 +119,10 @@ class MonitorNode(LifecycleNode):
             # Known before the long work, for whoever watches the start; the unit is watched all
             # the same.
             log.warning(str(error))
+        begun_s = time.monotonic()
         log.info(SENTENCE if is_first_run() else 'Loading the engine.')
         self.session = session = Session(self, self.settings, self._stop, self._log)
-        log.info(f'Ready after {session.warm_up_s:.1f} s of loading and compiling.')
+        log.info(f'Ready after {time.monotonic() - begun_s:.1f} s of loading and compiling.')
         if session.recording.problem:
             log.warning(session.recording.problem)
         return _SUCCESS

@@ -78,9 +78,7 @@ class Session:
                 for name, topic in OUTPUTS.items()
             }
             self.engine = self._made_engine()
-            self.warm_up_s = warm_up(
-                settings, self.worker, stop, wait=not self._continuity.goes_on
-            )
+            warm_up(settings, self.worker, stop, wait=not self._continuity.goes_on)
             self._log_clock = LogClock(self._continuity.log_ns)
             self.recording = self._open_recording()
         except BaseException:

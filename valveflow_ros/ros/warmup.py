@@ -25,6 +25,7 @@ from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.core.prediction import Predictor
 from valveflow_ros.core.window import WindowContents
 from valveflow_ros.records import NS_PER_S, SampleTable, SegmentKind, Signal, table_to_readings
+from valveflow_ros.report.first_run import must_compile_to_fit
 from valveflow_ros.ros.worker import FitWorker
 
 _LONGEST_S = 300.0
@@ -77,8 +78,8 @@ def made_up_curve(settings: Settings) -> Characteristic:
     )
 
 
-def warm_up(settings: Settings, worker: FitWorker, stop: Callable[[], bool], wait: bool) -> float:
-    """Compile, or load what was compiled before; return how many seconds it took.
+def warm_up(settings: Settings, worker: FitWorker, stop: Callable[[], bool], wait: bool) -> None:
+    """Compile, or load what was compiled before.
 
     The worker does its share meanwhile. If it fails, that shows at the first
     real fit, with a sentence; nothing is lost by going on.
@@ -90,9 +91,10 @@ def warm_up(settings: Settings, worker: FitWorker, stop: Callable[[], bool], wai
     stop : callable
         Tells whether to give up waiting.
     wait : bool
-        Wait for the worker too: without a curve nothing can be said before its first fit. Who
-        has a curve goes on at once.
+        Wait for the worker too, if it has to compile: without a curve nothing can be said before
+        its first fit. Who has a curve goes on at once.
     """
+    wait = wait and must_compile_to_fit()
     begun = time.monotonic()
     task = made_up_task(settings)
     worker.rehearse(task)
@@ -112,7 +114,6 @@ def warm_up(settings: Settings, worker: FitWorker, stop: Callable[[], bool], wai
     while wait and worker.rehearsing and not stop() and time.monotonic() - begun < _LONGEST_S:
         time.sleep(0.02)
         worker.poll()
-    return time.monotonic() - begun
 
 
 def _predict(settings: Settings, curve: Characteristic, c: WindowContents) -> None:
