@@ -115,9 +115,8 @@ def outputs() -> str:
 
 def service_names() -> list[str]:
     """Return the services the node offers, without ``~/``."""
-    source = (_NODE / 'monitor_node.py').read_text()
-    found = re.findall(r"'(?:~/)?([a-z_]+)'", source)
-    return [name for name in _SERVICES if name in found]
+    source = (_NODE / 'services.py').read_text()
+    return re.findall(r"'([a-z_]+)'", source)
 
 
 def services() -> str:

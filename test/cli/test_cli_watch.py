@@ -171,6 +171,7 @@ def test_the_newest_recording_of_a_folder_is_taken(run, tmp_path):
     (['nothing.mcap'], 1, 'is not there'),
     (['.'], 1, 'has no recording in it'),
     (['x.mcap', '--node', 'a'], 2, '--node'),
+    (['x.mcap', '--ask', 'refit'], 2, '--ask'),
     (['x', '--interval', '0'], 2, '0.1 to 3600'),
 ])  # fmt: skip
 def test_what_cannot_be_watched(run, tmp_path, monkeypatch, words, status, part):
@@ -196,3 +197,5 @@ def test_with_ros_another_process_takes_over(run, monkeypatch):
     run('watch', '--once', '--node', '/a/b')
     assert taken[0][1:3] == ['-m', 'valveflow_ros.ros.watch_main']
     assert taken[0][3:] == ['--interval', '1.0', '--once', '--node', '/a/b']
+    run('watch', '--ask', 'shelve_alarms')
+    assert taken[1][3:] == ['--interval', '1.0', '--ask', 'shelve_alarms']

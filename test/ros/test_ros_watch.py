@@ -13,6 +13,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from ros_helpers import wait_until
 from std_msgs.msg import Header
+from std_srvs.srv import Trigger
 from valveflow_msgs.msg import Alarm, Diagnosis, DiagnosisCause, FlowCharacteristic, Prediction
 
 from valveflow_ros.report.terminal_draw import screen
@@ -144,6 +145,43 @@ def test_one_picture_of_a_real_process(speaker, processes):
     assert frame['recorder']['sentence'] == 'Recording.'
 
 
+@pytest.mark.parametrize(('success', 'status'), [(True, 0), (False, 1)])
+def test_the_monitor_is_asked_and_its_answer_told(speaker, processes, success, status):
+    asked = []
+
+    def answer(_request, response):
+        asked.append(response)
+        response.success, response.message = success, 'There is an answer.'
+        return response
+
+    speaker.create_service(Trigger, '~/acknowledge_alarms', answer)
+    process = processes.start('valveflow_ros.ros.watch_main', '--ask', 'acknowledge_alarms')
+    executor = SingleThreadedExecutor(context=speaker.context)
+    executor.add_node(speaker)
+
+    def done():
+        executor.spin_once(timeout_sec=0.05)
+        return process.poll() is not None
+
+    wait_until(done, 'the answer')
+    executor.shutdown()
+    assert len(asked) == 1
+    assert process.returncode == status
+    assert 'There is an answer.' in processes.output(process)
+
+
+def test_a_monitor_that_does_not_answer_is_told(speaker, processes):
+    process = processes.start('valveflow_ros.ros.watch_main', '--ask', 'refit')
+
+    def done():
+        speaker.go_on()
+        return process.poll() is not None
+
+    wait_until(done, 'the end')
+    assert process.returncode == 1
+    assert '/valveflow_monitor does not answer' in processes.output(process)
+
+
 def test_messages_within_messages_become_mappings():
     message = Diagnosis(causes=[DiagnosisCause(name='a', parameter_names=['x'])])
     found = fields_of(message)
@@ -157,4 +195,4 @@ def test_help_needs_no_ros_to_run(capsys):
         watch_main.main(['--help'])
     assert ended.value.code == 0
     page = capsys.readouterr().out
-    assert 'example:\n  ros2 run valveflow_ros watch' in page
+    assert 'examples:\n  ros2 run valveflow_ros watch' in page

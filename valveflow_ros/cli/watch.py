@@ -19,6 +19,7 @@ example:
 
 and over ROS 2, in a shell that has it:
   valveflow watch
+  valveflow watch --ask acknowledge_alarms
 
 Where the output is no terminal, each change is a line instead."""
 
@@ -42,6 +43,11 @@ def arguments(parser: ArgumentParser) -> None:
         help='which monitor to listen to over ROS 2, such as /unit1/valveflow_monitor; '
         'found by itself where there is one',
     )  # fmt: skip
+    parser.add_argument(
+        '--ask', metavar='SERVICE',
+        help='have the monitor do something: acknowledge_alarms, shelve_alarms, unshelve_alarms, '
+        'set_reference, refit or diagnose; print its answer, then stop',
+    )  # fmt: skip
 
 
 def run(options: Namespace, console: Console) -> Outcome:
@@ -53,4 +59,6 @@ def run(options: Namespace, console: Console) -> Outcome:
         return watch_ros(options)
     if options.node is not None:
         raise UsageError('--node chooses a running monitor and does not go with a LOG.')
+    if options.ask is not None:
+        raise UsageError('--ask is for a running monitor and does not go with a LOG.')
     return watch_log(options, console)

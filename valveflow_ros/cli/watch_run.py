@@ -87,6 +87,7 @@ def watch_ros(options: Namespace) -> Outcome:
     words += ['--once'] if options.once else []
     words += ['--json'] if options.json else []
     words += ['--node', options.node] if options.node else []
+    words += ['--ask', options.ask] if options.ask else []
     sys.stdout.flush()
     sys.stderr.flush()
     os.execv(sys.executable, [sys.executable, '-m', _MODULE, *words])

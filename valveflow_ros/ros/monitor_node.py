@@ -21,6 +21,7 @@ from valveflow_ros.ros.diagnostics import Changes, Item, Level, array
 from valveflow_ros.ros.encoding import encode
 from valveflow_ros.ros.record_place import check_record_place
 from valveflow_ros.ros.sentences import with_place
+from valveflow_ros.ros.services import SERVICES
 from valveflow_ros.ros.session import DIAGNOSTICS, Session
 
 _SUCCESS = TransitionCallbackReturn.SUCCESS
@@ -75,16 +76,13 @@ class MonitorNode(LifecycleNode):
         self.add_on_set_parameters_callback(self._judge)
         self.add_post_set_parameters_callback(self._take)
         self._health = self.create_publisher(DiagnosticArray, DIAGNOSTICS, 10)
+        works = (
+            self._refit, self._acknowledge, self._shelve, self._unshelve, self._set_reference,
+            self._diagnose,
+        )  # fmt: skip
         self._offered = [
             self.create_service(Trigger, f'~/{name}', self._service(work))
-            for name, work in (
-                ('refit', self._refit),
-                ('acknowledge_alarms', self._acknowledge),
-                ('shelve_alarms', self._shelve),
-                ('unshelve_alarms', self._unshelve),
-                ('set_reference', self._set_reference),
-                ('diagnose', self._diagnose),
-            )
+            for name, work in zip(SERVICES, works, strict=True)
         ]
 
     # Parameters

@@ -15,6 +15,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
+from std_srvs.srv import Trigger
 
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.report.terminal_board import CURVE, HEALTH
@@ -22,6 +23,7 @@ from valveflow_ros.report.terminal_number import number
 from valveflow_ros.report.terminal_screen import Screen
 from valveflow_ros.ros.secure_start import check_security
 from valveflow_ros.ros.sentences import one_line, with_place
+from valveflow_ros.ros.services import SERVICES
 from valveflow_ros.ros.transport import choose_transport
 from valveflow_ros.ros.usage import Parser
 from valveflow_ros.ros.watch_node import WatchNode
@@ -29,6 +31,7 @@ from valveflow_ros.ros.watch_node import WatchNode
 _LOOK_S = 0.5
 # For one picture: how long a monitor may take to be found, and then to say how it is.
 _FIND_S, _HEAR_S = 5.0, 3.0
+_ANSWER_S = 10.0
 
 
 def parser() -> argparse.ArgumentParser:
@@ -38,7 +41,9 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description='Show how a running monitor is doing, drawn anew once a second: the curve '
         "with today's\noperating point, residuals, alarms, inputs, recorder, diagnosis. Ctrl-C "
-        'ends it.\n\nexample:\n  ros2 run valveflow_ros watch --node /unit1/valveflow_monitor',
+        'ends it. With --ask\nhave the monitor do something.\n\nexamples:\n'
+        '  ros2 run valveflow_ros watch --node /unit1/valveflow_monitor\n'
+        '  ros2 run valveflow_ros watch --ask acknowledge_alarms',
         epilog='The same as "valveflow watch"; ROS arguments follow --ros-args.',
     )
     made.add_argument(
@@ -53,6 +58,10 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         '--json', action='store_true', help='with --once: print the picture as JSON, for programs'
     )
+    made.add_argument(
+        '--ask', metavar='SERVICE', choices=SERVICES,
+        help=f'have the monitor do one of {", ".join(SERVICES)}; print its answer, then stop',
+    )  # fmt: skip
     return made
 
 
@@ -63,6 +72,8 @@ def main(args: Sequence[str] | None = None) -> int:
     options = made.parse_args(remove_ros_args(arguments)[1:])
     if options.json and not options.once:
         made.error('--json goes with --once: one picture is one object')
+    if options.ask and options.once:
+        made.error('--ask and --once do not go together')
     try:
         choose_transport()
         check_security(arguments)
@@ -93,6 +104,8 @@ def _run(options: argparse.Namespace) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
+        if options.ask:
+            return _ask(node, executor, options.ask)
         if options.once:
             return _once(node, executor, options.json)
         with Screen(sys.stdout) as screen:
@@ -112,11 +125,32 @@ def _listen(node: WatchNode, executor: SingleThreadedExecutor, seconds: float) -
         executor.spin_once(timeout_sec=min(left_s, _LOOK_S))
 
 
-def _once(node: WatchNode, executor: SingleThreadedExecutor, as_json: bool) -> int:
+def _find(node: WatchNode, executor: SingleThreadedExecutor) -> bool:
+    """Wait until the monitor is found; False if it is not."""
     begun_s = time.monotonic()
     while not node.monitor and time.monotonic() - begun_s < _FIND_S:
         _listen(node, executor, 0.1)
-    if not node.monitor:
+    return bool(node.monitor)
+
+
+def _ask(node: WatchNode, executor: SingleThreadedExecutor, service: str) -> int:
+    if not _find(node, executor):
+        return _complain(node.frame().note)
+    client = node.create_client(Trigger, f'{node.monitor}/{service}')
+    if client.wait_for_service(timeout_sec=_FIND_S):
+        answer = client.call_async(Trigger.Request())
+        executor.spin_until_future_complete(answer, timeout_sec=_ANSWER_S)
+        if answer.done():
+            response = answer.result()
+            if not response.success:
+                return _complain(response.message)
+            print(response.message, flush=True)
+            return 0
+    return _complain(f'{node.monitor} does not answer; nothing is known to be done.')
+
+
+def _once(node: WatchNode, executor: SingleThreadedExecutor, as_json: bool) -> int:
+    if not _find(node, executor):
         return _complain(node.frame().note)
     found_s = time.monotonic()
     # The health comes once a second, and what is latched at once.
