@@ -21,6 +21,7 @@ _ABOUT = {
     'reference': 'the curve against its reference',
     'recorder': 'is everything on disk',
     'state': 'is there a state to go on with after a restart',
+    'parameters': 'only where a parameter was given that does not exist',
     'name': 'only where another node of the domain bears the name of this one',
 }
 

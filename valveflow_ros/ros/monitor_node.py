@@ -71,8 +71,7 @@ class MonitorNode(LifecycleNode):
         self._changes = Changes()
         self._look_around_s, self._alike = 0.0, 1
         self.settings = Settings(declare.declare(self))
-        for sentence in declare.unknown_overrides(self):
-            self.get_logger().warning(f'{sentence} It is ignored.')
+        self._ignored = declare.unknown_overrides(self)
         self.add_on_set_parameters_callback(self._judge)
         self.add_post_set_parameters_callback(self._take)
         self._health = self.create_publisher(DiagnosticArray, DIAGNOSTICS, 10)
@@ -196,7 +195,7 @@ class MonitorNode(LifecycleNode):
         if session is None:
             items = [Item('fit', Level.STALE, 'The monitor is not configured.')]
         else:
-            items = [*session.items(), *self.namesakes(now_s)]
+            items = [*session.items(), *self.misspelt(), *self.namesakes(now_s)]
         now_ns = time.time_ns()
         data = encode(array(items, self.settings.text('unit_tag'), now_ns))
         self._health.publish(data)
@@ -209,6 +208,14 @@ class MonitorNode(LifecycleNode):
             alike.setdefault((item.level, item.sentence), []).append(item.name)
         for (level, sentence), names in alike.items():
             self._log(level, f'{", ".join(names)}: {sentence}')
+
+    def misspelt(self) -> list[Item]:
+        """Return an item if a parameter was given that there is not, else nothing."""
+        if not self._ignored:
+            return []
+        # It stands in the health too: whoever set it takes it to be in force.
+        sentence = f'{" ".join(self._ignored)} Ignored.'
+        return [Item('parameters', Level.WARN, sentence, {'Ignored': len(self._ignored)})]
 
     def namesakes(self, now_s: float) -> list[Item]:
         """Return an item if another node of the domain bears this one's name, else nothing."""
