@@ -134,6 +134,8 @@ def test_killed_and_started_again_it_goes_on_with_curve_alarm_and_recording(
     plant.until(lambda: len(plant.alarms) > before, 'the standing alarm')
     plant.quiet(0.5)
     assert plant.alarms[before:] == [raised]
+    told = processes.output(second)
+    assert f'from before, alarm residual, unacknowledged: {raised.sentence}' in told
     late: list[Alarm] = []
     plant.node.create_subscription(Alarm, f'{MONITOR}/alarms', late.append, LATCHED)
     plant.until(lambda: late, 'the standing alarm for who comes late')

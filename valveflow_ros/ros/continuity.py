@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from valveflow_ros.config import Settings
+from valveflow_ros.core.alarms import AlarmState
 from valveflow_ros.core.events import Event
 from valveflow_ros.errors import ValveflowError
+from valveflow_ros.ros.chronicle import line_of
 from valveflow_ros.ros.diagnostics import Item, Level
 from valveflow_ros.ros.keeper import Keeper
 from valveflow_ros.ros.leftovers import Leftovers
@@ -114,6 +116,9 @@ class Continuity:
         self._begun = True
         earlier.tail.clear()
         self._log(Level.OK, f'Going on after {engine.monitor.rows} rows of an earlier run.')
+        for last in (engine.monitor.alarm.last, engine.monitor.reference.alarm.last):
+            if last is not None and last.state != AlarmState.NORMAL and (line := line_of(last)):
+                self._log(line[0], f'from before, {line[1]}')
 
     def look_after(self, recording: Recording) -> None:
         """Finish in the background what other runs left unfinished beside this recording."""
