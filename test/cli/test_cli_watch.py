@@ -11,7 +11,7 @@ from monitor_recording import START_NS, Monitor, alarm, cdr, recording, stamp
 
 from valveflow_ros.cli import watch_run
 from valveflow_ros.cli.watch_log import LogWatch
-from valveflow_ros.report.terminal_board import HEALTH, KEPT, Board
+from valveflow_ros.report.terminal_board import AGE, HEALTH, KEPT, Board
 from valveflow_ros.report.terminal_frame import OK, STALE, WARN
 
 SECOND = 10**9
@@ -124,6 +124,21 @@ def test_the_health_of_another_unit_is_not_taken_for_this_ones(tag, early):
     assert [(i.name, i.sentence) for i in frame.inputs] == [('valve_opening', 'fine')]
     assert frame.recorder is not None
     assert frame.recorder.sentence == 'fine'
+
+
+@pytest.mark.parametrize(('age', 'later_s'), [('431.5', 431.5), ('unknown', 0.0), ('nan', 0.0)])
+def test_without_a_sample_the_health_tells_how_old_the_curve_is(age, later_s):
+    board = Board()
+    board.take('valveflow_msgs/msg/FlowCharacteristic', {
+        'header': {'stamp': stamp(START_NS), 'frame_id': 'U1'}, 'breakpoints': [1.0, 2.0],
+        'values': [1.0, 2.0], 'status': 1, 'cause': '', 'model_id': 'a', 'samples': 9,
+        'window_start': stamp(START_NS - 9), 'window_end': stamp(START_NS), 'rmse_mw': 0.1,
+    })  # fmt: skip
+    board.take(HEALTH, {'status': [{
+        'name': 'valveflow: U1 fit', 'hardware_id': 'U1', 'level': 0, 'message': '',
+        'values': [{'key': AGE, 'value': age}],
+    }]})  # fmt: skip
+    assert board.frame('x').now_ns == START_NS + round(later_s * SECOND)
 
 
 # The verb

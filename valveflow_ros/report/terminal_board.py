@@ -22,6 +22,7 @@ PREDICTION = 'valveflow_msgs/msg/Prediction'
 ALARM = 'valveflow_msgs/msg/Alarm'
 DIAGNOSIS = 'valveflow_msgs/msg/Diagnosis'
 HEALTH = 'diagnostic_msgs/msg/DiagnosticArray'
+AGE = 'Age of the curve (s)'
 # A quarter of an hour at one sample a second: more than fits on any terminal.
 KEPT = 900
 
@@ -134,6 +135,10 @@ class Board:
                 HealthView(i.name.removeprefix('input '), i.level, i.sentence) for i in inputs
             )
         self.recorder = next((i for i in items if i.name == 'recorder'), self.recorder)
+        fit = next((status for status in ours if str(status['name']).endswith(' fit')), None)
+        if fit is not None and self._curve is not None and not self._samples:
+            # Without a sample the age of the curve is what tells the plant's time.
+            self.at(self._curve.window[1] + _age_ns(fit))
 
 
 def stamp_ns(stamp: Fields) -> int:
@@ -154,6 +159,15 @@ def _curve(fields: Fields) -> CurveView:
 
 def _floats(values: Iterable[Any]) -> tuple[float, ...]:
     return tuple(float(value) for value in values)
+
+
+def _age_ns(fit: Fields) -> int:
+    """Return the age of the curve that the health tells, 0 where it tells none."""
+    told = {str(pair['key']): str(pair['value']) for pair in fit.get('values', ())}
+    try:
+        return round(float(told[AGE]) * NS_PER_S)
+    except (KeyError, ValueError, OverflowError):
+        return 0
 
 
 def _item(status: Fields) -> HealthView:

@@ -82,11 +82,11 @@ def sample_words(sample: SampleView | None) -> Said:
 
 def alarm_words(alarm: AlarmView) -> Said:
     """Say how an alarm stands."""
-    since = f' since {moment(alarm.raised_ns)[11:16]}' if alarm.raised_ns else ''
-    if not alarm.standing:
-        since = ''
+    raised = f', raised {moment(alarm.raised_ns)[11:16]}'
+    if not (alarm.standing and alarm.raised_ns):
+        raised = ''
     tone = {UNACKNOWLEDGED: 'bad', ACKNOWLEDGED: 'bad'}.get(alarm.state, 'warn')
-    text = f'{alarm.name}: {word(ALARM_STATES, alarm.state)}{since}. {alarm.sentence}'
+    text = f'{alarm.name}: {word(ALARM_STATES, alarm.state)}{raised}. {alarm.sentence}'
     return text, tone
 
 
