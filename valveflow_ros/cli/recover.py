@@ -43,7 +43,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     lost = (
         f'{counted(report.damaged_chunks, "place")} damaged and left out'
         if report.damaged_chunks
-        else 'nothing damaged'
+        else f'nothing {"else " if report.warnings else ""}damaged'
     )
     text = (
         f'Kept {counted(report.messages, "message")} in {counted(report.chunks, "chunk")}; {lost}.'
