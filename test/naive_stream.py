@@ -27,8 +27,6 @@ class NaiveAligner:
         self.lateness = round(settings['lateness'] * NS)
         self.hold = round(settings['hold_limit'] * NS)
         self.jump = max(round(settings['clock_jump'] * NS), 3 * self.period)
-        self.window = round(settings['window_days'] * 86400 * NS)
-        self.oldest = None
         self.limits = {}
         for info in SIGNALS:
             name = 'valve_opening' if info.topic == 'valve_command' else info.topic
@@ -71,34 +69,27 @@ class NaiveAligner:
         else:
             if self.waiting and abs(time - self.waiting[-1][0]) > self.jump:
                 self.give_up_waiting()
-            if len(self.waiting) >= 20:
-                self.count(self.waiting[-20][1], 'time_outlier')  # only twenty can wait
             self.waiting.append((time, signal, value, quality))
             # The values of one instant do not confirm each other.
             stamps = [r[0] for r in self.waiting]
             instants = 1 + sum(a != b for a, b in itertools.pairwise(stamps))
-            if time > self.newest and (instants >= 3 or len(stamps) >= 20):
+            enough = len(stamps) == 20
+            if time > self.newest and (instants >= 3 or enough):
                 self.believe()
-            elif time < self.newest and self.went_back(stamps):
+            elif time < self.newest and enough:
                 while self.tick is not None and self.tick <= self.newest:
                     self.close()  # what was before the restart is told to its end
                 self.resets.append(len(self.rows))
                 self.forget()
                 self.believe()
 
-    def went_back(self, stamps):
-        """Twenty readings, and a minute of them for each day of the window that is later."""
-        first = max(self.oldest, self.newest - self.window)
-        days = (self.newest - max(first, stamps[-1])) / (86400 * NS)
-        return len(stamps) >= 20 and stamps[-1] - stamps[0] >= min(days, 10) * 60 * NS
-
     def give_up_waiting(self):
-        for _, signal, _, _ in self.waiting[-20:]:
+        for _, signal, _, _ in self.waiting:
             self.count(signal, 'time_outlier')
         self.waiting = []
 
     def believe(self):
-        waiting, self.waiting = self.waiting[-20:], []
+        waiting, self.waiting = self.waiting, []
         for reading in waiting:
             # They count as arriving together: only what the lateness closes is closed between.
             time = reading[0]
@@ -115,7 +106,6 @@ class NaiveAligner:
         else:
             if self.tick is None:
                 self.tick = self.on_grid(time)
-                self.oldest = time if self.oldest is None else min(self.oldest, time)
             elif time <= self.tick - self.period:
                 self.count(signal, 'late')
             before.append((time, value, quality))

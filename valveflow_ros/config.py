@@ -165,8 +165,7 @@ _TIME_BASE = (
               'How long a row waits for slower topics before it is closed.', 0.0, 3600.0),
     Parameter('clock_jump', 15.0, 's',
               'A stamp further ahead than this needs two more instants like it to be believed; '
-              'stamps further behind need twenty in a row, for a minute for each day of rows '
-              'that they let go (ten at most).',
+              'stamps further behind than this, twenty in a row, set aside the rows they passed.',
               1.0, 1e6),
     Parameter('window_days', 10.0, 'd', 'Length of the rolling window.', 0.02, 60.0),
 )  # fmt: skip

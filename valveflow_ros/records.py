@@ -151,6 +151,10 @@ class SampleTable:
         cut = slice(start, end)
         return SampleTable(self.time_ns[cut], self.values[cut], self.quality[cut])
 
+    def take(self, rows: IntArray) -> SampleTable:
+        """Return copies of some rows."""
+        return SampleTable(self.time_ns[rows], self.values[rows], self.quality[rows])
+
     @classmethod
     def from_columns(
         cls,

@@ -9,6 +9,7 @@ import re
 import numpy as np
 import pytest
 
+from valveflow_ros.cli.alignment import align
 from valveflow_ros.cli.engine import watch
 from valveflow_ros.config import Settings
 from valveflow_ros.core.characteristic_json import from_json
@@ -255,6 +256,24 @@ def test_only_what_follows_the_last_step_back_of_the_clock_counts(run, tmp_path)
     assert all(s.end_ns <= watched.table.time_ns[-1] for s in watched.segments)
     inside = {s.start_ns for s in watched.segments}
     assert len(inside) == len(watched.segments), 'no segment of the forgotten rows'
+
+
+def test_stamps_of_1970_for_a_minute_cost_that_minute():
+    true = table_to_readings(table(2, stairs))
+    slip = slice(len(true) // 2, len(true) // 2 + 300)
+    time_ns = true.time_ns.copy()
+    time_ns[slip] -= true.time_ns[0]
+    settings = Settings({'refit_period': 0.0})
+    wrong = Readings(time_ns, true.signal, true.value, true.quality)
+    watched, whole = watch(wrong, settings), watch(true, settings)
+    assert watched.clock_resets == 1
+    lost = set(whole.table.time_ns.tolist()) - set(watched.table.time_ns.tolist())
+    assert 0 < len(lost) <= 80
+    assert min(lost) >= true.time_ns[slip][0]
+    # What was aligned is found again by its place, as a diagnosis on top of a model needs it.
+    rows, resets, _ = align(wrong, settings)
+    assert len(resets) == 1
+    assert rows.take(watched.rows).time_ns.tolist() == watched.table.time_ns.tolist()
 
 
 def test_a_log_without_any_reading_is_refused():

@@ -87,7 +87,6 @@ rules = st.fixed_dictionaries(
         'hold_limit': st.sampled_from([2.5, 3.0, 10.0]),
         'lateness': st.sampled_from([0.0, 0.5, 2.0, 7.0]),
         'clock_jump': st.sampled_from([1.0, 10.0, 60.0]),
-        'window_days': st.sampled_from([0.03, 0.5, 10.0]),
     }
 )
 
@@ -214,30 +213,6 @@ def test_a_clock_set_back_restarts_the_rows_once_and_loses_none_before_it():
     assert aligned.table.time_ns[49] == START_NS - 7200 * NS_PER_S
     assert len(aligned.table) + len(rest.table) == 49 + 30
     assert np.all(np.diff(aligned.table.time_ns[:49]) == NS_PER_S)
-
-
-def week_and(*stretches):
-    """Return all signals every ten seconds for a week, then ``(from_s, seconds)`` at 1 Hz."""
-    times = [range(0, 7 * 86400, 10), *(range(a, a + n) for a, n in stretches)]
-    return [
-        (START_NS + t * NS_PER_S, s, GOOD[s], 0) for part in times for t in part for s in range(4)
-    ]
-
-
-@pytest.mark.parametrize(('seconds', 'resets'), [(30, 0), (400, 0), (440, 1)])
-def test_a_clock_that_would_cost_a_week_is_doubted_for_seven_minutes(seconds, resets):
-    wrong = -START_NS // NS_PER_S + 1000  # 1970
-    rows = week_and((wrong, seconds))
-    aligner = Aligner(Settings())
-    aligned = aligner.feed(Readings.of(rows))
-    assert len(aligned.resets) == resets
-    outliers = aligner.counts()['valve_opening']['time_outlier']
-    # Five instants wait, or were believed; all others are counted.
-    assert outliers == (seconds - 5 if resets == 0 else 7 * 60 - 4)
-    rest = week_and((7 * 86400, 60))[-60 * 4 :]
-    aligned = aligner.feed(Readings.of(rest))
-    assert len(aligned.resets) == 0
-    assert aligned.table.time_ns[-1] >= rest[-1][0] - NS_PER_S
 
 
 def test_the_optional_command_is_held_while_sent_and_absent_otherwise():

@@ -306,14 +306,15 @@ def test_a_refused_fit_leaves_the_old_curve_as_stale_and_says_why():
 def test_requests_never_share_a_name_even_when_time_comes_again():
     monitor = Monitor(SETTINGS)
     table = plant_table(0, N)
-    names = set()
+    names, curve = set(), None
     for _ in range(3):
         fed = monitor.feed(table)
         (request,) = of_type(fed.events, FitRequested)
         assert request.task.request_ns not in names
         names.add(request.task.request_ns)
+        curve = curve or fit(request.task)
         monitor.restart(CLOCK_BACK)
-        assert monitor.adopt(request.task.request_ns, fit(request.task)) == []
+        assert monitor.adopt(request.task.request_ns, curve) == []
     assert len(names) == 3
 
 

@@ -290,9 +290,9 @@ def held(monitor):
 @given(
     st.integers(0, 2**32 - 1),
     st.sampled_from([-3e8, -7200.0, -60.0, 60.0, 3600.0, 1e5, 2.6e6]),
-    st.integers(1, 30),
+    st.integers(1, 50),
 )
-def test_a_clock_that_is_wrong_for_seconds_costs_no_more_than_its_own_step(seed, off_s, seconds):
+def test_a_clock_that_is_wrong_for_seconds_costs_no_row_before_or_after(seed, off_s, seconds):
     """Stamps of a gateway that has not heard the time yet, or was told a wrong one."""
     table = plant_table(seed, N)
     settings = SETTINGS.changed({'window_days': 1.0, 'refit_period': 0.0})
@@ -309,14 +309,14 @@ def test_a_clock_that_is_wrong_for_seconds_costs_no_more_than_its_own_step(seed,
             feed_aligned(to, aligned)
     times, segments = held(monitor)
     begun = readings.time_ns[border]
-    # Stamps that went back for long enough were believed: what they had passed is gone.
-    most_s = min(-off_s, 86400.0) if off_s < 0 and slip >= 20 else 0.0
-    safe_ns = begun - round((most_s + settings.settle_s + 60.0) * NS_PER_S)
+    # What was special then may have closed earlier or later, since the rows were broken off.
+    safe_ns = begun - round((settings.settle_s + 60.0) * NS_PER_S)
     expected, before = held(true)
     assert [t for t in times if t < safe_ns] == [t for t in expected if t < safe_ns]
     assert [s for s in segments if s.end_ns < safe_ns] == [s for s in before if s.end_ns < safe_ns]
     assert times == sorted(set(times))
-    assert max(times) == table.time_ns[-1]
+    after_ns = readings.time_ns[border + slip]
+    assert set(times) >= {t for t in expected if t < begun or t > after_ns + 5 * NS_PER_S}
 
 
 @pytest.mark.parametrize('late', [0, 25])

@@ -1,14 +1,13 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from streams import START_NS, examples
+from streams import START_NS, blocks_of, examples
 
 from valveflow_ros.core.segmenter import FoundSegment
+from valveflow_ros.core.state_bytes import from_bytes, to_bytes
 from valveflow_ros.core.window import RollingWindow
 from valveflow_ros.records import NS_PER_S, SegmentKind, SpecialSegment
 
@@ -27,69 +26,103 @@ def rows_after(last_ns, n, gap_s=0):
     return last_ns + (gap_s + 1 + np.arange(n, dtype=np.int64)) * NS_PER_S
 
 
+RETURN = 10**6  # to where the time was before it went back, and a little on
+
 actions = st.lists(
-    st.tuples(st.integers(0, 200), st.sampled_from([0, 0, 0, 5, 300, -3, -90, -1000])),
+    st.tuples(
+        st.one_of(st.integers(0, 40), st.integers(0, 200)),
+        st.sampled_from([0, 0, 5, 300, RETURN, RETURN, -3, -30, -90, -1000]),
+    ),
     min_size=1,
     max_size=25,
 )
 
 
 class NaiveWindow:
-    """All rows and all segments, for ever; the window is looked up when asked for."""
+    """All rows one by one and all segments, for ever; the window is looked up when asked for."""
 
     def __init__(self, window_s):
         self.window_s = window_s
-        self.rows, self.segments = [], []
+        self.most = max(16, window_s + 1)
+        self.rows, self.aside, self.segments = [], [], []  # rows are (number, time, values)
 
-    def cut(self, time_ns):
-        """Keep the rows before a time, of the last ones that a window without gaps would hold."""
-        known = self.rows[-max(16, self.window_s + 1) :]
-        gone = len(self.rows) - len(known)
-        self.rows = [row for row in known if row[0] < time_ns]
-        stay = [s for s in self.segments if s.first_row >= gone and s.segment.end_ns < time_ns]
-        self.segments = [replace(s, first_row=s.first_row - gone, end_row=s.end_row - gone)
-                         for s in stay]  # fmt: skip
+    def take(self, row):
+        if self.aside and row[1] > self.aside[-1][1]:
+            if not self.rows or row[1] - self.rows[-1][1] > 1.5 * NS_PER_S:
+                # The time leapt over what it had gone back behind: it had not gone back.
+                self.rows = [r for r in self.rows if r[0] < self.aside[0][0]] + self.aside
+            self.aside = []
+        self.rows = [*self.rows, row][-self.most :]
+        since = [r for r in self.rows if self.aside and r[0] > self.aside[-1][0]]
+        if self.aside and len(since) >= min(len(self.aside), 3600):
+            self.aside = []
+
+    def go_back(self, time_ns):
+        passed = [r for r in self.rows if r[1] >= time_ns]
+        if self.aside:
+            passed = [r for r in passed if r[0] < self.aside[0][0]]
+        self.rows = [r for r in self.rows if r[1] < time_ns]
+        self.aside = passed + self.aside
 
     def contents(self):
         if not self.rows:
             return [], []
-        oldest = self.rows[-1][0] - self.window_s * NS_PER_S
-        first = next(k for k, row in enumerate(self.rows) if row[0] > oldest)
+        oldest = self.rows[-1][1] - self.window_s * NS_PER_S
+        inside = [row for row in self.rows if row[1] > oldest]
+        numbers = [row[0] for row in inside]
         spans = [
-            [s.first_row - first, s.end_row - first, int(s.segment.kind)]
+            [numbers.index(s.first_row), numbers.index(s.end_row - 1) + 1, int(s.segment.kind)]
             for s in self.segments
-            if s.first_row >= first
+            if {s.first_row, s.end_row - 1} <= set(numbers)
         ]
-        return self.rows[first:], spans
+        return inside, spans
 
 
-@examples(60)
+@examples(300)
 @given(actions, st.sampled_from([20, 60, 333]), st.integers(0, 2**32 - 1))
 def test_after_every_append_the_window_holds_what_the_slow_truth_holds(plan, window_s, seed):
     rng = np.random.default_rng(seed)
     fast, slow = RollingWindow(window_s, 1.0), NaiveWindow(window_s)
     last = START_NS
-    counted = 0
+    counted, newest, times = 0, START_NS, []
     for n, gap in plan:
+        if gap == RETURN:
+            last, gap = newest, 3
         time_ns = rows_after(last, n, gap)
         columns = rng.normal(0.0, 1.0, (3, n))
         if n and gap < 0:
-            fast.cut(int(time_ns[0]))
-            slow.cut(int(time_ns[0]))
-        counted += n
+            fast.go_back(int(time_ns[0]))
+            slow.go_back(int(time_ns[0]))
         columns[0, rng.random(n) < 0.1] = np.nan
-        fast.append(time_ns, *columns)
-        slow.rows += list(zip(time_ns.tolist(), *columns.tolist(), strict=True))
+        for start, end in blocks_of(n, sorted(rng.integers(0, n + 1, 2).tolist())):
+            fast.append(time_ns[start:end], *columns[:, start:end])
+        for row in zip(time_ns.tolist(), *columns.tolist(), strict=True):
+            slow.take((counted, *row))
+            times.append(row[0])
+            counted += 1
         if n:
             last = int(time_ns[-1])
+            newest = max(newest, last)
+        first = counted - n - 15
+        if n and gap < 0 <= first and times[first + 14] - times[first] == 14 * NS_PER_S:
+            # One that was open when the clock went back.
+            found = segment(2, first, first + 15, times[first])
+            fast.add_segment(found)
+            slow.segments.append(found)
         if n > 20:
-            end, kind = len(slow.rows), SegmentKind(int(rng.integers(1, 3)))
-            fast.add_segment(segment(1, counted - 15, counted - 5, int(time_ns[-15]), kind))
-            slow.segments.append(segment(1, end - 15, end - 5, int(time_ns[-15]), kind))
+            kind = SegmentKind(int(rng.integers(1, 3)))
+            found = segment(1, counted - 15, counted - 5, int(time_ns[-15]), kind)
+            fast.add_segment(found)
+            slow.segments.append(found)
+        if rng.random() < 0.2:
+            saved = from_bytes(to_bytes(fast.snapshot()))
+            fast = RollingWindow(window_s, 1.0)
+            fast.restore(saved)
         rows, spans = slow.contents()
         held = fast.contents()
-        assert held.time_ns.tolist() == [r[0] for r in rows]
-        for c, column in enumerate((held.u, held.power_mw, held.temperature_degc), start=1):
+        assert fast.numbers().tolist() == [r[0] for r in rows]
+        assert held.time_ns.tolist() == [r[1] for r in rows]
+        for c, column in enumerate((held.u, held.power_mw, held.temperature_degc), start=2):
             assert np.array_equal(column, [r[c] for r in rows], equal_nan=True)
         assert held.spans.tolist() == spans
         assert fast.rows_seen == counted

@@ -89,11 +89,19 @@ def test_stamps_ahead_of_the_machines_clock_are_told_once_for_each_look(off_s: f
     scene.says(Level.OK, '1 Hz.')
 
 
-@pytest.mark.parametrize('off_s', [10.0, 0.0, -3600.0, -1e9])
-def test_stamps_of_a_recording_or_a_little_off_are_no_matter(off_s: float) -> None:
+@pytest.mark.parametrize(
+    ('off_s', 'words'),
+    [
+        (10.0, '1 Hz.'),
+        (0.0, '1 Hz.'),
+        (-10.0, '1 Hz.'),
+        (-3600.0, "1 Hz; stamps are 1 h behind this machine's clock."),
+    ],
+)
+def test_stamps_of_a_recording_or_a_little_off_are_well(off_s: float, words: str) -> None:
     scene = Scene()
     scene.health.note('valve_opening', reading_at(off_s))
-    scene.says(Level.OK, '1 Hz.')
+    scene.says(Level.OK, words)
 
 
 def test_where_there_is_a_clock_the_machines_own_says_nothing() -> None:
@@ -178,6 +186,9 @@ def test_two_publishers_are_named() -> None:
 def test_a_signal_that_comes_in_two_ways_is_named() -> None:
     scene = Scene()
     scene.publishers[PLANT_SAMPLE] = Publishers(1)
+    # Somebody could send samples and does not.
+    scene.says(Level.OK, 'Hz')
+    scene.hear(PLANT_SAMPLE, NOW - 1.0)
     scene.says(Level.WARN, '/plant/valve_opening and /plant/plant_sample are both published')
     # The command may come beside samples that do not hold it.
     scene.says(Level.OK, 'Hz', 'valve_command')

@@ -55,12 +55,16 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class _Rows:
-    """Aligned rows, special segments, and the model where one was found."""
+    """Aligned rows, special segments, and the model where one was found.
+
+    The places are those of the rows among all of the log; None: they are all.
+    """
 
     table: SampleTable
     spans_ns: IntArray
     model: RegionalModel | None
     why: str = ''
+    places: IntArray | None = None
 
 
 def read_model(path: Path) -> Characteristic | ExtendedModel:
@@ -118,7 +122,10 @@ def diagnosed_in(
         regional = first_model(rows.table, step, exponent, settle)
     record = Record(rows.table, step, exponent, settle, rows.spans_ns)
     if earlier is not None:
-        record = on_top(record, earlier, engine_align(log, settings)[0])
+        measured = engine_align(log, settings)[0]
+        record = on_top(
+            record, earlier, measured if rows.places is None else measured.take(rows.places)
+        )
         notes.append(held_words(earlier.held))
     found, (signatures, answers, maps) = diagnose_with_views(
         record, regional, model is not None, console
@@ -175,11 +182,13 @@ def _rows(
     spans = np.array([(s.start_ns, s.end_ns) for s in watched.segments], dtype=np.int64)
     spans = spans.reshape(-1, 2)
     if not wanted:
-        return _Rows(watched.table, spans, None)
+        return _Rows(watched.table, spans, None, places=watched.rows)
     try:
-        return _Rows(watched.table, spans, engine.outlined(watched, console.progress))
+        model = engine.outlined(watched, console.progress)
     except DataError as error:
-        return _Rows(watched.table, spans, None, f'{error} All rows are used instead.')
+        why = f'{error} All rows are used instead.'
+        return _Rows(watched.table, spans, None, why, watched.rows)
+    return _Rows(watched.table, spans, model, places=watched.rows)
 
 
 def engine_align(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from valveflow_ros.core.noise import WARM_UP, WINDOW
 from valveflow_ros.core.offline import feed_aligned
 from valveflow_ros.core.threads import ahead
 from valveflow_ros.errors import DataError
-from valveflow_ros.records import SIGNALS, Readings, SampleTable, SpecialSegment
+from valveflow_ros.records import SIGNALS, IntArray, Readings, SampleTable, SpecialSegment
 from valveflow_ros.report.numbers import duration
 from valveflow_ros.report.quality import REASON_WORDS
 
@@ -35,7 +34,9 @@ class Watched:
     Attributes
     ----------
     table : SampleTable
-        The rows in the engine's window, without those that the clock had passed when it went back.
+        The rows in the engine's window; where the clock went back without those it had passed.
+    rows : int64 (n,)
+        Their places among all rows of the log.
     segments : tuple of SpecialSegment
     counts : dict
         ``{topic: {reason: readings}}``.
@@ -45,6 +46,7 @@ class Watched:
     """
 
     table: SampleTable
+    rows: IntArray
     segments: tuple[SpecialSegment, ...]
     counts: dict[str, dict[str, int]]
     task: FitTask
@@ -72,9 +74,7 @@ def watch(
     blocks = aligned_blocks(aligner, readings, progress, 'finding segments')
     for aligned in ahead(corrected(blocks, corrector)):
         resets += len(aligned.resets)
-        borders = [0, *aligned.resets.tolist(), len(aligned.table)]
-        for start, end in pairwise(borders):
-            _append(tables, aligned.table.part(start, end))
+        tables.append(aligned.table)
         feed_aligned(monitor, aligned)
     table, counts = SampleTable.concatenate(tables), aligner.counts()
     check_signals(table, counts)
@@ -82,22 +82,10 @@ def watch(
         raise DataError(_no_segment(table, settings, monitor.noise().learnt))
     task = next(e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
     # A log longer than the window is longer than what the fit sees.
-    first = int(task.contents.time_ns[0])
-    held = table.part(int(np.searchsorted(table.time_ns, first)), len(table))
+    rows = monitor.numbers()
     if corrector is not None:
         task = replace(task, held=corrector.held)
-    return Watched(held, monitor.special_segments(), counts, task, resets)
-
-
-def _append(tables: list[SampleTable], table: SampleTable) -> None:
-    """Append rows; where the clock went back they take the place of those it had passed."""
-    while len(table) and tables and tables[-1].time_ns[-1] >= table.time_ns[0]:
-        last = tables.pop()
-        before = last.part(0, int(np.searchsorted(last.time_ns, table.time_ns[0])))
-        if len(before):
-            tables.append(before)
-    if len(table):
-        tables.append(table)
+    return Watched(table.take(rows), rows, monitor.special_segments(), counts, task, resets)
 
 
 def identify(watched: Watched, progress: Progress = quiet) -> Characteristic:

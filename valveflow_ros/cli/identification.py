@@ -81,7 +81,7 @@ def found_in(
     except DataError as error:
         raise refusal(error, log.readings, settings) from None
     if watched.clock_resets:
-        told = 'The clock went back within the log; the rows it had passed are left out.'
+        told = 'The clock went back within the log; where it stayed, what it had passed is out.'
         console.warn(told)
         notes.append(told)
     if told := advice_for(watched.table, settings):

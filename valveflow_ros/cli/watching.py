@@ -84,7 +84,7 @@ def see(
         raise DataError(f'{source}: {error}') from None
     told = (*log.contents.warnings, *(d.sentence for d in log.doubts), *notes)
     if watched.clock_resets:
-        back = f'{source}: the clock went back; the rows it had passed are left out.'
+        back = f'{source}: the clock went back; where it stayed, what it had passed is out.'
         console.warn(back)
         told = (*told, back)
     return Seen(source, settings, watched, told)

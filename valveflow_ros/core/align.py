@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from valveflow_ros.config import Settings
 from valveflow_ros.core.align_kernel import (
     BEHIND_CONFIRMED,
-    CLOCK_AT_FIRST,
     NEVER,
     NEWEST,
     REASONS,
@@ -84,12 +83,11 @@ class Aligner(ArrayMemory):
             lateness_ns=round(settings.real('lateness') * NS_PER_S),
             hold_ns=round(settings.real('hold_limit') * NS_PER_S),
             jump_ns=round(max(settings.real('clock_jump'), 3.0 * period) * NS_PER_S),
-            window_ns=round(86400.0 * settings.real('window_days') * NS_PER_S),
             spare=math.ceil(settings.real('lateness') / period) + 3,
         )
         spare = self._rules.spare
         self._state = State(
-            clock=np.array(CLOCK_AT_FIRST, dtype=np.int64),
+            clock=np.array([NEVER, NEVER, 0, -1, 0], dtype=np.int64),
             newest_ns=np.full(N_SIGNALS, NEVER, dtype=np.int64),
             held_ns=np.full(N_SIGNALS, NEVER, dtype=np.int64),
             held=np.full(N_SIGNALS, np.nan),

@@ -24,23 +24,18 @@ REASONS = (
 _ACCEPTED, _NOT_FINITE, _BAD, _IMPOSSIBLE, _DUPLICATE, _ORDER, _OUTLIER, _LATE = range(8)
 
 _AHEAD_CONFIRMED = 3  # instants that must agree before a leap forward is believed
-BEHIND_CONFIRMED = 20  # and readings before the clock is believed to have gone back
-_SHARE = 1440  # these must last a minute for each day of rows that believing them costs,
-_LONGEST_DOUBT_NS = 600 * 10**9  # and at most this
+BEHIND_CONFIRMED = 20  # and before the clock is believed to have gone back
 NEVER = np.iinfo(np.int64).min
 _LATEST_NS = 2**62  # the year 2116; later stamps would overflow
 
 # Places in the clock.
-_NEXT, NEWEST, _WAITING, _BELIEVED, _RESETS, _FIRST, _SINCE = range(7)
-CLOCK_AT_FIRST = (NEVER, NEVER, 0, -1, 0, NEVER, NEVER)
+_NEXT, NEWEST, _WAITING, _BELIEVED, _RESETS = range(5)
 
 
 class State(NamedTuple):
     """All the kernel remembers, as arrays it writes."""
 
-    # Next row, newest stamp accepted, readings waiting, of them believed, resets, the oldest stamp
-    # accepted, the stamp with which the waiting began.
-    clock: IntArray
+    clock: IntArray  # next row, newest stamp accepted, readings waiting, of them believed, resets
     newest_ns: IntArray  # (5,) newest stamp of each signal
     held_ns: IntArray  # (5,) the newest value not after the next row
     held: FloatArray
@@ -65,7 +60,6 @@ class Rules(NamedTuple):
     lateness_ns: int
     hold_ns: int
     jump_ns: int
-    window_ns: int
     spare: int  # rows that may stand open at a time
 
 
@@ -89,8 +83,6 @@ def _accept(state: State, rules: Rules, time_ns: int, s: int, v: float, q: int) 
     row = -((-time_ns) // rules.period_ns)
     if clock[_NEXT] == NEVER:
         clock[_NEXT] = row * rules.period_ns
-        if clock[_FIRST] == NEVER or time_ns < clock[_FIRST]:
-            clock[_FIRST] = time_ns
     elif time_ns <= clock[_NEXT] - rules.period_ns:
         state.counts[s, _LATE] += 1
     state.newest_ns[s] = time_ns
@@ -164,54 +156,26 @@ def _drop_waiting(state: State) -> None:
 
 
 @jit
-def _drop_oldest(state: State) -> None:
-    """Count the reading that waited longest, to make room for another."""
-    state.counts[state.wait_signal[0], _OUTLIER] += 1
-    for k in range(1, state.wait_ns.size):
-        state.wait_ns[k - 1], state.wait_signal[k - 1] = state.wait_ns[k], state.wait_signal[k]
-        state.wait[k - 1], state.wait_quality[k - 1] = state.wait[k], state.wait_quality[k]
-    state.clock[_WAITING] -= 1
-
-
-@inlined
-def _doubt_ns(clock: IntArray, rules: Rules, time_ns: int) -> int:
-    """Return how long a clock that went back is not believed.
-
-    A gateway that starts in 1970 until it has asked for the time must not cost days of rows.
-    """
-    kept = max(time_ns, clock[_FIRST], clock[NEWEST] - rules.window_ns)
-    doubt: int = min((clock[NEWEST] - kept) // _SHARE, _LONGEST_DOUBT_NS)
-    return doubt
-
-
-@jit
 def _wait(state: State, rules: Rules, time_ns: int, s: int, v: float, q: int) -> int:
-    """Let a reading far off in time wait; 1 when a leap ahead is confirmed, -1 one back.
-
-    Believing a leap ahead costs nothing: rows stay until others need their room.
-    """
+    """Let a reading far off in time wait; 1 when a leap ahead is confirmed, -1 one back."""
     clock = state.clock
     if clock[_WAITING] > 0:
         last = state.wait_ns[clock[_WAITING] - 1]
         if abs(time_ns - last) > rules.jump_ns:
             _drop_waiting(state)
-    if clock[_WAITING] == 0:
-        clock[_SINCE] = time_ns
-    elif clock[_WAITING] == state.wait_ns.size:
-        _drop_oldest(state)
     n = clock[_WAITING]
     state.wait_ns[n], state.wait_signal[n] = time_ns, s
     state.wait[n], state.wait_quality[n] = v, q
     clock[_WAITING] = n + 1
-    if time_ns < clock[NEWEST]:
-        lasted = time_ns - clock[_SINCE] >= _doubt_ns(clock, rules, time_ns)
-        return -1 if n + 1 == BEHIND_CONFIRMED and lasted else 0
+    ahead = time_ns > clock[NEWEST]
     # The values of one instant must not confirm each other: what counts is instants.
     instants = 1
     for k in range(1, n + 1):
         if state.wait_ns[k] != state.wait_ns[k - 1]:
             instants += 1
-    return 1 if n + 1 == BEHIND_CONFIRMED or instants >= _AHEAD_CONFIRMED else 0
+    if n + 1 < BEHIND_CONFIRMED and (not ahead or instants < _AHEAD_CONFIRMED):
+        return 0
+    return 1 if ahead else -1
 
 
 @jit

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 
 from valveflow_ros.config import Settings
 from valveflow_ros.core.alarm_desk import Act, AlarmDesk
@@ -33,7 +32,7 @@ from valveflow_ros.core.segmenter import NoiseLevel, Segmented, Segmenter
 from valveflow_ros.core.state import Continuing, State
 from valveflow_ros.core.window import RollingWindow
 from valveflow_ros.errors import DataError
-from valveflow_ros.records import SampleTable, SpecialSegment
+from valveflow_ros.records import IntArray, SampleTable, SpecialSegment
 
 BY_HAND = 'asked for by hand'
 
@@ -116,6 +115,10 @@ class Monitor:
         """Return the special segments in the window, in order of time."""
         return self._window.special_segments()
 
+    def numbers(self) -> IntArray:
+        """Return the numbers of the rows in the window, counted from the first one taken."""
+        return self._window.numbers()
+
     def noise(self) -> NoiseLevel:
         """Return the noise levels the thresholds stand on."""
         return self._segmenter.noise()
@@ -185,6 +188,7 @@ class Monitor:
         DataError
             One is running already, or there is nothing to fit.
         """
+        self._check_clock()
         if self.fit_pending:
             raise DataError('A fit is running already.')
         if not self._window.segments:
@@ -193,6 +197,7 @@ class Monitor:
 
     def request_diagnosis(self) -> list[Event]:
         """Ask for a diagnosis now; raises `DataError` where that makes no sense."""
+        self._check_clock()
         return self.diagnosing.request(self._last_ns, self._window, self.characteristic)
 
     def acknowledge(self) -> list[Event]:
@@ -239,15 +244,16 @@ class Monitor:
     def restart(self, reason: str) -> list[Event]:
         """Begin anew after the clock went back; curve, alarm and the rows before it stay.
 
-        The rows and segments that the clock had passed are let go with the next row, whose time
-        tells which those are.
+        The rows that the clock had passed are set aside with the next row, whose time tells which
+        those are; see `RollingWindow`.
         """
         pending = self._refits.pending_ns
         events: list[Event] = [] if pending is None else self.refuse(pending, reason)
+        # What the curve stands on may have changed, and a fit that was running is lost.
+        self._refits.owe()
         self._correction.restart()
         self._went_back = True
         events += self.diagnosing.restart(reason)
-        self._refits.restart()
         self._force.restart(reason)
         return [*events, self._journal(JournalKind.RESET, 0, '', reason)]
 
@@ -295,6 +301,10 @@ class Monitor:
             'diagnosing': self.diagnosing,
         }
 
+    def _check_clock(self) -> None:
+        if self._went_back:
+            raise DataError('The clock has just gone back; try again after the next sample.')
+
     def _take(self, rows: Rows, events: list[Event]) -> tuple[int, bool]:
         """Run rows up to the next segment's close through everything.
 
@@ -306,7 +316,8 @@ class Monitor:
         n = segmented.rows
         rows = rows.part(0, n)
         if self._went_back:
-            segmented = self._let_go(int(rows.time_ns[0]), segmented)
+            self._went_back = False
+            self._window.go_back(int(rows.time_ns[0]))
         self._window.append(
             rows.time_ns, rows.u, rows.power_mw, rows.temperature_degc, rows.opening_percent,
             rows.command_percent,
@@ -318,18 +329,6 @@ class Monitor:
         self.judged = Judged(self._last_ns, float(block.evidence[-1]), float(block.shift_mw[-1]))
         self._say(block, segmented, events)
         return n, bool(segmented.found)
-
-    def _let_go(self, time_ns: int, segmented: Segmented) -> Segmented:
-        """Let go of the rows that the clock had passed when it went back to a time."""
-        self._went_back = False
-        moved = self._window.cut(time_ns)
-        found = []
-        for row, segment in segmented.found:
-            if segment.end_row > self._rows:
-                found.append((row, segment))
-            elif segment.segment.end_ns < time_ns:  # it was open, but what closed it came later
-                found.append((row, segment.moved(moved)))
-        return replace(segmented, found=found)
 
     def _say(self, block: PredictionBlock, segmented: Segmented, events: list[Event]) -> None:
         """Append what the rows brought; a segment can only have closed at the last of them."""

@@ -30,7 +30,7 @@ _AT_DESK = {
     JournalKind.SHELVE: Monitor.shelve,
     JournalKind.UNSHELVE: Monitor.unshelve,
 }
-CLOCK_BACK = 'The clock went back; the rows it had passed were let go.'
+CLOCK_BACK = 'The clock went back; the rows it had passed are set aside.'
 
 
 def _quiet(_share: float, _what: str) -> None:

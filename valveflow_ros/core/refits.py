@@ -24,7 +24,8 @@ class Refits:
 
     def rows_until_due(self, time_ns: IntArray, settings: Settings) -> tuple[int, bool]:
         """Return how many rows to take before the period is over, and whether it is among them."""
-        if self._last_ns is None:
+        # The time may have gone back: the period is not to last the longer for it.
+        if self._last_ns is None or time_ns[0] < self._last_ns:
             self._last_ns = int(time_ns[0])
         period_ns = round(settings.real('refit_period') * NS_PER_S)
         if period_ns == 0:
@@ -72,7 +73,11 @@ class Refits:
         """Wait no longer for the outcome that was asked for; its segments count as new."""
         if self.pending_ns is not None:
             self.pending_ns = None
-            self._segments_at_request = min(self._segments_at_request, self.segments_seen - 1)
+            self.owe()
+
+    def owe(self) -> None:
+        """Let the segments of the last request count as new."""
+        self._segments_at_request = min(self._segments_at_request, self.segments_seen - 1)
 
     def snapshot(self) -> State:
         """Return what is remembered; see `core.state`."""
@@ -90,8 +95,3 @@ class Refits:
         self._last_name_ns = saved['last_name_ns']
         self._segments_at_request = saved['segments_at_request']
         self.segments_seen = saved['segments_seen']
-
-    def restart(self) -> None:
-        """Begin to count anew; names go on."""
-        self._last_ns = None
-        self._segments_at_request = self.segments_seen

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,10 +31,6 @@ class FoundSegment:
     segment: SpecialSegment
     first_row: int
     end_row: int
-
-    def moved(self, rows: int) -> FoundSegment:
-        """Return it with larger numbers of rows."""
-        return replace(self, first_row=self.first_row + rows, end_row=self.end_row + rows)
 
 
 @dataclass(frozen=True, slots=True)

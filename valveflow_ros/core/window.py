@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import islice
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SegmentKind, SpecialSegment
 
 _FIRST_ROOM = 16384
+# A clock that went back is believed when so much of the new time has come.
+_DOUBT_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +66,20 @@ NO_ROWS = WindowContents(
 )
 
 
+@dataclass(slots=True)
+class _Aside:
+    """Rows that the clock had passed when it went back, and the segments among them."""
+
+    time_ns: IntArray
+    number: IntArray
+    data: FloatArray
+    segments: list[FoundSegment]
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.time_ns)
+
+
 class RollingWindow:
     """Rows of the last days, and the special segments among them.
 
@@ -70,21 +87,28 @@ class RollingWindow:
     ----------
     window_s, period_s : float
         Length of the window and step of the rows; together they bound the memory.
+
+    Notes
+    -----
+    A clock that goes back may do so for good, or because a gateway has not heard the time yet.
+    So the rows it had passed are set aside. They come back when the time leaps over them, in
+    place of the rows since; they are let go when as many rows have come, or an hour of them.
+    What a leap ahead puts outside the window stays among the last rows, so many as fill a
+    window without gaps, and is inside again when the leap is taken back.
     """
 
     def __init__(self, window_s: float, period_s: float) -> None:
         self._window_ns = round(window_s * NS_PER_S)
-        self._rows = max(16, int(np.ceil(window_s / period_s)) + 1)
+        self._step_ns = round(1.5 * period_s * NS_PER_S)
+        self._doubt = max(1, math.ceil(_DOUBT_S / period_s))
+        self._rows = max(16, math.ceil(window_s / period_s) + 1)
         # Rows are dropped a sixteenth of the window at a time.
         self._most_room = self._rows * 17 // 16 + 16
-        self._room = min(_FIRST_ROOM, self._most_room)
-        self._time_ns = np.empty(self._room, dtype=np.int64)
-        self._data = np.empty((5, self._room))
-        self._end = 0
-        self._base = 0
-        # A leap ahead may be taken back: segments it put outside stay while their rows do.
+        self._seen = 0
         self._segments: deque[FoundSegment] = deque()
-        self._outside = 0
+        self._aside: _Aside | None = None
+        self._end = 0
+        self._clear()
 
     @classmethod
     def of(cls, settings: Settings) -> RollingWindow:
@@ -92,22 +116,22 @@ class RollingWindow:
         return cls(86400.0 * settings.real('window_days'), settings.real('sample_period'))
 
     def __len__(self) -> int:
-        """Return the number of rows held."""
+        """Return the number of rows held, without those set aside."""
         return self._end
 
     @property
     def rows_seen(self) -> int:
-        """Return the number of rows ever appended; the next row's absolute number."""
-        return self._base + self._end
+        """Return the number of rows ever appended; the next row's number."""
+        return self._seen
 
     @property
     def segments(self) -> int:
         """Return the number of special segments inside the window."""
-        return len(self._segments) - self._outside
+        return len(self.special_segments())
 
     def special_segments(self) -> tuple[SpecialSegment, ...]:
         """Return the special segments inside the window, in order of time."""
-        return tuple(s.segment for s in islice(self._segments, self._outside, None))
+        return tuple(found.segment for found in self._inside())
 
     @property
     def special_samples(self) -> int:
@@ -119,8 +143,8 @@ class RollingWindow:
         """Return the time from the oldest row inside the window to the newest."""
         if self._end == 0:
             return 0.0
-        held_ns = int(self._time_ns[self._end - 1]) - int(self._time_ns[0])
-        return min(held_ns, self._window_ns) / NS_PER_S
+        oldest_ns = int(self._time_ns[self._held().start])
+        return min(int(self._time_ns[self._end - 1]) - oldest_ns, self._window_ns) / NS_PER_S
 
     def append(
         self,
@@ -131,45 +155,65 @@ class RollingWindow:
         opening_percent: FloatArray | None = None,
         command_percent: FloatArray | None = None,
     ) -> None:
-        """Append rows, later than all there are; those that have left the window are forgotten."""
+        """Append rows that follow each other in time; those outside the window are forgotten."""
+        data = np.full((5, len(time_ns)), np.nan)
+        data[0], data[1], data[2] = u, power_mw, temperature_degc
+        if opening_percent is not None:
+            data[3] = opening_percent
+        if command_percent is not None:
+            data[4] = command_percent
+        number = np.arange(self._seen, self._seen + len(time_ns), dtype=np.int64)
+        self._seen += len(time_ns)
         done = 0
-        while done < len(time_ns):
-            if self._end == self._room:
-                self._make_room()
-            take = min(self._room - self._end, len(time_ns) - done)
-            part, place = slice(done, done + take), slice(self._end, self._end + take)
-            self._time_ns[place] = time_ns[part]
-            self._data[0, place] = u[part]
-            self._data[1, place] = power_mw[part]
-            self._data[2, place] = temperature_degc[part]
-            self._data[3, place] = np.nan if opening_percent is None else opening_percent[part]
-            self._data[4, place] = np.nan if command_percent is None else command_percent[part]
-            self._end += take
-            done += take
+        while self._aside is not None and done < len(time_ns):
+            done = self._append_in_doubt(self._aside, time_ns, number, data, done)
+        self._add(time_ns[done:], number[done:], data[:, done:])
         self._forget()
 
     def add_segment(self, found: FoundSegment) -> None:
         """Remember a special segment that has closed."""
-        self._segments.append(found)
+        aside = self._aside
+        if aside is not None and _has(aside.number, found.end_row - 1):
+            # It was open when the clock went back.
+            aside.segments.append(found)
+        elif _has(self._number[: self._end], found.end_row - 1):
+            self._segments.append(found)
+            self._forget()
 
-    def cut(self, time_ns: int) -> int:
-        """Let go of the rows from a time on, and of the segments that reach into them.
+    def go_back(self, time_ns: int) -> None:
+        """Set aside the rows from a time on, to which the clock went back."""
+        self._drop_oldest()
+        cut = int(np.searchsorted(self._time_ns[: self._end], time_ns, side='left'))
+        old, stop = self._aside, self._end
+        if old is not None:
+            # What came since the clock went back before is neither here nor there.
+            stop = cut + int(np.searchsorted(self._number[cut : self._end], old.number[0]))
+        passed = _Aside(
+            self._time_ns[cut:stop].copy(), self._number[cut:stop].copy(),
+            self._data[:, cut:stop].copy(), [],
+        )  # fmt: skip
+        newest = -1 if stop == cut else int(passed.number[-1])
+        stay: deque[FoundSegment] = deque()
+        for found in self._segments:
+            if found.segment.end_ns < time_ns:
+                stay.append(found)
+            elif found.end_row - 1 <= newest:
+                passed.segments.append(found)
+        self._segments = stay
+        self._end = cut
+        self._give_back_room()
+        if old is not None:
+            passed = _Aside(
+                np.concatenate([passed.time_ns, old.time_ns]),
+                np.concatenate([passed.number, old.number]),
+                np.concatenate([passed.data, old.data], axis=1),
+                passed.segments + old.segments,
+            )
+        self._aside = passed if len(passed) else None
 
-        What a leap ahead had put outside the window, and is among its last rows, is inside again.
-        Returns by how much the numbers of the rows that stay grow, so that those of the rows to
-        come follow them.
-        """
-        held = self._held()
-        end = int(np.searchsorted(self._time_ns[held], time_ns, side='left'))
-        gone = int(self._end - held.start - end)
-        for column in (self._time_ns, *self._data):
-            column[:end] = column[held][:end].copy()
-        self._base += held.start + gone
-        self._end = end
-        stay = [s for s in self._segments if s.segment.end_ns < time_ns]
-        self._segments = deque(segment.moved(gone) for segment in stay)
-        self._count()
-        return gone
+    def numbers(self) -> IntArray:
+        """Return the numbers of the rows inside the window, counted from the first ever."""
+        return self._number[self._first() : self._end].copy()
 
     def tail(self, rows: int) -> tuple[IntArray, FloatArray, FloatArray]:
         """Return copies of time, ``u`` and power of the last ``rows`` rows, or of all held."""
@@ -180,46 +224,95 @@ class RollingWindow:
         """Return a copy of the rows inside the window and their segments."""
         if self._end == 0:
             return NO_ROWS
-        first = self._first()
-        offset = self._base + first
+        inside = slice(self._first(), self._end)
+        number = self._number[inside]
         spans = [
-            (s.first_row - offset, s.end_row - offset, int(s.segment.kind))
-            for s in islice(self._segments, self._outside, None)
-            if s.first_row >= offset
+            (*np.searchsorted(number, (s.first_row, s.end_row)).tolist(), int(s.segment.kind))
+            for s in self._inside()
         ]
-        command = self._data[4, first : self._end]
+        command = self._data[4, inside]
         return WindowContents(
-            self._time_ns[first : self._end].copy(),
-            self._data[0, first : self._end].copy(),
-            self._data[1, first : self._end].copy(),
-            self._data[2, first : self._end].copy(),
+            self._time_ns[inside].copy(),
+            self._data[0, inside].copy(),
+            self._data[1, inside].copy(),
+            self._data[2, inside].copy(),
             np.array(spans, dtype=np.int64).reshape(-1, 3),
-            self._data[3, first : self._end].copy(),
+            self._data[3, inside].copy(),
             # Most units do not log it, and a snapshot goes to another process.
             command.copy() if np.isfinite(command).any() else np.empty(0),
         )
 
     def snapshot(self) -> State:
         """Return what is remembered; see `core.state`."""
-        rows = self._held()
-        command = self._data[4, rows]
+        rows, aside = self._held(), self._aside
         return {
-            'time_ns': self._time_ns[rows].copy(),
-            'rows': self._data[:4, rows].copy(),
-            'command': command.copy() if np.isfinite(command).any() else np.empty(0),
-            'base': self._base + rows.start,
-            'segments': [found_values(s) for s in self._segments],
+            'seen': self._seen,
+            **_plain(self._time_ns[rows], self._number[rows], self._data[:, rows], self._segments),
+            'aside': aside and _plain(aside.time_ns, aside.number, aside.data, aside.segments),
         }
 
     def restore(self, saved: State) -> None:
         """Go on from a state; raises `DataError` if it does not fit."""
-        time_ns, rows, command = saved['time_ns'], saved['rows'], saved['command']
-        if rows.shape != (4, len(time_ns)) or len(command) not in (0, len(time_ns)):
-            raise DataError('The saved state has rows of different lengths.')
-        self._end, self._base = 0, int(saved['base'])
-        self.append(time_ns, rows[0], rows[1], rows[2], rows[3], command if len(command) else None)
-        self._segments = deque(found_of(values) for values in saved['segments'])
-        self._count()
+        rows, aside = _rows_of(saved), saved['aside']
+        self._clear()
+        self._seen = int(saved['seen'])
+        self._add(rows.time_ns, rows.number, rows.data)
+        self._segments = deque(rows.segments)
+        self._aside = aside and _rows_of(aside)
+
+    def _clear(self) -> None:
+        """Hold nothing."""
+        self._room = min(_FIRST_ROOM, self._most_room)
+        self._time_ns = np.empty(self._room, dtype=np.int64)
+        self._number = np.empty(self._room, dtype=np.int64)
+        self._data = np.empty((5, self._room))
+        self._end = 0
+
+    def _add(self, time_ns: IntArray, number: IntArray, data: FloatArray) -> None:
+        """Append rows to those held."""
+        done = 0
+        while done < len(time_ns):
+            if self._end == self._room:
+                self._make_room()
+            take = min(self._room - self._end, len(time_ns) - done)
+            part, place = slice(done, done + take), slice(self._end, self._end + take)
+            self._time_ns[place], self._number[place] = time_ns[part], number[part]
+            self._data[:, place] = data[:, part]
+            self._end += take
+            done += take
+
+    def _append_in_doubt(
+        self, aside: _Aside, time_ns: IntArray, number: IntArray, data: FloatArray, done: int
+    ) -> int:
+        """Append rows until it is settled whether the clock went back for good."""
+        since = self._end - int(np.searchsorted(self._number[: self._end], aside.number[-1]))
+        enough = done + min(len(aside), self._doubt) - since
+        over = done + int(np.searchsorted(time_ns[done:], aside.time_ns[-1], side='right'))
+        until = min(enough, over, len(time_ns))
+        self._add(time_ns[done:until], number[done:until], data[:, done:until])
+        if until == enough:
+            self._aside = None
+        elif until == over and until < len(time_ns):
+            before_ns = self._time_ns[self._end - 1] if self._end else 0
+            self._aside = None
+            if time_ns[over] - before_ns > self._step_ns:
+                self._take_back(aside)
+        return until
+
+    def _take_back(self, aside: _Aside) -> None:
+        """Put the rows set aside in the place of those since."""
+        last = aside.number[-1]
+        self._end = int(np.searchsorted(self._number[: self._end], last))
+        self._segments = deque(s for s in self._segments if s.end_row - 1 <= last)
+        self._segments.extend(aside.segments)
+        self._add(aside.time_ns, aside.number, aside.data)
+
+    def _inside(self) -> list[FoundSegment]:
+        """Return the segments inside the window, in order of time."""
+        if not self._end:
+            return []
+        oldest = int(self._time_ns[self._end - 1]) - self._window_ns
+        return [found for found in self._segments if found.segment.start_ns > oldest]
 
     def _held(self) -> slice:
         """Return the places of the last rows, as many as a full window has."""
@@ -229,39 +322,75 @@ class RollingWindow:
         """Return the place of the oldest row inside the window."""
         if self._end == 0:
             return 0
+        held = self._held()
         oldest = self._time_ns[self._end - 1] - self._window_ns
-        return int(np.searchsorted(self._time_ns[: self._end], oldest, side='right'))
+        return int(held.start + np.searchsorted(self._time_ns[held], oldest, side='right'))
 
     def _make_room(self) -> None:
         """Grow until the window fits, then drop the oldest rows many at a time."""
-        limit = self._most_room
-        if self._room < limit:
-            self._room = min(limit, 2 * self._room)
-            time_ns = np.empty(self._room, dtype=np.int64)
-            data = np.empty((5, self._room))
-            time_ns[: self._end] = self._time_ns[: self._end]
-            data[:, : self._end] = self._data[:, : self._end]
-            self._time_ns, self._data = time_ns, data
+        if self._room < self._most_room:
+            self._resize(min(self._most_room, 2 * self._room))
             return
-        drop = self._end - self._rows
+        self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        """Keep as many rows as a full window has."""
+        if self._end <= self._rows:
+            return
+        held = self._held()
         # One column at a time: a copy of all would be as large as the window itself.
-        for column in (self._time_ns, *self._data):
-            column[: self._rows] = column[drop : self._end].copy()
-        self._base += drop
+        for column in (self._time_ns, self._number, *self._data):
+            column[: self._rows] = column[held].copy()
         self._end = self._rows
 
+    def _give_back_room(self) -> None:
+        """Need less memory where few rows are left, since those set aside need theirs."""
+        if self._room > _FIRST_ROOM and 4 * self._end < self._room:
+            self._resize(min(self._most_room, max(_FIRST_ROOM, 2 * self._end)))
+
+    def _resize(self, room: int) -> None:
+        end, self._room = self._end, room
+        time_ns, number, data = self._time_ns, self._number, self._data
+        self._time_ns, self._number = np.empty(room, np.int64), np.empty(room, np.int64)
+        self._data = np.empty((5, room))
+        self._time_ns[:end], self._number[:end] = time_ns[:end], number[:end]
+        self._data[:, :end] = data[:, :end]
+
     def _forget(self) -> None:
-        """Let go of segments whose rows are gone, and pass over those before the window."""
-        first = self._base + self._held().start
+        """Let go of segments whose rows are gone."""
+        if not self._end:
+            return
+        first = int(self._number[self._held().start])
         while self._segments and self._segments[0].first_row < first:
             self._segments.popleft()
-            self._outside = max(0, self._outside - 1)
-        if self._end:
-            oldest = int(self._time_ns[self._end - 1]) - self._window_ns
-            while self.segments and self._segments[self._outside].segment.start_ns <= oldest:
-                self._outside += 1
 
-    def _count(self) -> None:
-        """Count anew what lies outside."""
-        self._outside = 0
-        self._forget()
+
+def _has(numbers: IntArray, number: int) -> bool:
+    """Tell whether a row is among some."""
+    place = int(np.searchsorted(numbers, number))
+    return place < len(numbers) and int(numbers[place]) == number
+
+
+def _plain(
+    time_ns: IntArray, number: IntArray, data: FloatArray, segments: Iterable[FoundSegment]
+) -> State:
+    """Return rows and segments as plain values; most units do not log the command."""
+    command = data[4]
+    return {
+        'time_ns': time_ns.copy(),
+        'number': number.copy(),
+        'rows': data[:4].copy(),
+        'command': command.copy() if np.isfinite(command).any() else np.empty(0),
+        'segments': [found_values(found) for found in segments],
+    }
+
+
+def _rows_of(saved: State) -> _Aside:
+    """Return rows and segments of plain values; raises `DataError` if they do not fit."""
+    time_ns, number, rows, command = (saved[n] for n in ('time_ns', 'number', 'rows', 'command'))
+    n = len(time_ns)
+    if rows.shape != (4, n) or len(number) != n or len(command) not in (0, n):
+        raise DataError('The saved state has rows of different lengths.')
+    last = command if len(command) else np.full(n, np.nan)
+    segments = [found_of(values) for values in saved['segments']]
+    return _Aside(time_ns, number, np.concatenate([rows, last[None]]), segments)

@@ -22,7 +22,7 @@ def on_top(record: Record, earlier: ExtendedModel, measured: SampleTable) -> Rec
     record : Record
         Its table was freed of the causes of ``earlier``.
     measured : SampleTable
-        The rows before that, the last ones of them those of the record.
+        The rows of the record before that.
 
     Notes
     -----
@@ -35,8 +35,7 @@ def on_top(record: Record, earlier: ExtendedModel, measured: SampleTable) -> Rec
         values[:, Signal.VALVE_COMMAND] = np.nan
         quality[:, Signal.VALVE_COMMAND] = Quality.BAD
         rows = SampleTable(rows.time_ns, values, quality)
-    last = measured.part(len(measured) - len(rows), len(measured))
-    return replace(record, table=rows, measured=last)
+    return replace(record, table=rows, measured=measured)
 
 
 def freed(record: Record, held: tuple[HeldCause, ...]) -> Record:

@@ -105,7 +105,7 @@ class InputHealth:
         name = _speaking(info.topic, tallies, publishers)
         tally, seen = tallies[name], publishers.get(name, Publishers())
         level, sentence = self._judge(info, name, tally, seen, counts, now_s, listening_s)
-        if level <= Level.WARN and info.required and self._twice(info.topic, publishers):
+        if level <= Level.WARN and info.required and self._twice(info.topic, publishers, tallies):
             both = f'{self.topics[info.topic]} and {self.topics[PLANT_SAMPLE]}'
             level = Level.WARN
             sentence = f'{both} are both published; their values are mixed. Stop one of them.'
@@ -139,7 +139,7 @@ class InputHealth:
         topic = self.topics[name]
         rejected = self._new(self._rejected, info.topic, _rejected(counts))
         lost = self._new(self._lost, info.topic, tally.lost)
-        ahead = self._stamps.ahead(info.topic)
+        ahead, behind = self._stamps.look(info.topic)
         if seen.wrong_types:
             kinds = ' and '.join(seen.wrong_types)
             return Level.ERROR, f'{topic} is published as {kinds}, which the monitor cannot take.'
@@ -164,7 +164,8 @@ class InputHealth:
             return Level.WARN, ahead
         if lost:
             return Level.WARN, f'{lost} messages of {topic} were lost on the way.'
-        return Level.OK, f'{_hertz(tally.rate_hz())}.'
+        rate = _hertz(tally.rate_hz())
+        return Level.OK, f'{rate}; {behind}.' if behind else f'{rate}.'
 
     def _silent(
         self, info: SignalInfo, name: str, seen: Publishers, listening_s: float
@@ -214,9 +215,12 @@ class InputHealth:
         return since_s
 
     @staticmethod
-    def _twice(topic: str, publishers: Mapping[str, Publishers]) -> bool:
-        """Tell whether a signal comes on its own topic and on the stamped one."""
-        return all(publishers.get(n, Publishers()).right for n in (topic, PLANT_SAMPLE))
+    def _twice(
+        topic: str, publishers: Mapping[str, Publishers], tallies: Mapping[str, Tally]
+    ) -> bool:
+        """Tell whether a signal has come on its own topic and on the stamped one."""
+        both = (topic, PLANT_SAMPLE)
+        return all(publishers.get(n, Publishers()).right and tallies[n].received for n in both)
 
     @staticmethod
     def _new(before: dict[str, int], key: str, count: int) -> int:

@@ -1,4 +1,4 @@
-"""The executable `monitor`: there at once, own signals, sentences instead of traces."""
+"""The executable `monitor`: its signals are its own before anything else is loaded."""
 
 from __future__ import annotations
 
@@ -7,67 +7,22 @@ import os
 import sys
 from collections.abc import Sequence
 
-from valveflow_ros.config import TABLE
-from valveflow_ros.errors import ValveflowError
-from valveflow_ros.ros.presence import Presence
-from valveflow_ros.ros.secure_start import check_security
-from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.stops import StopFlag, Stopped
-from valveflow_ros.ros.transport import choose_transport
-from valveflow_ros.ros.usage import show, usage, wants_help
-
-_ABOUT = """usage: monitor [--ros-args ...]
-
-Watches valve opening, main steam pressure and temperature and generated power, and keeps the
-flow characteristic of the main steam valve. It runs until it is asked to end (Ctrl-C)."""
-_EXAMPLE = (
-    'ros2 run valveflow_ros monitor --ros-args -p unit_tag:=U1 -p main_steam_pressure_unit:=bar'
-)
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the monitor until it is asked to stop; return the exit status."""
-    if wants_help(args):
-        show(usage(_ABOUT, _EXAMPLE, TABLE))
-        return 0
+    stop = StopFlag().install()
     # Recordings, logs and compiled code are nobody else's business, whatever the shell allowed.
     before = os.umask(0o077)
     try:
-        return _main(args)
-    finally:
-        os.umask(before)
-
-
-def _main(args: Sequence[str] | None) -> int:
-    stop = StopFlag().install()
-    try:
-        choose_transport()
-        check_security(args)
-        presence = Presence(args)
-    except ValveflowError as error:
-        return _complain(str(error))
-    except Exception as error:  # noqa: BLE001 - rclpy raises what its C++ gave it
-        return _complain(f'ROS could not be started: {one_line(error)}')
-    try:
-        # Compiler and libraries take a second, in which the others of the domain get to know
-        # this process. A signal need not wait for them: nothing has been begun.
         with stop.cutting():
-            work = importlib.import_module('valveflow_ros.ros.monitor_loop')
-        return int(work.run(stop, presence))
+            begin = importlib.import_module('valveflow_ros.ros.monitor_begin')
+        return int(begin.run(stop, args))
     except Stopped:
         return 0
-    except ValveflowError as error:
-        return _complain(str(error))
-    except Exception as error:  # noqa: BLE001 - a person is owed a sentence, not a trace
-        return _complain(f'The monitor failed unexpectedly: {with_place(error)}')
     finally:
-        stop.last()
-        presence.close()
-
-
-def _complain(sentence: str) -> int:
-    print(f'valveflow monitor: {sentence}', file=sys.stderr)
-    return 1
+        os.umask(before)
 
 
 if __name__ == '__main__':

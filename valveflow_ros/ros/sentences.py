@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import os
+import re
 import traceback
+
+_IN_C = re.compile(r',? at /\S+\.c(?:pp)?:\d+')
 
 
 def one_line(error: BaseException) -> str:
-    """Return the first line of an error's text, or its name if it has none."""
-    text = str(error).strip().splitlines()
+    """Return the first line of an error's text, or its name if it has none.
+
+    Where in C code it happened, as rcl writes it, tells nobody anything.
+    """
+    text = _IN_C.sub('', str(error)).strip().splitlines()
     return text[0] if text else type(error).__name__
 
 

@@ -33,16 +33,23 @@ class StampHealth:
             self._last_ns[topic] = time_ns
             self._lead_ns[topic] = max(time_ns - host_ns, self._lead_ns.get(topic, -(2**62)))
 
-    def ahead(self, topic: str) -> str:
-        """Return by how much the stamps since the last look were ahead; empty if they were not.
+    def look(self, topic: str) -> tuple[str, str]:
+        """Return what is wrong with the stamps since the last look, and what is only odd.
 
         A stamp that is behind may be that of a recording which is played; none can be ahead.
+        Both are empty where this machine's clock agrees.
         """
         lead_ns = self._lead_ns.pop(topic, 0)
-        if not self._by_host or lead_ns <= self._jump_ns:
-            return ''
+        if not self._by_host or abs(lead_ns) <= self._jump_ns:
+            return '', ''
+        if lead_ns < 0:
+            off = duration(-lead_ns / NS_PER_S)
+            return '', f"stamps are {off} behind this machine's clock"
         most = duration(lead_ns / NS_PER_S)
-        return f"Stamps are up to {most} ahead of this machine's clock; set both by one server."
+        return (
+            f"Stamps are up to {most} ahead of this machine's clock; set both by one server.",
+            '',
+        )
 
     def far(self, topic: str, newest_ns: int) -> str:
         """Return how far the last stamp is from the newest that counts; empty if it is near."""

@@ -43,6 +43,7 @@ class Tally:
     _number: int = 0
     _mixed: bool = False
     _anew: bool = False
+    _several: bool = False
     _irregular_before: int = 0
     _lost_before: int = 0
 
@@ -71,8 +72,10 @@ class Tally:
             self.lost = min(self.lost, self._lost_before)
         self._lost_before = self.lost
         mixed = count > 1 or self.irregular > self._irregular_before
-        self._anew = self._anew or (self._mixed and not mixed)
-        self._mixed, self._irregular_before = mixed, self.irregular
+        # The last number may be that of the one which is gone.
+        self._anew = self._anew or (self._several and count <= 1)
+        self._mixed, self._several = mixed, count > 1
+        self._irregular_before = self.irregular
 
     def note_arrival(self, count: int, now_s: float) -> None:
         """Take the time at which ``count`` messages were found."""

@@ -73,7 +73,10 @@ def _fit_values(
 
 def _age_s(monitor: Monitor) -> float:
     curve = monitor.characteristic
-    return math.nan if curve is None else (monitor.last_ns - curve.source.window_end_ns) / 1e9
+    if curve is None:
+        return math.nan
+    # The clock may have gone back behind what the curve was found from.
+    return max(0.0, (monitor.last_ns - curve.source.window_end_ns) / 1e9)
 
 
 def alarm_item(monitor: Monitor) -> Item:
