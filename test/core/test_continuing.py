@@ -85,6 +85,21 @@ def test_a_leap_ahead_that_is_taken_back_costs_no_row_whenever_it_is_taken_up(cu
     ]  # fmt: skip
 
 
+def test_a_clock_that_flaps_asks_no_more_fits_than_one_that_stands():
+    settings = SETTINGS.changed({'refit_period': 2500.0, 'refit_segments': 0})
+    monitor = Monitor(settings)
+    events = feed_rows(monitor, plant_table(3, N))
+    for k in range(10):
+        events += monitor.restart(CLOCK_BACK)
+        events += feed_rows(monitor, plant_table(4, 25, start_ns=10**12))
+        begun_ns = START_NS + (N + 100 * k) * NS_PER_S
+        events += feed_rows(monitor, plant_table(5 + k, 40, start_ns=begun_ns))
+    assert not [e for e in events if isinstance(e, FitRequested)]
+    later = START_NS + (N + 1000) * NS_PER_S
+    events = feed_rows(monitor, plant_table(20, 1000, start_ns=later))
+    assert [e for e in events if isinstance(e, FitRequested)]
+
+
 @examples(15)
 @given(seeds, table_harms(N), st.integers(0, 5 * N))
 def test_an_aligner_taken_up_again_closes_the_same_rows(seed, harms, cut):

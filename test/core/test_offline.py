@@ -339,6 +339,12 @@ def test_a_recording_with_a_clock_set_back_is_repeated_from_its_readings(late):
         events += replayer.feed(aligned.table)
     same(live.events, events)
     assert any(e.kind == JournalKind.RESET for e in live.journal())
+    # With the line of the journal or, after a kill, without it: the rows tell it too.
+    for journal in (live.journal(), [e for e in live.journal() if e.kind != JournalKind.RESET]):
+        replayer, again = JournalReplayer(Monitor(SETTINGS), journal, left=[]), []
+        for aligned in align_all(Aligner(SETTINGS), readings):
+            again += replayer.feed_aligned(aligned)
+        assert sum(e.kind == JournalKind.RESET for e in journal_of(again)) == 1
 
 
 def test_all_rows_of_a_finished_list_come_out():

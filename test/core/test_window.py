@@ -48,20 +48,23 @@ class NaiveWindow:
 
     def take(self, row):
         if self.aside and row[1] > self.aside[-1][1]:
-            if not self.rows or row[1] - self.rows[-1][1] > 1.5 * NS_PER_S:
+            step_s = (self.aside[-1][1] - self.earliest) / NS_PER_S
+            if not self.rows or (row[1] - self.rows[-1][1]) / NS_PER_S > step_s / 2:
                 # The time leapt over what it had gone back behind: it had not gone back.
                 self.rows = [r for r in self.rows if r[0] < self.aside[0][0]] + self.aside
             self.aside = []
         self.rows = [*self.rows, row][-self.most :]
-        since = [r for r in self.rows if self.aside and r[0] > self.aside[-1][0]]
-        if self.aside and len(since) >= min(len(self.aside), 3600):
+        if self.aside and row[0] - self.aside[-1][0] >= min(len(self.aside), 3600):
             self.aside = []
 
-    def go_back(self, time_ns):
+    def go_back(self, back_ns):
+        time_ns = back_ns
         passed = [r for r in self.rows if r[1] >= time_ns]
         if self.aside:
             passed = [r for r in passed if r[0] < self.aside[0][0]]
-        self.rows = [r for r in self.rows if r[1] < time_ns]
+            time_ns = min(time_ns, self.earliest)
+        self.earliest = time_ns
+        self.rows = [r for r in self.rows if r[1] < back_ns]
         self.aside = passed + self.aside
 
     def contents(self):
@@ -160,6 +163,32 @@ def test_counters_follow_segments_out_of_the_window():
     assert (window.segments, window.special_samples) == (1, 15)
     window.append(rows_after(int(more[-1]), 60), *np.zeros((3, 60)))
     assert (window.segments, window.special_samples) == (0, 0)
+
+
+def feed(window, first_s, end_s, marks):
+    """Append rows of a second, marked by a value of their own."""
+    seconds = np.arange(first_s, end_s, dtype=np.int64)
+    window.append(seconds * NS_PER_S, *np.full((3, len(seconds)), float(marks)))
+
+
+def test_a_run_that_begins_again_and_again_is_the_last_one():
+    window = RollingWindow(86400.0, 1.0)
+    for run in range(1, 6):
+        if run > 1:
+            window.go_back(10 * NS_PER_S)
+        feed(window, 10, 3000 - 100 * run, run)
+    feed(window, 3200, 3210, 6)
+    assert window.contents().u.tolist() == [5.0] * 2490 + [6.0] * 10
+
+
+def test_a_gap_where_the_first_run_ended_is_no_return():
+    window = RollingWindow(86400.0, 1.0)
+    feed(window, 10, 1810, 1)
+    window.go_back(10 * NS_PER_S)
+    feed(window, 10, 700, 2)
+    feed(window, 701, 1809, 2)
+    feed(window, 1811, 1820, 3)
+    assert window.contents().u.tolist() == [2.0] * 1798 + [3.0] * 9
 
 
 def test_memory_is_bounded_however_long_it_runs():

@@ -417,6 +417,20 @@ def test_losses_are_counted_again_when_one_publisher_is_left(
     assert tally.lost == before + 3
 
 
+def test_another_publisher_after_a_pause_or_for_a_moment_invents_no_loss() -> None:
+    tally = Tally()
+    for number in (1, 2, 3):
+        tally.note_number(number)
+    tally.note_publishers(0)
+    tally.note_publishers(1)
+    tally.note_number(40)
+    assert tally.lost == 0
+    for number in (500, 41):
+        tally.note_number(number)
+    tally.note_publishers(1)
+    assert tally.lost == 0
+
+
 def test_a_restarted_publisher_is_one_irregularity() -> None:
     tally = Tally()
     for number in (5, 6, 7, 1, 2, 3):

@@ -83,6 +83,7 @@ class Diagnosing:
         self._model: tuple[Characteristic, RegionalModel] | None = None
         self._hour: int | None = None
         self._night: int | None = None
+        self._night_before: int | None = None
         self._asked_ns: int | None = None
         self._named_ns = 0
         self._wanted = ''
@@ -130,7 +131,8 @@ class Diagnosing:
         self._hour = hour
         events = self._judge()
         night = self._night_of(time_ns)
-        tonight = night != self._night and self.settings.whole('diagnosis_hour') >= 0
+        another = night not in (self._night, self._night_before)
+        tonight = another and self.settings.whole('diagnosis_hour') >= 0
         self._night = night
         reason = self._wanted or (NIGHTLY if tonight else '')
         if reason and self._may_ask(time_ns) and not self._objection(window, curve):
@@ -181,6 +183,7 @@ class Diagnosing:
             'last': None if last is None else [_plain(last.task), last.content, last.reason],
             'hour': self._hour,
             'night': self._night,
+            'night_before': self._night_before,
             'asked_ns': self._asked_ns,
             'named_ns': self._named_ns,
             'wanted': self._wanted,
@@ -196,6 +199,7 @@ class Diagnosing:
         self.last = last and Diagnosed(self._task(last[0]), last[1], last[2])
         self._pending = pending and self._task(pending)
         self._hour, self._night = saved['hour'], saved['night']
+        self._night_before = saved['night_before']
         self._asked_ns, self._named_ns = saved['asked_ns'], saved['named_ns']
         self._wanted, self._raised = saved['wanted'], saved['raised']
 
@@ -219,7 +223,8 @@ class Diagnosing:
         events = self.give_up(reason)
         self._mismatch = Mismatch(self.settings.real('sample_period'))
         self.misfit, self.sentence, self._wanted = NOTHING, '', ''
-        self._hour = self._night = self._asked_ns = None
+        # Should the clock come again, it is no other night for that.
+        self._night_before, self._hour, self._night = self._night, None, None
         return events
 
     def _judge(self) -> list[Event]:
@@ -250,7 +255,8 @@ class Diagnosing:
 
     def _may_ask(self, time_ns: int) -> bool:
         pause_ns = round(self.settings.real('diagnosis_pause') * _HOUR_NS)
-        return self._asked_ns is None or time_ns - self._asked_ns >= pause_ns
+        # The clock may have gone back behind the last one.
+        return self._asked_ns is None or not 0 <= time_ns - self._asked_ns < pause_ns
 
     def _objection(self, window: RollingWindow, curve: Characteristic | None) -> str:
         """Return why there can be no diagnosis, empty if there can."""

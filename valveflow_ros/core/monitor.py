@@ -188,7 +188,6 @@ class Monitor:
         DataError
             One is running already, or there is nothing to fit.
         """
-        self._check_clock()
         if self.fit_pending:
             raise DataError('A fit is running already.')
         if not self._window.segments:
@@ -197,7 +196,6 @@ class Monitor:
 
     def request_diagnosis(self) -> list[Event]:
         """Ask for a diagnosis now; raises `DataError` where that makes no sense."""
-        self._check_clock()
         return self.diagnosing.request(self._last_ns, self._window, self.characteristic)
 
     def acknowledge(self) -> list[Event]:
@@ -301,7 +299,8 @@ class Monitor:
             'diagnosing': self.diagnosing,
         }
 
-    def _check_clock(self) -> None:
+    def check_clock(self) -> None:
+        """Raise `DataError` between a step back of the clock and the row that tells how far."""
         if self._went_back:
             raise DataError('The clock has just gone back; try again after the next sample.')
 

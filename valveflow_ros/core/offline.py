@@ -110,6 +110,7 @@ class JournalReplayer:
         self._tasks: dict[int, FitTask] = {}
         self._diagnose = diagnose
         self._diagnosis: DiagnosisTask | None = None
+        self._reset_at = -1
 
     def feed(self, table: SampleTable) -> list[Event]:
         """Feed rows; return the events."""
@@ -126,6 +127,20 @@ class JournalReplayer:
             done += fed.rows
             events += fed.events
             self._keep(fed.events)
+
+    def feed_aligned(self, aligned: Aligned) -> list[Event]:
+        """Feed rows with restarts of the clock among them; return the events.
+
+        A run that was killed may have left no line of the journal about the last one.
+        """
+        events: list[Event] = []
+        start = 0
+        for reset in aligned.resets.tolist():
+            events += self.feed(aligned.table.part(start, reset))
+            if self._reset_at != self._monitor.rows:
+                events += self._monitor.restart(CLOCK_BACK)
+            start = reset
+        return events + self.feed(aligned.table.part(start, len(aligned.table)))
 
     def _keep(self, events: list[Event]) -> None:
         for event in events:
@@ -175,6 +190,7 @@ class JournalReplayer:
         if entry.kind in _AT_DESK:
             return _AT_DESK[entry.kind](monitor)
         if entry.kind == JournalKind.RESET:
+            self._reset_at = monitor.rows
             return monitor.restart(entry.text)
         if entry.kind == JournalKind.RESUMED:
             return monitor.resume(entry.text)

@@ -18,20 +18,29 @@ class Refits:
     def __init__(self) -> None:
         self.pending_ns: int | None = None
         self._last_ns: int | None = None
+        self._later_ns: int | None = None
         self._last_name_ns = 0
         self._segments_at_request = 0
         self.segments_seen = 0
 
     def rows_until_due(self, time_ns: IntArray, settings: Settings) -> tuple[int, bool]:
         """Return how many rows to take before the period is over, and whether it is among them."""
-        # The time may have gone back: the period is not to last the longer for it.
-        if self._last_ns is None or time_ns[0] < self._last_ns:
+        if self._last_ns is None:
             self._last_ns = int(time_ns[0])
+        elif time_ns[0] < self._last_ns:
+            # The clock went back, and the period is not to last the longer for it; but should it
+            # come again, the period is not over at once.
+            self._later_ns, self._last_ns = self._last_ns, int(time_ns[0])
+        over = len(time_ns)
+        if self._later_ns is not None:
+            over = int(np.searchsorted(time_ns, self._later_ns, side='right'))
+            if over == 0:
+                self._last_ns, self._later_ns, over = self._later_ns, None, len(time_ns)
         period_ns = round(settings.real('refit_period') * NS_PER_S)
         if period_ns == 0:
-            return len(time_ns), False
+            return over, False
         due = int(np.searchsorted(time_ns, self._last_ns + period_ns, side='left'))
-        return (due + 1, True) if due < len(time_ns) else (len(time_ns), False)
+        return (due + 1, True) if due < over else (over, False)
 
     def due(self, last_ns: int, closed: bool, by_time: bool, settings: Settings) -> bool:
         """Tell whether the time or the segments since the last request ask for one.
@@ -58,7 +67,7 @@ class Refits:
         # After the clock went back names must not come again.
         self.pending_ns = max(last_ns, self._last_name_ns + 1)
         self._last_name_ns = self.pending_ns
-        self._last_ns = last_ns
+        self._last_ns, self._later_ns = last_ns, None
         self._segments_at_request = self.segments_seen
         return self.pending_ns
 
@@ -84,6 +93,7 @@ class Refits:
         return {
             'pending_ns': self.pending_ns,
             'last_ns': self._last_ns,
+            'later_ns': self._later_ns,
             'last_name_ns': self._last_name_ns,
             'segments_at_request': self._segments_at_request,
             'segments_seen': self.segments_seen,
@@ -92,6 +102,6 @@ class Refits:
     def restore(self, saved: State) -> None:
         """Go on from a state."""
         self.pending_ns, self._last_ns = saved['pending_ns'], saved['last_ns']
-        self._last_name_ns = saved['last_name_ns']
+        self._later_ns, self._last_name_ns = saved['later_ns'], saved['last_name_ns']
         self._segments_at_request = saved['segments_at_request']
         self.segments_seen = saved['segments_seen']

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -68,8 +67,9 @@ NO_ROWS = WindowContents(
 
 @dataclass(slots=True)
 class _Aside:
-    """Rows that the clock had passed when it went back, and the segments among them."""
+    """Rows that the clock had passed when it went back to a time, and the segments among them."""
 
+    from_ns: int
     time_ns: IntArray
     number: IntArray
     data: FloatArray
@@ -91,15 +91,16 @@ class RollingWindow:
     Notes
     -----
     A clock that goes back may do so for good, or because a gateway has not heard the time yet.
-    So the rows it had passed are set aside. They come back when the time leaps over them, in
-    place of the rows since; they are let go when as many rows have come, or an hour of them.
+    So the rows it had passed are set aside. They come back when the time leaps over them by as
+    much as it went back, in place of the rows since; they are let go when as many rows have come,
+    or an hour of them.
     What a leap ahead puts outside the window stays among the last rows, so many as fill a
     window without gaps, and is inside again when the leap is taken back.
     """
 
     def __init__(self, window_s: float, period_s: float) -> None:
         self._window_ns = round(window_s * NS_PER_S)
-        self._step_ns = round(1.5 * period_s * NS_PER_S)
+        self._period_ns = round(period_s * NS_PER_S)
         self._doubt = max(1, math.ceil(_DOUBT_S / period_s))
         self._rows = max(16, math.ceil(window_s / period_s) + 1)
         # Rows are dropped a sixteenth of the window at a time.
@@ -140,11 +141,11 @@ class RollingWindow:
 
     @property
     def span_s(self) -> float:
-        """Return the time from the oldest row inside the window to the newest."""
+        """Return the time from the oldest row inside the window to the end of the newest."""
         if self._end == 0:
             return 0.0
-        oldest_ns = int(self._time_ns[self._held().start])
-        return min(int(self._time_ns[self._end - 1]) - oldest_ns, self._window_ns) / NS_PER_S
+        span_ns = int(self._time_ns[self._end - 1]) - int(self._time_ns[self._first()])
+        return (span_ns + self._period_ns) / NS_PER_S
 
     def append(
         self,
@@ -189,7 +190,7 @@ class RollingWindow:
             # What came since the clock went back before is neither here nor there.
             stop = cut + int(np.searchsorted(self._number[cut : self._end], old.number[0]))
         passed = _Aside(
-            self._time_ns[cut:stop].copy(), self._number[cut:stop].copy(),
+            time_ns, self._time_ns[cut:stop].copy(), self._number[cut:stop].copy(),
             self._data[:, cut:stop].copy(), [],
         )  # fmt: skip
         newest = -1 if stop == cut else int(passed.number[-1])
@@ -204,6 +205,7 @@ class RollingWindow:
         self._give_back_room()
         if old is not None:
             passed = _Aside(
+                min(time_ns, old.from_ns),
                 np.concatenate([passed.time_ns, old.time_ns]),
                 np.concatenate([passed.number, old.number]),
                 np.concatenate([passed.data, old.data], axis=1),
@@ -247,9 +249,14 @@ class RollingWindow:
         rows, aside = self._held(), self._aside
         return {
             'seen': self._seen,
-            **_plain(self._time_ns[rows], self._number[rows], self._data[:, rows], self._segments),
-            'aside': aside and _plain(aside.time_ns, aside.number, aside.data, aside.segments),
-        }
+            **_plain(
+                _Aside(
+                    0, self._time_ns[rows], self._number[rows], self._data[:, rows],
+                    list(self._segments),
+                )
+            ),
+            'aside': aside and _plain(aside),
+        }  # fmt: skip
 
     def restore(self, saved: State) -> None:
         """Go on from a state; raises `DataError` if it does not fit."""
@@ -285,7 +292,8 @@ class RollingWindow:
         self, aside: _Aside, time_ns: IntArray, number: IntArray, data: FloatArray, done: int
     ) -> int:
         """Append rows until it is settled whether the clock went back for good."""
-        since = self._end - int(np.searchsorted(self._number[: self._end], aside.number[-1]))
+        # Rows that a further step back has thrown out count too, or it would never be settled.
+        since = int(number[done] - aside.number[-1]) - 1
         enough = done + min(len(aside), self._doubt) - since
         over = done + int(np.searchsorted(time_ns[done:], aside.time_ns[-1], side='right'))
         until = min(enough, over, len(time_ns))
@@ -295,7 +303,8 @@ class RollingWindow:
         elif until == over and until < len(time_ns):
             before_ns = self._time_ns[self._end - 1] if self._end else 0
             self._aside = None
-            if time_ns[over] - before_ns > self._step_ns:
+            # Who returns leaps as far as the clock went back; less is a gap in the new time.
+            if time_ns[over] - before_ns > (aside.time_ns[-1] - aside.from_ns) // 2:
                 self._take_back(aside)
         return until
 
@@ -371,17 +380,16 @@ def _has(numbers: IntArray, number: int) -> bool:
     return place < len(numbers) and int(numbers[place]) == number
 
 
-def _plain(
-    time_ns: IntArray, number: IntArray, data: FloatArray, segments: Iterable[FoundSegment]
-) -> State:
+def _plain(rows: _Aside) -> State:
     """Return rows and segments as plain values; most units do not log the command."""
-    command = data[4]
+    command = rows.data[4]
     return {
-        'time_ns': time_ns.copy(),
-        'number': number.copy(),
-        'rows': data[:4].copy(),
+        'from_ns': rows.from_ns,
+        'time_ns': rows.time_ns.copy(),
+        'number': rows.number.copy(),
+        'rows': rows.data[:4].copy(),
         'command': command.copy() if np.isfinite(command).any() else np.empty(0),
-        'segments': [found_values(found) for found in segments],
+        'segments': [found_values(found) for found in rows.segments],
     }
 
 
@@ -393,4 +401,5 @@ def _rows_of(saved: State) -> _Aside:
         raise DataError('The saved state has rows of different lengths.')
     last = command if len(command) else np.full(n, np.nan)
     segments = [found_of(values) for values in saved['segments']]
-    return _Aside(time_ns, number, np.concatenate([rows, last[None]]), segments)
+    data = np.concatenate([rows, last[None]])
+    return _Aside(int(saved['from_ns']), time_ns, number, data, segments)

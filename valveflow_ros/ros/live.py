@@ -93,10 +93,12 @@ class LiveEngine:
 
     def request_diagnosis(self) -> list[Event]:
         """Ask for a diagnosis now; raises `DataError` where that makes no sense."""
+        self.monitor.check_clock()
         return self._pass_on(self.monitor.request_diagnosis())
 
     def request_fit(self) -> list[Event]:
         """Ask for a fit now; raises `DataError` where that makes no sense."""
+        self.monitor.check_clock()
         return self._pass_on(self.monitor.request_fit())
 
     def acknowledge(self) -> list[Event]:

@@ -141,7 +141,7 @@ def retrace(
             row for m in block
             for row in decoder.recorded(inputs[m.topic], m.data, m.publish_time_ns)
         ]  # fmt: skip
-        events = replayer.feed(engine.aligner.feed(Readings.of(rows)).table)
+        events = replayer.feed_aligned(engine.aligner.feed(Readings.of(rows)))
         for output in speaker.of(events):
             if told[output.name, output.time_ns]:
                 told[output.name, output.time_ns] -= 1

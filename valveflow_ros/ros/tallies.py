@@ -57,6 +57,8 @@ class Tally:
         elif number <= self._number:
             self.irregular += 1
             self._mixed = True
+            # What was taken for a gap may have been the step to the other one's numbers.
+            self.lost = min(self.lost, self._lost_before)
         elif not self._mixed and not self._anew:
             self.lost += number - self._number - 1
         self._number, self._anew = number, False
@@ -73,7 +75,7 @@ class Tally:
         self._lost_before = self.lost
         mixed = count > 1 or self.irregular > self._irregular_before
         # The last number may be that of the one which is gone.
-        self._anew = self._anew or (self._several and count <= 1)
+        self._anew = self._anew or (self._several and count <= 1) or count == 0
         self._mixed, self._several = mixed, count > 1
         self._irregular_before = self.irregular
 

@@ -224,7 +224,7 @@ def _began_elsewhere(
 
 def _fed(replayer: JournalReplayer, aligner: Aligner, rows: list[Row]) -> list[Event]:
     try:
-        return replayer.feed(aligner.feed(Readings.of(rows)).table)
+        return replayer.feed_aligned(aligner.feed(Readings.of(rows)))
     except (KeyError, ValveflowError) as error:
         raise _DifferenceError(
             f'The replay cannot follow the journal: {str(error).rstrip(".")}.'
