@@ -139,7 +139,7 @@ class InputHealth:
         topic = self.topics[name]
         rejected = self._new(self._rejected, info.topic, _rejected(counts))
         lost = self._new(self._lost, info.topic, tally.lost)
-        ahead, behind = self._stamps.look(info.topic)
+        ahead, behind = self._stamps.look(info.signal)
         if seen.wrong_types:
             kinds = ' and '.join(seen.wrong_types)
             return Level.ERROR, f'{topic} is published as {kinds}, which the monitor cannot take.'
@@ -187,7 +187,7 @@ class InputHealth:
     def _why(self, info: SignalInfo, counts: Mapping[str, int]) -> str:
         found = self._impossible.pop(info.topic, None)
         if found is None:
-            far = self._stamps.far(info.topic, self._newest_ns)
+            far = self._stamps.far(info.signal, self._newest_ns)
             if self._new(self._outliers, info.topic, counts['time_outlier']) and far:
                 return far
             reasons = [f'{r.replace("_", " ")} {counts[r]}' for r in _REJECTED if counts[r]]

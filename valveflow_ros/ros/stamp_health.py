@@ -8,6 +8,8 @@ from valveflow_ros.records import NS_PER_S, SIGNALS
 from valveflow_ros.report.numbers import duration
 from valveflow_ros.ros.inputs import Row
 
+_NONE = -(2**63)
+
 
 class StampHealth:
     """Remembers the stamps of each signal from one look to the next.
@@ -23,24 +25,26 @@ class StampHealth:
     def __init__(self, clock_jump_s: float, by_host: bool = True) -> None:
         self._jump_ns = round(clock_jump_s * NS_PER_S)
         self._by_host = by_host
-        self._last_ns: dict[str, int] = {}
-        self._lead_ns: dict[str, int] = {}
+        # By the signals' numbers: this is done for every message.
+        self._last_ns = [0] * len(SIGNALS)
+        self._lead_ns = [_NONE] * len(SIGNALS)
 
     def note(self, rows: Iterable[Row], host_ns: int) -> None:
         """Take the readings of a message and what this machine's clock shows."""
         for time_ns, number, _, _ in rows:
-            topic = SIGNALS[number].topic
-            self._last_ns[topic] = time_ns
-            self._lead_ns[topic] = max(time_ns - host_ns, self._lead_ns.get(topic, -(2**62)))
+            self._last_ns[number] = time_ns
+            lead_ns = time_ns - host_ns
+            if lead_ns > self._lead_ns[number]:
+                self._lead_ns[number] = lead_ns
 
-    def look(self, topic: str) -> tuple[str, str]:
+    def look(self, number: int) -> tuple[str, str]:
         """Return what is wrong with the stamps since the last look, and what is only odd.
 
         A stamp that is behind may be that of a recording which is played; none can be ahead.
         Both are empty where this machine's clock agrees.
         """
-        lead_ns = self._lead_ns.pop(topic, 0)
-        if not self._by_host or abs(lead_ns) <= self._jump_ns:
+        lead_ns, self._lead_ns[number] = self._lead_ns[number], _NONE
+        if not self._by_host or lead_ns == _NONE or abs(lead_ns) <= self._jump_ns:
             return '', ''
         if lead_ns < 0:
             off = duration(-lead_ns / NS_PER_S)
@@ -51,9 +55,9 @@ class StampHealth:
             '',
         )
 
-    def far(self, topic: str, newest_ns: int) -> str:
+    def far(self, number: int, newest_ns: int) -> str:
         """Return how far the last stamp is from the newest that counts; empty if it is near."""
-        off_ns = self._last_ns.get(topic, newest_ns) - newest_ns
+        off_ns = self._last_ns[number] - newest_ns
         if abs(off_ns) <= self._jump_ns:
             return ''
         off = duration(abs(off_ns) / NS_PER_S)
