@@ -26,6 +26,7 @@ def stopped_at(run, monkeypatch):
     """Run a verb and press Ctrl-C when its nth part begins, if it has so many."""
     # What a shell starts in the background ignores Ctrl-C, and so may this process.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setattr(sys, 'unraisablehook', sys.unraisablehook)
 
     def command(part, number, *words):
         seen: list[str] = []
@@ -103,6 +104,24 @@ def test_the_handlers_of_the_process_come_back(stopped_at, logs, identified, tmp
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     stopped_at(1, signal.SIGINT, *words_of('info', logs, identified, tmp_path))
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_what_a_library_has_half_made_is_cleared_away_without_a_word():
+    code = (
+        'import os, signal, sys\n'
+        'signal.signal(signal.SIGINT, signal.default_int_handler)\n'
+        'from valveflow_ros.cli import main\n'
+        'class Half:\n'
+        '    def __del__(self):\n'
+        '        self.close()\n'
+        'half = Half()\n'
+        'main.load = lambda name: os.kill(os.getpid(), signal.SIGINT)\n'
+        'sys.exit(main.main(["info", "x.mcap"]))'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (130, SAID)
 
 
 @pytest.mark.parametrize('seed', range(4))

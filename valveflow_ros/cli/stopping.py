@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -10,6 +11,10 @@ from types import FrameType
 
 # Whoever presses it twice means it once: what is cleaned up meanwhile is not to be cut.
 _ONCE_S = 2.0
+
+
+def _unheard(_: sys.UnraisableHookArgs) -> None:
+    """Say nothing."""
 
 
 class Stop:
@@ -30,6 +35,8 @@ class Stop:
         if self.number and now - self._at_s < _ONCE_S:
             return
         self.number, self._at_s = number, now
+        # What a library has half made complains when it is cleared away, until the process ends.
+        sys.unraisablehook = _unheard
         raise KeyboardInterrupt
 
     @contextmanager
