@@ -91,9 +91,9 @@ class RollingWindow:
     Notes
     -----
     A clock that goes back may do so for good, or because a gateway has not heard the time yet.
-    So the rows it had passed are set aside. They come back when the time leaps over them by as
-    much as it went back, in place of the rows since; they are let go when as many rows have come,
-    or an hour of them.
+    So the rows it had passed are set aside. They come back when the time leaps over them by at
+    least half of what it went back, in place of the rows since; they are let go when as many
+    rows have come, or an hour of them.
     What a leap ahead puts outside the window stays among the last rows, so many as fill a
     window without gaps, and is inside again when the leap is taken back.
     """
