@@ -19,13 +19,13 @@ import numpy as np
 
 from benchmarks.coverage_study import identify
 from valveflow_ros.config import Settings
-from valveflow_ros.core.chart import ChartDesign, ResidualChart
-from valveflow_ros.core.prediction import Predictor
-from valveflow_ros.core.run_length import block_means, design_chart
-from valveflow_ros.core.units import integrated_input
+from valveflow_ros.fit.chart import ChartDesign, ResidualChart
+from valveflow_ros.fit.run_length import block_means, design_chart
+from valveflow_ros.monitoring.prediction import Predictor
 from valveflow_ros.plant.random_unit import random_unit
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import NS_PER_S, Signal
+from valveflow_ros.signals.units import integrated_input
 
 RESULTS = Path(__file__).parent / 'results'
 _MOMENTS = 50

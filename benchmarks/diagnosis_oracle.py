@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.diagnosis.catalogue import catalogue
 from valveflow_ros.diagnosis.cause import Active
+from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.diagnose import Record
 from valveflow_ros.diagnosis.draws import held
 from valveflow_ros.diagnosis.evidence import colour

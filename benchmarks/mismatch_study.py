@@ -23,12 +23,12 @@ import numpy as np
 
 from benchmarks.diagnosis_cases import Case, hidden, null
 from valveflow_ros.config import PARAMETERS, Settings
-from valveflow_ros.core.events import CurveAdopted
-from valveflow_ros.core.mismatch import Mismatch
-from valveflow_ros.core.model import RegionalModel
-from valveflow_ros.core.monitor import Monitor
-from valveflow_ros.core.offline import feed_rows
-from valveflow_ros.core.prediction import PredictionBlock
+from valveflow_ros.curve.model import RegionalModel
+from valveflow_ros.monitoring.events import CurveAdopted
+from valveflow_ros.monitoring.mismatch import Mismatch
+from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.monitoring.offline import feed_rows
+from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import Signal
 

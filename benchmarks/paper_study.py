@@ -18,14 +18,14 @@ from pathlib import Path
 import numpy as np
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.align import Aligner
-from valveflow_ros.core.characteristic import Piece
-from valveflow_ros.core.events import FitRequested
-from valveflow_ros.core.fit import fit
-from valveflow_ros.core.monitor import Monitor
+from valveflow_ros.curve.characteristic import Piece
+from valveflow_ros.fit.fit import fit
+from valveflow_ros.monitoring.events import FitRequested
+from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.unit import paper_curve
 from valveflow_ros.records import Readings, SampleTable, table_to_readings
+from valveflow_ros.signals.align import Aligner
 
 RESULTS = Path(__file__).parent / 'results'
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from valveflow_ros.core.partition import partition
+from valveflow_ros.partition.partition import partition
 
 PIECES = 4
 Row = dict[str, object]

@@ -21,12 +21,12 @@ import numpy as np
 
 from benchmarks.segment_truth import Stretch, by_row, true_stretches
 from valveflow_ros.config import Settings
-from valveflow_ros.core.feeding import Rows
-from valveflow_ros.core.segmenter import Segmenter
+from valveflow_ros.monitoring.feeding import Rows
 from valveflow_ros.plant.recorder import SimulatedLog
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import SegmentKind
+from valveflow_ros.segments.segmenter import Segmenter
 
 RESULTS = Path(__file__).parent / 'results'
 RIGHT, FOUND = 0.9, 0.5

@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.selection_kinds import KINDS, Sampled, random_truth
-from valveflow_ros.core.partition import partition
-from valveflow_ros.core.selection import paper_rule, select
-from valveflow_ros.core.selection_series import Series
+from valveflow_ros.partition.partition import partition
+from valveflow_ros.partition.selection import paper_rule, select
+from valveflow_ros.partition.selection_series import Series
 
 RESULTS = Path(__file__).parent / 'results'
 N, MOST, SHARE = 2000, 10, 0.01

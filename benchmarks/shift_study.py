@@ -3,7 +3,7 @@
 Run: ``python -m benchmarks.shift_study --seeds 12 --first 101``. Each seed is twenty days of
 the paper's plant: the first ten give the reference, the second ten the current curve. Effects
 begin after day 16, so that the current window holds both the old plant and the new one. The
-factor in ``core/shift.py`` was fixed on seeds 1 to 12; the figures kept beside this file are of
+factor in ``curve/shift.py`` was fixed on seeds 1 to 12; the figures kept beside this file are of
 other seeds. ``--wander 1`` adds a slow disturbance of so many MW (time constant two hours).
 """
 
@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.characteristic import Characteristic
-from valveflow_ros.core.events import FitRequested, SegmentClosed
-from valveflow_ros.core.fit import fit
-from valveflow_ros.core.monitor import Monitor
-from valveflow_ros.core.shift import Shift, judge_shift
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.shift import Shift, judge_shift
+from valveflow_ros.fit.fit import fit
+from valveflow_ros.monitoring.events import FitRequested, SegmentClosed
+from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.plant.unit import UnitDescription

@@ -10,7 +10,7 @@ from typing import Any
 
 from docs.page_tables import table
 from docs.picture_data import DATA, commands
-from valveflow_ros.diagnosis import catalogue as causes
+from valveflow_ros.diagnosis import causes
 from valveflow_ros.plant import effects
 
 FAULTS = ('flatline', 'quantisation', 'spikes')
@@ -43,7 +43,7 @@ def part(name: str, which: str) -> str:
 
 
 def _docstring(name: str) -> str:
-    package = 'plant.effects' if name in FAULTS else 'diagnosis.catalogue'
+    package = 'plant.effects' if name in FAULTS else 'diagnosis.causes'
     path = Path(inspect.getfile(effects)).parents[2] / package.replace('.', '/') / f'{name}.py'
     source = path.read_text()
     return inspect.cleandoc(source.split('"""')[1])

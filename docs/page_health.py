@@ -10,7 +10,7 @@ from pathlib import Path
 from docs.page_tables import table
 
 _PACKAGE = Path(__file__).resolve().parent.parent / 'valveflow_ros'
-_NODE = _PACKAGE / 'ros'
+_NODE = _PACKAGE / 'ros' / 'node'
 
 _ABOUT = {
     'input …': 'one for each signal: is it there, in time, believable, complete',
@@ -86,7 +86,7 @@ def diagnostics() -> str:
 
 def reasons() -> str:
     """Return why a reading is not taken, from the comments of the aligner."""
-    source = (_PACKAGE / 'core' / 'align_kernel.py').read_text()
+    source = (_PACKAGE / 'signals' / 'align_kernel.py').read_text()
     block = source[source.index('REASONS = (') :].split(')')[0]
     rows = re.findall(r"'(\w+)',\s*# (.*)", block)
     return table(('counted as', 'means'), ((f'`{a.replace("_", " ")}`', b) for a, b in rows))

@@ -10,8 +10,8 @@ import numpy as np
 
 from benchmarks.load.monitor import Ears
 from benchmarks.load.sender import Stream
-from valveflow_ros.core.align import REASONS
 from valveflow_ros.logs import open_log
+from valveflow_ros.signals.align import REASONS
 
 _VALUE_AT = 4  # bytes before the value of a Float64
 

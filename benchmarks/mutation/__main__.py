@@ -50,15 +50,15 @@ _STATE = (
     'test/ros/test_ros_keeper.py',
 )
 TESTS: Mapping[str, tuple[str, ...]] = {
-    'valveflow_ros/logs/recorder.py': _RECORDER,
-    'valveflow_ros/logs/recorder_loop.py': _RECORDER,
-    'valveflow_ros/logs/ledger.py': _RECORDER,
-    'valveflow_ros/logs/recover.py': _RECOVER,
+    'valveflow_ros/logs/mcap/recorder.py': _RECORDER,
+    'valveflow_ros/logs/mcap/recorder_loop.py': _RECORDER,
+    'valveflow_ros/logs/mcap/ledger.py': _RECORDER,
+    'valveflow_ros/logs/mcap/recover.py': _RECOVER,
     'valveflow_ros/logs/part_file.py': (*_RECOVER, _RECORDER[-1]),
-    'valveflow_ros/logs/chunk_builder.py': (*_RECORDER, _RECOVER[-1]),
-    'valveflow_ros/ros/state_folder.py': _STATE,
-    'valveflow_ros/core/state_bytes.py': _STATE,
-    'valveflow_ros/core/state.py': (*_STATE, 'test/core/test_continuing.py'),
+    'valveflow_ros/logs/mcap/chunk_builder.py': (*_RECORDER, _RECOVER[-1]),
+    'valveflow_ros/ros/node/state_folder.py': _STATE,
+    'valveflow_ros/state_bytes.py': _STATE,
+    'valveflow_ros/state.py': (*_STATE, 'test/core/test_continuing.py'),
 }
 
 

@@ -38,9 +38,9 @@ class Work:
 
     def __init__(self, folder: Path) -> None:
         from valveflow_ros.config import Settings
-        from valveflow_ros.core.events import FitRequested
-        from valveflow_ros.core.monitor import Monitor
         from valveflow_ros.logs import open_log
+        from valveflow_ros.monitoring.events import FitRequested
+        from valveflow_ros.monitoring.monitor import Monitor
         from valveflow_ros.records import SampleTable
 
         self.folder = folder
@@ -55,7 +55,7 @@ class Work:
 
     def rows(self) -> None:
         """Feed a day of rows to the engine, without a fit."""
-        from valveflow_ros.core.monitor import Monitor
+        from valveflow_ros.monitoring.monitor import Monitor
 
         for _ in range(4):
             monitor, done = Monitor(self.settings), 0
@@ -64,7 +64,7 @@ class Work:
 
     def refit(self) -> None:
         """Fit the curve to a day."""
-        from valveflow_ros.core.fit import fit
+        from valveflow_ros.fit.fit import fit
 
         fit(self.task)
 
@@ -92,7 +92,7 @@ class Work:
 
     def aligner(self) -> None:
         """Put a day's readings into rows."""
-        from valveflow_ros.core.align import Aligner
+        from valveflow_ros.signals.align import Aligner
 
         for _ in range(2):
             aligner = Aligner(self.settings)

@@ -10,7 +10,7 @@ import lz4.frame
 import zstandard
 from log_files import FLOAT64, START_NS, STOCK, float64
 
-from valveflow_ros.logs.layout import (
+from valveflow_ros.logs.mcap.layout import (
     MAGIC,
     RECORD_HEAD,
     Op,

@@ -14,7 +14,8 @@ from benchmarks.torture.memory import MIB, peak, resident
 from benchmarks.torture.stock import stock_count
 from benchmarks.torture.trial import Options, Outcome
 from valveflow_ros.errors import RecordingError, ValveflowError
-from valveflow_ros.logs import RecordingWriter, open_log, recover
+from valveflow_ros.logs import RecordingWriter, open_log
+from valveflow_ros.logs.mcap import recover
 
 PER_CHUNK = 20
 FLIPS = 20_000

@@ -24,7 +24,7 @@ from valveflow_ros.logs import (
     open_log,
     recover_leftovers,
 )
-from valveflow_ros.logs.folder import METADATA_NAME
+from valveflow_ros.logs.mcap.folder import METADATA_NAME
 
 CALLS = 300
 BATCHES, PER_BATCH, ROTATE_EVERY = 30, 20, 3

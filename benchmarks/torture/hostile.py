@@ -15,7 +15,8 @@ from benchmarks.torture.memory import MIB
 from benchmarks.torture.trial import Options, Outcome
 from valveflow_ros.cli.main import main as valveflow
 from valveflow_ros.errors import ValveflowError
-from valveflow_ros.logs import open_log, recover
+from valveflow_ros.logs import open_log
+from valveflow_ros.logs.mcap import recover
 
 # A file of up to a mebibyte may cost so much CPU time, a larger one more in proportion.
 MOST_S = 2.0

@@ -11,7 +11,7 @@ import lz4.frame
 import zstandard
 
 from benchmarks.torture.bombs import chunk
-from valveflow_ros.logs.layout import CHUNK_HEAD, MAGIC, RECORD_HEAD, Op
+from valveflow_ros.logs.mcap.layout import CHUNK_HEAD, MAGIC, RECORD_HEAD, Op
 
 ODD = (0, 1, 2, 7, 8, 255, 256, 0x7FFF, 0xFFFF, 1 << 31, (1 << 32) - 1, 1 << 63, (1 << 64) - 1)
 LARGEST = 4 << 20

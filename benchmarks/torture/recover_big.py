@@ -10,7 +10,8 @@ from benchmarks.torture.bounded import run_bounded
 from benchmarks.torture.kill_child import TOPICS
 from benchmarks.torture.memory import MIB, peak
 from benchmarks.torture.trial import Options, Outcome
-from valveflow_ros.logs import RecordingWriter, recover
+from valveflow_ros.logs import RecordingWriter
+from valveflow_ros.logs.mcap import recover
 
 SECONDS = 3600
 RATE = 4000

@@ -13,19 +13,14 @@ import numpy as np
 from benchmarks.torture.memory import MIB, descriptors, peak, resident, threads
 from benchmarks.torture.trial import Options, Outcome
 from valveflow_ros.config import Settings
-from valveflow_ros.core.characteristic import Characteristic
-from valveflow_ros.core.events import (
-    DiagnosisRequested,
-    Event,
-    FitRequested,
-    SegmentClosed,
-)
-from valveflow_ros.core.fit_task import FitTask
-from valveflow_ros.core.monitor import Monitor
-from valveflow_ros.core.prediction import PredictionBlock
+from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.errors import DataError
+from valveflow_ros.fit.fit_task import FitTask
+from valveflow_ros.monitoring.events import DiagnosisRequested, Event, FitRequested, SegmentClosed
+from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.records import NS_PER_S, SampleTable
-from valveflow_ros.ros.memory import give_back
+from valveflow_ros.ros.worker.memory import give_back
 
 DAYS = 365
 PERIOD_DAYS = 30
@@ -125,7 +120,7 @@ class _Walk:
 
 def _fitted(task: FitTask) -> Any:
     # Loaded in the other process alone, as in the node.
-    from valveflow_ros.core.fit import fit
+    from valveflow_ros.fit.fit import fit
 
     try:
         return fit(task)

@@ -130,7 +130,7 @@ def test_full_opening_below_the_table_is_told(run, model, tmp_path):
 
 
 def test_an_inverse_that_is_not_exact_is_not_written(run, model, tmp_path, monkeypatch):
-    monkeypatch.setattr('valveflow_ros.core.compensation._identity', lambda curve: 0.5)
+    monkeypatch.setattr('valveflow_ros.curve.compensation._identity', lambda curve: 0.5)
     table = tmp_path / 't.csv'
     said = run('compensate', '--model', model(), '-o', table).refused()
     assert 'The inverse is not exact: F(F^-1(x)) differs from x by up to 0.5 MW' in said

@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 
-from valveflow_ros.core.units import UNITS
 from valveflow_ros.logs import open_log
 from valveflow_ros.records import SIGNALS, Signal
+from valveflow_ros.signals.units import UNITS
 
 HEADER = 'Zeit,Spare,CV,PS,TS,MW'
 OPTIONS = [

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from valveflow_ros.cli import historian
-from valveflow_ros.logs import open_log, table_file
+from valveflow_ros.logs import open_log
+from valveflow_ros.logs.tables.tables import table_file
 from valveflow_ros.records import Signal
 
 GERMAN = 'Zeitstempel;Ventilstellung;Frischdampfdruck;FD-Temperatur;Bruttoleistung;Drehzahl'

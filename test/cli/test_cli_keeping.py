@@ -7,13 +7,13 @@ from argparse import Namespace
 
 import pytest
 
+from valveflow_ros.baselines import comparison_json, validation_json
 from valveflow_ros.cli.console import Outcome
 from valveflow_ros.cli.file_marks import signed, writer
 from valveflow_ros.cli.files import write_texts
 from valveflow_ros.cli.keeping import REPORT, keep_others, renamed
 from valveflow_ros.cli.report_files import _others_pictures, with_report
-from valveflow_ros.compare import comparison_json, validation_json
-from valveflow_ros.core import characteristic_json, shift_json
+from valveflow_ros.curve import characteristic_json, shift_json
 from valveflow_ros.diagnosis import diagnosis_json
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.report.page import Figure, Page, Section

@@ -17,9 +17,9 @@ from valveflow_ros.cli.parameters import (
 )
 from valveflow_ros.cli.usage import UsageError
 from valveflow_ros.config import PARAMETERS, Settings, as_yaml
-from valveflow_ros.core.units import UNITS, convert
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.records import SIGNALS, Signal
+from valveflow_ros.signals.units import UNITS, convert
 
 
 @pytest.mark.parametrize('info', SIGNALS, ids=lambda i: i.topic)

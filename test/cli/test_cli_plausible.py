@@ -7,8 +7,8 @@ import pytest
 
 from valveflow_ros.cli.plausible import doubt
 from valveflow_ros.config import Settings
-from valveflow_ros.core.units import UNITS
 from valveflow_ros.records import SIGNALS, Signal
+from valveflow_ros.signals.units import UNITS
 
 USUAL = {
     Signal.VALVE_OPENING: (31.0, 94.0),

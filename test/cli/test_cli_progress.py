@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from valveflow_ros.cli import console
 from valveflow_ros.cli.pace import _PACES, pace_of
-from valveflow_ros.report.terminal_progress import Progress, in_words
+from valveflow_ros.report.terminal.terminal_progress import Progress, in_words
 
 
 class Clock:
@@ -158,7 +158,7 @@ def test_the_parts_of_a_pace_are_those_a_verb_tells(run, logs, identified, tmp_p
 def test_every_part_of_a_pace_is_told_somewhere():
     """Also those of the verbs that take too long to be run here."""
     root = Path(console.__file__).parents[1]
-    rooms = ('cli', 'core', 'compare', 'diagnosis')
+    rooms = ('cli', 'fit', 'monitoring', 'segments', 'baselines', 'diagnosis')
     text = ''.join(p.read_text() for room in rooms for p in root.glob(f'{room}/*.py')
                    if p.name != 'pace.py')  # fmt: skip
     for parts in _PACES.values():

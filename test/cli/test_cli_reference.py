@@ -7,7 +7,7 @@ import os
 
 import pytest
 
-from valveflow_ros.core.characteristic_json import from_json
+from valveflow_ros.curve.characteristic_json import from_json
 from valveflow_ros.logs import write_samples
 from valveflow_ros.plant.step_test import StepPlan, step_test
 

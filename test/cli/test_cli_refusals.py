@@ -11,7 +11,7 @@ import pytest
 from valveflow_ros.cli.files import check_folder
 from valveflow_ros.cli.usage import Parser, UsageError
 from valveflow_ros.cli.verbs import VERBS, load
-from valveflow_ros.report import terminal_number
+from valveflow_ros.report.terminal import terminal_number
 
 
 def options_of(verb: str) -> list[Action]:

@@ -9,10 +9,10 @@ from monitor_recording import START_NS, STOCK, TYPES, Monitor, cdr, diagnosis, r
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import open_log
-from valveflow_ros.logs.cdr import Decoder
-from valveflow_ros.logs.follow import Follower
-from valveflow_ros.logs.layout import Op
-from valveflow_ros.logs.seek import candidates
+from valveflow_ros.logs.mcap.cdr import Decoder
+from valveflow_ros.logs.mcap.follow import Follower
+from valveflow_ros.logs.mcap.layout import Op
+from valveflow_ros.logs.mcap.seek import candidates
 from valveflow_ros.logs.source import Source
 
 SECOND = 10**9

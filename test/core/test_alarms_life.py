@@ -11,11 +11,11 @@ from alarm_story import held_in
 from streams import START_NS
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.alarm_life import AlarmLife
-from valveflow_ros.core.alarms import AlarmState, Priority, ResidualAlarm
-from valveflow_ros.core.state_bytes import from_bytes, to_bytes
 from valveflow_ros.errors import DataError
+from valveflow_ros.monitoring.alarm_life import AlarmLife
+from valveflow_ros.monitoring.alarms import AlarmState, Priority, ResidualAlarm
 from valveflow_ros.records import NS_PER_S
+from valveflow_ros.state_bytes import from_bytes, to_bytes
 
 DAY_S = 86_400
 NORMAL, UNACKNOWLEDGED, _, RETURNED, SHELVED, SUPPRESSED, _ = AlarmState

@@ -11,7 +11,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from streams import INTERPRETED, START_NS, frozen
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.alarms import AlarmState, ResidualAlarm
+from valveflow_ros.monitoring.alarms import AlarmState, ResidualAlarm
 from valveflow_ros.records import NS_PER_S
 
 NORMAL, UNACKNOWLEDGED, ACKNOWLEDGED, RETURNED, SHELVED, SUPPRESSED, _ = AlarmState

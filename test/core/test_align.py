@@ -8,7 +8,6 @@ from naive_stream import NaiveAligner
 from streams import START_NS, blocks_of, cuts, examples, needs_jit
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.align import REASONS, Aligner
 from valveflow_ros.records import (
     N_SIGNALS,
     NS_PER_S,
@@ -19,6 +18,7 @@ from valveflow_ros.records import (
     Signal,
     table_to_readings,
 )
+from valveflow_ros.signals.align import REASONS, Aligner
 
 GOOD = [50.0, 10.0, 540.0, 200.0, 50.0]
 WRONG = [float('nan'), float('inf'), -float('inf'), 1e9, -1e9]

@@ -11,7 +11,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from streams import examples
 
-from valveflow_ros.core.characteristic import (
+from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
     Piece,
@@ -19,7 +19,7 @@ from valveflow_ros.core.characteristic import (
     ResidualStatistics,
     Source,
 )
-from valveflow_ros.core.characteristic_json import from_json, to_json
+from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.errors import DataError
 
 NAN, INF = math.nan, math.inf

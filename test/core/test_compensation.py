@@ -12,15 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import examples
 
-from valveflow_ros.core.characteristic import (
+from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
     Piece,
     ResidualStatistics,
     Source,
 )
-from valveflow_ros.core.compensation import compensate
-from valveflow_ros.core.inverse_points import spread, thin
+from valveflow_ros.curve.compensation import compensate
+from valveflow_ros.curve.inverse_points import spread, thin
 from valveflow_ros.errors import DataError, InputError
 
 

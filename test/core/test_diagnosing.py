@@ -11,12 +11,17 @@ from hypothesis import strategies as st
 from streams import blocks_of, cuts, examples
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.diagnosing import ALARM, ASKED, FITS_AGAIN, NIGHTLY, Diagnosing
-from valveflow_ros.core.events import Diagnosed, DiagnosisRequested, JournalEntry, JournalKind
-from valveflow_ros.core.mismatch import Misfit
-from valveflow_ros.core.window import RollingWindow, WindowContents
 from valveflow_ros.errors import DataError
+from valveflow_ros.monitoring.diagnosing import ALARM, ASKED, FITS_AGAIN, NIGHTLY, Diagnosing
+from valveflow_ros.monitoring.events import (
+    Diagnosed,
+    DiagnosisRequested,
+    JournalEntry,
+    JournalKind,
+)
+from valveflow_ros.monitoring.mismatch import Misfit
 from valveflow_ros.records import NS_PER_S
+from valveflow_ros.segments.window import RollingWindow, WindowContents
 
 HOUR_NS = 3600 * NS_PER_S
 DAY_NS = 24 * HOUR_NS

@@ -7,8 +7,8 @@ import pytest
 from streams import lagged, needs_jit
 from test_refine import START, TRUE, measured
 
-from valveflow_ros.core.input_errors import relative_noise
-from valveflow_ros.core.refine import refine
+from valveflow_ros.fit.input_errors import relative_noise
+from valveflow_ros.fit.refine import refine
 
 
 def wandering(rng, n):
@@ -60,7 +60,7 @@ def test_sensor_noise_makes_the_plant_slower_and_most_of_it_is_taken_back(monkey
     errors = {}
     for name in ('corrected', 'as it is'):
         if name == 'as it is':
-            monkeypatch.setattr('valveflow_ros.core.refine.corrected', lambda *args: args[2])
+            monkeypatch.setattr('valveflow_ros.fit.refine.corrected', lambda *args: args[2])
         errors[name] = []
         for seed in range(3):
             samples = measured(one, seed, n=16_000, noise=0.2)

@@ -20,24 +20,24 @@ from streams import (
 )
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.alarms import AlarmChange, AlarmState
-from valveflow_ros.core.chart import ResidualChart
-from valveflow_ros.core.curve_status import CurveStatus
-from valveflow_ros.core.events import (
+from valveflow_ros.errors import DataError, ParameterError
+from valveflow_ros.fit.chart import ResidualChart
+from valveflow_ros.fit.fit import fit
+from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState
+from valveflow_ros.monitoring.curve_status import CurveStatus
+from valveflow_ros.monitoring.events import (
     CurveAdopted,
     FitRequested,
     JournalEntry,
     JournalKind,
     SegmentClosed,
 )
-from valveflow_ros.core.fit import fit
-from valveflow_ros.core.monitor import Monitor
-from valveflow_ros.core.offline import CLOCK_BACK, feed_rows
-from valveflow_ros.core.prediction import PredictionBlock, PredictionState
-from valveflow_ros.core.segmenter import Segmenter
-from valveflow_ros.core.units import integrated_input
-from valveflow_ros.errors import DataError, ParameterError
+from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.monitoring.offline import CLOCK_BACK, feed_rows
+from valveflow_ros.monitoring.prediction import PredictionBlock, PredictionState
 from valveflow_ros.records import NS_PER_S, SampleTable, Signal
+from valveflow_ros.segments.segmenter import Segmenter
+from valveflow_ros.signals.units import integrated_input
 
 SETTINGS = Settings(QUICK_MONITOR)
 N = 700

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from valveflow_ros.core.normal_kernel import square_sum
-from valveflow_ros.core.whitening import normal_equations, whitened
+from valveflow_ros.fit.normal_kernel import square_sum
+from valveflow_ros.fit.whitening import normal_equations, whitened
 
 
 @settings(max_examples=40, deadline=None)

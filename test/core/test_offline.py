@@ -21,19 +21,19 @@ from streams import (
 )
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.align import Aligner
-from valveflow_ros.core.events import CurveAdopted, FitRequested, JournalEntry, JournalKind
-from valveflow_ros.core.fit import fit
-from valveflow_ros.core.monitor import Monitor
-from valveflow_ros.core.offline import (
+from valveflow_ros.errors import DataError, ValveflowError
+from valveflow_ros.fit.fit import fit
+from valveflow_ros.monitoring.events import CurveAdopted, FitRequested, JournalEntry, JournalKind
+from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.monitoring.offline import (
     CLOCK_BACK,
     JournalReplayer,
     align_all,
     feed_aligned,
     feed_rows,
 )
-from valveflow_ros.errors import DataError, ValveflowError
 from valveflow_ros.records import NS_PER_S, Readings, SampleTable, table_to_readings
+from valveflow_ros.signals.align import Aligner
 
 SETTINGS = Settings(QUICK_MONITOR)
 N = 700

@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from partition_kinds import KINDS, samples, valve
 
-from valveflow_ros.core.partition import partition
 from valveflow_ros.errors import DataError, ParameterError, TooFewSamplesError
+from valveflow_ros.partition.partition import partition
 
 COMPILED = not numba.config.DISABLE_JIT
 ROOT = Path(__file__).resolve().parents[2]
@@ -197,7 +197,7 @@ def test_differences_of_prefix_sums_find_an_optimum_that_does_not_exist():
 
 
 def test_a_cost_that_its_breaks_do_not_have_is_not_certified(monkeypatch):
-    from valveflow_ros.core import partition as module
+    from valveflow_ros.partition import partition as module
 
     right = module.best_partitions
 
@@ -366,7 +366,7 @@ def test_flat_y_costs_nothing():
 def test_it_runs_without_the_compiler():
     """Coverage is measured that way, and the loops must mean the same in plain Python."""
     code = (
-        'import numpy as np; from valveflow_ros.core.partition import partition;'
+        'import numpy as np; from valveflow_ros.partition.partition import partition;'
         'r = np.random.default_rng(1); u = r.uniform(size=150);'
         'p = partition(u, np.abs(u - .4) + .1 * r.normal(size=150), 4);'
         'print(p.certified, *(float(c).hex() for c in p.cost))'

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from partition_kinds import KINDS, samples
 
-from valveflow_ros.core import partition_layers
-from valveflow_ros.core.partition_layers import best_partitions, layers, prepare
-from valveflow_ros.core.partition_levels import make_levels
+from valveflow_ros.partition import partition_layers
+from valveflow_ros.partition.partition_layers import best_partitions, layers, prepare
+from valveflow_ros.partition.partition_levels import make_levels
 
 COMPILED = not numba.config.DISABLE_JIT
 PIECES = 10

@@ -10,9 +10,14 @@ from naive_stream import naive_curve, naive_respond
 from streams import START_NS, blocks_of, cuts, examples, frozen, grid_ns, steps_and_ramps
 from test_characteristic import DYNAMICS, curve
 
-from valveflow_ros.core.prediction import PredictionState, Predictor, no_prediction
-from valveflow_ros.core.segmenter_kernel import NO_DATA, SETTLED_SLOPE, SETTLED_STEADY, TRANSIENT
+from valveflow_ros.monitoring.prediction import PredictionState, Predictor, no_prediction
 from valveflow_ros.records import NS_PER_S
+from valveflow_ros.segments.segmenter_kernel import (
+    NO_DATA,
+    SETTLED_SLOPE,
+    SETTLED_STEADY,
+    TRANSIENT,
+)
 
 N = 260
 NAN = math.nan

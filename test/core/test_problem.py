@@ -6,11 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import examples
 
-from valveflow_ros.core import problem as module
-from valveflow_ros.core import whitening
-from valveflow_ros.core.model import RegionalModel
-from valveflow_ros.core.problem import Problem, Samples
-from valveflow_ros.core.whitening import normal_equations
+from valveflow_ros.curve.model import RegionalModel
+from valveflow_ros.fit import problem as module
+from valveflow_ros.fit import whitening
+from valveflow_ros.fit.problem import Problem, Samples
+from valveflow_ros.fit.whitening import normal_equations
 
 seeds = st.integers(0, 2**32 - 1)
 N = 3000

@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from partition_kinds import samples, valve
 
-from valveflow_ros.core.partition import partition
-from valveflow_ros.core.selection import paper_rule, select
 from valveflow_ros.errors import DataError, InputError, ParameterError
+from valveflow_ros.partition.partition import partition
+from valveflow_ros.partition.selection import paper_rule, select
 
 COMPILED = not numba.config.DISABLE_JIT
 N = 2000 if COMPILED else 150

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import START_NS, examples
 
-from valveflow_ros.core.characteristic import (
+from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
     Piece,
@@ -20,10 +20,10 @@ from valveflow_ros.core.characteristic import (
     ResidualStatistics,
     Source,
 )
-from valveflow_ros.core.line_error import curve_error, piece_error
-from valveflow_ros.core.segment_residual import segment_residuals
-from valveflow_ros.core.shift import ShiftLimits, judge_shift
-from valveflow_ros.core.shift_json import shift_json
+from valveflow_ros.curve.line_error import curve_error, piece_error
+from valveflow_ros.curve.segment_residual import segment_residuals
+from valveflow_ros.curve.shift import ShiftLimits, judge_shift
+from valveflow_ros.curve.shift_json import shift_json
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import NS_PER_S, SegmentKind, SpecialSegment
 

@@ -4,8 +4,8 @@ import threading
 
 import pytest
 
-from valveflow_ros.core import threads
-from valveflow_ros.core.threads import ahead, share
+from valveflow_ros import threads
+from valveflow_ros.threads import ahead, share
 
 
 @pytest.fixture(params=[1, 2, 4])

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from streams import examples
 
 from valveflow_ros.config import PARAMETERS
-from valveflow_ros.core.units import UNITS, convert, integrated_input, unit_of
 from valveflow_ros.errors import InputError
 from valveflow_ros.records import SIGNALS, Signal
+from valveflow_ros.signals.units import UNITS, convert, integrated_input, unit_of
 
 # The same state of a plant, told in every unit there is (NIST SP 811 for the definitions).
 SAME = {

@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from valveflow_ros.diagnosis import kernels, quality
-from valveflow_ros.diagnosis.catalogue import catalogue
 from valveflow_ros.diagnosis.cause import Active, Stage, Told
+from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.diagnosis_json import model_from_json, model_json
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import Task, base_mask, base_tangents, cause_tangents

@@ -10,8 +10,8 @@ from diagnosis_records import record, rough_model, table, unit
 from hypothesis import given
 from hypothesis import strategies as st
 
-from valveflow_ros.diagnosis.catalogue import catalogue
 from valveflow_ros.diagnosis.cause import Active, Kind
+from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.draws import beliefs, free, held
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import Task, whitening

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from valveflow_ros.diagnosis.catalogue import catalogue
 from valveflow_ros.diagnosis.cause import Active
+from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.diagnosis_json import cause_json
 from valveflow_ros.diagnosis.estimate import DAY_S, Estimate, dates
 from valveflow_ros.diagnosis.gain import Gain

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from valveflow_ros.logs.layout import MAGIC, RECORD_HEAD, Op
+from valveflow_ros.logs.mcap.layout import MAGIC, RECORD_HEAD, Op
 
 
 def records(raw: bytes) -> list[tuple[int, int, int]]:

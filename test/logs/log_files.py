@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from valveflow_ros.logs import LogContents, Message, RecordingWriter
-from valveflow_ros.logs.definitions import Definitions
+from valveflow_ros.logs.mcap.definitions import Definitions
 from valveflow_ros.records import SIGNALS, Readings, SampleTable, Signal
 
 START_NS = 1_700_000_000_000_000_000

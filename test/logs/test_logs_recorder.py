@@ -19,7 +19,7 @@ from valveflow_ros.logs import (
     RecorderState,
     open_log,
 )
-from valveflow_ros.logs.ledger import DROPS_SHOWN_S, Ledger
+from valveflow_ros.logs.mcap.ledger import DROPS_SHOWN_S, Ledger
 from valveflow_ros.logs.part_file import PartFile, is_held
 
 QUICK = RecorderSettings(
@@ -406,7 +406,7 @@ def test_a_leftover_that_cannot_be_read_holds_up_nothing(tmp_path, monkeypatch, 
         raise problem
 
     # The package's function of that name hides the module.
-    monkeypatch.setattr(sys.modules['valveflow_ros.logs.recover'], 'taken', fail)
+    monkeypatch.setattr(sys.modules['valveflow_ros.logs.mcap.recover'], 'taken', fail)
     recorder = recorder_of(folder)
     record(recorder, 0, 3)
     status = recorder.close()

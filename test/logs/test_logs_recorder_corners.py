@@ -26,14 +26,14 @@ from valveflow_ros.logs import (
     RecordingWriter,
     open_log,
     part_file,
-    recover,
     recover_leftovers,
 )
-from valveflow_ros.logs.layout import Op
-from valveflow_ros.logs.ledger import Ledger
+from valveflow_ros.logs.mcap import recover
+from valveflow_ros.logs.mcap.layout import Op
+from valveflow_ros.logs.mcap.ledger import Ledger
+from valveflow_ros.logs.mcap.recorder_loop import RecorderLoop
+from valveflow_ros.logs.mcap.writer import Message
 from valveflow_ros.logs.part_file import PartFile, taken
-from valveflow_ros.logs.recorder_loop import RecorderLoop
-from valveflow_ros.logs.writer import Message
 
 QUICK = RecorderSettings(flush_period_s=0.002, sync_period_s=0.0, retry_s=0.002, retry_max_s=0.01,
                          free_floor_bytes=0)  # fmt: skip

@@ -24,14 +24,14 @@ from valveflow_ros.logs import (
     RecorderState,
     RecordingWriter,
     open_log,
-    recorder_loop,
 )
-from valveflow_ros.logs.chunk_builder import ChunkBuilder
-from valveflow_ros.logs.compression import ZSTD, Unpacker
-from valveflow_ros.logs.layout import CHUNK_HEAD, RECORD_HEAD, Op
-from valveflow_ros.logs.ledger import DROPS_SHOWN_S, Ledger
-from valveflow_ros.logs.qos import Qos
-from valveflow_ros.logs.recorder_loop import NewTopic, RecorderLoop
+from valveflow_ros.logs.mcap import recorder_loop
+from valveflow_ros.logs.mcap.chunk_builder import ChunkBuilder
+from valveflow_ros.logs.mcap.compression import ZSTD, Unpacker
+from valveflow_ros.logs.mcap.layout import CHUNK_HEAD, RECORD_HEAD, Op
+from valveflow_ros.logs.mcap.ledger import DROPS_SHOWN_S, Ledger
+from valveflow_ros.logs.mcap.qos import Qos
+from valveflow_ros.logs.mcap.recorder_loop import NewTopic, RecorderLoop
 
 STEP_S = 7.0
 

@@ -11,8 +11,9 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs import RecordingWriter, open_log, recover, recover_leftovers
-from valveflow_ros.logs.layout import Op
+from valveflow_ros.logs import RecordingWriter, open_log, recover_leftovers
+from valveflow_ros.logs.mcap import recover
+from valveflow_ros.logs.mcap.layout import Op
 from valveflow_ros.logs.part_file import is_held
 
 DIE_WRITING = """

@@ -10,9 +10,10 @@ import pytest
 from log_files import FLOAT64, START_NS, STOCK, float64
 
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs import LogContents, RecordingWriter, messages_since, open_log, since
-from valveflow_ros.logs.folder import Split, finished_files
-from valveflow_ros.logs.writer import Message
+from valveflow_ros.logs import LogContents, RecordingWriter, messages_since, open_log
+from valveflow_ros.logs.mcap import since
+from valveflow_ros.logs.mcap.folder import Split, finished_files
+from valveflow_ros.logs.mcap.writer import Message
 
 N = 900
 

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from valveflow_ros.logs.layout import LayoutError, Op
-from valveflow_ros.logs.walk import walk
+from valveflow_ros.logs.mcap.layout import LayoutError, Op
+from valveflow_ros.logs.mcap.walk import walk
 
 
 def naive_walk(content):

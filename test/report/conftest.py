@@ -9,7 +9,7 @@ import pytest
 from chromium import BROWSERS, Chromium, installed
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.characteristic import (
+from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
     Piece,

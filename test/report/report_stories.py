@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from valveflow_ros.core.alarm_records import AlarmState
-from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.curve.model import RegionalModel
 from valveflow_ros.diagnosis.estimate import Estimate
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.gain import Gain, SegmentGain
@@ -13,6 +12,7 @@ from valveflow_ros.diagnosis.residual_map import ResidualMap
 from valveflow_ros.diagnosis.result import NAMED, Diagnosis, NamedCause
 from valveflow_ros.diagnosis.scene import Reference
 from valveflow_ros.diagnosis.signature import Answer, Signature
+from valveflow_ros.monitoring.alarm_records import AlarmState
 from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.diagnosis import Diagnosed
 from valveflow_ros.report.history_data import AlarmMoment, CurveMoment, DiagnosisMoment, History

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from report_stories import diagnosed, diagnosis
 
-from valveflow_ros.core.characteristic import HeldCause
-from valveflow_ros.diagnosis import catalogue
+from valveflow_ros.curve.characteristic import HeldCause
+from valveflow_ros.diagnosis import causes
 from valveflow_ros.diagnosis.result import NOTHING
 from valveflow_ros.report.diagnosis import diagnosis_page
 from valveflow_ros.report.diagnosis_words import axis_titles, points_to
@@ -104,7 +104,7 @@ def test_a_held_cause_is_told_without_a_number_of_days():
 
 def test_causes_counted_from_the_mean_are_those_of_the_catalogue_that_change_with_time():
     counted = set()
-    for module in Path(catalogue.__file__).parent.glob('[!_]*.py'):
+    for module in Path(causes.__file__).parent.glob('[!_]*.py'):
         taken = re.search(r'catalogue\._time import (.+)', module.read_text('utf-8'))
         if taken and {'change', 'ramp', 'since'} & set(taken[1].split(', ')):
             counted.add(module.stem)

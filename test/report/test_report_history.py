@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from report_stories import HOUR_NS, KNOTS, START_NS, STEP_MW, history
 
-from valveflow_ros.core.alarm_records import AlarmState
+from valveflow_ros.monitoring.alarm_records import AlarmState
 from valveflow_ros.report.history import (
     curve_history_figure,
     followed,

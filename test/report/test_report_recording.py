@@ -10,8 +10,8 @@ from mcap_ros2.writer import Writer
 from report_stories import HOUR_NS, START_NS, history
 
 from valveflow_ros.cli.monitor_history import history_in
-from valveflow_ros.core.alarm_records import AlarmState
 from valveflow_ros.logs import Definitions, open_log
+from valveflow_ros.monitoring.alarm_records import AlarmState
 from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.history_data import AlarmMoment
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from valveflow_ros.core.shift import judge_shift
-from valveflow_ros.core.units import integrated_input
+from valveflow_ros.curve.shift import judge_shift
 from valveflow_ros.records import Signal
 from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.identification import identification_report
 from valveflow_ros.report.segment_figure import segments_figure
 from valveflow_ros.report.shift import shift_section
+from valveflow_ros.signals.units import integrated_input
 
 
 def with_means(data):

@@ -9,11 +9,11 @@ import re
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from valveflow_ros.report import terminal_text
-from valveflow_ros.report.terminal_canvas import DOTS_X, DOTS_Y, Canvas
-from valveflow_ros.report.terminal_changes import changes
-from valveflow_ros.report.terminal_draw import screen
-from valveflow_ros.report.terminal_frame import (
+from valveflow_ros.report.terminal import terminal_text
+from valveflow_ros.report.terminal.terminal_canvas import DOTS_X, DOTS_Y, Canvas
+from valveflow_ros.report.terminal.terminal_changes import changes
+from valveflow_ros.report.terminal.terminal_draw import screen
+from valveflow_ros.report.terminal.terminal_frame import (
     AlarmView,
     CurveView,
     DiagnosisView,
@@ -21,7 +21,7 @@ from valveflow_ros.report.terminal_frame import (
     HealthView,
     SampleView,
 )
-from valveflow_ros.report.terminal_text import cells, clean, cut, painted, wrapped
+from valveflow_ros.report.terminal.terminal_text import cells, clean, cut, painted, wrapped
 
 SECOND = 10**9
 START = 1_700_000_000 * SECOND

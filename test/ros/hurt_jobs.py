@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from valveflow_ros.config import Settings
-from valveflow_ros.ros.warmup import made_up_curve
+from valveflow_ros.ros.node.warmup import made_up_curve
 
 
 def good(task: Any) -> Any:
@@ -92,7 +92,7 @@ def told(task: Any) -> Any:
 
 def diagnosed(task: Any) -> Any:
     """Return a small diagnosis at once."""
-    from valveflow_ros.core.diagnosis_task import DiagnosisContent
+    from valveflow_ros.monitoring.diagnosis_task import DiagnosisContent
 
     content = {
         'verdict': 'nothing', 'sentence': 'The model explains the unit.', 'causes': [],

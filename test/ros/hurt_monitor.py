@@ -16,7 +16,7 @@ from typing import Any
 
 from valveflow_ros.logs.part_file import PartFile
 from valveflow_ros.ros import monitor_main
-from valveflow_ros.ros.monitor_node import MonitorNode
+from valveflow_ros.ros.node.monitor_node import MonitorNode
 from valveflow_ros.ros.taking import Taker
 
 HOLD, HELD = Path('hold'), Path('held')

@@ -25,16 +25,16 @@ from valveflow_msgs.msg import (
 from valveflow_msgs.msg import JournalEntry as JournalMessage
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.alarms import AlarmChange, AlarmState, Priority
-from valveflow_ros.core.curve_status import CurveStatus
-from valveflow_ros.core.events import JournalEntry, JournalKind
-from valveflow_ros.core.prediction import PredictionBlock, PredictionState
+from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState, Priority
+from valveflow_ros.monitoring.curve_status import CurveStatus
+from valveflow_ros.monitoring.events import JournalEntry, JournalKind
+from valveflow_ros.monitoring.prediction import PredictionBlock, PredictionState
 from valveflow_ros.records import NS_PER_S, Quality, SegmentKind
 from valveflow_ros.records import SpecialSegment as SegmentRecord
 from valveflow_ros.ros import conversions
 from valveflow_ros.ros.encoding import encode
+from valveflow_ros.ros.node.warmup import made_up_curve
 from valveflow_ros.ros.prediction_bytes import prediction_bytes
-from valveflow_ros.ros.warmup import made_up_curve
 from valveflow_ros.ros.wire import clock_bytes, float64_bytes
 
 times = st.integers(0, (1 << 31) * NS_PER_S - 1)

@@ -19,33 +19,33 @@ from test_ros_live import SlowWorker, rows_of
 from valveflow_msgs.msg import Diagnosis
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.align import Aligner
-from valveflow_ros.core.diagnosis_task import DiagnosisTask
-from valveflow_ros.core.events import (
+from valveflow_ros.errors import DataError
+from valveflow_ros.monitoring.diagnosis_task import DiagnosisTask
+from valveflow_ros.monitoring.events import (
     Diagnosed,
     DiagnosisRequested,
     Event,
     JournalEntry,
     JournalKind,
 )
-from valveflow_ros.core.monitor import Monitor
-from valveflow_ros.core.offline import JournalReplayer
-from valveflow_ros.errors import DataError
+from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.monitoring.offline import JournalReplayer
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import NS_PER_S, Readings, table_to_readings
 from valveflow_ros.ros import diagnosis_message
 from valveflow_ros.ros.chronicle import line_of
-from valveflow_ros.ros.diagnosis_health import diagnosis_item, model_item
 from valveflow_ros.ros.diagnostics import Level
-from valveflow_ros.ros.live import LiveEngine
-from valveflow_ros.ros.monitor_node import MonitorNode
+from valveflow_ros.ros.node.diagnosis_health import diagnosis_item, model_item
+from valveflow_ros.ros.node.live import LiveEngine
+from valveflow_ros.ros.node.monitor_node import MonitorNode
+from valveflow_ros.ros.node.warmup import made_up_curve, made_up_task
 from valveflow_ros.ros.outputs import Output, Outputs
 from valveflow_ros.ros.simulator_steps import effects_of
 from valveflow_ros.ros.verify import diagnosed_elsewhere
-from valveflow_ros.ros.warmup import made_up_curve, made_up_task
-from valveflow_ros.ros.worker import DiagnosisWorker
-from valveflow_ros.ros.worker_child import answer
+from valveflow_ros.ros.worker.worker import DiagnosisWorker
+from valveflow_ros.ros.worker.worker_child import answer
+from valveflow_ros.signals.align import Aligner
 
 pytestmark = pytest.mark.usefixtures('jobs_on_path')
 STEP_S, FAULT_DAYS = 10.0, 0.5

@@ -27,8 +27,8 @@ from std_srvs.srv import Trigger
 from valveflow_msgs.msg import Alarm, Diagnosis, FlowCharacteristic, JournalEntry, Prediction
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.events import JournalKind
 from valveflow_ros.logs import LogContents, RecordingWriter, open_log
+from valveflow_ros.monitoring.events import JournalKind
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import SIGNALS, SampleTable, Signal

@@ -14,18 +14,18 @@ import numpy as np
 import pytest
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.events import CurveAdopted
-from valveflow_ros.core.state_bytes import from_bytes, to_bytes
 from valveflow_ros.errors import DataError, RecordingError
-from valveflow_ros.ros.continuity import Continuity
+from valveflow_ros.monitoring.events import CurveAdopted
 from valveflow_ros.ros.diagnostics import Level
-from valveflow_ros.ros.keeper import Keeper, folder_of
-from valveflow_ros.ros.live import LiveEngine
-from valveflow_ros.ros.outcome import Outcome
+from valveflow_ros.ros.node.continuity import Continuity
+from valveflow_ros.ros.node.keeper import Keeper, folder_of
+from valveflow_ros.ros.node.live import LiveEngine
+from valveflow_ros.ros.node.recording import Recording
+from valveflow_ros.ros.node.state_folder import ASIDE, STATE, StateFolder, StateWriter
+from valveflow_ros.ros.node.warmup import made_up_curve
 from valveflow_ros.ros.outputs import Outputs
-from valveflow_ros.ros.recording import Recording
-from valveflow_ros.ros.state_folder import ASIDE, STATE, StateFolder, StateWriter
-from valveflow_ros.ros.warmup import made_up_curve
+from valveflow_ros.ros.worker.outcome import Outcome
+from valveflow_ros.state_bytes import from_bytes, to_bytes
 
 ENGINE = {'numbers': np.arange(3.0)}
 
@@ -210,8 +210,8 @@ _WRITES = """
 import itertools, os, sys
 import numpy as np
 from pathlib import Path
-from valveflow_ros.core.state_bytes import to_bytes
-from valveflow_ros.ros.state_folder import StateFolder
+from valveflow_ros.state_bytes import to_bytes
+from valveflow_ros.ros.node.state_folder import StateFolder
 for line in iter(sys.stdin.readline, ''):
     child = os.fork()
     if child:

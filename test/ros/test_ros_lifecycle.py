@@ -19,8 +19,9 @@ from std_srvs.srv import Trigger
 
 from valveflow_ros.config import TABLE
 from valveflow_ros.logs import open_log
-from valveflow_ros.ros import monitor_node, simulator_steps
-from valveflow_ros.ros.monitor_node import MonitorNode
+from valveflow_ros.ros import simulator_steps
+from valveflow_ros.ros.node import monitor_node
+from valveflow_ros.ros.node.monitor_node import MonitorNode
 
 pytestmark = pytest.mark.ros
 DONE = TransitionCallbackReturn.SUCCESS

@@ -14,10 +14,10 @@ from valveflow_ros.config import Settings
 from valveflow_ros.diagnosis.model_json import to_json
 from valveflow_ros.errors import ParameterError, RecordingError
 from valveflow_ros.logs import open_log
-from valveflow_ros.ros import model_file
 from valveflow_ros.ros import verify as verifying
 from valveflow_ros.ros.demo_processes import ros_arguments
-from valveflow_ros.ros.session import Session
+from valveflow_ros.ros.node import model_file
+from valveflow_ros.ros.node.session import Session
 
 HELD = {'backlash': {'w_percent': 0.5}, 'gain_drift': {'g': 0.05}, 'clock': {'d_s': 3.0}}
 

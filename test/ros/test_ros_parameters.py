@@ -17,7 +17,7 @@ from valveflow_ros.errors import ParameterError
 from valveflow_ros.ros import monitor_main
 from valveflow_ros.ros.declare import changed, declare, descriptor, unknown_overrides
 from valveflow_ros.ros.diagnostics import Level
-from valveflow_ros.ros.monitor_node import MonitorNode
+from valveflow_ros.ros.node.monitor_node import MonitorNode
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).resolve().parents[2]

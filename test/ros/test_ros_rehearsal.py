@@ -10,8 +10,8 @@ pytest.importorskip('rclpy')
 from ros_helpers import wait_until
 from test_ros_worker import TASK, worker
 
-from valveflow_ros.core.characteristic import Characteristic
-from valveflow_ros.ros.worker import FitWorker
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.ros.worker.worker import FitWorker
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures('jobs_on_path')]
 

@@ -10,11 +10,11 @@ import pytest
 pytest.importorskip('rclpy')
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.align import Aligner
-from valveflow_ros.core.monitor import Monitor
 from valveflow_ros.logs import LoggedMessage
+from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.ros.node.resuming import Earlier, retrace
 from valveflow_ros.ros.outputs import Output
-from valveflow_ros.ros.resuming import Earlier, retrace
+from valveflow_ros.signals.align import Aligner
 
 NAMES = {'/m/characteristic': 'characteristic', '/m/breakpoints': 'breakpoints'}
 LOG_NS = 1_700_000_000_000_000_000

@@ -24,12 +24,12 @@ from valveflow_ros.config import TABLE, Settings
 from valveflow_ros.errors import ParameterError, RecordingError, ValveflowError
 from valveflow_ros.logs import Recorder, RecorderSettings, open_log
 from valveflow_ros.ros import monitor_main, replay_main, secure_start, simulator_main
-from valveflow_ros.ros.model_file import extended_of
-from valveflow_ros.ros.monitor_node import MonitorNode
-from valveflow_ros.ros.recording import Recording, new_folder
-from valveflow_ros.ros.reference_file import reference_of
+from valveflow_ros.ros.node.model_file import extended_of
+from valveflow_ros.ros.node.monitor_node import MonitorNode
+from valveflow_ros.ros.node.recording import Recording, new_folder
+from valveflow_ros.ros.node.reference_file import reference_of
+from valveflow_ros.ros.node.state_folder import LOCK, STATE, StateFolder
 from valveflow_ros.ros.secure_start import InsecureError, check_security
-from valveflow_ros.ros.state_folder import LOCK, STATE, StateFolder
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).resolve().parents[2]

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.state import put_back
-from valveflow_ros.core.state_bytes import from_bytes, to_bytes
 from valveflow_ros.errors import DataError, RecordingError
-from valveflow_ros.logs import recorder
-from valveflow_ros.ros import state_folder
-from valveflow_ros.ros.keeper import Keeper
-from valveflow_ros.ros.state_folder import STATE, InUseError, StateFolder, StateWriter
-from valveflow_ros.ros.warmup import made_up_curve
+from valveflow_ros.logs.mcap import recorder
+from valveflow_ros.ros.node import state_folder
+from valveflow_ros.ros.node.keeper import Keeper
+from valveflow_ros.ros.node.state_folder import STATE, InUseError, StateFolder, StateWriter
+from valveflow_ros.ros.node.warmup import made_up_curve
+from valveflow_ros.state import put_back
+from valveflow_ros.state_bytes import from_bytes, to_bytes
 
 CURVE = made_up_curve(Settings()).with_id()
 

@@ -22,12 +22,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.state import ArrayMemory, copies, put_back
-from valveflow_ros.core.state_bytes import FORMAT, VERSION, from_bytes, to_bytes
 from valveflow_ros.errors import DataError, RecordingError
-from valveflow_ros.ros import state_folder
-from valveflow_ros.ros.state_folder import LOCK, STATE, InUseError, StateFolder, StateWriter
-from valveflow_ros.ros.warmup import made_up_curve
+from valveflow_ros.ros.node import state_folder
+from valveflow_ros.ros.node.state_folder import LOCK, STATE, InUseError, StateFolder, StateWriter
+from valveflow_ros.ros.node.warmup import made_up_curve
+from valveflow_ros.state import ArrayMemory, copies, put_back
+from valveflow_ros.state_bytes import FORMAT, VERSION, from_bytes, to_bytes
 
 CURVE = made_up_curve(Settings()).with_id()
 

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.align import Aligned, Aligner
-from valveflow_ros.core.corrector import Corrector
+from valveflow_ros.monitoring.corrector import Corrector
 from valveflow_ros.records import IntArray, Readings, SampleTable
+from valveflow_ros.signals.align import Aligned, Aligner
 
 Progress = Callable[[float, str], None]
 _BLOCK = 200_000  # readings between two looks at the progress bar

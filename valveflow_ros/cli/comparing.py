@@ -7,15 +7,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from valveflow_ros.baselines.comparison import compare
+from valveflow_ros.baselines.comparison_json import to_json
+from valveflow_ros.baselines.data import other_data, samples_of
+from valveflow_ros.baselines.truth import Truth
 from valveflow_ros.cli import engine
 from valveflow_ros.cli.console import Console, Outcome
 from valveflow_ros.cli.mapping import Mapping as Columns
 from valveflow_ros.cli.report_words import columns
 from valveflow_ros.cli.watching import Seen, cut_in_two, read, see
-from valveflow_ros.compare.comparison import compare
-from valveflow_ros.compare.comparison_json import to_json
-from valveflow_ros.compare.data import other_data, samples_of
-from valveflow_ros.compare.truth import Truth
 from valveflow_ros.config import PARAMETERS
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.report.comparison_csv import curves_csv, parameters_csv, segments_csv

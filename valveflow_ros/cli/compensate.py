@@ -7,7 +7,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.report.terminal_number import number, whole
+from valveflow_ros.report.terminal.terminal_number import number, whole
 
 _DESCRIPTION = """\
 Write the inverse of a flow characteristic as a table: the integrated input u that gives a
@@ -67,7 +67,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     from valveflow_ros.cli.files import check_output
     from valveflow_ros.cli.model_file import read_model
     from valveflow_ros.cli.outputs import TABLES
-    from valveflow_ros.core.compensation import Compensation, compensate
+    from valveflow_ros.curve.compensation import Compensation, compensate
 
     check_output(options.output, TABLES, source=options.model, overwrite=options.overwrite)
     curve = read_model(options.model)

@@ -6,7 +6,7 @@ from bisect import bisect_left
 from collections.abc import Callable
 
 from valveflow_ros.cli.compensation_table import within
-from valveflow_ros.core.compensation import Compensation, corner_count
+from valveflow_ros.curve.compensation import Compensation, corner_count
 from valveflow_ros.errors import DataError
 from valveflow_ros.report.numbers import counted
 

@@ -13,7 +13,7 @@ import numpy as np
 from valveflow_ros.cli.console import Outcome
 from valveflow_ros.cli.files import whole_file
 from valveflow_ros.cli.report_words import columns
-from valveflow_ros.core.compensation import Compensation
+from valveflow_ros.curve.compensation import Compensation
 from valveflow_ros.records import FloatArray
 from valveflow_ros.report.numbers import counted, decimals, plain
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, TextIO
 
 from valveflow_ros.cli.pace import pace_of
-from valveflow_ros.report.terminal_progress import Progress
+from valveflow_ros.report.terminal.terminal_progress import Progress
 
 # What commands a terminal, or turns the order of what it shows: all but tabs and line feeds.
 _COMMANDS = re.compile('[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]')

@@ -7,9 +7,9 @@ import numpy as np
 from valveflow_ros.cli.plausible import limits
 from valveflow_ros.cli.usage import UsageError
 from valveflow_ros.config import Settings
-from valveflow_ros.core.unit_table import UNITS
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import SIGNALS, Quality, Readings, Signal
+from valveflow_ros.signals.unit_table import UNITS
 
 
 def check_constants(constants: dict[Signal, float]) -> None:

@@ -20,9 +20,8 @@ from valveflow_ros.cli.monitor_history import history_in
 from valveflow_ros.cli.parameters import settings_for
 from valveflow_ros.cli.report_words import columns
 from valveflow_ros.config import Settings
-from valveflow_ros.core.characteristic import Characteristic
-from valveflow_ros.core.corrector import Corrector
-from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.model import RegionalModel
 from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.diagnose import Record, diagnose
 from valveflow_ros.diagnosis.diagnosis_json import model_json, to_json
@@ -32,6 +31,7 @@ from valveflow_ros.diagnosis.on_top import on_top
 from valveflow_ros.diagnosis.result import NAMED, NOTHING, UNEXPLAINED, Diagnosis
 from valveflow_ros.diagnosis.views import Views, views
 from valveflow_ros.errors import DataError
+from valveflow_ros.monitoring.corrector import Corrector
 from valveflow_ros.records import SIGNALS, IntArray, SampleTable
 from valveflow_ros.report.diagnosis import Diagnosed
 from valveflow_ros.report.diagnosis_words import cells

@@ -11,8 +11,8 @@ _LARGE_BYTES = 20_000_000  # less than this is read before anybody has to wait
 
 def first_facts(path: Path) -> str:
     """Return a sentence from the summary of a large finished recording, else nothing."""
+    from valveflow_ros.logs.mcap.summary import read_summary
     from valveflow_ros.logs.source import Source
-    from valveflow_ros.logs.summary import read_summary
     from valveflow_ros.report.numbers import count, duration, moment
 
     if path.suffix.lower() != '.mcap':

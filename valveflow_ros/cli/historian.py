@@ -25,11 +25,10 @@ from valveflow_ros.cli.log_input import (
 from valveflow_ros.cli.mapping import Mapping
 from valveflow_ros.cli.plausible import doubt
 from valveflow_ros.config import Settings
-from valveflow_ros.core.unit_table import convert
 from valveflow_ros.errors import DataError, InputError, RecordingError
-from valveflow_ros.logs.historian_refusal import RefusedError
 from valveflow_ros.logs.reader import TABLE_SUFFIXES
-from valveflow_ros.logs.table_reader import RawBlock, TableReader
+from valveflow_ros.logs.tables.historian_refusal import RefusedError
+from valveflow_ros.logs.tables.table_reader import RawBlock, TableReader
 from valveflow_ros.records import (
     SIGNALS,
     ByteArray,
@@ -42,6 +41,7 @@ from valveflow_ros.records import (
     table_to_readings,
 )
 from valveflow_ros.report.quality import gaps
+from valveflow_ros.signals.unit_table import convert
 
 _ROWS = 200_000  # in memory at a time
 _BY_COLUMN = {info.column: info for info in SIGNALS}

@@ -9,7 +9,7 @@ from typing import TypeVar
 from valveflow_ros.cli.mapping import Constant, Mapping, read_mapping
 from valveflow_ros.cli.usage import UsageError
 from valveflow_ros.errors import ValveflowError
-from valveflow_ros.logs.historian_refusal import THEIRS, RefusedError, Remedy
+from valveflow_ros.logs.tables.historian_refusal import THEIRS, RefusedError, Remedy
 
 Result = TypeVar('Result')
 _TABLE = {'time-zone': 'time_zone', 'date-order': 'date_order', 'decimal': 'decimal',

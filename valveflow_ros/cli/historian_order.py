@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from valveflow_ros.logs.tables import order_note
+from valveflow_ros.logs.tables.tables import order_note
 from valveflow_ros.records import IntArray
 
 

@@ -19,16 +19,16 @@ from valveflow_ros.cli.monitor_history import history_in
 from valveflow_ros.cli.parameters import settings_for
 from valveflow_ros.cli.report_words import columns, rejected_words
 from valveflow_ros.config import Settings
-from valveflow_ros.core.characteristic import Characteristic
-from valveflow_ros.core.characteristic_json import to_json
-from valveflow_ros.core.corrector import Corrector
-from valveflow_ros.core.shift import ShiftLimits, judge_shift
-from valveflow_ros.core.shift_json import shift_json
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.characteristic_json import to_json
+from valveflow_ros.curve.shift import ShiftLimits, judge_shift
+from valveflow_ros.curve.shift_json import shift_json
 from valveflow_ros.diagnosis import model_json
 from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.extended_model import ExtendedModel
 from valveflow_ros.errors import DataError
+from valveflow_ros.monitoring.corrector import Corrector
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.answer import doubt, explained, opening_gain, temperature_words
 from valveflow_ros.report.identified import Identified

@@ -62,7 +62,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     from valveflow_ros.cli.historian_open import looked_through
     from valveflow_ros.cli.outputs import check_log
     from valveflow_ros.errors import InputError
-    from valveflow_ros.logs.historian_refusal import RefusedError
+    from valveflow_ros.logs.tables.historian_refusal import RefusedError
 
     if options.output is not None:
         check_log(options.output, source=options.table, overwrite=options.overwrite)
@@ -117,7 +117,7 @@ def _written(
 ) -> Outcome:
     from valveflow_ros.cli.outputs import TABLES, write_log
     from valveflow_ros.errors import DataError
-    from valveflow_ros.logs.importing import write_readings
+    from valveflow_ros.logs.mcap.importing import write_readings
     from valveflow_ros.records import SampleTable
 
     path: Path = options.output

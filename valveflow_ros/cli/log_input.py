@@ -16,12 +16,12 @@ from valveflow_ros.cli.mapping import Column, Mapping
 from valveflow_ros.cli.plausible import Doubt, doubt
 from valveflow_ros.cli.usage import UsageError
 from valveflow_ros.config import Settings
-from valveflow_ros.core.unit_table import UNITS, air_in, convert, known_units
 from valveflow_ros.errors import InputError
 from valveflow_ros.logs import LogContents, open_log
-from valveflow_ros.logs.historian_match import choosing, option
-from valveflow_ros.logs.historian_refusal import THEIRS, RefusedError
+from valveflow_ros.logs.tables.historian_match import choosing, option
+from valveflow_ros.logs.tables.historian_refusal import THEIRS, RefusedError
 from valveflow_ros.records import SIGNALS, Readings, Signal
+from valveflow_ros.signals.unit_table import UNITS, air_in, convert, known_units
 
 # A column is not the signal it is named after if most of its values cannot be.
 _MOST = 0.5

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from valveflow_ros.cli.usage import UsageError
 
 if TYPE_CHECKING:
-    from valveflow_ros.logs.table_options import TableOptions
+    from valveflow_ros.logs.tables.table_options import TableOptions
     from valveflow_ros.records import Signal
 
 _TIMES = ('time', 'date')
@@ -48,7 +48,7 @@ class Constant:
 
 
 def _as_seen() -> TableOptions:
-    from valveflow_ros.logs.table_options import AS_SEEN
+    from valveflow_ros.logs.tables.table_options import AS_SEEN
 
     return AS_SEEN
 
@@ -149,7 +149,7 @@ def read_mapping(columns: Sequence[str | About], constants: Sequence[str]) -> Ma
 
 def _table(said: Sequence[About]) -> TableOptions:
     from valveflow_ros.errors import InputError
-    from valveflow_ros.logs.historian_zone import zone_of
+    from valveflow_ros.logs.tables.historian_zone import zone_of
 
     options = _as_seen()
     try:
@@ -183,8 +183,8 @@ def _column(text: str) -> Column:
 def _constant(text: str) -> Constant:
     import numpy as np
 
-    from valveflow_ros.core.unit_table import convert
     from valveflow_ros.errors import InputError
+    from valveflow_ros.signals.unit_table import convert
 
     name, rest = _split('constant', text)
     signal = _signal(name, 'constant')
@@ -205,8 +205,8 @@ def _constant(text: str) -> Constant:
 
 def _unit(signal: Signal, text: str) -> str:
     """Return the project's name of a unit, the text itself if it spells none."""
-    from valveflow_ros.core.unit_table import known_units
-    from valveflow_ros.logs.historian_units import unit_named
+    from valveflow_ros.logs.tables.historian_units import unit_named
+    from valveflow_ros.signals.unit_table import known_units
 
     written = text.strip()
     known = {spelling.lower(): spelling for spelling in known_units(signal)}

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from valveflow_ros.cli.usage import UsageError
-from valveflow_ros.core.characteristic import Characteristic
-from valveflow_ros.core.characteristic_json import FORMAT, from_json
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.characteristic_json import FORMAT, from_json
 from valveflow_ros.errors import DataError, RecordingError
 
 if TYPE_CHECKING:

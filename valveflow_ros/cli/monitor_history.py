@@ -8,9 +8,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from valveflow_ros.core.alarm_records import AlarmState
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import LogContents
+from valveflow_ros.monitoring.alarm_records import AlarmState
 from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.history_data import AlarmMoment, CurveMoment, DiagnosisMoment, History
 

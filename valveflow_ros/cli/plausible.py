@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.unit_table import UNITS, unit_of
 from valveflow_ros.records import SIGNALS, FloatArray, Signal
+from valveflow_ros.signals.unit_table import UNITS, unit_of
 
 # What the signals of a steam unit in operation usually read, in engine units.
 _USUAL = {

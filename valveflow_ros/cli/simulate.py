@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.report.terminal_number import number, whole
+from valveflow_ros.report.terminal.terminal_number import number, whole
 
 if TYPE_CHECKING:
     from valveflow_ros.plant.recorder import SimulatedLog

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from valveflow_ros.compare.truth import Truth, read_truth
+from valveflow_ros.baselines.truth import Truth, read_truth
 from valveflow_ros.errors import DataError, RecordingError
 
 _MOST_BYTES = 50_000_000

@@ -9,7 +9,7 @@ from valveflow_ros.cli.console import Console, Outcome
 from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
 from valveflow_ros.cli.parameter_options import add_parameters
 from valveflow_ros.cli.report_files import add_report_files, check_report_files, with_report
-from valveflow_ros.report.terminal_number import number
+from valveflow_ros.report.terminal.terminal_number import number
 
 _DESCRIPTION = """\
 Hold a characteristic against a log it was not made from: in each steady-state and

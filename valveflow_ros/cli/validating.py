@@ -8,16 +8,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from valveflow_ros.baselines.data import other_data
+from valveflow_ros.baselines.validation import validate
+from valveflow_ros.baselines.validation_json import to_json
 from valveflow_ros.cli.console import Console, Outcome
 from valveflow_ros.cli.mapping import Mapping as Columns
 from valveflow_ros.cli.model_file import model_path
 from valveflow_ros.cli.report_words import columns
 from valveflow_ros.cli.usage import UsageError
 from valveflow_ros.cli.watching import read, see
-from valveflow_ros.compare.data import other_data
-from valveflow_ros.compare.validation import validate
-from valveflow_ros.compare.validation_json import to_json
-from valveflow_ros.core.characteristic import Characteristic
+from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.diagnosis.extended_model import ExtendedModel
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.report.comparison_csv import segments_csv

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from valveflow_ros.diagnosis.bench import Bench
-from valveflow_ros.diagnosis.catalogue import catalogue
+from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import Task, settle
 from valveflow_ros.diagnosis.simplify import simplified, without_knot

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.curve.model import RegionalModel
 from valveflow_ros.diagnosis.estimate import Estimate, dates
 from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.records import BoolArray

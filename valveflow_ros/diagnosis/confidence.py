@@ -16,8 +16,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from valveflow_ros.diagnosis.catalogue import catalogue
 from valveflow_ros.diagnosis.cause import Kind, Stage, Unknown
+from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.draws import free
 from valveflow_ros.diagnosis.estimate import Estimate
 from valveflow_ros.diagnosis.evidence import colour, long_run_variance

@@ -21,10 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from valveflow_ros.core.characteristic import HeldCause
-from valveflow_ros.core.corrector import Corrector
-from valveflow_ros.core.state import Continuing, State, copies, put_back
-from valveflow_ros.core.units import integrated_input
+from valveflow_ros.curve.characteristic import HeldCause
 from valveflow_ros.diagnosis import kernels as flows
 from valveflow_ros.diagnosis import streaming_kernels as kernels
 from valveflow_ros.diagnosis.cause import Active, Stage
@@ -41,6 +38,7 @@ from valveflow_ros.diagnosis.streaming import (
     valves,
 )
 from valveflow_ros.errors import DataError
+from valveflow_ros.monitoring.corrector import Corrector
 from valveflow_ros.records import (
     NS_PER_S,
     ByteArray,
@@ -50,6 +48,8 @@ from valveflow_ros.records import (
     SampleTable,
     Signal,
 )
+from valveflow_ros.signals.units import integrated_input
+from valveflow_ros.state import Continuing, State, copies, put_back
 
 # Functions like exp take several numbers at once; blocks of whole such handfuls round alike.
 _HANDFUL = 16

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.curve.model import RegionalModel
 from valveflow_ros.diagnosis.bench import Bench
 from valveflow_ros.diagnosis.confidence import Certainty
 from valveflow_ros.diagnosis.extended import Extended

@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.core.jit import jit
 from valveflow_ros.diagnosis.cause import Active, Cause, Kind, Stage, Values
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.scene import Scene
+from valveflow_ros.jit import jit
 from valveflow_ros.records import BoolArray, FloatArray
 
 _EVERY = 7  # rows are enough for a median

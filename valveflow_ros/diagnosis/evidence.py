@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from valveflow_ros.core.whitening import inflation
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import Task
 from valveflow_ros.diagnosis.hidden import fair_open_residual
 from valveflow_ros.diagnosis.nuisance import nuisance
 from valveflow_ros.diagnosis.scene import FOLDS, SEALED_FOLD
+from valveflow_ros.fit.whitening import inflation
 from valveflow_ros.records import FloatArray
 
 _LAGS = 3

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.curve.model import RegionalModel
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import Active, Stage
 from valveflow_ros.diagnosis.scene import Scene

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from valveflow_ros.core.characteristic import (
+from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
     HeldCause,
@@ -14,7 +14,7 @@ from valveflow_ros.core.characteristic import (
     ResidualStatistics,
     Source,
 )
-from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.curve.model import RegionalModel
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.scene import Reference
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from valveflow_ros.core.model import RegionalModel
-from valveflow_ros.core.problem import Samples
-from valveflow_ros.core.refine import refine
-from valveflow_ros.core.units import integrated_input
+from valveflow_ros.curve.model import RegionalModel
 from valveflow_ros.errors import DataError
+from valveflow_ros.fit.problem import Samples
+from valveflow_ros.fit.refine import refine
 from valveflow_ros.records import FloatArray, SampleTable, Signal
+from valveflow_ros.signals.units import integrated_input
 
 _PIECES, _MOST = 4, 6
 _LEAST_SPREAD = 0.02

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.core.model import RegionalModel
-from valveflow_ros.core.problem import free_parameters
-from valveflow_ros.core.whitening import fit_ar
+from valveflow_ros.curve.model import RegionalModel
 from valveflow_ros.diagnosis.cause import Cause, Kind, Stage, Values
 from valveflow_ros.diagnosis.draws import believed_residual, drawn
 from valveflow_ros.diagnosis.extended import Extended, answer, drive, flow_of, region_path
 from valveflow_ros.diagnosis.scene import ORDER, Scene
+from valveflow_ros.fit.problem import free_parameters
+from valveflow_ros.fit.whitening import fit_ar
 from valveflow_ros.records import BoolArray, FloatArray
 
 _LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4)

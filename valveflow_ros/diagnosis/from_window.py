@@ -6,14 +6,14 @@ import json
 
 import numpy as np
 
-from valveflow_ros.core.diagnosis_task import DiagnosisContent, DiagnosisTask
-from valveflow_ros.core.model import RegionalModel
-from valveflow_ros.core.window import WindowContents
+from valveflow_ros.curve.model import RegionalModel
 from valveflow_ros.diagnosis.diagnose import Record, diagnose
 from valveflow_ros.diagnosis.diagnosis_json import to_json
 from valveflow_ros.diagnosis.first_model import first_model
 from valveflow_ros.diagnosis.on_top import freed
+from valveflow_ros.monitoring.diagnosis_task import DiagnosisContent, DiagnosisTask
 from valveflow_ros.records import FloatArray, IntArray, SampleTable, Signal
+from valveflow_ros.segments.window import WindowContents
 
 # A pressure that u was made of and that is made of u again differs in its last bits, which would
 # hide that it stood still.

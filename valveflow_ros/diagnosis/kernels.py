@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from valveflow_ros.core.jit import jit
-from valveflow_ros.core.regional_kernel import (
+from valveflow_ros.curve.regional_kernel import (
     TAP_0,
     TAP_1,
     TAP_2,
@@ -14,6 +13,7 @@ from valveflow_ros.core.regional_kernel import (
     curve,
     region_of,
 )
+from valveflow_ros.jit import jit
 from valveflow_ros.records import ByteArray, FloatArray
 
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from valveflow_ros.core.json_field import Field
-from valveflow_ros.core.model import RegionalModel
-from valveflow_ros.diagnosis.catalogue import catalogue
+from valveflow_ros.curve.json_field import Field
+from valveflow_ros.curve.model import RegionalModel
 from valveflow_ros.diagnosis.cause import Active
+from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.extended_model import ExtendedModel
 from valveflow_ros.diagnosis.scene import Reference

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from valveflow_ros.core.characteristic import HeldCause
-from valveflow_ros.diagnosis.catalogue import catalogue
+from valveflow_ros.curve.characteristic import HeldCause
 from valveflow_ros.diagnosis.cause import Stage
+from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.diagnose import Record
 from valveflow_ros.diagnosis.extended_model import ExtendedModel
 from valveflow_ros.records import Quality, SampleTable, Signal

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from valveflow_ros.diagnosis import actuator
-from valveflow_ros.diagnosis.catalogue import catalogue
 from valveflow_ros.diagnosis.cause import Told
+from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.estimate import Estimate
 from valveflow_ros.diagnosis.gain import Gain, rmse
 from valveflow_ros.diagnosis.quality import Fault

@@ -11,13 +11,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from valveflow_ros.core.model import RegionalModel
-from valveflow_ros.core.problem import Samples
-from valveflow_ros.core.refine import search
+from valveflow_ros.curve.model import RegionalModel
 from valveflow_ros.diagnosis.extended import Drive, Extended, answer, drive
 from valveflow_ros.diagnosis.fitting import Task, settle
 from valveflow_ros.diagnosis.simplify import simplified
 from valveflow_ros.errors import TooFewSamplesError
+from valveflow_ros.fit.problem import Samples
+from valveflow_ros.fit.refine import search
 
 _MORE_PIECES, _MOST = 3, 8
 _EACH = 5.0  # log-likelihood that each number more of curve and regions must bring

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 
 from valveflow_ros.diagnosis.bench import Bench
 from valveflow_ros.diagnosis.bumps import without_bumps
-from valveflow_ros.diagnosis.catalogue import catalogue
 from valveflow_ros.diagnosis.cause import Active, Start
+from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.draws import held
 from valveflow_ros.diagnosis.evidence import Evidence, colour, weigh
 from valveflow_ros.diagnosis.extended import Extended

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from valveflow_ros.core.model import RegionalModel
+from valveflow_ros.curve.model import RegionalModel
 
 SHALLOW = 0.2  # change of slope relative to the larger one
 _JUMP_MW = 0.01

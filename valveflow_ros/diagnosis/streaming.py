@@ -12,14 +12,14 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from valveflow_ros.core.model import RegionalModel
-from valveflow_ros.core.regional_kernel import make_taps
-from valveflow_ros.core.state import ArrayMemory, State, put_back
+from valveflow_ros.curve.model import RegionalModel
+from valveflow_ros.curve.regional_kernel import make_taps
 from valveflow_ros.diagnosis import streaming_kernels as kernels
 from valveflow_ros.diagnosis.cause import Active, Stage
 from valveflow_ros.diagnosis.scene import Reference
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import ByteArray, FloatArray, IntArray
+from valveflow_ros.state import ArrayMemory, State, put_back
 
 _DRAWS = 10  # as many as the catalogue's stiction averages over
 _SEED = 20_240

@@ -8,16 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from valveflow_ros.core.jit import jit
-from valveflow_ros.core.regional_kernel import (
-    TAP_0,
-    TAP_1,
-    TAP_2,
-    TAP_A,
-    TAP_WHOLE,
-    region_of,
-)
+from valveflow_ros.curve.regional_kernel import TAP_0, TAP_1, TAP_2, TAP_A, TAP_WHOLE, region_of
 from valveflow_ros.diagnosis.kernels import play_step, rate_step, slip_step
+from valveflow_ros.jit import jit
 from valveflow_ros.records import NS_PER_S, ByteArray, FloatArray, IntArray
 
 GOES_ON, ANEW, NO_DATA = 0, 1, 2

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from valveflow_ros.core.whitening import inflation
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import Task
 from valveflow_ros.diagnosis.scene import FOLDS, SEALED_FOLD
+from valveflow_ros.fit.whitening import inflation
 from valveflow_ros.records import BoolArray, FloatArray
 
 LEAST_GAIN, LEAST_SIGN, LEAST_MW2 = 14.0, 3.0, 0.02

@@ -1,18 +1,18 @@
 """Files, without ROS: recordings in MCAP, tables in CSV and Parquet, repair."""
 
-from valveflow_ros.logs.cdr import Decoder
 from valveflow_ros.logs.contents import LogContents, LoggedMessage, TopicInfo
-from valveflow_ros.logs.definitions import Definitions
-from valveflow_ros.logs.importing import WrittenLog, write_samples
-from valveflow_ros.logs.qos import LATCHED, Qos
+from valveflow_ros.logs.mcap.cdr import Decoder
+from valveflow_ros.logs.mcap.definitions import Definitions
+from valveflow_ros.logs.mcap.importing import WrittenLog, write_samples
+from valveflow_ros.logs.mcap.qos import LATCHED, Qos
+from valveflow_ros.logs.mcap.recorder import Recorder
+from valveflow_ros.logs.mcap.recorder_status import RecorderSettings, RecorderState, RecorderStatus
+from valveflow_ros.logs.mcap.recover import RecoveryReport, recover, recover_leftovers
+from valveflow_ros.logs.mcap.since import messages_since
+from valveflow_ros.logs.mcap.writer import Message, RecordingWriter
 from valveflow_ros.logs.reader import open_log
-from valveflow_ros.logs.recorder import Recorder
-from valveflow_ros.logs.recorder_status import RecorderSettings, RecorderState, RecorderStatus
-from valveflow_ros.logs.recover import RecoveryReport, recover, recover_leftovers
-from valveflow_ros.logs.since import messages_since
-from valveflow_ros.logs.table_write import write_table
-from valveflow_ros.logs.tables import RawTable, read_table
-from valveflow_ros.logs.writer import Message, RecordingWriter
+from valveflow_ros.logs.tables.table_write import write_table
+from valveflow_ros.logs.tables.tables import RawTable, read_table
 
 __all__ = [
     'LATCHED',

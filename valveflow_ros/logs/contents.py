@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 from valveflow_ros.errors import InputError
-from valveflow_ros.logs.cdr import Decoder
+from valveflow_ros.logs.mcap.cdr import Decoder
 from valveflow_ros.records import IntArray, Readings, Signal
 
 

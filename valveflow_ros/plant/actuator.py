@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from valveflow_ros.core.jit import jit
+from valveflow_ros.jit import jit
 from valveflow_ros.plant.hooks import Bank
 from valveflow_ros.records import FloatArray
 

@@ -12,7 +12,7 @@ import enum
 
 import numpy as np
 
-from valveflow_ros.core.jit import jit
+from valveflow_ros.jit import jit
 from valveflow_ros.records import FloatArray
 
 

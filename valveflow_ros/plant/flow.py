@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from valveflow_ros.core.jit import jit
+from valveflow_ros.jit import jit
 from valveflow_ros.plant.hooks import AddedCurve, Hooks
 from valveflow_ros.records import FloatArray
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from valveflow_ros.core.jit import jit
+from valveflow_ros.jit import jit
 from valveflow_ros.plant.unit import Region
 from valveflow_ros.records import FloatArray
 

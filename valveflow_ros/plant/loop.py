@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from valveflow_ros.core.jit import jit
+from valveflow_ros.jit import jit
 from valveflow_ros.plant import actuator
 from valveflow_ros.plant.flow import FlowLaw, added, flow_law, interpolate, nozzle_factor
 from valveflow_ros.plant.hooks import Hooks

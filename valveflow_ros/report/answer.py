@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from valveflow_ros.core.characteristic import Characteristic, Piece
+from valveflow_ros.curve.characteristic import Characteristic, Piece
 from valveflow_ros.records import FloatArray, Signal
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.numbers import (

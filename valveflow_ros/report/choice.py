@@ -7,7 +7,7 @@ from html import escape
 
 import numpy as np
 
-from valveflow_ros.core.characteristic import Choice
+from valveflow_ros.curve.characteristic import Choice
 from valveflow_ros.records import FloatArray
 from valveflow_ros.report.figure import Figure, Spec, rounded, token
 from valveflow_ros.report.numbers import plain

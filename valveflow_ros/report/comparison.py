@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from valveflow_ros import __version__
-from valveflow_ros.compare.library import NAMES
+from valveflow_ros.baselines.library import NAMES
 from valveflow_ros.report.choice import choice_figure
 from valveflow_ros.report.comparison_data import Compared
 from valveflow_ros.report.comparison_figures import curves_figure, truth_figure

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from valveflow_ros.compare.judged import Judgement
+from valveflow_ros.baselines.judged import Judgement
 from valveflow_ros.records import FloatArray
 from valveflow_ros.report.comparison_data import METHODS, Compared
 from valveflow_ros.report.comparison_tables import KIND

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from valveflow_ros.compare.comparison import Comparison
-from valveflow_ros.core.window import WindowContents
+from valveflow_ros.baselines.comparison import Comparison
+from valveflow_ros.segments.window import WindowContents
 
 # In the order in which they are told; the names of the numbers, and those for people.
 METHODS = ('paper', 'proposed', 'hammerstein', 'sparse')

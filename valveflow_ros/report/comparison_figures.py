@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from valveflow_ros.core.window import WindowContents
 from valveflow_ros.records import FloatArray
 from valveflow_ros.report.comparison_csv import curves_of
 from valveflow_ros.report.comparison_data import LEGEND, METHODS, Compared
 from valveflow_ros.report.downsample import thin
 from valveflow_ros.report.figure import Figure, Spec, rounded, token
 from valveflow_ros.report.words import input_axis
+from valveflow_ros.segments.window import WindowContents
 
 _DOTS = 5000
 # Colour, dash and width of each method's line, everywhere on the page.

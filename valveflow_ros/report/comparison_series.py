@@ -7,7 +7,7 @@ from datetime import datetime, timezone
 
 import numpy as np
 
-from valveflow_ros.compare.judged import JudgedSegment
+from valveflow_ros.baselines.judged import JudgedSegment
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SegmentKind
 from valveflow_ros.report.comparison_data import Compared
 from valveflow_ros.report.comparison_figures import line_of

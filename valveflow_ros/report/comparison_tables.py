@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from valveflow_ros.compare.comparison import Line
-from valveflow_ros.compare.judged import JudgedSegment
-from valveflow_ros.compare.verdict import Pair, Terms
+from valveflow_ros.baselines.comparison import Line
+from valveflow_ros.baselines.judged import JudgedSegment
+from valveflow_ros.baselines.verdict import Pair, Terms
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.report.comparison_data import LABELS, METHODS, PREDICTIONS, Compared
 from valveflow_ros.report.numbers import decimals, interval, moment, plain

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from valveflow_ros import __version__
-from valveflow_ros.compare.judged import JudgedSegment
-from valveflow_ros.compare.validation import OTHER, PieceCheck, Validation, Verdict
-from valveflow_ros.core.window import WindowContents
+from valveflow_ros.baselines.judged import JudgedSegment
+from valveflow_ros.baselines.validation import OTHER, PieceCheck, Validation, Verdict
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.report.comparison_validation_figures import input_figure, time_figure
 from valveflow_ros.report.numbers import (
@@ -23,6 +22,7 @@ from valveflow_ros.report.numbers import (
 )
 from valveflow_ros.report.page import Page, Section, folded, notice, paragraph, table, text
 from valveflow_ros.report.words import input_unit
+from valveflow_ros.segments.window import WindowContents
 
 LABELS = {
     'curve': 'curve',

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from valveflow_ros.compare.validation import Validation
+from valveflow_ros.baselines.validation import Validation
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.report.figure import Figure, Spec, packed, rounded, token
 from valveflow_ros.report.words import input_axis

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from valveflow_ros.compare.verdict import BASELINES, Finding, Outcome, Pair, Terms, finding_of
+from valveflow_ros.baselines.verdict import BASELINES, Finding, Outcome, Pair, Terms, finding_of
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.report.comparison_data import LABELS, Compared
 from valveflow_ros.report.numbers import counted, duration, plain

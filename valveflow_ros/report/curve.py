@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from valveflow_ros.core.characteristic import Piece
+from valveflow_ros.curve.characteristic import Piece
 from valveflow_ros.records import FloatArray
 from valveflow_ros.report.downsample import Density, density
 from valveflow_ros.report.figure import Figure, Spec, rounded, token

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from valveflow_ros.core.characteristic import RegionDynamics
+from valveflow_ros.curve.characteristic import RegionDynamics
 from valveflow_ros.report.figure import Figure, Spec, rounded, token
 from valveflow_ros.report.numbers import decimals, with_error
 from valveflow_ros.report.page import table

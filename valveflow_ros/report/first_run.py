@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from typing import Any
 
 SENTENCE = 'The engine is compiled for this machine now, once; that takes about a minute.'
-_ENGINE = 'valveflow_ros.core.'
+_ROOMS = ('jit', 'sums', 'signals', 'segments', 'partition', 'curve', 'fit', 'monitoring')
+_ENGINE = tuple(f'valveflow_ros.{room}' for room in _ROOMS)
 # Some are only ever compiled into others, or for tests.
 _FEW = 0.05
 
@@ -17,14 +18,15 @@ def is_first_run() -> bool:
 
     False as well where nothing is compiled or nothing can be told.
     """
-    from valveflow_ros.core import monitor  # noqa: F401 - what is asked about must be loaded
+    from valveflow_ros.monitoring import monitor  # noqa: F401 - what is asked about must be loaded
 
     return _cold_share() > 0.5
 
 
 def must_compile_to_fit() -> bool:
     """Tell whether more than a few functions of engine and fit have to be compiled for a fit."""
-    from valveflow_ros.core import fit, monitor  # noqa: F401 - what is asked about must be loaded
+    from valveflow_ros.fit import fit  # noqa: F401 - what is asked about must be loaded
+    from valveflow_ros.monitoring import monitor  # noqa: F401
 
     return _cold_share() > _FEW
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from valveflow_ros.core.alarm_records import AlarmState
+from valveflow_ros.monitoring.alarm_records import AlarmState
 from valveflow_ros.records import FloatArray
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from valveflow_ros import __version__
 from valveflow_ros.config import PARAMETERS
-from valveflow_ros.core.characteristic import Characteristic
-from valveflow_ros.core.step_test import RULE
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.fit.step_test import RULE
 from valveflow_ros.report.answer import (
     answer_words,
     breakpoints_table,

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.characteristic import Characteristic
-from valveflow_ros.core.shift import Shift
-from valveflow_ros.core.units import integrated_input
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.shift import Shift
 from valveflow_ros.records import (
     FloatArray,
     IntArray,
@@ -21,6 +20,7 @@ from valveflow_ros.records import (
 )
 from valveflow_ros.report.downsample import segment_rows
 from valveflow_ros.report.history_data import History
+from valveflow_ros.signals.units import integrated_input
 
 
 @dataclass(frozen=True, slots=True)

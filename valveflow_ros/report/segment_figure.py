@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from valveflow_ros.core.segment_residual import SegmentResiduals, segment_residuals
+from valveflow_ros.curve.segment_residual import SegmentResiduals, segment_residuals
 from valveflow_ros.report.figure import Figure, Spec, packed, rounded, token
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.numbers import counted, plain

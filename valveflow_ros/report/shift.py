@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from valveflow_ros.core.segment_residual import SegmentResiduals, segment_residuals
-from valveflow_ros.core.shift import PieceShift, Shift
+from valveflow_ros.curve.segment_residual import SegmentResiduals, segment_residuals
+from valveflow_ros.curve.shift import PieceShift, Shift
 from valveflow_ros.report.figure import Figure, Spec, packed, rounded, token
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.numbers import decimals, moment, plain, with_error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from valveflow_ros.core.alarm_records import AlarmState
+from valveflow_ros.monitoring.alarm_records import AlarmState
 from valveflow_ros.report.figure import Figure, Spec, rounded, token
 from valveflow_ros.report.history_data import AlarmMoment, History
 from valveflow_ros.report.numbers import counted, duration, moment

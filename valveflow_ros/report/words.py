@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from fractions import Fraction
 
-from valveflow_ros.core.characteristic import HeldCause
+from valveflow_ros.curve.characteristic import HeldCause
 from valveflow_ros.report.numbers import plain
 
 _DATED = ('t0_days',)  # parameters that are moments
@@ -42,7 +42,7 @@ def input_axis(value: float) -> dict[str, str]:
     return {'text': input_title(value), 'short': f'u ({input_unit(value)})'}
 
 
-# Causes whose change is counted from the mean of the record, see `diagnosis.catalogue`.
+# Causes whose change is counted from the mean of the record, see `diagnosis.causes`.
 _FROM_THE_MEAN = frozenset((
     'curve_step', 'gain_drift', 'gain_step', 'input_drift', 'input_step', 'intervals',
     'output_offset_drift',

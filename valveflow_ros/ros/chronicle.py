@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 
-from valveflow_ros.core.alarms import AlarmChange, AlarmState
-from valveflow_ros.core.diagnosing import FITS_AGAIN
-from valveflow_ros.core.events import (
+from valveflow_ros.errors import counted
+from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState
+from valveflow_ros.monitoring.diagnosing import FITS_AGAIN
+from valveflow_ros.monitoring.events import (
     CurveAdopted,
     Diagnosed,
     Event,
@@ -14,7 +15,6 @@ from valveflow_ros.core.events import (
     JournalKind,
     ReferenceSet,
 )
-from valveflow_ros.errors import counted
 from valveflow_ros.ros.diagnostics import Level
 
 _STANDING = (AlarmState.UNACKNOWLEDGED, AlarmState.RETURNED_UNACKNOWLEDGED)

@@ -11,11 +11,11 @@ from valveflow_msgs.msg import Alarm, FlowCharacteristic
 from valveflow_msgs.msg import JournalEntry as JournalMessage
 from valveflow_msgs.msg import SpecialSegment as SegmentMessage
 
-from valveflow_ros.core.alarms import AlarmChange
-from valveflow_ros.core.characteristic import Characteristic
-from valveflow_ros.core.curve_status import CurveStatus
-from valveflow_ros.core.events import JournalEntry, JournalKind
-from valveflow_ros.core.shift import Shift
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.shift import Shift
+from valveflow_ros.monitoring.alarms import AlarmChange
+from valveflow_ros.monitoring.curve_status import CurveStatus
+from valveflow_ros.monitoring.events import JournalEntry, JournalKind
 from valveflow_ros.records import NS_PER_S, FloatArray, SpecialSegment
 
 # The latest time whose seconds a stamp can hold.

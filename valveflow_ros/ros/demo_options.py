@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from valveflow_ros.report.terminal_number import number, whole
+from valveflow_ros.report.terminal.terminal_number import number, whole
 from valveflow_ros.ros.usage import Parser
 
 

@@ -9,8 +9,8 @@ from typing import Any
 
 from valveflow_msgs.msg import Diagnosis, DiagnosisCause
 
-from valveflow_ros.core.diagnosis_task import DiagnosisTask
-from valveflow_ros.core.events import Diagnosed
+from valveflow_ros.monitoring.diagnosis_task import DiagnosisTask
+from valveflow_ros.monitoring.events import Diagnosed
 from valveflow_ros.ros.conversions import header
 
 NOT_YET = 'Not diagnosed yet: a diagnosis needs a curve and a day of data.'

@@ -12,8 +12,8 @@ from std_msgs.msg import Float64
 from valveflow_msgs.msg import PlantSample
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.units import UNITS, Unit, unit_of
 from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
+from valveflow_ros.signals.units import UNITS, Unit, unit_of
 
 Row = tuple[int, int, float, int]
 """A reading as ``(time_ns, signal, value, quality)``, as `Readings.of` takes it."""

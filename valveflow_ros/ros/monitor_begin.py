@@ -41,7 +41,7 @@ def run(stop: StopFlag, args: Sequence[str] | None) -> int:
         # Compiler and libraries take a second, in which the others of the domain get to know
         # this process. A signal need not wait for them: nothing has been begun.
         with stop.cutting():
-            work = importlib.import_module('valveflow_ros.ros.monitor_loop')
+            work = importlib.import_module('valveflow_ros.ros.node.monitor_loop')
         return int(work.run(stop, presence))
     except Stopped:
         return 0

@@ -20,15 +20,15 @@ from valveflow_msgs.msg import (
     SpecialSegment,
 )
 
-from valveflow_ros.core import events as engine
-from valveflow_ros.core.alarm_voice import BURIED
-from valveflow_ros.core.alarms import AlarmChange, AlarmState
-from valveflow_ros.core.characteristic import Characteristic
-from valveflow_ros.core.curve_status import CurveStatus
-from valveflow_ros.core.events import JournalKind
-from valveflow_ros.core.monitor import Monitor
-from valveflow_ros.core.prediction import PredictionBlock
-from valveflow_ros.core.shift import Shift
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.shift import Shift
+from valveflow_ros.monitoring import events as engine
+from valveflow_ros.monitoring.alarm_voice import BURIED
+from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState
+from valveflow_ros.monitoring.curve_status import CurveStatus
+from valveflow_ros.monitoring.events import JournalKind
+from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.ros import conversions, diagnosis_message
 from valveflow_ros.ros.encoding import encode
 from valveflow_ros.ros.prediction_bytes import prediction_bytes

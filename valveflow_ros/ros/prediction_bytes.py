@@ -12,7 +12,7 @@ import functools
 import struct
 from collections.abc import Iterator
 
-from valveflow_ros.core.prediction import PredictionBlock
+from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.records import NS_PER_S
 from valveflow_ros.ros.conversions import LAST_NS
 

@@ -6,7 +6,7 @@ import os
 
 from valveflow_ros.config import Settings
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.ros.recording import DEFAULT_FOLDER, at_home
+from valveflow_ros.ros.node.recording import DEFAULT_FOLDER, at_home
 
 
 def check_record_place(settings: Settings) -> None:

@@ -14,8 +14,8 @@ from rclpy.utilities import remove_ros_args
 
 from valveflow_ros.errors import ValveflowError, counted
 from valveflow_ros.logs import open_log
-from valveflow_ros.report.terminal_number import number
-from valveflow_ros.report.terminal_progress import Progress
+from valveflow_ros.report.terminal.terminal_number import number
+from valveflow_ros.report.terminal.terminal_progress import Progress
 from valveflow_ros.ros.playing import Player
 from valveflow_ros.ros.replay_steps import steps_of
 from valveflow_ros.ros.secure_start import check_security

@@ -9,8 +9,8 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.logs import LogContents
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.ros.inputs import INPUT_BY_NAME, PLANT_SAMPLE, header_time_ns
+from valveflow_ros.ros.node.recording import TOPICS
 from valveflow_ros.ros.playing import Step
-from valveflow_ros.ros.recording import TOPICS
 from valveflow_ros.ros.wire import float64_bytes
 
 

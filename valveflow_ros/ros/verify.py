@@ -14,21 +14,22 @@ from rclpy.serialization import deserialize_message
 from valveflow_msgs.msg import JournalEntry as JournalMessage
 
 from valveflow_ros.config import Settings
-from valveflow_ros.core.align import Aligner
-from valveflow_ros.core.corrector import Corrector
-from valveflow_ros.core.diagnosis_task import DiagnosisContent, DiagnosisTask
-from valveflow_ros.core.events import Event, JournalEntry, JournalKind
-from valveflow_ros.core.monitor import Monitor
-from valveflow_ros.core.offline import JournalReplayer
 from valveflow_ros.diagnosis import model_json
 from valveflow_ros.errors import DataError, RecordingError, ValveflowError, counted
 from valveflow_ros.logs import LogContents, LoggedMessage, open_log
+from valveflow_ros.monitoring.corrector import Corrector
+from valveflow_ros.monitoring.diagnosis_task import DiagnosisContent, DiagnosisTask
+from valveflow_ros.monitoring.events import Event, JournalEntry, JournalKind
+from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.monitoring.offline import JournalReplayer
 from valveflow_ros.records import Readings
-from valveflow_ros.ros import conversions, model_file
+from valveflow_ros.ros import conversions
 from valveflow_ros.ros.inputs import Decoder, Row
+from valveflow_ros.ros.node import model_file
+from valveflow_ros.ros.node.recording import PARAMETERS, TOPICS
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
-from valveflow_ros.ros.recording import PARAMETERS, TOPICS
-from valveflow_ros.ros.worker import DiagnosisWorker
+from valveflow_ros.ros.worker.worker import DiagnosisWorker
+from valveflow_ros.signals.align import Aligner
 
 # Small, so that what is said before a decision that cannot be repeated is compared first.
 _BLOCK = 500

@@ -18,9 +18,9 @@ from rclpy.utilities import remove_ros_args
 from std_srvs.srv import Trigger
 
 from valveflow_ros.errors import ValveflowError
-from valveflow_ros.report.terminal_board import CURVE, HEALTH
-from valveflow_ros.report.terminal_number import number
-from valveflow_ros.report.terminal_screen import Screen
+from valveflow_ros.report.terminal.terminal_board import CURVE, HEALTH
+from valveflow_ros.report.terminal.terminal_number import number
+from valveflow_ros.report.terminal.terminal_screen import Screen
 from valveflow_ros.ros.secure_start import check_security
 from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.services import SERVICES

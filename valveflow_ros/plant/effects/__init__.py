@@ -1,4 +1,4 @@
-"""The effects a plant can have, one file each; a file put here is found by its ``EFFECT``."""
+"""The effects a plant can have, by family; every `Effect` at the top of a module here is one."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from valveflow_ros.plant.effect import Effect
 @functools.cache
 def catalogue() -> dict[str, Effect]:
     """Return all effects by name, in alphabetical order."""
-    found: dict[str, Effect] = {}
-    for module in sorted(pkgutil.iter_modules(__path__), key=lambda info: info.name):
-        effect = importlib.import_module(f'{__name__}.{module.name}').EFFECT
-        found[effect.name] = effect
-    return dict(sorted(found.items()))
+    modules = [
+        importlib.import_module(f'{__name__}.{m.name}') for m in pkgutil.iter_modules(__path__)
+    ]
+    effects = [
+        made for module in modules for made in vars(module).values() if isinstance(made, Effect)
+    ]
+    return {effect.name: effect for effect in sorted(effects, key=lambda effect: effect.name)}

@@ -1,0 +1,75 @@
+"""Characteristics and data made by hand: everything in them is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from valveflow_ros.baselines.judged import OtherData
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.characteristic_json import from_json
+from valveflow_ros.fit.problem import Samples
+from valveflow_ros.records import NS_PER_S, SegmentKind
+
+KNOTS = (1000.0, 1400.0, 1800.0, 2200.0)
+SLOPES = (0.2, 0.1, 0.05)
+FIRST_MW = 150.0
+ROWS, SEGMENT = 12_000, 400
+
+
+def characteristic(shift_mw=0.0, exponent=1.125, dynamics=False) -> Characteristic:
+    """Return a curve of three pieces, lifted by ``shift_mw``."""
+    values = FIRST_MW + shift_mw + np.concatenate([[0.0], np.cumsum(400.0 * np.array(SLOPES))])
+    pieces = [
+        {
+            'u_from': KNOTS[k], 'u_to': KNOTS[k + 1], 'slope': SLOPES[k],
+            'intercept': float(values[k] - SLOPES[k] * KNOTS[k]),
+            'slope_stderr': 0.001, 'intercept_stderr': 1.0, 'samples': 1000,
+        }
+        for k in range(3)
+    ]  # fmt: skip
+    region = {'power_from': 100.0, 'power_to': 400.0, 'time_constant_s': 20.0, 'delay_s': 2.0}
+    return from_json(
+        {
+            'format': 'valveflow/characteristic', 'version': 1, 'pressure_exponent': exponent,
+            'pieces': pieces, 'breakpoint_intervals': [[None, None]] * 2,
+            'selection': {'rule': 'paper', 'cost': {}, 'turning_angle': {}},
+            'segments': {'steady': 10, 'slope_response': 5, 'samples': 3000},
+            'dynamics': [region] if dynamics else [], 'partition': {'pieces': pieces},
+        }
+    )  # fmt: skip
+
+
+def other_data(noise_mw=1.0, seed=7, shift_mw=0.0, above=9e9, u_shift=0.0) -> OtherData:
+    """Return rests at many loads, all of them special segments, one in three called a slope.
+
+    ``shift_mw`` is added to the power where u is beyond ``above``.
+    """
+    rng = np.random.default_rng(seed)
+    levels = 1050.0 + 1100.0 * rng.random(ROWS // SEGMENT)
+    u = np.repeat(levels, SEGMENT) + rng.normal(0.0, 0.5, ROWS)
+    power = characteristic().model.static(u) + rng.normal(0.0, noise_mw, ROWS)
+    power = power + shift_mw * (u > above)
+    first = np.arange(0, ROWS, SEGMENT)
+    kinds = np.where(np.arange(len(first)) % 3 == 2, SegmentKind.SLOPE, SegmentKind.STEADY)
+    spans = np.column_stack([first + 50, first + SEGMENT, kinds]).astype(np.int64)
+    samples = Samples(u + u_shift, power, np.ones(ROWS, dtype=np.uint8), 1.0, 20.0, 10)
+    return OtherData(samples, np.arange(ROWS, dtype=np.int64) * NS_PER_S, spans)
+
+
+@pytest.fixture(scope='session')
+def make_curve():
+    """Return the maker of characteristics."""
+    return characteristic
+
+
+@pytest.fixture
+def curve(make_curve):
+    """Return the same, by its short name."""
+    return make_curve
+
+
+@pytest.fixture
+def data():
+    """Return the maker of data to judge by."""
+    return other_data

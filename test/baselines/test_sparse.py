@@ -1,0 +1,221 @@
+"""The sparse baseline: library, equations, thresholding, simulation and rest."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from valveflow_ros.baselines import library
+from valveflow_ros.baselines.derivative import Form, equations, forms_for
+from valveflow_ros.baselines.holdout import part_of
+from valveflow_ros.baselines.sparse import THRESHOLDS, fit_sparse, thresholded
+from valveflow_ros.baselines.sparse_model import SparseModel
+from valveflow_ros.fit.problem import Samples
+
+compiled = pytest.mark.skipif(
+    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
+)
+TIME_S, GAIN, OFFSET = 40.0, 0.15, 20.0  # y' = (GAIN u + OFFSET - y) / TIME_S
+
+
+def linear_xi():
+    xi = np.zeros(library.SIZE)
+    xi[0], xi[1], xi[2] = OFFSET / TIME_S, -1.0 / TIME_S, GAIN / TIME_S
+    return xi
+
+
+def wave(seconds):
+    return 1500.0 + 350.0 * np.sin(seconds / 700.0) + 120.0 * np.sin(seconds / 190.0 + 1.0)
+
+
+def linear_plant(hours, noise_mw, seed=5):
+    """Return the linear plant under a smooth input, with noise."""
+    seconds = np.arange(int(hours * 3600.0), dtype=np.float64)
+    u = wave(seconds)
+    a = np.exp(-1.0 / TIME_S)
+    mean = (1.0 - a) * TIME_S
+    x = GAIN * u + OFFSET
+    y = np.empty(len(u))
+    y[0] = x[0]
+    for t in range(1, len(u)):  # exact for an input that is straight between rows
+        y[t] = a * y[t - 1] + (mean - a) * x[t - 1] + (1.0 - mean) * x[t]
+    rng = np.random.default_rng(seed)
+    power = y + noise_mw * rng.standard_normal(len(u))
+    return Samples(u, power, np.ones(len(u), dtype=np.uint8), 1.0, 210.0, 10), y
+
+
+def model(xi):
+    return SparseModel(xi, 1000.0, 2000.0, 150.0, 330.0, 240.0, 1.0)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(-5.0, 5.0), st.floats(-5.0, 5.0))
+def test_the_library_is_the_papers(y, u):
+    wanted = [
+        1.0, y, u, y**2, y * u, u**2, y**3, y**2 * u, y * u**2, u**3,
+        np.sin(y), np.sin(u), np.cos(y), np.cos(u),
+    ]  # fmt: skip
+    row = library.columns(np.array([y]), np.array([u]))[0]
+    np.testing.assert_allclose(row, wanted, atol=1e-12)
+    xi = np.random.default_rng(1).normal(size=library.SIZE)
+    assert library.rate(y, u, xi) == pytest.approx(float(row @ xi), abs=1e-9)
+
+
+def test_a_simulation_is_the_solution_of_the_equation():
+    xi = np.zeros(library.SIZE)
+    xi[[0, 1, 2, 4, 10]] = [0.5, -0.02, 0.004, -5e-6, 0.03]
+    seconds = np.arange(900.0)
+    data = Samples(wave(seconds), np.full(900, 200.0), np.ones(900, np.uint8), 1.0, 0.0, 10)
+    answer, settled = model(xi).run(data)
+
+    def slope(t, y):
+        u = np.interp(t, seconds, data.u)
+        return [library.rate(float(y[0]), float(u), xi)]
+
+    exact = solve_ivp(slope, (0.0, 899.0), [200.0], t_eval=seconds, rtol=1e-8, max_step=1.0)
+    np.testing.assert_allclose(answer, exact.y[0], atol=1e-4)
+    assert settled.all()
+
+
+def test_a_gap_begins_anew_at_the_measured_power_and_running_away_is_told():
+    usable = np.ones(400, dtype=np.uint8)
+    usable[200:210] = 0
+    power = np.where(np.arange(400) < 205, 100.0, 300.0)
+    data = Samples(np.full(400, 1500.0), power, usable, 1.0, 50.0, 10)
+    still = model(np.zeros(library.SIZE))
+    answer, settled = still.run(data)
+    assert np.all(answer[:200] == 100.0)
+    assert np.isnan(answer[200:210]).all()
+    assert np.all(answer[210:] == 300.0)
+    assert settled[:50].sum() == 0
+    assert settled[210:260].sum() == 0
+    away = np.zeros(library.SIZE)
+    away[6] = 1.0  # y' = y^3
+    assert np.isinf(model(away).run(data)[0][10:200]).all()
+
+
+@compiled
+@pytest.mark.parametrize('form', forms_for(1.0), ids=lambda f: f'{f.kind}-{f.window_s:g}')
+def test_exact_data_satisfy_the_equations(form):
+    data, _ = linear_plant(2.0, 0.0)
+    # The start out of rest has a corner, which no window sees as it is.
+    rows = equations(part_of(data, 600, len(data.u)), form)
+    error = rows[:, :-1] @ linear_xi() - rows[:, -1]
+    # Smoothing bends what it smooths; that grows with the window but stays small beside y'.
+    assert np.abs(error).max() < 0.05 * np.abs(rows[:, -1]).max()
+
+
+@compiled
+def test_no_window_holds_a_gap():
+    data, _ = linear_plant(0.5, 0.0)
+    usable = data.usable.copy()
+    usable[900] = 0
+    power = data.power_mw.copy()
+    power[900] = 1e9  # would be seen from far
+    hurt = Samples(data.u, power, usable, 1.0, 210.0, 10)
+    for kind in ('derivative', 'weak'):
+        rows = equations(hurt, Form(kind, 21.0))
+        assert 0 < len(rows) < len(equations(data, Form(kind, 21.0)))
+        assert np.abs(rows[:, 1]).max() < 1e4
+
+
+def test_thresholding_keeps_what_is_large_and_refits():
+    rng = np.random.default_rng(8)
+    theta = rng.normal(size=(500, 6))
+    true = np.array([2.0, 0.0, -1.0, 0.05, 0.0, 0.5])
+    target = theta @ true + 0.01 * rng.normal(size=500)
+    found = thresholded(theta, target, 0.2)
+    assert np.array_equal(found != 0.0, [True, False, True, False, False, True])
+    kept = theta[:, [0, 2, 5]]
+    np.testing.assert_allclose(
+        found[[0, 2, 5]], np.linalg.lstsq(kept, target, rcond=None)[0], rtol=1e-9
+    )
+    full = np.linalg.lstsq(theta, target, rcond=None)[0]
+    np.testing.assert_allclose(thresholded(theta, target, 0.0), full)
+    assert not thresholded(theta, target, 10.0).any()
+
+
+@compiled
+def test_a_linear_plant_is_found():
+    data, clean = linear_plant(12.0, 1.0)
+    found = fit_sparse(data)
+    answer, settled = found.model.run(data)
+    keep = settled > 0
+    assert np.sqrt(np.mean((answer - clean)[keep] ** 2)) < 0.3
+    u = np.linspace(1100.0, 1900.0, 50)
+    # A smooth library near a straight truth; half a MW of 120 is what noise and surplus leave.
+    assert np.abs(found.model.static(u) - (GAIN * u + OFFSET)).max() < 0.5
+    assert {'u', 'y'} & set(found.model.terms)
+    assert all(np.isfinite(mse) or np.isinf(mse) for *_, mse in found.mse_by_form)
+
+
+@compiled
+def test_the_curve_is_where_the_equation_rests():
+    u = np.linspace(1000.0, 2000.0, 77)
+    np.testing.assert_allclose(model(linear_xi()).static(u), GAIN * u + OFFSET, atol=1e-6)
+    # Where it rests nowhere within reach, nothing is said.
+    never = np.zeros(library.SIZE)
+    never[0] = 1.0
+    assert np.isnan(model(never).static(u)).all()
+
+
+@compiled
+def test_of_several_rests_the_curve_keeps_to_one_branch():
+    xi = np.zeros(library.SIZE)
+    xi[0], xi[1], xi[2], xi[10] = OFFSET / TIME_S, -1.0 / TIME_S, GAIN / TIME_S, 0.02
+    u = np.linspace(1000.0, 2000.0, 200)
+    curve = model(xi).static(u)
+    assert np.isfinite(curve).all()
+    assert np.abs(curve - (GAIN * u + OFFSET)).max() < 0.02 * TIME_S + 0.01
+
+
+@compiled
+def test_a_rest_that_swings_with_sin_u_is_followed():
+    xi = linear_xi()
+    xi[library.NAMES.index('sin u')] = 4.0 / TIME_S
+    u = np.random.default_rng(4).uniform(1000.0, 2000.0, 500)
+    error = model(xi).static(u) - (GAIN * u + OFFSET + 4.0 * np.sin(u))
+    # Straight between places 0.25 apart: 4 * 0.25**2 / 8 at most.
+    assert np.abs(error).max() < 0.035
+
+
+def test_thresholds_rise_from_none():
+    assert THRESHOLDS[0] == 0.0
+    assert np.all(np.diff(THRESHOLDS) > 0.0)
+
+
+@pytest.mark.parametrize('threshold', [0.0, 0.05, 0.3, 2.0])
+def test_pysindy_thresholds_alike(threshold):
+    """The package of the method's own authors, where it is installed."""
+    pysindy = pytest.importorskip('pysindy')
+    data, _ = linear_plant(3.0, 1.0)
+    rows = equations(data, Form('weak', 61.0))
+    rows = rows / np.sqrt(np.mean(rows**2, axis=0))
+    ours = thresholded(rows[:, :-1], rows[:, -1], threshold)
+    # Its last, "unbiased" refit cuts singular values below 1e-6, which this library has.
+    theirs = pysindy.STLSQ(threshold=threshold, alpha=0.0, max_iter=30, unbias=False)
+    theirs.fit(rows[:, :-1], rows[:, -1:])
+    found = np.asarray(theirs.coef_)[0]
+    assert np.array_equal(found != 0.0, ours != 0.0)
+    predicted, ours_predicted = rows[:, :-1] @ found, rows[:, :-1] @ ours
+    # It solves normal equations, whose condition is 5e13 here; both sides have unit size.
+    np.testing.assert_allclose(predicted, ours_predicted, atol=2e-4)
+    left, ours_left = (np.sum((p - rows[:, -1]) ** 2) for p in (predicted, ours_predicted))
+    assert left == pytest.approx(ours_left, rel=1e-6)
+
+
+def test_pysindy_has_the_same_library():
+    pysindy = pytest.importorskip('pysindy')
+    rng = np.random.default_rng(3)
+    x = rng.uniform(-2.0, 2.0, (20, 2))
+    theirs = (pysindy.PolynomialLibrary(degree=3) + pysindy.FourierLibrary(n_frequencies=1)).fit(x)
+    table = np.asarray(theirs.transform(x))
+    ours = library.columns(x[:, 0].copy(), x[:, 1].copy())
+    assert table.shape == ours.shape
+    for column in ours.T:
+        assert np.isclose(table, column[:, None]).all(axis=0).any()

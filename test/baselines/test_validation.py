@@ -1,0 +1,92 @@
+"""Does a characteristic hold on other data."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import numpy as np
+import pytest
+
+from valveflow_ros.baselines.validation import Verdict, validate
+from valveflow_ros.baselines.validation_json import to_json
+from valveflow_ros.errors import DataError
+
+pytestmark = pytest.mark.skipif(
+    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
+)
+
+
+def test_the_right_curve_holds(curve, data):
+    for seed in range(5):
+        found = validate(curve(), data(seed=seed), 1.0)
+        assert found.verdict is Verdict.HOLDS
+        assert found.judged_by == 'curve'
+        assert abs(found.overall.test.mean) < 0.1
+        assert sum(c.segments for c in found.pieces) == found.overall.segments == 30
+
+
+def test_a_shift_is_found_with_its_sign_and_size(curve, data):
+    found = validate(curve(shift_mw=-3.0), data(), 1.0)
+    assert found.verdict is Verdict.OFF
+    assert found.overall.test.mean == pytest.approx(3.0, abs=0.1)
+    assert found.overall.low_mw < 3.0 < found.overall.high_mw + 0.1
+    assert validate(curve(shift_mw=-3.0), data(), 5.0).verdict is Verdict.HOLDS
+
+
+def test_a_shift_of_one_piece_is_found_on_it(curve, data):
+    found = validate(curve(), data(shift_mw=-4.0, above=1800.0), 1.0)
+    assert found.verdict is Verdict.OFF
+    means = [c.test.mean for c in found.pieces]
+    assert means[2] == pytest.approx(-4.0, abs=0.2)
+    assert np.abs(means[:2]).max() < 0.2
+
+
+def test_noise_too_large_for_the_tolerance_leaves_it_open(curve, data):
+    assert validate(curve(), data(noise_mw=20.0), 0.5).verdict is Verdict.OPEN
+
+
+def test_dynamics_are_judged_where_they_are_known(curve, data):
+    found = validate(curve(dynamics=True), data(), 1.0)
+    assert found.judged_by == 'simulated'
+    assert set(found.predictions) == {'curve', 'simulated'}
+    assert found.verdict is Verdict.HOLDS
+
+
+def test_the_better_of_two_is_told(curve, data):
+    found = validate(curve(), data(), 1.0, against=curve(shift_mw=2.0))
+    assert found.gain is not None
+    assert found.gain.zero_is_rejected()
+    assert found.gain.mean == pytest.approx(4.0, rel=0.2)
+    turned = validate(curve(shift_mw=2.0), data(), 1.0, against=curve())
+    assert turned.gain is not None
+    assert turned.gain.mean == pytest.approx(-found.gain.mean)
+    same = validate(curve(), data(), 1.0, against=curve())
+    assert same.gain is not None
+    assert not same.gain.zero_is_rejected()
+
+
+def test_curves_over_different_inputs_are_not_mixed(curve, data):
+    with pytest.raises(DataError, match='different inputs'):
+        validate(curve(), data(), 1.0, against=curve(exponent=1.0))
+
+
+def test_the_share_beyond_the_curve_is_told(curve, data):
+    found = validate(curve(), data(u_shift=600.0), 1.0)
+    u = data(u_shift=600.0).samples.u
+    rows = np.concatenate([np.arange(a, b) for a, b, _ in data().spans])
+    assert found.outside_share == pytest.approx(np.mean(u[rows] > 2200.0))
+    assert 0.1 < found.outside_share < 0.9
+
+
+def test_the_json_says_the_same(curve, data):
+    found = validate(curve(), data(), 1.0, against=curve(shift_mw=2.0))
+    content = json.loads(json.dumps(to_json(found), allow_nan=False))
+    assert content['format'] == 'valveflow/validation'
+    assert content['version'] == 1
+    assert content['verdict'] == 'holds'
+    assert len(content['segments']) == content['judged']['segments'] == 30
+    mean = content['overall']['mean_difference_mw']['mean']
+    weights = [s['samples'] for s in content['segments']]
+    means = [s['scores']['curve']['each_sample']['mean'] for s in content['segments']]
+    assert mean == pytest.approx(np.average(means, weights=weights))

@@ -1,1 +1,0 @@
-"""The engine: pure, without clock, files, threads or ROS."""

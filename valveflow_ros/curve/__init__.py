@@ -1,0 +1,1 @@
+"""The flow characteristic: evaluated, written, inverted, and compared with a reference."""

@@ -1,0 +1,222 @@
+"""The result: the flow characteristic, how sure it is, and what it was made from."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from valveflow_ros.curve.chart_design import ChartDesign
+from valveflow_ros.curve.model import RegionalModel
+from valveflow_ros.errors import DataError
+from valveflow_ros.records import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """One line segment of eq. (2); u in % MPa^m, slope in MW per unit of u, intercept in MW."""
+
+    u_from: float
+    u_to: float
+    slope: float
+    intercept: float
+    slope_stderr: float
+    intercept_stderr: float
+    samples: int
+
+
+@dataclass(frozen=True, slots=True)
+class RegionDynamics:
+    """First-order dynamics with delay, eq. (3), between two power levels.
+
+    ``power_to_stderr_mw`` is the standard error of the upper level; the last region has none.
+    """
+
+    power_from: float
+    power_to: float
+    time_constant_s: float
+    delay_s: float
+    time_constant_stderr_s: float
+    delay_stderr_s: float
+    power_to_stderr_mw: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """How J was chosen: the rule, Omega(J) of eq. (19) and Lambda(J) of eq. (24).
+
+    ``confidence`` is the probability of each J; empty where the rule has none.
+    """
+
+    rule: str
+    cost: dict[int, float]
+    turning_angle: dict[int, float]
+    note: str = ''
+    confidence: dict[int, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Support:
+    """What a piece rests on: special segments and samples inside it.
+
+    ``levels`` are the distinct steady levels in u. ``identifiable`` says whether the
+    condition after Proposition 2 of the paper holds.
+    """
+
+    steady: int
+    slope_response: int
+    samples: int
+    levels: tuple[float, ...]
+    identifiable: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """The data the curve was fitted to."""
+
+    window_start_ns: int
+    window_end_ns: int
+    steady: int
+    slope_response: int
+    samples: int
+    temperature_mean_degc: float
+    temperature_spread_k: float
+    temperature_flag: bool
+
+
+@dataclass(frozen=True, slots=True)
+class HeldCause:
+    """A cause of the diagnosis that was taken out of the rows before the curve was fitted.
+
+    ``values`` are its parameters by name; ``sentence`` says it to a person.
+    """
+
+    name: str
+    values: tuple[tuple[str, float], ...]
+    sentence: str
+
+
+@dataclass(frozen=True, slots=True)
+class ResidualStatistics:
+    """What residuals of this curve look like on the data it was fitted to (MW).
+
+    95 % of single measurements lie within +- ``width_mw`` of the prediction. ``chart`` watches
+    for a lasting shift; without one there is no alarm.
+    """
+
+    rmse_mw: float
+    average_sd_mw: float
+    average_s: float
+    input_noise: float
+    power_noise_mw: float
+    width_mw: float = math.nan
+    chart: ChartDesign | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Characteristic:
+    """A fitted flow characteristic x = F(u).
+
+    Where causes were ``held`` the curve is that of the plant without them.
+    """
+
+    pressure_exponent: float
+    pieces: tuple[Piece, ...]
+    breakpoint_intervals: tuple[tuple[float, float], ...]
+    choice: Choice
+    source: Source
+    residuals: ResidualStatistics
+    dynamics: tuple[RegionDynamics, ...] = ()
+    partition_pieces: tuple[Piece, ...] = ()
+    notes: tuple[str, ...] = ()
+    support: tuple[Support, ...] = ()
+    model_id: str = field(default='')
+    held: tuple[HeldCause, ...] = field(default=(), repr=False)
+
+    @property
+    def breakpoints(self) -> FloatArray:
+        """Return the boundary point vector U of the paper, shape (J + 1,)."""
+        return np.array([self.pieces[0].u_from, *(p.u_to for p in self.pieces)])
+
+    @property
+    def model(self) -> RegionalModel:
+        """Return the numbers as the model that predicts."""
+        slopes = np.array([p.slope for p in self.pieces])
+        intercepts = np.array([p.intercept for p in self.pieces])
+        knots = self.breakpoints
+        return RegionalModel(
+            knots=knots,
+            left=slopes * knots[:-1] + intercepts,
+            right=slopes * knots[1:] + intercepts,
+            levels=np.array([d.power_to for d in self.dynamics[:-1]]),
+            time_constants=np.array([d.time_constant_s for d in self.dynamics]),
+            delays=np.array([d.delay_s for d in self.dynamics]),
+        )
+
+    def values(self) -> FloatArray:
+        """Return F at the breakpoints in MW, shape (J + 1,); at a jump the mean of both ends."""
+        m = self.model
+        inner = 0.5 * (m.right[:-1] + m.left[1:])
+        return np.concatenate([m.left[:1], inner, m.right[-1:]])
+
+    def __call__(self, u: FloatArray) -> FloatArray:
+        """Evaluate F(u) in MW, eq. (26); NaN outside the identified range.
+
+        Nothing is known beyond the outer breakpoints, so nothing is said there.
+        """
+        u = np.asarray(u, dtype=np.float64)
+        knots = self.breakpoints
+        inside = (u >= knots[0]) & (u <= knots[-1])
+        return np.where(inside, self.model.static(u), np.nan)
+
+    def inverse(self, power_mw: FloatArray) -> FloatArray:
+        """Return u = F^-1(x); NaN for a power the curve does not reach.
+
+        Raises
+        ------
+        DataError
+            The curve does not rise throughout, so it has no inverse.
+        """
+        m = self.model
+        if np.any(m.slopes() <= 0.0):
+            falling = int(np.argmin(m.slopes())) + 1
+            raise DataError(
+                f'The curve has no inverse: piece {falling} does not rise '
+                f'(slope {m.slopes()[falling - 1]:.4g} MW per unit of u).'
+            )
+        x, u = _rising_points(m)
+        power = np.asarray(power_mw, dtype=np.float64)
+        # Of equal x the first counts: the smallest u that reaches the power.
+        i = np.clip(np.searchsorted(x, power, side='left'), 1, len(x) - 1)
+        with np.errstate(invalid='ignore'):
+            share = (power - x[i - 1]) / (x[i] - x[i - 1])
+        found = u[i - 1] + share * (u[i] - u[i - 1])
+        return np.where((power >= x[0]) & (power <= x[-1]), found, np.nan)
+
+    def with_id(self) -> Characteristic:
+        """Return a copy whose `model_id` is a hash of its numbers."""
+        # Held causes count where there are some; the names of other curves stay what they were.
+        told = repr(replace(self, model_id='')) + (repr(self.held) if self.held else '')
+        digest = hashlib.sha256(told.encode()).hexdigest()
+        return replace(self, model_id=digest[:12])
+
+
+def _rising_points(m: RegionalModel) -> tuple[FloatArray, FloatArray]:
+    """Return (x, u) along which the smallest u that reaches a power lies.
+
+    At a jump up the knot answers for all powers inside it; after a jump down a
+    piece counts only from where it goes beyond what was reached before.
+    """
+    points = [(float(m.left[0]), float(m.knots[0]))]
+    for k, slope in enumerate(m.slopes()):
+        reached = points[-1][0]
+        low = max(float(m.left[k]), reached)
+        if m.right[k] > low:
+            begin = float(m.knots[k] + (low - m.left[k]) / slope)
+            # Powers inside a jump, or skipped by lower pieces, are answered by where this begins.
+            points += [(reached, begin), (low, begin), (float(m.right[k]), float(m.knots[k + 1]))]
+    points = [points[0], *(b for a, b in itertools.pairwise(points) if a != b)]
+    return np.array([x for x, _ in points]), np.array([u for _, u in points])

@@ -1,0 +1,294 @@
+"""The inverse of the flow characteristic as a table for the turbine controller."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from valveflow_ros.curve.characteristic import Characteristic, Piece
+from valveflow_ros.curve.inverse_points import spread, thin
+from valveflow_ros.curve.line_error import curve_error, piece_of
+from valveflow_ros.errors import DataError, InputError
+from valveflow_ros.records import FloatArray
+
+_JOINED_MW = 1e-6  # pieces whose ends differ by less meet: what is left is rounding
+_CHECKED = 20_001  # powers at which the inverse is tried
+_STEEP = 5.0  # a gain beyond this many times the least one is too large, unless told otherwise
+
+
+@dataclass(frozen=True, slots=True)
+class Compensation:
+    """Demanded power to integrated input.
+
+    Attributes
+    ----------
+    power_mw, u, u_stderr : float64 (n,)
+        The table: power rises, u does not fall; one standard error of u.
+    gain : float64 (n,)
+        Units of u per MW from this point to the next; the last repeats the one before.
+    within : bool (n,)
+        The gain is within its limit.
+    curve : Characteristic
+        The part of the curve that was inverted.
+    gains : float64 (J,)
+        Units of u per MW of each of its pieces.
+    gain_limit : float
+    largest_step : float
+        The largest ratio of the gains of two neighbouring pieces, 1 or more.
+    useful_mw : tuple of float
+        The widest range of power over which the gain stays within its limit.
+    identity_mw : float
+        Largest ``|F(F^-1(x)) - x|`` over the whole range, jumps left out.
+    table_mw, table_u : float
+        Largest error that interpolating in the table as written has, in MW and in u.
+    jumps : tuple of (float, float, float)
+        Where the curve jumps up: u, and the powers below and above.
+    first_piece : int
+        Number that the first of these pieces has in the whole curve, from 1.
+    notes : tuple of str
+    """
+
+    power_mw: FloatArray
+    u: FloatArray
+    u_stderr: FloatArray
+    gain: FloatArray
+    within: np.ndarray
+    curve: Characteristic
+    gains: FloatArray
+    gain_limit: float
+    largest_step: float
+    useful_mw: tuple[float, float]
+    identity_mw: float
+    table_mw: float
+    table_u: float
+    jumps: tuple[tuple[float, float, float], ...]
+    first_piece: int
+    notes: tuple[str, ...]
+
+
+def compensate(
+    curve: Characteristic,
+    points: int = 16,
+    gain_limit: float | None = None,
+    u_from: float = -math.inf,
+    u_to: float = math.inf,
+    places: int = 4,
+) -> Compensation:
+    """Invert a curve.
+
+    Parameters
+    ----------
+    curve : Characteristic
+    points : int
+        Length of the table, 2 or more. Knots come first: with J + 1 or more points linear
+        interpolation of the table is exact; with fewer the knots are kept that make its
+        largest error in power least.
+    gain_limit : float, optional
+        Units of u per MW beyond which the table is of no use; by default five times the
+        least gain of the curve.
+    u_from, u_to : float
+        Leave out what lies outside.
+    places : int
+        Decimals of power and u in the table; the errors are those of the rounded numbers.
+
+    Raises
+    ------
+    DataError
+        The curve does not rise throughout; the sentence names the piece and what to do.
+    InputError
+        ``points`` or the range makes no table.
+    """
+    if points < 2:
+        raise InputError(f'A table needs 2 points or more, not {points}.')
+    cut, first = _cut(curve, u_from, u_to)
+    _rises(cut, first)
+    x, u = _corners(cut)
+    exact = len(x)
+    x, u = spread(x, u, points) if points >= exact else thin(x, u, points)
+    gain = np.diff(u) / np.maximum(np.diff(x), 1e-300)
+    gain = np.where(np.diff(x) > 0.0, gain, math.inf)
+    gain = np.append(gain, gain[-1])
+    x, u = np.round(x, places), np.round(u, places)
+    gains = np.array([1.0 / p.slope for p in cut.pieces])
+    limit = _STEEP * float(gains.min()) if gain_limit is None else gain_limit
+    table_mw, table_u = _table_errors(cut, x, u)
+    made = Compensation(
+        power_mw=x, u=u, u_stderr=_u_error(cut, u), gain=gain,
+        within=gain <= limit * (1.0 + 1e-9), curve=cut, gains=gains, gain_limit=limit,
+        largest_step=_largest_step(gains), useful_mw=_useful(cut, gains, limit),
+        identity_mw=_identity(cut), table_mw=table_mw, table_u=table_u, jumps=_jumps(cut),
+        first_piece=first, notes=(),
+    )  # fmt: skip
+    return replace(made, notes=_notes(made, points, exact))
+
+
+def _cut(curve: Characteristic, u_from: float, u_to: float) -> tuple[Characteristic, int]:
+    """Return the curve between two u, and the number of its first piece."""
+    knots = curve.breakpoints
+    low, high = max(u_from, float(knots[0])), min(u_to, float(knots[-1]))
+    if not low < high:
+        raise InputError(
+            f'The curve is known for u from {knots[0]:.1f} to {knots[-1]:.1f}; '
+            f'nothing of it lies between {u_from:g} and {u_to:g}.'
+        )
+    kept = [
+        (k, replace(p, u_from=max(p.u_from, low), u_to=min(p.u_to, high)))
+        for k, p in enumerate(curve.pieces)
+        if p.u_from < high and p.u_to > low
+    ]
+    inner = tuple(curve.breakpoint_intervals[k] for k, _ in kept[:-1])
+    part = replace(curve, pieces=tuple(p for _, p in kept), breakpoint_intervals=inner)
+    return part, kept[0][0] + 1
+
+
+def _end(piece: Piece, u: float) -> float:
+    return piece.slope * u + piece.intercept
+
+
+def _rises(curve: Characteristic, first: int) -> None:
+    """Refuse a curve that has no inverse."""
+    what = (
+        'Identify from data in which the unit moves more there, or leave that part out with '
+        '--u-from and --u-to.'
+    )
+    for number, piece in enumerate(curve.pieces, first):
+        if piece.slope <= 0.0:
+            does = 'falls' if piece.slope < 0.0 else 'is level'
+            raise DataError(
+                f'The curve has no inverse: piece {number} (u {piece.u_from:.1f} to '
+                f'{piece.u_to:.1f}) {does} ({piece.slope:.4g} MW per unit of u), so one power '
+                f'belongs to several openings. {what}'
+            )
+    for number, (a, b) in enumerate(itertools.pairwise(curve.pieces), first):
+        drop = _end(a, a.u_to) - _end(b, b.u_from)
+        if drop > _JOINED_MW:
+            raise DataError(
+                f'The curve has no inverse: at u = {a.u_to:.1f}, between pieces {number} and '
+                f'{number + 1}, it falls by {drop:.3g} MW. {what}'
+            )
+
+
+def _jumps(curve: Characteristic) -> tuple[tuple[float, float, float], ...]:
+    """Return where the curve jumps up."""
+    ends = [
+        (a.u_to, _end(a, a.u_to), _end(b, b.u_from)) for a, b in itertools.pairwise(curve.pieces)
+    ]
+    return tuple((u, low, high) for u, low, high in ends if high - low > _JOINED_MW)
+
+
+def _corners(curve: Characteristic) -> tuple[FloatArray, FloatArray]:
+    """Return power and u of the corners; a jump has two."""
+    x: list[float] = []
+    u: list[float] = []
+    for piece in curve.pieces:
+        low = _end(piece, piece.u_from)
+        if not (x and abs(low - x[-1]) <= _JOINED_MW):
+            x.append(low)
+            u.append(piece.u_from)
+        x.append(_end(piece, piece.u_to))
+        u.append(piece.u_to)
+    return np.array(x), np.array(u)
+
+
+def corner_count(curve: Characteristic) -> int:
+    """Return the number of points with which a table of this curve is exact."""
+    return len(_corners(curve)[0])
+
+
+def _identity(curve: Characteristic) -> float:
+    """Return the largest difference of F(F^-1(x)) from x, outside jumps."""
+    x, _ = _corners(curve)
+    powers = np.unique(np.concatenate([np.linspace(x[0], x[-1], _CHECKED), x]))
+    inside = np.zeros(len(powers), dtype=bool)
+    for _, low, high in _jumps(curve):
+        inside |= (powers >= low) & (powers <= high)
+    powers = powers[~inside]
+    back = curve.model.static(curve.inverse(powers))
+    # A power at the very end may lie a rounding error beyond what the curve reaches.
+    back = np.where(np.isnan(back) & ((powers == x[0]) | (powers == x[-1])), powers, back)
+    return float(np.max(np.abs(back - powers), initial=0.0))
+
+
+def _table_errors(curve: Characteristic, x: FloatArray, u: FloatArray) -> tuple[float, float]:
+    """Return the largest error of interpolating in the table, in MW and in u.
+
+    All three lines are straight between the corners, so the corners decide.
+    """
+    corners_x, corners_u = _corners(curve)
+    rises = np.append(True, np.diff(u) > 0.0)
+    power_at = np.interp(corners_u, u[rises], x[rises])
+    jumping = np.zeros(len(corners_u), dtype=bool)
+    for place, _, _ in _jumps(curve):
+        jumping |= corners_u == place
+    at_table = np.abs(curve.model.static(np.clip(u, corners_u[0], corners_u[-1])) - x)
+    for _, low, high in _jumps(curve):
+        at_table[(x >= low - 1e-3) & (x <= high + 1e-3)] = 0.0
+    off_mw = np.abs(power_at - corners_x)[~jumping]
+    off_u = np.abs(np.interp(corners_x, x, u) - corners_u)
+    return (
+        float(max(off_mw.max(initial=0.0), at_table.max(initial=0.0))), float(off_u.max()),
+    )  # fmt: skip
+
+
+def _u_error(curve: Characteristic, u: FloatArray) -> FloatArray:
+    """Return the standard error of F^-1: that of F through the slope; at a knot the larger."""
+    slopes = np.array([p.slope for p in curve.pieces])
+    span = float(curve.breakpoints[-1] - curve.breakpoints[0])
+    error = np.zeros(len(u))
+    for side in (-1e-9, 1e-9):
+        at = np.clip(u + side * span, curve.breakpoints[0], curve.breakpoints[-1])
+        error = np.fmax(error, curve_error(curve, at) / slopes[piece_of(curve, at)])
+    known = all(math.isfinite(p.slope_stderr) for p in curve.pieces)
+    return error if known else np.where(error > 0.0, error, math.nan)
+
+
+def _largest_step(gains: FloatArray) -> float:
+    if len(gains) < 2:
+        return 1.0
+    ratio = gains[1:] / gains[:-1]
+    return float(np.maximum(ratio, 1.0 / ratio).max())
+
+
+def _useful(curve: Characteristic, gains: FloatArray, limit: float) -> tuple[float, float]:
+    """Return the widest range of power in which no piece has a gain beyond the limit."""
+    best, begun = (math.nan, math.nan), None
+    for piece, gain in zip(curve.pieces, gains, strict=True):
+        if gain > limit:
+            begun = None
+            continue
+        begun = _end(piece, piece.u_from) if begun is None else begun
+        high = _end(piece, piece.u_to)
+        if not high - begun <= best[1] - best[0]:
+            best = (begun, high)
+    return best
+
+
+def _notes(made: Compensation, points: int, exact: int) -> tuple[str, ...]:
+    """Return what whoever enters the table has to know."""
+    notes = [
+        f'Below {made.power_mw[0]:.2f} MW and above {made.power_mw[-1]:.2f} MW nothing is known '
+        'of the valve: the controller must hold u at the end of the table there.'
+    ]
+    pairs = zip(made.curve.pieces, made.gains, strict=True)
+    for number, (piece, gain) in enumerate(pairs, made.first_piece):
+        if gain > made.gain_limit:
+            notes.append(
+                f'Piece {number} (u {piece.u_from:.0f} to {piece.u_to:.0f}, '
+                f'{_end(piece, piece.u_from):.1f} to {_end(piece, piece.u_to):.1f} MW) hardly '
+                f'answers: 1 MW takes {gain:.3g} units of u (limit {made.gain_limit:.3g}), so '
+                'noise of the demand would drive the valve to and fro; do not use the table there.'
+            )
+    for u, low, high in made.jumps:
+        notes.append(
+            f'At u = {u:.1f} the curve jumps from {low:.2f} to {high:.2f} MW: demands between '
+            'the two get the same u and are not met exactly.'
+        )
+    if points < exact:
+        notes.append(
+            f'{exact} points would make the table exact; with {points} interpolation is off by '
+            f'up to {made.table_mw:.3g} MW.'
+        )
+    return tuple(notes)

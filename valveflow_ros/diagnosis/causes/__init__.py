@@ -1,0 +1,21 @@
+"""The catalogue of causes, by family; every `Cause` at the top of a module here is one of them."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import pkgutil
+
+from valveflow_ros.diagnosis.cause import Cause
+
+
+@functools.cache
+def catalogue() -> dict[str, Cause]:
+    """Return every cause by name, in alphabetical order."""
+    modules = [
+        importlib.import_module(f'{__name__}.{m.name}') for m in pkgutil.iter_modules(__path__)
+    ]
+    causes = [
+        made for module in modules for made in vars(module).values() if isinstance(made, Cause)
+    ]
+    return {cause.name: cause for cause in sorted(causes, key=lambda cause: cause.name)}

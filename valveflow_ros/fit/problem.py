@@ -1,0 +1,272 @@
+"""Measured rows, what a model makes of them, and how its parameters move."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from valveflow_ros.curve.model import RegionalModel
+from valveflow_ros.fit.answer_kernel import answer_residual
+from valveflow_ros.fit.normal_kernel import normal_sums, square_sum
+from valveflow_ros.fit.tangent_kernel import tangents
+from valveflow_ros.records import BoolArray, ByteArray, FloatArray
+from valveflow_ros.threads import cores, runs, share
+
+# What reacts to the power within the rows averaged, as a load controller does, would be
+# taken for dynamics of the valve: so in the end few rows are averaged.
+_FINE_S = 2.0
+# The filters of a stretch of rows begin so many time constants before it: what they began with is
+# then less than the last bit of the answer.
+_FORGOTTEN = 40.0
+# A stretch has this many means at least, and eight times what comes before it. How the rows are
+# cut depends on them and the model alone, so that the bits do not depend on the machine.
+_STRETCH = 8192
+_FEW = 4
+_LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4, 0.2, 0.1, 0.05)
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """All rows of the window, as the model needs them.
+
+    Attributes
+    ----------
+    u, power_mw : float64 (n,)
+    usable : uint8 (n,)
+        0 where a row has no data; a gap restarts the filters.
+    step_s : float
+    settle_s : float
+        Rows this long after a gap are not scored.
+    group : int
+        Rows averaged before scoring.
+    """
+
+    u: FloatArray
+    power_mw: FloatArray
+    usable: ByteArray
+    step_s: float
+    settle_s: float
+    group: int
+
+    @property
+    def means(self) -> int:
+        """Return the number of scored means."""
+        return len(self.u) // self.group
+
+    def finer(self) -> Samples:
+        """Return the same rows with hardly any averaging, for the last word on all parameters."""
+        return replace(self, group=max(1, min(self.group, round(_FINE_S / self.step_s))))
+
+    def coarser(self) -> Samples:
+        """Return means over some rows, for searches: two rows to a scored mean.
+
+        The filter is exact for a flow that is straight between rows, so little is
+        lost but what is faster than the rows.
+        """
+        factor = self.group // 2
+        if factor < 2:
+            return self
+        rows = len(self.u) // (2 * factor) * 2
+
+        def mean(values: FloatArray) -> FloatArray:
+            return np.asarray(values[: rows * factor].reshape(rows, factor).mean(axis=1))
+
+        usable = np.asarray(self.usable[: rows * factor].reshape(rows, factor).min(axis=1))
+        return replace(
+            self,
+            u=mean(self.u),
+            power_mw=mean(self.power_mw),
+            usable=usable,
+            step_s=self.step_s * factor,
+            group=2,
+        )
+
+
+class Problem:
+    """Measured means, and what a model makes of them."""
+
+    def __init__(self, samples: Samples) -> None:
+        self.samples = samples
+        m = samples.means
+        cut = m * samples.group
+        self.settle = round(samples.settle_s / samples.step_s)
+        self.u = np.ascontiguousarray(samples.u[:cut])
+        self.usable = np.ascontiguousarray(samples.usable[:cut])
+        power = np.where(self.usable > 0, samples.power_mw[:cut], 0.0)
+        self.power = power.reshape(m, samples.group).mean(axis=1)
+        self._threads = cores()
+
+    def answer(self, model: RegionalModel) -> tuple[FloatArray, ByteArray]:
+        """Return residual means (m,) and their weight."""
+        s = self.samples
+        residual = np.empty(s.means)
+        weight = np.empty(s.means, dtype=np.uint8)
+        taps = model.taps(s.step_s)
+
+        def stretch(begin: int, first: int, end: int) -> None:
+            answer_residual(
+                self.u, self.usable, self.power, model.knots, model.left, model.right,
+                model.levels, taps, self.settle, s.group, begin, first, end, residual, weight,
+            )  # fmt: skip
+
+        # An answer takes so little that more and shorter stretches would cost more than they gain.
+        share(stretch, self._stretches(model, least=-(-s.means // _FEW)), self._threads)
+        return residual, weight
+
+    def tangents(
+        self, model: RegionalModel, also: int = 0
+    ) -> tuple[FloatArray, FloatArray, ByteArray]:
+        """Return residual (m,), Jacobian of the prediction (m, P) and weight (m,).
+
+        There is room for some columns more behind the others, ``also``, not yet written.
+        """
+        s = self.samples
+        residual = np.empty(s.means)
+        jacobian = np.empty((s.means, 3 * model.pieces - 1 + 2 * model.regions + also))
+        weight = np.empty(s.means, dtype=np.uint8)
+
+        def stretch(begin: int, first: int, end: int) -> None:
+            part = slice(first, end)
+            self._tangents(
+                model, begin, first, end, residual[part], jacobian[part], weight[part]
+            )  # fmt: skip
+
+        share(stretch, self._stretches(model), self._threads)
+        return residual, jacobian, weight
+
+    def normal(self, model: RegionalModel, ar: FloatArray) -> tuple[FloatArray, int]:
+        """Return `normal_equations` of the tangents, which are never all in memory at once.
+
+        Returns
+        -------
+        sums : float64 (P + 1, P + 1)
+            The residual is the last column.
+        rows : int
+        """
+        order, columns = len(ar), 3 * model.pieces - 1 + 2 * model.regions
+        stretches = self._stretches(model, order)
+        sums = np.zeros((len(stretches), columns + 1, columns + 1))
+        rows = np.zeros(len(stretches), dtype=np.int64)
+
+        def stretch(k: int, begin: int, first: int, end: int) -> None:
+            back = min(first, order)
+            n = end - first + back
+            residual, jacobian = np.empty(n), np.empty((n, columns))
+            weight = np.empty(n, dtype=np.uint8)
+            self._tangents(model, begin, first - back, end, residual, jacobian, weight)
+            rows[k] = normal_sums(
+                jacobian, residual, weight, ar, back, n, sums[k], np.empty((0, columns))
+            )  # fmt: skip
+
+        share(stretch, [(k, *part) for k, part in enumerate(stretches)], self._threads)
+        total = np.tril(sums.sum(axis=0))
+        return total + np.tril(total, -1).T, int(rows.sum())
+
+    def _tangents(
+        self, model: RegionalModel, begin: int, first: int, end: int,
+        residual: FloatArray, jacobian: FloatArray, weight: ByteArray,
+    ) -> None:  # fmt: skip
+        s = self.samples
+        tangents(
+            self.u, self.usable, self.power, model.knots, model.left, model.right,
+            model.levels, model.time_constants, model.delays, s.step_s, self.settle, s.group,
+            begin, first, end, residual, jacobian, weight,
+        )  # fmt: skip
+
+    def cost(self, model: RegionalModel, ar: FloatArray) -> float:
+        """Return the sum of squared innovations."""
+        residual, weight = self.answer(model)
+        return float(square_sum(residual, weight, ar))
+
+    def _stretches(
+        self, model: RegionalModel, also: int = 0, least: int = 0
+    ) -> list[tuple[int, int, int]]:
+        """Cut the means into stretches: where the filters begin, the first that counts, the end.
+
+        So many means before the first are to be right, ``also``; a stretch has ``least`` means.
+        """
+        s = self.samples
+        memory_s = _FORGOTTEN * float(model.time_constants.max()) + float(model.delays.max())
+        lead = math.ceil((memory_s / s.step_s + self.settle + 3) / s.group) + also
+        length = max(_STRETCH, 8 * lead, least)
+        return [(max(0, first - lead), first, end) for first, end in runs(s.means, length)]
+
+
+def free_parameters(pieces: int, regions: int, jumps: BoolArray | None = None) -> BoolArray:
+    """Return the mask of free parameters in packed order; no jumps unless ``jumps`` (J - 1,)."""
+    if jumps is None:
+        jumps = np.zeros(pieces - 1, dtype=bool)
+    return np.concatenate(
+        [np.ones(2 * pieces, dtype=bool), jumps, np.ones(2 * regions, dtype=bool)]
+    )
+
+
+def in_bounds(model: RegionalModel, samples: Samples) -> bool:
+    """Tell whether a model is one a plant can have and a filter can run."""
+    span = model.knots[-1] - model.knots[0]
+    return bool(
+        np.all(np.diff(model.knots) > 0.004 * span)
+        and np.all(model.time_constants >= 0.1 * samples.step_s)
+        and np.all(model.time_constants <= 3600.0)
+        and np.all(model.delays >= 0.0)
+        and np.all(model.delays <= 600.0)
+    )
+
+
+def move(
+    problem: Problem, model: RegionalModel, ar: FloatArray, free: BoolArray, steps: int
+) -> tuple[RegionalModel, float]:
+    """Levenberg-Marquardt in the free parameters, levels held."""
+    damping = 1e-4
+    cost = problem.cost(model, ar)
+    for _ in range(steps):
+        sums, _ = problem.normal(model, ar)
+        normal, slope = sums[:-1, :-1][np.ix_(free, free)], sums[:-1, -1][free]
+        scale = np.sqrt(np.maximum(np.diag(normal), 1e-12 * np.diag(normal).max()))
+        normal = normal / np.outer(scale, scale)
+        better = None
+        for _ in range(6):
+            step = np.linalg.solve(
+                normal + damping * np.eye(len(scale)), slope / scale
+            ) / scale  # fmt: skip
+            packed = model.pack()
+            packed[free] += step
+            n_delays = model.regions
+            packed[-n_delays:] = np.maximum(packed[-n_delays:], 0.0)
+            trial = model.unpack(packed)
+            if in_bounds(trial, problem.samples):
+                value = problem.cost(trial, ar)
+                if value < cost:
+                    better = (trial, value)
+                    break
+            damping *= 10.0
+        if better is None:
+            break
+        gain = cost - better[1]
+        model, cost = better
+        damping = max(damping / 10.0, 1e-8)
+        if gain < 1e-7 * cost:
+            break
+    return model, cost
+
+
+def search_levels(
+    problem: Problem, model: RegionalModel, ar: FloatArray, cost: float
+) -> tuple[RegionalModel, float]:
+    """Move each level along a line, the step shrinking, while the cost falls."""
+    for k in range(len(model.levels)):
+        for step in _LEVEL_STEPS_MW:
+            for sign in (1.0, -1.0):
+                while True:
+                    levels = model.levels.copy()
+                    levels[k] += sign * step
+                    if np.any(np.diff(levels) <= 1.0):
+                        break
+                    trial = model.with_levels(levels)
+                    value = problem.cost(trial, ar)
+                    if not value < cost:
+                        break
+                    model, cost = trial, value
+    return model, cost

@@ -1,0 +1,129 @@
+"""How sure the parameters are, with noise that is correlated and depends on what happens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from valveflow_ros.curve.model import RegionalModel
+from valveflow_ros.fit.problem import Problem
+from valveflow_ros.fit.whitening import normal_equations
+from valveflow_ros.records import BoolArray, ByteArray, FloatArray
+from valveflow_ros.sums import gram
+
+_MOST_BLOCKS = 60
+_LEAST_IN_BLOCK_S = 500.0
+# The answer is not smooth in a level: half this many MW to both sides average over what lies near.
+_LEVEL_STEP_MW = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Certainty:
+    """Covariance of what was estimated.
+
+    Attributes
+    ----------
+    covariance : float64 (P, P)
+        Of the packed parameters. What was not free has 0; what was free and is not moved by
+        the data has NaN.
+    level_stderr : float64 (I - 1,)
+        Standard errors of the levels between regions, MW.
+    innovation_mw : float
+        sd of the whitened residual.
+    prediction_mw : float
+        How wrong the prediction is because parameters are: root mean square over all rows.
+    """
+
+    covariance: FloatArray
+    level_stderr: FloatArray
+    innovation_mw: float
+    prediction_mw: float
+
+
+def covariance_of(
+    problem: Problem,
+    model: RegionalModel,
+    free: BoolArray,
+    ar: FloatArray,
+    with_levels: bool = True,
+) -> Certainty:
+    """Return how sure the packed parameters are, and the levels unless they are held.
+
+    The inverse normal matrix, widened where sums of scores over blocks vary
+    more than independent innovations would let them. The levels count as
+    parameters, by differences: time constants and delays lean on them.
+    """
+    packed, levels = len(free), len(model.levels) if with_levels else 0
+    residual, jacobian, weight = problem.tangents(model, also=levels)
+    if levels:
+        _level_tangents(problem, model, jacobian[:, packed:])
+        free = np.append(free, np.ones(levels, dtype=bool))
+    sums, scores, rows = normal_equations(jacobian, residual, weight, ar, _blocks(problem))
+    moved = free & (np.diag(sums)[:-1] > 0.0)
+    used = np.flatnonzero(np.append(moved, True))
+    sums, scores = sums[np.ix_(used, used)], np.ascontiguousarray(scores[:, moved])
+    scale = np.sqrt(np.maximum(np.diag(sums)[:-1], 1e-300))
+    inverse = np.linalg.pinv(sums[:-1, :-1] / np.outer(scale, scale), hermitian=True)
+    inverse = inverse / np.outer(scale, scale)
+    variance = float(sums[-1, -1]) / max(rows - len(inverse), 1)
+    robust = inverse @ gram(scores) @ inverse
+    plain = inverse * variance
+    # Few blocks make the robust form noisy; it may widen, never narrow.
+    diagonal = np.maximum(np.diag(plain), 1e-300)
+    widen = np.sqrt(np.maximum(1.0, np.diag(robust) / diagonal))
+    covariance = np.zeros((len(free), len(free)))
+    covariance[np.ix_(moved, moved)] = plain * np.outer(widen, widen)
+    dead = np.flatnonzero(free & ~moved)
+    covariance[dead, dead] = np.nan
+    return Certainty(
+        covariance[:packed, :packed],
+        np.sqrt(np.diag(covariance)[packed:]),
+        float(np.sqrt(max(variance, 0.0))),
+        _prediction_error(jacobian, weight, np.where(np.outer(moved, moved), covariance, 0.0)),
+    )
+
+
+def _prediction_error(jacobian: FloatArray, weight: ByteArray, covariance: FloatArray) -> float:
+    """Return the root mean square of what errors of the parameters do to the answer."""
+    sums, _, rows = normal_equations(jacobian, np.zeros(len(weight)), weight, np.empty(0))
+    square = np.sum(sums[:-1, :-1] * covariance) / max(rows, 1)
+    return float(np.sqrt(max(square, 0.0)))
+
+
+def _blocks(problem: Problem) -> int:
+    """Return into how many blocks of time the window is cut."""
+    rows = max(1, round(_LEAST_IN_BLOCK_S / (problem.samples.step_s * problem.samples.group)))
+    return max(1, min(_MOST_BLOCKS, problem.samples.means // rows))
+
+
+def _level_tangents(problem: Problem, model: RegionalModel, columns: FloatArray) -> None:
+    """Write the answer's change per MW of each level, shape (m, I - 1)."""
+    for k in range(len(model.levels)):
+        half = np.zeros(len(model.levels))
+        half[k] = 0.5 * _LEVEL_STEP_MW
+        low, _ = problem.answer(model.with_levels(model.levels - half))
+        high, _ = problem.answer(model.with_levels(model.levels + half))
+        columns[:, k] = (low - high) / _LEVEL_STEP_MW
+
+
+def bend_certainty(problem: Problem, model: RegionalModel, ar: FloatArray) -> FloatArray:
+    """Return half the squared change of slope over its variance, for each inner knot (J - 1,).
+
+    That is the log-likelihood a knee is worth, with the robust variance.
+    """
+    j = model.pieces
+    free = np.zeros(len(model.pack()), dtype=bool)
+    free[: j + 1] = True
+    covariance = covariance_of(problem, model, free, ar, with_levels=False).covariance
+    # A value that no row moves is not known, and no bend at it is certain.
+    covariance = np.nan_to_num(covariance[: j + 1, : j + 1], nan=1e12)
+    width = np.diff(model.knots)
+    change = np.zeros((j - 1, j + 1))
+    for k in range(j - 1):
+        change[k, k] = 1.0 / width[k]
+        change[k, k + 1] = -1.0 / width[k] - 1.0 / width[k + 1]
+        change[k, k + 2] = 1.0 / width[k + 1]
+    variance = np.einsum('kp,pq,kq->k', change, covariance, change)
+    bend = np.diff(model.slopes())
+    return np.asarray(0.5 * bend**2 / np.maximum(variance, 1e-300))

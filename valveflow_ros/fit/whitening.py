@@ -1,0 +1,108 @@
+"""An autoregressive model of the residual, so that its samples may be counted as independent."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from valveflow_ros.curve.regional_kernel import lagged_products, whiten
+from valveflow_ros.fit.normal_kernel import normal_sums
+from valveflow_ros.records import ByteArray, FloatArray
+from valveflow_ros.threads import cores, runs, share
+
+ORDER = 4
+_LARGEST_SUM = 0.95
+# Rows whose sums are formed by themselves and then added in order: the bits do not depend on the
+# number of threads.
+_STRETCH = 16384
+
+
+def fit_ar(residual: FloatArray, weight: ByteArray, order: int = ORDER) -> FloatArray:
+    """Estimate AR coefficients by Yule-Walker over the weighted rows, shape (order,).
+
+    Rows with weight 0 neither count nor connect their neighbours. A residual
+    without power gives zeros.
+    """
+    products = lagged_products(residual, weight, order)
+    if not products[0] > 0.0:
+        return np.zeros(order)
+    # A touch of white noise keeps the system solvable for a residual that hardly varies.
+    products[0] *= 1.0 + 1e-9
+    ar = yule_walker(products)
+    # A residual that still holds a misfit looks like a random walk, and whitening by a
+    # root at one would make levels, and with them the misfit, invisible.
+    total = float(ar.sum())
+    return ar * (_LARGEST_SUM / total) if total > _LARGEST_SUM else ar
+
+
+def yule_walker(products: FloatArray) -> FloatArray:
+    """Solve for the coefficients whose process has these mean products at lags 0 to k, (k,).
+
+    Raises
+    ------
+    LinAlgError
+        There is no solution, or a product is not finite.
+    """
+    if not np.isfinite(products).all():
+        raise np.linalg.LinAlgError('the residual is not finite')
+    lags = np.arange(len(products) - 1)
+    # So few that the solver made for such matrices gains nothing, and takes long to load.
+    return np.asarray(np.linalg.solve(products[np.abs(lags[:, None] - lags)], products[1:]))
+
+
+def normal_equations(
+    jacobian: FloatArray, residual: FloatArray, weight: ByteArray, ar: FloatArray, blocks: int = 1
+) -> tuple[FloatArray, FloatArray, int]:
+    """Return products of whitened tangents and residual, block scores, and the rows counted.
+
+    Parameters
+    ----------
+    jacobian : float64 (m, P)
+    residual, weight : (m,)
+    ar : float64 (k,)
+    blocks : int
+        Even stretches of time for which scores are added up.
+
+    Returns
+    -------
+    sums : float64 (P + 1, P + 1)
+        The residual is the last column.
+    scores : float64 (blocks, P)
+    rows : int
+    """
+    columns = jacobian.shape[1]
+    table = np.ascontiguousarray(jacobian)
+    parts = runs(len(residual), _STRETCH)
+    sums = np.zeros((len(parts), columns + 1, columns + 1))
+    scores = np.zeros((len(parts), blocks, columns))
+    rows = np.zeros(len(parts), dtype=np.int64)
+
+    def add(k: int, first: int, end: int) -> None:
+        rows[k] = normal_sums(table, residual, weight, ar, first, end, sums[k], scores[k])
+
+    share(add, [(k, *part) for k, part in enumerate(parts)], cores())
+    return sums.sum(axis=0), scores.sum(axis=0), int(rows.sum())
+
+
+def whitened(columns: FloatArray, weight: ByteArray, ar: FloatArray) -> FloatArray:
+    """Return the innovations of each column, shape (rows left, columns)."""
+    columns = np.atleast_2d(columns.T).T
+    out = np.empty((columns.shape[0], columns.shape[1]))
+    rows = 0
+    buffer = np.empty(columns.shape[0])
+    for k in range(columns.shape[1]):
+        rows = whiten(np.ascontiguousarray(columns[:, k]), weight, ar, buffer)
+        out[:rows, k] = buffer[:rows]
+    return out[:rows]
+
+
+def inflation(residual: FloatArray, weight: ByteArray, longest_lag: int) -> float:
+    """Return how many times the variance of a long mean exceeds that of white noise.
+
+    Bartlett-weighted sum of autocorrelations up to ``longest_lag``; at least 1.
+    """
+    products = lagged_products(residual, weight, longest_lag)
+    if not products[0] > 0.0:
+        return 1.0
+    k = np.arange(1, longest_lag + 1)
+    tapered = (1.0 - k / (longest_lag + 1.0)) * products[1:] / products[0]
+    return float(max(1.0, 1.0 + 2.0 * tapered.sum()))

@@ -1,0 +1,246 @@
+"""A recording's folder: numbered splits and the `metadata.yaml` that rosbag2 asks for."""
+
+from __future__ import annotations
+
+import json
+import re
+import textwrap
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from valveflow_ros import __version__
+from valveflow_ros.errors import RecordingError
+from valveflow_ros.logs.mcap.chunk_file import ChunkFile
+from valveflow_ros.logs.mcap.summary import read_summary
+from valveflow_ros.logs.mcap.topic_table import TopicTable
+from valveflow_ros.logs.part_file import write_whole
+from valveflow_ros.logs.source import Source
+
+METADATA_NAME = 'metadata.yaml'
+METADATA_VERSION = 9
+ROS_DISTRO = 'jazzy'
+LIBRARY = f'valveflow_ros {__version__}'
+_NUMBERED = re.compile(r'(.*)_([0-9]{1,9})\.mcap(?:\.part)?\Z', re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class TopicInfoLine:
+    """What `metadata.yaml` says about a topic."""
+
+    topic: str
+    type: str
+    encoding: str
+    qos: str
+    type_hash: str
+
+
+@dataclass(frozen=True, slots=True)
+class Split:
+    """One finished file of a recording.
+
+    Attributes
+    ----------
+    name : str
+        File name within the folder.
+    start_ns, end_ns : int
+        First and last log time; 0 without messages.
+    messages : int
+        Number of messages.
+    topics : dict[str, TopicInfoLine]
+        The topics by name.
+    counts : dict[str, int]
+        Messages of each.
+    """
+
+    name: str
+    start_ns: int
+    end_ns: int
+    messages: int
+    topics: dict[str, TopicInfoLine] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, name: str, table: TopicTable, counts: Mapping[int, int], times: tuple[int, int]
+    ) -> Split:
+        """Describe a file by its topics, the messages of each channel, and its times."""
+        topics: dict[str, TopicInfoLine] = {}
+        by_topic: dict[str, int] = {}
+        for number, channel in table.channels.items():
+            topics[channel.topic] = TopicInfoLine(
+                channel.topic,
+                table.type_of(channel),
+                channel.encoding,
+                channel.metadata.get('offered_qos_profiles', ''),
+                channel.metadata.get('topic_type_hash', ''),
+            )
+            by_topic[channel.topic] = by_topic.get(channel.topic, 0) + counts.get(number, 0)
+        return cls(name, times[0], times[1], sum(counts.values()), topics, by_topic)
+
+    @classmethod
+    def of_file(cls, name: str, file: ChunkFile, table: TopicTable) -> Split:
+        """Describe a file that was just written."""
+        return cls.of(name, table, file.counts, (file.start_ns, file.end_ns))
+
+    @classmethod
+    def read(cls, path: Path) -> Split | None:
+        """Describe a finished file by its summary, ``None`` if it has none to be believed."""
+        try:
+            with Source.open(path) as source:
+                summary = read_summary(source)
+        except RecordingError:
+            return None
+        if summary is None:
+            return None
+        times = (summary.start_ns, summary.end_ns)
+        return cls.of(path.name, summary.table, summary.counts, times)
+
+
+def split_number(path: Path) -> int:
+    """Return the number at the end of a split's name, -1 if it has none."""
+    match = _NUMBERED.match(path.name)
+    return -1 if match is None else int(match.group(2))
+
+
+def is_split_of(name: str, recording: str) -> bool:
+    """Tell whether a file is called as the splits of a recording are."""
+    match = _NUMBERED.match(name)
+    return match is not None and match.group(1) == recording
+
+
+def in_order(paths: Iterable[Path]) -> list[Path]:
+    """Return files in the order of their numbers, then of their names."""
+    return sorted(paths, key=lambda path: (split_number(path), path.name))
+
+
+def finished_files(folder: Path) -> list[Path]:
+    """Return the finished splits of a folder in their order."""
+    return in_order(path for path in folder.glob('*.mcap') if path.is_file())
+
+
+def write_metadata(folder: Path, splits: list[Split]) -> None:
+    """Write `metadata.yaml` for these splits; raises `OSError`."""
+    write_whole(folder / METADATA_NAME, metadata_text(splits).encode())
+
+
+class Listing:
+    """The finished splits of a folder, and the `metadata.yaml` that names them.
+
+    Parameters
+    ----------
+    folder : Path
+        The recording's folder.
+
+    Attributes
+    ----------
+    splits : list of Split
+        In their order.
+    due : bool
+        `metadata.yaml` could not be written as it should be.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be read.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.due = False
+        self.splits: list[Split] = []
+        self._look()
+
+    def add(self, split: Split) -> None:
+        """Take note of a split that was just finished, without reading it again."""
+        self.splits.append(split)
+
+    def forget(self, name: str) -> None:
+        """Take note that a split was removed."""
+        self.splits = [split for split in self.splits if split.name != name]
+
+    def write(self) -> None:
+        """Write `metadata.yaml` for what is whole on the disk; raises `OSError`."""
+        self.due = True
+        # A file may have got its name although finishing it failed after that.
+        self._look()
+        write_metadata(self._folder, self.splits)
+        self.due = False
+
+    def _look(self) -> None:
+        known = {split.name: split for split in self.splits}
+        paths = finished_files(self._folder)
+        found = [known.get(path.name) or Split.read(path) for path in paths]
+        self.splits = [split for split in found if split is not None]
+
+
+def metadata_text(splits: list[Split]) -> str:
+    """Return the text of `metadata.yaml`."""
+    return 'rosbag2_bagfile_information:\n' + textwrap.indent(information_text(splits), '  ')
+
+
+def information_text(splits: list[Split]) -> str:
+    """Return what stands under the first key of `metadata.yaml`, and in the file's own record."""
+    start, duration = _span([s for s in splits if s.messages])
+    lines = [
+        f'version: {METADATA_VERSION}',
+        'storage_identifier: mcap',
+        f'duration:\n  nanoseconds: {duration}',
+        f'starting_time:\n  nanoseconds_since_epoch: {start}',
+        f'message_count: {sum(s.messages for s in splits)}',
+        'topics_with_message_count:' + ('' if any(s.topics for s in splits) else ' []'),
+        *_topic_lines(splits),
+        'compression_format: ""',
+        'compression_mode: ""',
+        'relative_file_paths:' + ('' if splits else ' []'),
+        *(f'  - {_quoted(split.name)}' for split in splits),
+        'files:' + ('' if splits else ' []'),
+        *(_file_lines(split) for split in splits),
+        f'custom_data:\n  recorded_by: {_quoted(LIBRARY)}',
+        f'ros_distro: {ROS_DISTRO}',
+    ]
+    return '\n'.join(lines) + '\n'
+
+
+def _span(splits: list[Split]) -> tuple[int, int]:
+    if not splits:
+        return 0, 0
+    start = min(split.start_ns for split in splits)
+    return start, max(split.end_ns for split in splits) - start
+
+
+def _topic_lines(splits: list[Split]) -> list[str]:
+    topics: dict[str, TopicInfoLine] = {}
+    counts: dict[str, int] = {}
+    for split in splits:
+        topics.update(split.topics)
+        for topic, count in split.counts.items():
+            counts[topic] = counts.get(topic, 0) + count
+    return [_topic_line(line, counts[line.topic]) for line in topics.values()]
+
+
+def _topic_line(line: TopicInfoLine, count: int) -> str:
+    qos = f'\n{textwrap.indent(line.qos, " " * 8)}' if line.qos else ' []'
+    return (
+        '  - topic_metadata:\n'
+        f'      name: {_quoted(line.topic)}\n'
+        f'      type: {_quoted(line.type)}\n'
+        f'      serialization_format: {_quoted(line.encoding)}\n'
+        f'      offered_qos_profiles:{qos}\n'
+        f'      type_description_hash: {_quoted(line.type_hash)}\n'
+        f'    message_count: {count}'
+    )
+
+
+def _file_lines(split: Split) -> str:
+    return (
+        f'  - path: {_quoted(split.name)}\n'
+        f'    starting_time:\n      nanoseconds_since_epoch: {split.start_ns}\n'
+        f'    duration:\n      nanoseconds: {split.end_ns - split.start_ns}\n'
+        f'    message_count: {split.messages}'
+    )
+
+
+def _quoted(text: str) -> str:
+    # A JSON string is a YAML string.
+    return json.dumps(text)

@@ -1,0 +1,282 @@
+"""Follows a recording while it is written: what was added since the last look, and no more.
+
+Nothing is held but the place that was reached, the topics of the file, and small
+attachments, so a recording may grow for months.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+from valveflow_ros.errors import RecordingError
+from valveflow_ros.logs.limits import DEFAULT_LIMITS, OverBudgetError
+from valveflow_ros.logs.mcap.folder import in_order
+from valveflow_ros.logs.mcap.follow_files import files_in, final_of, first_in, part_of
+from valveflow_ros.logs.mcap.layout import (
+    CHUNK_HEAD,
+    FOOTER_RECORD_SIZE,
+    MAGIC,
+    RECORD_HEAD,
+    Attachment,
+    LayoutError,
+    Op,
+)
+from valveflow_ros.logs.mcap.scan import Scanner
+from valveflow_ros.logs.mcap.seek import candidates, ends_well
+from valveflow_ros.logs.mcap.topic_table import TopicTable
+from valveflow_ros.logs.mcap.walk import MessageTable, walk
+from valveflow_ros.logs.part_file import is_held
+from valveflow_ros.logs.source import Source
+
+_MOST_ATTACHED = 1 << 20
+_GROUP_BYTES = 1 << 20
+_NEAR = 1 << 12
+_KINDS = frozenset(int(op) for op in Op)
+# Of these the length is known; it tells them from a chunk with a damaged first byte.
+_LAST = {int(Op.DATA_END): 4, int(Op.FOOTER): 20}
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Messages that were added.
+
+    Attributes
+    ----------
+    content : bytes
+        The records of some chunks.
+    messages : MessageTable
+        The messages in them.
+    topics : TopicTable
+        What their channels stand for.
+    share : float
+        How much of the files that are there has been read by now, 0 to 1.
+    """
+
+    content: bytes
+    messages: MessageTable
+    topics: TopicTable
+    share: float
+
+
+class Follower:
+    """Reads a recording from where it got to the last time.
+
+    Parameters
+    ----------
+    path : Path
+        An ``.mcap`` file, an ``.mcap.part``, or the folder of a recording,
+        finished or growing. A file may get its final name meanwhile, and a
+        folder may get further files.
+
+    Attributes
+    ----------
+    attachments : dict[str, bytes]
+        Small files inside the files.
+    damaged : int
+        Places where something was left out.
+
+    Raises
+    ------
+    RecordingError
+        There is nothing of that name, or it is no recording.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.attachments: dict[str, bytes] = {}
+        self.damaged = 0
+        self._folder = path if path.is_dir() else None
+        self._current: Path | None = None if self._folder else final_of(path)
+        self._ended = False
+        self._started = self._current
+        self._order: list[Path] = []
+        self._begin()
+        if self._folder is None:
+            with self._open() as source:
+                if source.size >= len(MAGIC) and source.read(0, len(MAGIC)) != MAGIC:
+                    raise RecordingError(path, 'is not an MCAP file; only those can be followed')
+
+    def _begin(self) -> None:
+        self._topics = TopicTable()
+        self._position = len(MAGIC)
+        self._ended = False
+        self._inode = 0
+
+    @property
+    def name(self) -> str:
+        """Return the file that is being read, empty if there is none yet."""
+        return '' if self._current is None else self._current.name
+
+    @property
+    def finished(self) -> bool:
+        """Tell whether the file that was read last is whole, and all of it was read."""
+        return self._ended
+
+    @property
+    def written(self) -> bool:
+        """Tell whether a living writer holds the file that is being read."""
+        if self._current is None:
+            return False
+        part = part_of(self._current)
+        try:
+            return part.exists() and is_held(part)
+        except OSError:
+            return False
+
+    @property
+    def size(self) -> int:
+        """Return how many bytes have been read of the present file."""
+        return self._position
+
+    def read(self) -> Iterator[Batch]:
+        """Yield what was added since the last call; nothing, if nothing was.
+
+        Raises
+        ------
+        RecordingError
+            The files cannot be read.
+        """
+        while self._find():
+            yield from self._rest_of_file()
+            following = self._following()
+            if following is None:
+                return
+            self._current = following
+            self._begin()
+
+    def _find(self) -> bool:
+        if self._current is None and self._folder is not None:
+            self._current = self._started = first_in(self._folder)
+        return self._current is not None and not (self._folder is None and self._ended)
+
+    def _following(self) -> Path | None:
+        """Return the file to go on with, if this one will not grow any more."""
+        if self._folder is None or self._current is None or (not self._ended and self.written):
+            return None
+        later = in_order({*files_in(self._folder), self._current})
+        place = later.index(self._current) + 1
+        return later[place] if place < len(later) else None
+
+    def _open(self) -> Source:
+        """Open the present file under the name it has now."""
+        assert self._current is not None
+        part = part_of(self._current)
+        try:
+            return Source.open(part if part.exists() else self._current)
+        except RecordingError:
+            # It may have got its final name between the two looks.
+            return Source.open(self._current)
+
+    def _rest_of_file(self) -> Iterator[Batch]:
+        if self._ended:
+            return
+        with self._open() as source:
+            inode = os.fstat(source.stream.fileno()).st_ino
+            if self._inode and inode != self._inode:
+                # It was made whole by copying, and what was read stands elsewhere in it.
+                self._begin()
+            self._inode = inode
+            scanner = Scanner(source)
+            contents: list[bytes] = []
+            size = 0
+            while (content := self._next(source, scanner)) is not None:
+                if content:
+                    contents.append(content)
+                    size += len(content)
+                if size >= _GROUP_BYTES:
+                    yield from self._batch(contents, source)
+                    contents, size = [], 0
+            yield from self._batch(contents, source)
+
+    def _next(self, source: Source, scanner: Scanner) -> bytes | None:
+        """Go past one record; return a chunk's content, b'' for another, None at the end."""
+        start = self._position
+        head = source.read(start, RECORD_HEAD.size)
+        if len(head) < RECORD_HEAD.size:
+            return None
+        op, length = RECORD_HEAD.unpack(head)
+        after = start + RECORD_HEAD.size + length
+        if _LAST.get(op) == length:
+            whole = source.size >= after + FOOTER_RECORD_SIZE
+            self._ended = whole and source.read(source.size - len(MAGIC), len(MAGIC)) == MAGIC
+            return None
+        if op not in _KINDS or op in _LAST or (op == Op.CHUNK and length < CHUNK_HEAD.size):
+            return self._beyond_damage(source)
+        if after > source.size:
+            if self.written and length <= DEFAULT_LIMITS.record_bytes:
+                return None
+            return self._beyond_damage(source, sure=False)
+        if op == Op.CHUNK:
+            return self._chunk(source, scanner, after)
+        self._position = after
+        if op == Op.ATTACHMENT:
+            self._attach(source, start, length)
+        return b''
+
+    def _chunk(self, source: Source, scanner: Scanner, after: int) -> bytes | None:
+        start = self._position
+        try:
+            content = scanner.chunk_at(start).content
+        except OverBudgetError:
+            self.damaged += 1
+            self._position = source.size
+            return None
+        except LayoutError:
+            # Its length is believed if the fields within say the same.
+            if next(candidates(source, start, start + 1), None) is None:
+                return self._beyond_damage(source)
+            self.damaged += 1
+            content = b''
+        self._position = after
+        return content
+
+    def _beyond_damage(self, source: Source, sure: bool = True) -> bytes | None:
+        """Go on with the next chunk; if there is none, and no damage for sure, wait for more."""
+        start, size = self._position + 1, source.size
+        # First where reading costs little: there may be many false heads beside one another.
+        near = min(start + _NEAR, size)
+        heads = chain(candidates(source, start, near), candidates(source, near, size))
+        found = next(heads, None)
+        self._ended = found is None and ends_well(source)
+        if found is None and not (sure or self._ended):
+            return None
+        self.damaged += 1
+        self._position = source.size if found is None else found
+        return None if found is None else b''
+
+    def _attach(self, source: Source, start: int, length: int) -> None:
+        if length > _MOST_ATTACHED:
+            return
+        try:
+            found = Attachment.unpack(source.read(start + RECORD_HEAD.size, length))
+        except LayoutError:
+            self.damaged += 1
+            return
+        self.attachments[found.name] = found.data
+
+    def _batch(self, contents: list[bytes], source: Source) -> Iterator[Batch]:
+        content = b''.join(contents)
+        if not content:
+            return
+        try:
+            messages, others = walk(content)
+            for op, record in others:
+                self._topics.add(op, record)
+        except LayoutError:
+            self.damaged += 1
+            return
+        yield Batch(content, messages, self._topics, self._share(source))
+
+    def _share(self, source: Source) -> float:
+        """Return how much has been read, files of equal size assumed."""
+        inside = self._position / max(1, source.size)
+        if self._folder is None or self._current is None:
+            return min(1.0, inside)
+        if self._current not in self._order:
+            self._order = in_order({*files_in(self._folder), self._current})
+        begun = self._order.index(self._started) if self._started in self._order else 0
+        done = self._order.index(self._current) - begun
+        return min(1.0, (done + inside) / max(1, len(self._order) - begun))

@@ -1,0 +1,255 @@
+"""Turns a table of samples into a recording, as fast as the disk allows.
+
+Records are laid out for a whole chunk at once: all of them have the same size,
+so a structured array is the chunk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from valveflow_ros.errors import DataError, RecordingError
+from valveflow_ros.logs.mcap.chunk_builder import CHUNK_BYTES, pack_content
+from valveflow_ros.logs.mcap.chunk_file import ChunkFile
+from valveflow_ros.logs.mcap.compression import Packer
+from valveflow_ros.logs.mcap.definitions import Definitions
+from valveflow_ros.logs.mcap.folder import (
+    LIBRARY,
+    METADATA_NAME,
+    Split,
+    information_text,
+    write_metadata,
+)
+from valveflow_ros.logs.mcap.layout import RECORD_HEAD, Attachment, Op, media_type
+from valveflow_ros.logs.mcap.topic_book import TableSchedule, TopicBook
+from valveflow_ros.logs.mcap.writer import Metadata
+from valveflow_ros.logs.names import FLOAT64
+from valveflow_ros.logs.part_file import PartFile, make_folder
+from valveflow_ros.records import (
+    SIGNALS,
+    IntArray,
+    Readings,
+    SampleTable,
+    Signal,
+    table_to_readings,
+)
+
+_RECORD = np.dtype(
+    [
+        ('op', 'u1'),
+        ('length', '<u8'),
+        ('channel', '<u2'),
+        ('sequence', '<u4'),
+        ('log_time', '<i8'),
+        ('publish_time', '<i8'),
+        ('mark', '>u4'),
+        ('value', '<f8'),
+    ]
+)
+# Little-endian CDR, no options.
+_MARK = 0x00010000
+_PER_CHUNK = CHUNK_BYTES // _RECORD.itemsize
+_BLOCK_ROWS = 100_000
+
+
+@dataclass(frozen=True, slots=True)
+class WrittenLog:
+    """A recording that was written: its file, and how many messages."""
+
+    path: Path
+    messages: int
+
+
+def write_samples(
+    table: SampleTable,
+    path: str | Path,
+    *,
+    prefix: str = '',
+    attachments: Mapping[str, bytes] | None = None,
+    metadata: Metadata | None = None,
+    definitions: Definitions | None = None,
+    overwrite: bool = False,
+) -> WrittenLog:
+    """Write samples as ``std_msgs/Float64`` topics named after the signals.
+
+    A sample's time is the publish time of its values. Log times are the same,
+    but for values of one sample, which follow each other by a nanosecond, so
+    that every reader sees them in the same order.
+
+    Parameters
+    ----------
+    table : SampleTable
+        Its NaN in required signals are written, as values of bad quality.
+    path : str or Path
+        Ending in ``.mcap``: that file. Otherwise a folder as rosbag2 makes it.
+    prefix : str
+        Namespace before the topics, such as ``/unit1``.
+    attachments, metadata, definitions
+        As in `RecordingWriter`.
+    overwrite : bool
+        Take the place of a file that exists.
+
+    Raises
+    ------
+    DataError
+        If there is nothing to write.
+    RecordingError
+        If the file exists or cannot be written.
+    """
+    optional = [i.signal for i in SIGNALS if np.isfinite(table.column(i.signal)).any()]
+    return write_readings(
+        _in_blocks(table), optional, path, prefix=prefix, attachments=attachments,
+        metadata=metadata, definitions=definitions, overwrite=overwrite,
+    )  # fmt: skip
+
+
+def write_readings(
+    blocks: Iterable[Readings],
+    signals: Collection[Signal],
+    path: str | Path,
+    *,
+    prefix: str = '',
+    attachments: Mapping[str, bytes] | None = None,
+    metadata: Metadata | None = None,
+    definitions: Definitions | None = None,
+    overwrite: bool = False,
+) -> WrittenLog:
+    """Write readings block by block; otherwise as `write_samples`.
+
+    Parameters
+    ----------
+    blocks : iterable of Readings
+        In the order of time, within each and from one to the next.
+    signals : collection of Signal
+        Those that occur; the required ones have a topic in any case.
+    """
+    place = Path(path)
+    target = place if place.suffix == '.mcap' else place / f'{place.resolve().name}_0.mcap'
+    if target.exists() and not overwrite:
+        raise RecordingError(target, 'exists already')
+    book = TopicBook(definitions or Definitions())
+    channels = np.zeros(len(SIGNALS), dtype=np.uint16)
+    for info in SIGNALS:
+        if info.required or info.signal in signals:
+            channels[info.signal] = len(book.ids) + 1
+            book.add(f'{prefix.rstrip("/")}/{info.topic}', FLOAT64)
+    records = _Records(channels)
+    parts = _parts(blocks, records)
+    first = next(parts)
+    try:
+        make_folder(target.parent)
+        out = PartFile(target, replace=True)
+        try:
+            file = ChunkFile(out, LIBRARY)
+            for name, data in (attachments or {}).items():
+                file.put_attachment(Attachment(name, media_type(name), data))
+            for name, items in (metadata or {}).items():
+                file.put_metadata(name, items)
+            _put_chunks(file, chain([first], parts), book)
+            split = Split.of_file(target.name, file, book.table)
+            information = information_text([split])
+            file.put_metadata('rosbag2', {'serialized_metadata': information})
+            file.finish(book.table)
+        except BaseException:
+            out.discard()
+            raise
+        _describe_beside(target, split)
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(target, f'cannot be written ({reason})') from None
+    return WrittenLog(target, records.count)
+
+
+def _in_blocks(table: SampleTable) -> Iterator[Readings]:
+    for start in range(0, len(table), _BLOCK_ROWS):
+        yield table_to_readings(table.part(start, start + _BLOCK_ROWS))
+
+
+class _Records:
+    """Turns readings into message records, in the order of their log times."""
+
+    def __init__(self, channels: NDArray[np.uint16]) -> None:
+        self.count = 0
+        self._channels = channels
+        self._sequence = np.zeros(len(channels), dtype=np.int64)
+        self._last_ns = -1
+
+    def of(self, readings: Readings) -> NDArray[np.void]:
+        if int(readings.time_ns[0]) < 0:
+            raise DataError('The samples begin before 1970, which a recording cannot hold.')
+        records: NDArray[np.void] = np.zeros(len(readings), dtype=_RECORD)
+        records['op'] = int(Op.MESSAGE)
+        records['length'] = _RECORD.itemsize - RECORD_HEAD.size
+        records['channel'] = self._channels[readings.signal]
+        log_time = strictly_increasing(np.r_[self._last_ns, readings.time_ns])[1:]
+        records['log_time'] = log_time
+        records['publish_time'] = readings.time_ns
+        records['mark'] = _MARK
+        records['value'] = readings.value
+        for signal in np.unique(readings.signal).tolist():
+            mine = readings.signal == signal
+            n = int(mine.sum())
+            records['sequence'][mine] = self._sequence[signal] + np.arange(1, n + 1)
+            self._sequence[signal] += n
+        self._last_ns = int(log_time[-1])
+        self.count += len(records)
+        return records
+
+
+def _parts(blocks: Iterable[Readings], records: _Records) -> Iterator[NDArray[np.void]]:
+    """Yield the records of one chunk each; raises `DataError` if there is none."""
+    rest: NDArray[np.void] = np.zeros(0, dtype=_RECORD)
+    for readings in blocks:
+        if not len(readings):
+            continue
+        # Left to itself, joining gives the fields the byte order of this machine.
+        rest = np.concatenate([rest, records.of(readings)], dtype=_RECORD)
+        whole = len(rest) - len(rest) % _PER_CHUNK
+        for start in range(0, whole, _PER_CHUNK):
+            yield rest[start : start + _PER_CHUNK]
+        rest = rest[whole:]
+    if len(rest):
+        yield rest
+    if not records.count:
+        raise DataError('There are no samples to write.')
+
+
+def strictly_increasing(times: IntArray) -> IntArray:
+    """Return times of which each is at least a nanosecond after the one before."""
+    steps = np.arange(len(times), dtype=np.int64)
+    return np.maximum.accumulate(times - steps) + steps
+
+
+def _put_chunks(file: ChunkFile, parts: Iterable[NDArray[np.void]], book: TopicBook) -> None:
+    schedule, packer, topics = TableSchedule(), Packer(), len(book.ids)
+    for part in parts:
+        due = schedule.due(topics)
+        table = book.packed() if due else b''
+        offset = len(table) + _RECORD.itemsize * np.arange(len(part), dtype=np.int64)
+        file.put_chunk(
+            pack_content(table + part.tobytes(), part['channel'], part['log_time'], offset, packer)
+        )
+        schedule.done(topics, due)
+
+
+def _describe_beside(target: Path, split: Split) -> None:
+    """Write `metadata.yaml`, unless one that tells of other files stands there."""
+    path = target.parent / METADATA_NAME
+    # A file by itself needs none: whoever writes several into one folder is not troubled by it.
+    if not path.exists() or _tells_of(path, target.name):
+        write_metadata(target.parent, [split])
+
+
+def _tells_of(path: Path, name: str) -> bool:
+    try:
+        top = yaml.safe_load(path.read_text(encoding='utf-8'))
+        return bool(top['rosbag2_bagfile_information']['relative_file_paths'] == [name])
+    except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError):
+        return False

@@ -1,0 +1,257 @@
+"""Makes a whole file of what a crash, a full disk or a bad sector left.
+
+Intact chunks are copied as they are and get a new index. A chunk whose
+checksum is wrong is left out and counted: nothing is repaired by guessing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from valveflow_ros.errors import RecordingError
+from valveflow_ros.logs.mcap.chunk_builder import PackedChunk
+from valveflow_ros.logs.mcap.chunk_file import ChunkFile
+from valveflow_ros.logs.mcap.folder import (
+    LIBRARY,
+    Split,
+    finished_files,
+    information_text,
+    write_metadata,
+)
+from valveflow_ros.logs.mcap.layout import CHUNK_HEAD, RECORD_HEAD, Cursor, LayoutError
+from valveflow_ros.logs.mcap.scan import Chunk, Scanner
+from valveflow_ros.logs.mcap.seek import SHAPE_SIZE, candidates
+from valveflow_ros.logs.mcap.summary import read_summary
+from valveflow_ros.logs.mcap.topic_table import TopicTable
+from valveflow_ros.logs.mcap.walk import walk
+from valveflow_ros.logs.mcap.warnings import scan_warnings
+from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, make_folder, taken
+from valveflow_ros.logs.source import Source
+
+
+@dataclass(frozen=True, slots=True)
+class RecoveryReport:
+    """What a recovery kept and what it had to leave.
+
+    Attributes
+    ----------
+    source, out : Path
+        The broken file and the whole one.
+    messages, chunks : int
+        Copied.
+    damaged_chunks : int
+        Places where something was lost, apart from a cut-off end.
+    bytes_read, bytes_written : int
+        Sizes of both files.
+    warnings : tuple of str
+        Sentences about what was met.
+    """
+
+    source: Path
+    out: Path
+    messages: int
+    chunks: int
+    damaged_chunks: int
+    bytes_read: int
+    bytes_written: int
+    warnings: tuple[str, ...]
+
+
+Progress = Callable[[int, int], None]
+
+
+def recover(
+    path: str | Path, out: str | Path, *, progress: Progress | None = None
+) -> RecoveryReport:
+    """Copy the intact chunks of ``path`` into a finished file ``out``.
+
+    Parameters
+    ----------
+    path : str or Path
+        An MCAP file in any state.
+    out : str or Path
+        The new file, which must not exist; its name should end in ``.mcap``.
+    progress : callable, optional
+        Called with bytes done and bytes in all.
+
+    Raises
+    ------
+    RecordingError
+        If ``path`` holds no intact chunk, or ``out`` exists or cannot be written.
+    """
+    target = Path(out)
+    if target.exists():
+        raise RecordingError(target, 'exists already; choose another name for the recovered file')
+    return _recover(Path(path), target, target.name, progress)
+
+
+def recover_leftovers(folder: str | Path) -> tuple[RecoveryReport, ...]:
+    """Finish every ``.part`` in a folder that no living recorder holds.
+
+    The ``.part`` is removed when its finished file is in place, or if not one chunk
+    was finished in it; one that cannot be read, or that holds damaged chunks only
+    is left. The folder's `metadata.yaml` is brought up to date.
+
+    Raises
+    ------
+    RecordingError
+        If the folder cannot be read.
+    """
+    home = Path(folder)
+    try:
+        parts = sorted(home.glob(f'*.mcap{PART_SUFFIX}'))
+        reports = [report for part in parts if (report := _leftover(part)) is not None]
+        if reports:
+            splits = [split for path in finished_files(home) if (split := Split.read(path))]
+            write_metadata(home, splits)
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(home, f'leftovers cannot be recovered ({reason})') from None
+    return tuple(reports)
+
+
+def _leftover(part: Path) -> RecoveryReport | None:
+    """Finish one; what cannot be read or finished now stays, and nobody has to wait for it."""
+    try:
+        return _finished(part)
+    except (OSError, RecordingError):
+        return None
+
+
+def _finished(part: Path) -> RecoveryReport | None:
+    if part.is_symlink() or not part.is_file():
+        return None
+    with taken(part) as free:
+        return _made_whole(part) if free else None
+
+
+def _made_whole(part: Path) -> RecoveryReport | None:
+    """Finish one that is held, so that no other recovery works on it at the same time."""
+    if part.stat().st_size == 0:
+        part.unlink()
+        return None
+    target = part.with_name(part.name[: -len(PART_SUFFIX)])
+    # The new file is written under another name, since its own .part is the source;
+    # a draft that a crash leaves is not taken for a recording.
+    draft = target.with_name(f'.{target.stem}.recovering')
+    try:
+        report = _recover(part, draft, target.name, None)
+    except RecordingError:
+        if _holds_nothing(part):
+            part.unlink()
+        return None
+    draft.replace(target)
+    part.unlink()
+    return replace(report, out=target)
+
+
+def _holds_nothing(part: Path) -> bool:
+    """Tell whether there is nothing in a file but the beginning of its first chunk, or less."""
+    with Source.open(part) as source:
+        scanner = Scanner(source)
+        chunks = sum(1 for _ in scanner.chunks())
+        cut_at = scanner.findings.cut_off_at
+        if chunks or scanner.findings.damaged:
+            return False
+        if cut_at is None or source.size - cut_at < SHAPE_SIZE:
+            return True
+        # A head whose fields agree was not damaged: the rest of its chunk was never written.
+        return next(candidates(source, cut_at, cut_at + 1), None) is not None
+
+
+def _recover(path: Path, target: Path, name: str, progress: Progress | None) -> RecoveryReport:
+    with Source.open(path) as source:
+        scanner = Scanner(source)
+        table = TopicTable()
+        chunks = _taken(scanner, table, progress, source.size)
+        first = next(chunks, None)
+        if first is None:
+            raise RecordingError(path, 'holds no intact chunk of messages, nothing to recover')
+        try:
+            make_folder(target.parent)
+            out = PartFile(target, replace=True)
+            try:
+                file = _copy(out, first, chunks)
+                _complete(table, source)
+                _finish(file, scanner, table, name)
+            except BaseException:
+                out.discard()
+                raise
+        except OSError as error:
+            reason = (error.strerror or str(error)).lower()
+            raise RecordingError(target, f'cannot be written ({reason})') from None
+        findings = scanner.findings
+        warnings = scan_warnings(findings, 'file')
+    return RecoveryReport(
+        path,
+        target,
+        file.messages,
+        file.chunks,
+        findings.damaged,
+        source.size,
+        file.position,
+        warnings,
+    )
+
+
+def _taken(
+    scanner: Scanner, table: TopicTable, progress: Progress | None, size: int
+) -> Iterator[PackedChunk]:
+    for chunk in scanner.chunks():
+        if not chunk.content:
+            continue
+        try:
+            packed = _described(chunk, table)
+        except LayoutError as error:
+            scanner.findings.blame(f'the chunk at byte {chunk.offset}: {error}')
+            continue
+        yield packed
+        if progress is not None:
+            progress(chunk.end, size)
+
+
+def _described(chunk: Chunk, table: TopicTable) -> PackedChunk:
+    messages, others = walk(chunk.content)
+    for op, content in others:
+        table.add(op, content)
+    cursor = Cursor(chunk.record)
+    cursor.position = RECORD_HEAD.size + CHUNK_HEAD.size
+    return PackedChunk(
+        chunk.record,
+        messages.channel,
+        messages.log_time,
+        messages.offset,
+        len(chunk.content),
+        cursor.text(),
+    )
+
+
+def _copy(out: PartFile, first: PackedChunk, rest: Iterator[PackedChunk]) -> ChunkFile:
+    file = ChunkFile(out, LIBRARY)
+    file.put_chunk(first)
+    for chunk in rest:
+        file.put_chunk(chunk)
+    return file
+
+
+def _complete(table: TopicTable, source: Source) -> None:
+    """Add topics that only an intact summary still knows."""
+    summary = read_summary(source)
+    if summary is not None:
+        try:
+            table.take_over(summary.table)
+        except LayoutError as error:
+            raise RecordingError(source.path, f'contradicts itself: {error}') from None
+
+
+def _finish(file: ChunkFile, scanner: Scanner, table: TopicTable, split_name: str) -> None:
+    for attachment in scanner.findings.attachments.values():
+        file.put_attachment(attachment)
+    for name, items in scanner.findings.metadata.items():
+        if name != 'rosbag2':
+            file.put_metadata(name, items)
+    split = Split.of_file(split_name, file, table)
+    file.put_metadata('rosbag2', {'serialized_metadata': information_text([split])})
+    file.finish(table)

@@ -1,0 +1,296 @@
+"""Finds every intact chunk of an MCAP file, whatever happened to the rest of it.
+
+The file is followed record by record. Where the chain breaks, the next bytes
+that look like the head of a chunk are sought and tried. A chunk counts only if
+its content has the checksum it was written with: nothing is repaired, so a
+damaged file yields fewer values and never wrong ones. Indexes are not used,
+because an unfinished file has none.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from valveflow_ros.logs.limits import DEFAULT_LIMITS, Budget, Limits, OverBudgetError
+from valveflow_ros.logs.mcap.compression import Unpacker
+from valveflow_ros.logs.mcap.layout import (
+    CHUNK_HEAD,
+    MAGIC,
+    RECORD_HEAD,
+    Attachment,
+    Cursor,
+    LayoutError,
+    Op,
+)
+from valveflow_ros.logs.mcap.seek import SHAPE_SIZE, candidates, ends_well
+from valveflow_ros.logs.source import Source
+
+_INDEX_HEAD = struct.Struct('<BQHI')
+_INDEX_BLOCK = 4096
+_KINDS = frozenset(int(op) for op in Op)
+# So many messages outside of chunks before the first chunk: there will be none.
+_BARE_ENOUGH = 1000
+# Shorter records cannot hide a chunk.
+_SMALLEST_CHUNK = RECORD_HEAD.size + CHUNK_HEAD.size + 12
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """An intact chunk: where it stands, its record as it is, what it holds."""
+
+    offset: int
+    record: bytes
+    content: bytes
+
+    @property
+    def end(self) -> int:
+        """Return where the next record begins."""
+        return self.offset + len(self.record)
+
+
+@dataclass(slots=True)
+class Findings:
+    """What a scan met besides intact chunks."""
+
+    chunks: int = 0
+    damaged: int = 0
+    unchecked: int = 0
+    bare_messages: int = 0
+    finished: bool = False
+    cut_off_at: int | None = None
+    begins_well: bool = True
+    over_budget: bool = False
+    reasons: list[str] = field(default_factory=list)
+    attachments: dict[str, Attachment] = field(default_factory=dict)
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+
+    def blame(self, reason: str) -> None:
+        """Count a damaged chunk or stretch; the first few reasons are kept."""
+        self.damaged += 1
+        if len(self.reasons) < 8:
+            self.reasons.append(reason)
+
+
+class Scanner:
+    """Goes once through a file; `findings` is complete when `chunks` is exhausted.
+
+    Parameters
+    ----------
+    source : Source
+        The open file.
+    limits : Limits
+        What the file may cost.
+    unchecked : bool
+        Also accept chunks that were written without a checksum.
+    """
+
+    def __init__(
+        self, source: Source, limits: Limits = DEFAULT_LIMITS, unchecked: bool = False
+    ) -> None:
+        self.findings = Findings()
+        self._source = source
+        self._limits = limits
+        self._unchecked = unchecked
+        self._budget = Budget(source.size, limits)
+        self._attachment_bytes_left = limits.attachment_bytes
+        self._unpacker = Unpacker()
+
+    def chunks(self) -> Iterator[Chunk]:
+        """Yield the intact chunks in the order of the file.
+
+        Raises
+        ------
+        RecordingError
+            Only if the device fails.
+        """
+        try:
+            yield from self._follow()
+        except OverBudgetError:
+            self.findings.over_budget = True
+
+    def chunk_at(self, offset: int) -> Chunk:
+        """Return the chunk that was found at ``offset`` before; raises `LayoutError`."""
+        _, length = self._head(offset)
+        return self._chunk(offset, length)
+
+    def _follow(self) -> Iterator[Chunk]:
+        source, findings = self._source, self.findings
+        findings.finished = ends_well(source)
+        findings.begins_well = source.read(0, len(MAGIC)) == MAGIC
+        position = len(MAGIC) if findings.begins_well else 0
+        while position < source.size and not self._is_end(position):
+            chunk, position = self._step(position)
+            if chunk is not None:
+                yield chunk
+                position = self._behind_indexes(position)
+            elif findings.bare_messages >= _BARE_ENOUGH and not findings.chunks:
+                return
+
+    def _behind_indexes(self, position: int) -> int:
+        """Return where the message indexes end that follow a chunk and agree with themselves.
+
+        They make up most records of a slow plant's file; a wrong length
+        disagrees with the length that stands within.
+        """
+        block, place = b'', 0
+        while True:
+            if place + _INDEX_HEAD.size > len(block):
+                # Those of large chunks are longer than what was looked at at once.
+                position, place = position + place, 0
+                block = self._source.read(position, _INDEX_BLOCK)
+                if len(block) < _INDEX_HEAD.size:
+                    return position
+            op, length, _, inner = _INDEX_HEAD.unpack_from(block, place)
+            after = place + RECORD_HEAD.size + length
+            if op != Op.MESSAGE_INDEX or inner != length - 6:
+                return position + place
+            if position + after > self._source.size:
+                return position + place
+            place = after
+
+    def _step(self, position: int) -> tuple[Chunk | None, int]:
+        """Deal with the record at a position; return its chunk, if any, and where to go on."""
+        op, length = self._head(position)
+        after = position + RECORD_HEAD.size + length
+        problem = ''
+        if op == Op.CHUNK:
+            try:
+                return self._accept(position, length), after
+            except LayoutError as error:
+                if after <= self._source.size:
+                    self._budget.regret(length)
+                    problem = f'the chunk at byte {position}: {error}'
+                # A length is believed if the fields within say the same.
+                agreed = next(candidates(self._source, position, position + 1), None) is not None
+                if agreed and self._plausible(after):
+                    self.findings.blame(problem)
+                    return None, after
+        elif op in _KINDS and after <= self._source.size and self._plausible(after):
+            hidden = self._inside(op, position, length)
+            return hidden, (after if hidden is None else hidden.end)
+        return self._resynchronise(position, problem)
+
+    def _resynchronise(self, position: int, problem: str) -> tuple[Chunk | None, int]:
+        chunk = self._seek(position + 1, self._source.size)
+        if chunk is None and not problem and not self.findings.finished:
+            self.findings.cut_off_at = position
+            return None, self._source.size
+        self.findings.blame(problem or f'the chain of records breaks at byte {position}')
+        return chunk, (self._source.size if chunk is None else chunk.end)
+
+    def _seek(self, start: int, end: int) -> Chunk | None:
+        """Return the first intact chunk whose record begins in ``[start, end)``."""
+        for position in candidates(self._source, start, end):
+            _, length = self._head(position)
+            try:
+                return self._accept(position, length)
+            except LayoutError:
+                self._budget.regret(length)
+        return None
+
+    def _accept(self, position: int, length: int) -> Chunk:
+        chunk = self._chunk(position, length)
+        self.findings.chunks += 1
+        return chunk
+
+    def _chunk(self, position: int, length: int) -> Chunk:
+        if length > self._limits.record_bytes:
+            raise LayoutError(f'its length of {length} bytes is beyond all bounds')
+        raw = self._source.read(position, RECORD_HEAD.size + length)
+        if len(raw) < RECORD_HEAD.size + length:
+            raise LayoutError('it is cut off')
+        self._budget.spend(length)
+        cursor = Cursor(raw)
+        cursor.position = RECORD_HEAD.size
+        _, _, size, crc = CHUNK_HEAD.unpack(cursor.take(CHUNK_HEAD.size))
+        compression = cursor.text()
+        packed = cursor.take(cursor.u64())
+        if cursor.position != len(raw):
+            raise LayoutError('its length disagrees with its content')
+        if size > self._limits.chunk_bytes:
+            raise LayoutError(f'it claims to unpack to {size} bytes, which is beyond all bounds')
+        self._budget.spend(size)
+        content = self._unpacker.unpack(compression, packed, size)
+        if zlib.crc32(content) != crc:
+            self._refuse_checksum(crc)
+        return Chunk(position, raw, content)
+
+    def _refuse_checksum(self, crc: int) -> None:
+        if crc != 0:
+            raise LayoutError('its checksum is wrong')
+        self.findings.unchecked += 1
+        if not self._unchecked:
+            raise LayoutError('it was written without a checksum')
+
+    def _inside(self, op: int, position: int, length: int) -> Chunk | None:
+        """Look into a record that is no chunk, and for a chunk that a wrong length would hide."""
+        if op == Op.MESSAGE:
+            self.findings.bare_messages += 1
+        if op == Op.ATTACHMENT:
+            self._attachment(position, length)
+            return None
+        if op == Op.METADATA and length <= self._limits.definition_bytes:
+            self._metadata(position, length)
+        if length < _SMALLEST_CHUNK or (
+            op == Op.MESSAGE_INDEX and self._is_index(position, length)
+        ):
+            return None
+        start = position + RECORD_HEAD.size
+        return self._seek(start, start + length)
+
+    def _is_index(self, position: int, length: int) -> bool:
+        """Tell whether a message index agrees with its own length, which a wrong one does not."""
+        raw = self._source.read(position + RECORD_HEAD.size + 2, 4)
+        return int.from_bytes(raw, 'little') == length - 6
+
+    def _attachment(self, position: int, length: int) -> None:
+        if length > self._attachment_bytes_left:
+            self.findings.blame(f'the attachment at byte {position} is larger than can be read')
+            return
+        self._attachment_bytes_left -= length
+        content = self._source.read(position + RECORD_HEAD.size, length)
+        try:
+            attachment = Attachment.unpack(content)
+        except LayoutError as error:
+            self.findings.blame(str(error))
+            return
+        self.findings.attachments[attachment.name] = attachment
+
+    def _metadata(self, position: int, length: int) -> None:
+        cursor = Cursor(self._source.read(position + RECORD_HEAD.size, length))
+        try:
+            name = cursor.text()
+            items = cursor.text_map()
+        except LayoutError as error:
+            self.findings.blame(f'the metadata at byte {position}: {error}')
+            return
+        if len(self.findings.metadata) < self._limits.channels:
+            self.findings.metadata[name] = items
+
+    def _head(self, position: int) -> tuple[int, int]:
+        raw = self._source.read(position, RECORD_HEAD.size)
+        if len(raw) < RECORD_HEAD.size:
+            return 0, 0
+        op, length = RECORD_HEAD.unpack(raw)
+        return op, length
+
+    def _is_end(self, position: int) -> bool:
+        size = self._source.size
+        return position == size - len(MAGIC) and self._source.read(position, 8) == MAGIC
+
+    def _plausible(self, position: int) -> bool:
+        """Tell whether a record, or the end of the file, may begin here."""
+        size = self._source.size
+        if position == size or self._is_end(position):
+            return True
+        if not self.findings.finished and 0 <= size - position < SHAPE_SIZE:
+            # Too little of a last record to be judged.
+            return True
+        op, length = self._head(position)
+        if op not in _KINDS or position + RECORD_HEAD.size + length <= size:
+            return op in _KINDS
+        # The last chunk of an unfinished file may be cut off, with a head that agrees.
+        return next(candidates(self._source, position, position + 1), None) is not None

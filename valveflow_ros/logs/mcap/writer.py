@@ -1,0 +1,299 @@
+"""Writes a recording: a folder of MCAP splits that ROS 2 tools read with nothing of ours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple
+
+from valveflow_ros.errors import RecordingError
+from valveflow_ros.logs.mcap.chunk_builder import CHUNK_BYTES, ChunkBuilder
+from valveflow_ros.logs.mcap.chunk_file import ChunkFile
+from valveflow_ros.logs.mcap.definitions import Definitions
+from valveflow_ros.logs.mcap.folder import (
+    LIBRARY,
+    Listing,
+    Split,
+    finished_files,
+    information_text,
+    split_number,
+)
+from valveflow_ros.logs.mcap.layout import Attachment, media_type
+from valveflow_ros.logs.mcap.qos import Qos
+from valveflow_ros.logs.mcap.topic_book import TableSchedule, TopicBook
+from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, Writable, make_folder
+
+_SPLITS_APART, _NUMBERS_APART = 64, 1 << 26
+
+OpenFile = Callable[[Path], Writable]
+Metadata = Mapping[str, Mapping[str, str]]
+
+
+class Message(NamedTuple):
+    """A message on its way into a recording: raw CDR bytes and their times."""
+
+    topic: str
+    data: bytes
+    log_time_ns: int
+    publish_time_ns: int
+
+
+class RecordingWriter:
+    """One recording folder, one thread.
+
+    A folder that exists is continued: numbers go on and `metadata.yaml`
+    covers all of its finished splits. A file is begun with its first chunk.
+    After a `RecordingError` the file at hand is abandoned as it is, the
+    messages that were not on disk are kept, and the next `flush` begins a new
+    file with them.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The folder; made if absent, for its owner only.
+    name : str, optional
+        Splits are called ``NAME_0.mcap``, ...; by default as the folder.
+    definitions : Definitions, optional
+        Where message definitions are found.
+    attachments : mapping of str to bytes
+        Files to stand in every split (parameters, model).
+    metadata : mapping of str to mapping of str to str
+        Records to stand in every split.
+    head_messages : callable
+        Gives the latched messages that are repeated at the head of every split
+        but the first.
+    open_file : callable
+        Opens a split for writing.
+
+    Raises
+    ------
+    RecordingError
+        If the folder cannot be made or used.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        *,
+        name: str | None = None,
+        definitions: Definitions | None = None,
+        attachments: Mapping[str, bytes] | None = None,
+        metadata: Metadata | None = None,
+        head_messages: Callable[[], Iterable[Message]] = tuple,
+        open_file: OpenFile = PartFile,
+    ) -> None:
+        self.folder = Path(folder)
+        self.name = name or self.folder.resolve().name
+        self.attachments: dict[str, bytes] = dict(attachments or {})
+        self.metadata: dict[str, Mapping[str, str]] = dict(metadata or {})
+        self.written = 0
+        self.bytes_finished = 0
+        self.files_finished = 0
+        self.path: Path | None = None
+        self._open_file = open_file
+        self._head_messages = head_messages
+        self._begun = 0
+        self._topics = TopicBook(definitions or Definitions())
+        self._builder = ChunkBuilder()
+        self._file: ChunkFile | None = None
+        self._schedule = TableSchedule()
+        self._sequences: dict[int, int] = {}
+        self._on_disk: dict[int, int] = {}  # the same, without what waits
+        try:
+            make_folder(self.folder)
+            self._listing = Listing(self.folder)
+        except OSError as error:
+            raise self._failed(error) from None
+        # Numbers in a folder that is continued are others than before: by them a repetition is
+        # known. No split holds so many messages that they could meet.
+        self._before = (self._next_number() % _SPLITS_APART) * _NUMBERS_APART
+
+    def add_topic(
+        self,
+        topic: str,
+        type_name: str,
+        *,
+        qos: Qos | None = None,
+        type_hash: str | None = None,
+        definition: str | None = None,
+    ) -> None:
+        """Make a topic known before its first message; see `TopicBook.add`."""
+        self._topics.add(topic, type_name, qos, type_hash, definition)
+
+    def write(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
+        """Take a message of raw CDR bytes; every 64 KiB of them become a chunk on disk.
+
+        Raises
+        ------
+        RecordingError
+            If a chunk could not be written; the message is kept all the same.
+        KeyError
+            If the topic was not added.
+        """
+        channel = self._topics.ids[topic]
+        sequence = self._sequences.get(channel, self._before) + 1
+        self._sequences[channel] = sequence
+        self._builder.add(channel, sequence, log_time_ns, publish_time_ns, data)
+        if self._builder.size >= CHUNK_BYTES:
+            self.flush()
+
+    @property
+    def waiting(self) -> int:
+        """Messages taken by `write` and not on disk yet."""
+        return len(self._builder)
+
+    @property
+    def finished(self) -> list[Split]:
+        """The finished splits of the folder."""
+        return list(self._listing.splits)
+
+    @property
+    def file_bytes(self) -> int:
+        """Bytes of the split at hand."""
+        return self._file.position if self._file is not None else 0
+
+    def flush(self) -> None:
+        """Hand waiting messages to the operating system; a killed process loses them no more."""
+        if not len(self._builder):
+            return
+        try:
+            self._put(self._begin())
+        except OSError as error:
+            self.abandon()
+            raise self._failed(error) from None
+
+    def sync(self) -> None:
+        """Bring what was flushed to the disk itself; a power cut loses it no more."""
+        if self._file is None:
+            return
+        try:
+            self._file.sync()
+        except OSError as error:
+            self.abandon()
+            raise self._failed(error) from None
+
+    def note(self, name: str, items: Mapping[str, str]) -> None:
+        """Write a metadata record into the split at hand, if there is one."""
+        if self._file is None:
+            return
+        try:
+            self._file.put_metadata(name, items)
+        except OSError as error:
+            self.abandon()
+            raise self._failed(error) from None
+
+    def rotate(self) -> None:
+        """Finish the split at hand; the next flush begins a new one."""
+        self.flush()
+        self._finish()
+
+    def close(self) -> None:
+        """Finish the recording; what is written afterwards begins a new split."""
+        self.rotate()
+
+    def abandon(self) -> None:
+        """Let go of the split at hand, unfinished; `recover` makes a whole file of it."""
+        if self._file is not None:
+            self._file.abandon()
+            self._file = None
+            self.path = None
+
+    def forget(self, name: str) -> None:
+        """Strike a split that was deleted from `metadata.yaml`."""
+        self._listing.forget(name)
+        self._list()
+
+    def __enter__(self) -> RecordingWriter:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Finish the recording, or leave it unfinished after an error."""
+        if kind is None:
+            self.close()
+        else:
+            self.abandon()
+
+    def _put(self, file: ChunkFile) -> None:
+        topics = len(self._topics.ids)
+        due = self._schedule.due(topics)
+        chunk = self._builder.build(self._topics.packed() if due else b'')
+        before = file.messages
+        try:
+            file.put_chunk(chunk)
+        finally:
+            # A whole chunk is not to be written again, even if the index behind it failed.
+            if file.messages > before:
+                self.written += self.waiting
+                self._on_disk = dict(self._sequences)
+                self._builder.clear()
+        self._schedule.done(topics, due)
+
+    def _begin(self) -> ChunkFile:
+        if self._file is None:
+            self.path = self.folder / f'{self.name}_{self._next_number()}.mcap'
+            out = self._open_file(self.path)
+            try:
+                file = ChunkFile(out, LIBRARY)
+                for name, data in self.attachments.items():
+                    file.put_attachment(Attachment(name, media_type(name), data))
+                for name, items in self.metadata.items():
+                    file.put_metadata(name, items)
+                if self._begun:
+                    self._repeat(file)
+            except OSError:
+                out.discard()
+                raise
+            self._begun, self._file, self._schedule = self._begun + 1, file, TableSchedule()
+        return self._file
+
+    def _repeat(self, file: ChunkFile) -> None:
+        """Write latched messages again, as if received with the new split's first message."""
+        head = ChunkBuilder()
+        for message in self._head_messages():
+            channel = self._topics.ids[message.topic]
+            # Never before the original, so that a reader can tell which is which.
+            times = max(self._builder.first_log_ns, message.log_time_ns), message.publish_time_ns
+            # Its own number: a newer message of its topic may be waiting to be written.
+            head.add(channel, self._on_disk.get(channel, 0), *times, message.data)
+        if len(head):
+            file.put_chunk(head.build(self._topics.packed()))
+
+    def _next_number(self) -> int:
+        parts = self.folder.glob(f'*.mcap{PART_SUFFIX}')
+        return max(map(split_number, [*finished_files(self.folder), *parts]), default=-1) + 1
+
+    def _list(self) -> None:
+        try:
+            self._listing.write()
+        except OSError as error:
+            raise self._failed(error) from None
+
+    def _finish(self) -> None:
+        if self._file is None or self.path is None:
+            if self._listing.due:
+                self._list()
+            return
+        split = Split.of_file(self.path.name, self._file, self._topics.table)
+        try:
+            self._file.put_metadata('rosbag2', {'serialized_metadata': information_text([split])})
+            self._file.finish(self._topics.table)
+            self.bytes_finished += self._file.position
+            self.files_finished += 1
+            self._listing.add(split)
+            self._file = self.path = None
+        except OSError as error:
+            self._listing.due = True
+            self.abandon()
+            raise self._failed(error) from None
+        self._list()
+
+    def _failed(self, error: OSError) -> RecordingError:
+        reason = (error.strerror or str(error)).lower()
+        return RecordingError(self.path or self.folder, f'cannot be written ({reason})')

@@ -1,0 +1,1 @@
+"""Tables of historians: CSV, Excel and Parquet."""

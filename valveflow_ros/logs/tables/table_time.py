@@ -1,0 +1,271 @@
+"""Makes nanoseconds of whatever a historian writes as time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from valveflow_ros.errors import InputError
+from valveflow_ros.logs.tables.historian_dates import DateStyle, date_style, english, tidied
+from valveflow_ros.logs.tables.historian_refusal import RefusedError, Remedy
+from valveflow_ros.logs.tables.historian_zone import LocalClock, zone_of
+from valveflow_ros.logs.tables.table_numbers import as_numbers, descending, is_excel, scale
+from valveflow_ros.logs.tables.table_options import AS_SEEN, TableOptions
+from valveflow_ros.logs.tables.table_stamps import from_stamps, iso_times, with_offsets
+from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_NEVER = np.iinfo(np.int64).min
+_WHOLE_LIMIT = 2.0**63
+# The day 1970-01-01 of a workbook.
+_EXCEL_EPOCH_DAYS = 25569
+_HOUR_NS = 3600 * NS_PER_S
+# A log of some years has no more autumns.
+_FEW = 8
+
+
+class TimeReader:
+    """Reads the column of time block by block, all blocks by the same rule.
+
+    Parameters
+    ----------
+    samples : list of str
+        Texts of the column from the whole file.
+    where : str
+        Name of the file, for sentences.
+    name : str
+        Name of the column, for sentences.
+    options : TableOptions
+        What the person said.
+    zone : str
+        A zone that the file itself names; what the person said goes before it.
+
+    Raises
+    ------
+    InputError
+        If dates can be read in two ways, or the zone is not known.
+    """
+
+    def __init__(
+        self,
+        samples: list[str],
+        where: str,
+        name: str,
+        options: TableOptions = AS_SEEN,
+        zone: str = '',
+    ) -> None:
+        self.where = f"{where}: the column '{name}'"
+        self.zone = options.time_zone or zone
+        self.notes: list[str] = []
+        self.any_time = False
+        self.kind = ''
+        self._zoned = False
+        self._last: int | None = None
+        self._set_back: list[int] = []
+        self._other_steps_back = 0
+        place = zone_of(self.zone)
+        self._clock = None if place is None else LocalClock(place, self.zone, where)
+        if self._clock is not None and len(samples) > 1:
+            self._clock.newest_first = descending(samples)
+        numbers = as_numbers(samples)
+        self._excel = is_excel(numbers)
+        self._unit, self._factor = scale(numbers)
+        self._style = None if len(numbers) else date_style(samples, options.date_order, self.where)
+
+    def read(self, column: pd.Series[Any]) -> IntArray:
+        """Return int64 nanoseconds; a time that cannot be read is ``never()``.
+
+        Numbers are Unix seconds unless they are too large for that; texts that
+        name no zone are in the zone of this reader.
+        """
+        import pandas as pd
+
+        if isinstance(column.dtype, pd.DatetimeTZDtype):
+            self._zoned = True
+            stamps = from_stamps(column)
+        elif column.dtype.kind == 'M':
+            stamps = self._from_local(column)
+        else:
+            stamps = self._from_cells(column)
+        self.any_time = self.any_time or bool((stamps != _NEVER).any())
+        if self._clock is None and not self._zoned and not self.zone and self.kind != 'seconds':
+            self._look_back(stamps[stamps != _NEVER])
+        return stamps
+
+    def _look_back(self, stamps: IntArray) -> None:
+        """Look for the hour that comes twice when a local clock is set back."""
+        steps = np.diff(stamps if self._last is None else np.r_[self._last, stamps])
+        back = np.flatnonzero(steps < 0)
+        hour = (steps[back] >= -_HOUR_NS) & (steps[back] < -_HOUR_NS // 2)
+        self._other_steps_back += int((~hour).sum())
+        if hour.any():
+            at = int(back[hour][0]) + (0 if self._last is None else -1)
+            self._set_back.append(int(stamps[at]) if at >= 0 else int(self._last or 0))
+        self._last = int(stamps[-1]) if len(stamps) else self._last
+
+    def finish(self) -> list[str]:
+        """Return what is to be said of the times.
+
+        Raises
+        ------
+        InputError
+            If not one value was a time.
+        """
+        if not self.any_time:
+            raise InputError(
+                f'{self.where} holds no time; it must be a date with a time of day, or Unix '
+                'seconds, or name another with --column time=THEIRS.'
+            )
+        if 0 < len(self._set_back) <= _FEW and not self._other_steps_back:
+            when = np.datetime64(self._set_back[0], 'ns').astype('datetime64[s]')
+            raise RefusedError(
+                self.where,
+                f'the times go back by an hour after {when}, as those of a local '
+                'clock do in autumn; add --time-zone with the place, such as --time-zone '
+                'Europe/Berlin (or --time-zone UTC if they are UTC all the same)',
+                [Remedy('time-zone', 'Europe/Berlin')],
+            )
+        notes = [*self.notes]
+        if self._clock is not None and self._clock.folded:
+            notes.append(
+                f'In autumn the clock of {self.zone} is set back: {self._clock.folded} rows '
+                'stand in the hour that comes twice; its first pass was taken as summer time.'
+            )
+        return notes
+
+    @property
+    def words(self) -> str:
+        """Return how the times are written."""
+        if self.kind == 'seconds':
+            return f'numbers of {self._unit} since 1970'
+        return f'written like {self.kind}' if self.kind.startswith("'") else self.kind
+
+    @property
+    def told_zone(self) -> str:
+        """Return where the zone of the times comes from, as a clause."""
+        if self.kind in ('seconds', ''):
+            return 'UTC'
+        if self._zoned:
+            return 'as each time says'
+        return self.zone or 'UTC (the times name no zone)'
+
+    def _from_cells(self, column: pd.Series[Any]) -> IntArray:
+        import pandas as pd
+
+        if column.dtype.kind in 'iu' and not self._excel:
+            return self._whole(column.to_numpy())
+        if column.dtype.kind == 'f' and not hasattr(column.dtype, 'na_value'):
+            return self._numbers(column.to_numpy(dtype=np.float64))
+        text = column.astype('string').str.strip()
+        numbers = pd.to_numeric(text, errors='coerce')
+        if self._style is not None or not float(numbers.notna().mean()) >= 0.5:
+            return self._from_texts(text)
+        whole = text.str.fullmatch(r'[+-]?[0-9]{1,18}').fillna(False)
+        if bool(whole[numbers.notna()].all()) and not self._excel:
+            filled = text.where(whole, '0').astype('int64').to_numpy()
+            stamps = self._whole(filled)
+            stamps[~whole.to_numpy(dtype=bool)] = _NEVER
+            return stamps
+        return self._numbers(numbers.to_numpy(dtype=np.float64, na_value=np.nan))
+
+    def _from_texts(self, text: pd.Series[Any]) -> IntArray:
+        import pandas as pd
+
+        style = self._style or DateStyle()
+        self._zoned = self._zoned or style.zoned
+        if not style.formats:
+            self._say('ISO 8601')
+            if style.zoned or self._clock is None:
+                return iso_times(text)
+            return self._from_local(pd.to_datetime(text, format='ISO8601', errors='coerce'))
+        self._say(style.words)
+        return self._styled(text, style)
+
+    def _styled(self, text: pd.Series[Any], style: DateStyle) -> IntArray:
+        """Read texts by formats: on each only what those before left."""
+        import pandas as pd
+
+        found, left = self._by_formats(text, style)
+        if left.any():
+            # Only what no format fits is worth a look at each text.
+            tidy = text[left].map(lambda t: english(tidied(t)) if style.named else tidied(t),
+                                  na_action='ignore')  # fmt: skip
+            again, _ = self._by_formats(with_offsets(tidy) if style.zoned else tidy, style)
+            found = found.copy()
+            found[left] = again
+        return self._from_local(found) if not style.zoned else from_stamps(pd.to_datetime(found))
+
+    def _by_formats(
+        self, text: pd.Series[Any], style: DateStyle
+    ) -> tuple[pd.Series[Any], NDArray[np.bool_]]:
+        import pandas as pd
+
+        kind = 'datetime64[ns, UTC]' if style.zoned else 'datetime64[ns]'
+        found = pd.Series(pd.NaT, index=text.index, dtype=kind)
+        left = text.notna().to_numpy(dtype=bool)
+        for form in style.formats:
+            if not left.any():
+                break
+            suffixes = ('%z', ' %z') if style.zoned else ('',)
+            for suffix in suffixes:
+                read = pd.to_datetime(
+                    text[left], format=form + suffix, errors='coerce', utc=style.zoned
+                )
+                found[left] = read.astype(kind)
+                left = found.isna().to_numpy() & text.notna().to_numpy(dtype=bool)
+                if not left.any():
+                    break
+        return found, left
+
+    def _from_local(self, stamps: pd.Series[Any]) -> IntArray:
+        if not self.kind:
+            self._say('stamps of the file')
+        return from_stamps(stamps if self._clock is None else self._clock.to_utc(stamps))
+
+    def _whole(self, numbers: NDArray[np.integer[Any]]) -> IntArray:
+        """Scale whole numbers without passing through floats, which would round nanoseconds."""
+        self._say_numbers()
+        wide = numbers.astype(np.float64) * self._factor
+        near = np.abs(wide) < _WHOLE_LIMIT
+        return np.where(near, numbers.astype(np.int64) * self._factor, _NEVER).astype(np.int64)
+
+    def _numbers(self, numbers: FloatArray) -> IntArray:
+        import pandas as pd
+
+        if self._excel:
+            self._say('days of a workbook')
+            days = np.where(np.isfinite(numbers), numbers, 0.0) - _EXCEL_EPOCH_DAYS
+            # A double of days knows a second to about a microsecond, no better.
+            milli = np.rint(days * 86_400_000.0).astype(np.int64) * 1_000_000
+            local = pd.Series(milli.astype('datetime64[ns]')).where(np.isfinite(numbers))
+            return self._from_local(local)
+        self._say_numbers()
+        usable = np.isfinite(numbers) & (np.abs(numbers) < _WHOLE_LIMIT / self._factor)
+        safe = np.where(usable, numbers, 0.0)
+        # Whole part and fraction apart: a double of seconds since 1970 resolves 0.2 us only as a
+        # whole, and its fraction would lose digits in the product.
+        whole = np.floor(safe)
+        fraction = np.rint((safe - whole) * self._factor).astype(np.int64)
+        stamps: IntArray = whole.astype(np.int64) * self._factor + fraction
+        stamps[~usable] = _NEVER
+        return stamps
+
+    def _say_numbers(self) -> None:
+        self.kind = 'seconds'
+        if self._unit != 's' and not self.notes:
+            self.notes.append(
+                'The numbers in the time column are too large for seconds and were taken as '
+                f'{self._unit}.'
+            )
+
+    def _say(self, kind: str) -> None:
+        self.kind = kind
+
+
+def never() -> int:
+    """Return the stamp that stands for a time that cannot be read."""
+    return int(_NEVER)

@@ -1,0 +1,116 @@
+"""What the engine says: events, each with the time of the row at which it happened."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.shift import Shift
+from valveflow_ros.fit.fit_task import FitTask
+from valveflow_ros.monitoring.alarms import AlarmChange
+from valveflow_ros.monitoring.diagnosis_task import DiagnosisTask
+from valveflow_ros.monitoring.prediction import PredictionBlock
+from valveflow_ros.records import SpecialSegment
+
+
+class JournalKind(enum.IntEnum):
+    """Why the engine's state changed other than by a row; numbers as in the message."""
+
+    FIT_REQUESTED = 1
+    FIT_ADOPTED = 2
+    FIT_REFUSED = 3
+    ACKNOWLEDGE = 4
+    SET_REFERENCE = 5
+    RESET = 6
+    DIAGNOSE = 7
+    SETTINGS = 8
+    DIAGNOSED = 9
+    DIAGNOSIS_FAILED = 10
+    MISMATCH = 11
+    SHELVE = 12
+    UNSHELVE = 13
+    RESUMED = 14
+
+
+@dataclass(frozen=True, slots=True)
+class JournalEntry:
+    """One decision, at the boundary after ``rows`` rows; a replay repeats it there."""
+
+    time_ns: int
+    kind: JournalKind
+    request_ns: int
+    rows: int
+    model_id: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentClosed:
+    """A special segment has ended."""
+
+    segment: SpecialSegment
+
+
+@dataclass(frozen=True, slots=True)
+class FitRequested:
+    """A fit is wanted; somebody has to compute ``task`` and hand the outcome back."""
+
+    task: FitTask
+
+
+@dataclass(frozen=True, slots=True)
+class CurveAdopted:
+    """A new curve predicts from the next row on.
+
+    ``shift`` is the judgement against the reference, None without one.
+    """
+
+    characteristic: Characteristic
+    shift: Shift | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceSet:
+    """Later curves are judged against this one."""
+
+    characteristic: Characteristic
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosisRequested:
+    """A diagnosis is wanted; somebody has to compute ``task`` and hand the outcome back."""
+
+    task: DiagnosisTask
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosed:
+    """A diagnosis has ended.
+
+    Attributes
+    ----------
+    task : DiagnosisTask
+        What was diagnosed.
+    content : str
+        What `diagnosis.json` would hold; empty if there is no result.
+    reason : str
+        Why there is none.
+    """
+
+    task: DiagnosisTask
+    content: str
+    reason: str
+
+
+Event = (
+    PredictionBlock
+    | SegmentClosed
+    | FitRequested
+    | CurveAdopted
+    | ReferenceSet
+    | DiagnosisRequested
+    | Diagnosed
+    | AlarmChange
+    | JournalEntry
+)

@@ -1,0 +1,369 @@
+"""The engine: rows in, events out. No clock, no files, no threads, no ROS."""
+
+from __future__ import annotations
+
+import json
+import math
+
+from valveflow_ros.config import Settings
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.characteristic_json import to_json
+from valveflow_ros.errors import DataError
+from valveflow_ros.fit.fit_task import FitTask
+from valveflow_ros.monitoring.alarm_desk import Act, AlarmDesk
+from valveflow_ros.monitoring.alarms import Judged, ResidualAlarm
+from valveflow_ros.monitoring.corrector import Correction, Corrector
+from valveflow_ros.monitoring.curve_in_force import CurveInForce
+from valveflow_ros.monitoring.curve_status import CurveStatus
+from valveflow_ros.monitoring.diagnosing import Diagnosing
+from valveflow_ros.monitoring.events import (
+    CurveAdopted,
+    Event,
+    FitRequested,
+    JournalEntry,
+    JournalKind,
+    ReferenceSet,
+    SegmentClosed,
+)
+from valveflow_ros.monitoring.feeding import Fed, Rows
+from valveflow_ros.monitoring.prediction import PredictionBlock
+from valveflow_ros.monitoring.reference import ReferenceKeeper
+from valveflow_ros.monitoring.refits import Refits
+from valveflow_ros.records import IntArray, SampleTable, SpecialSegment
+from valveflow_ros.segments.segmenter import NoiseLevel, Segmented, Segmenter
+from valveflow_ros.segments.window import RollingWindow
+from valveflow_ros.state import Continuing, State
+
+BY_HAND = 'asked for by hand'
+
+
+class Monitor:
+    """Keep the window, the segments, the curve, the reference, the predictions and the alarms.
+
+    Parameters
+    ----------
+    settings : Settings
+    corrector : Corrector, optional
+        Takes known causes out of the rows before anything looks at them.
+
+    Notes
+    -----
+    The state changes by rows and by the calls `adopt`, `refuse`, `acknowledge`, `shelve`,
+    `unshelve`, `request_fit`, `set_reference`, `request_diagnosis`, `restart` and
+    `reconfigure`, and those of `diagnosing`, nothing else, and each such call leaves a
+    `JournalEntry` with the number of rows before it. Rows and journal together give the same
+    events again, bit for bit.
+    """
+
+    def __init__(self, settings: Settings, corrector: Corrector | None = None) -> None:
+        self.settings = settings
+        self._correction = Correction(corrector)
+        self._segmenter = Segmenter(settings)
+        self._window = RollingWindow.of(settings)
+        self.alarm = ResidualAlarm(settings)
+        self._force = CurveInForce(settings)
+        self._rows = 0
+        self._last_ns = 0
+        self._went_back = False
+        self.judged = Judged(0, math.nan, math.nan)
+        self._refits = Refits()
+        self.reference = ReferenceKeeper(settings)
+        self._desk = AlarmDesk(self.alarm, self.reference.alarm)
+        self.diagnosing = Diagnosing(settings, self.alarm, self._journal)
+
+    @property
+    def rows(self) -> int:
+        """Return the number of rows taken so far."""
+        return self._rows
+
+    @property
+    def last_ns(self) -> int:
+        """Return the time of the newest row, 0 before the first."""
+        return self._last_ns
+
+    @property
+    def characteristic(self) -> Characteristic | None:
+        """Return the running curve."""
+        return self._force.characteristic
+
+    @property
+    def status(self) -> CurveStatus:
+        """Return what the running curve is worth."""
+        return self._force.status
+
+    @property
+    def cause(self) -> str:
+        """Return why there is no curve, or only a stale one; empty if it is fresh."""
+        return self._force.cause
+
+    @property
+    def fit_pending(self) -> bool:
+        """Tell whether a fit was asked for and its outcome is awaited."""
+        return self._refits.pending_ns is not None
+
+    @property
+    def segments(self) -> int:
+        """Return the number of special segments in the window."""
+        return self._window.segments
+
+    @property
+    def special_samples(self) -> int:
+        """Return the number of samples in those segments."""
+        return self._window.special_samples
+
+    def special_segments(self) -> tuple[SpecialSegment, ...]:
+        """Return the special segments in the window, in order of time."""
+        return self._window.special_segments()
+
+    def numbers(self) -> IntArray:
+        """Return the numbers of the rows in the window, counted from the first one taken."""
+        return self._window.numbers()
+
+    def noise(self) -> NoiseLevel:
+        """Return the noise levels the thresholds stand on."""
+        return self._segmenter.noise()
+
+    def reconfigure(self, settings: Settings) -> list[Event]:
+        """Take settings of which only live ones differ.
+
+        Raises
+        ------
+        ParameterError
+            One differs that may not be changed while the monitor runs.
+        """
+        changed = self.settings.live_changes(settings)
+        if not changed:
+            return []
+        self.settings = self.diagnosing.settings = settings
+        self._desk.configure(settings)
+        self._force.configure(settings)
+        text = json.dumps(changed, sort_keys=True)
+        return [self._journal(JournalKind.SETTINGS, 0, '', text)]
+
+    def feed(self, table: SampleTable) -> Fed:
+        """Take rows until they end, or a fit or a diagnosis is wanted."""
+        events: list[Event] = []
+        rows = Rows.of(table, self.settings.real('pressure_exponent'), self._correction)
+        done = 0
+        while done < len(table):
+            until, by_time = self._refits.rows_until_due(table.time_ns[done:], self.settings)
+            most = min(until, self.diagnosing.rows_until_look(table.time_ns[done:]))
+            taken, closed = self._take(rows.part(done, done + most), events)
+            done += taken
+            # Decisions never fall where a block happens to end: cutting must not matter.
+            looked = self.diagnosing.look(self._last_ns, self._window, self.characteristic)
+            events += looked
+            asked = self._ask() if self._due(closed, by_time and taken == until) else []
+            events += asked
+            if asked or looked:
+                break
+        return Fed(done, events)
+
+    def adopt(self, request_ns: int, characteristic: Characteristic) -> list[Event]:
+        """Let ``characteristic`` predict from the next row on.
+
+        An outcome of a request that is no longer awaited is ignored.
+        """
+        if not self._refits.settle(request_ns):
+            return []
+        self._force.adopt(characteristic, self._window)
+        shift, changes = self.reference.judge(
+            characteristic, self._window.special_segments(), self._last_ns, self.settings
+        )
+        entry = self._journal(JournalKind.FIT_ADOPTED, request_ns, characteristic.model_id, '')
+        return [CurveAdopted(characteristic, shift), entry, *changes]
+
+    def refuse(self, request_ns: int, reason: str) -> list[Event]:
+        """Note that a fit gave no curve; the old one stays, as stale."""
+        if not self._refits.settle(request_ns):
+            return []
+        self._force.refuse(reason)
+        return [self._journal(JournalKind.FIT_REFUSED, request_ns, '', reason)]
+
+    def request_fit(self) -> list[Event]:
+        """Ask for a fit now.
+
+        Raises
+        ------
+        DataError
+            One is running already, or there is nothing to fit.
+        """
+        if self.fit_pending:
+            raise DataError('A fit is running already.')
+        if not self._window.segments:
+            raise DataError('There is no special segment to fit yet.')
+        return self._ask(BY_HAND)
+
+    def request_diagnosis(self) -> list[Event]:
+        """Ask for a diagnosis now; raises `DataError` where that makes no sense."""
+        return self.diagnosing.request(self._last_ns, self._window, self.characteristic)
+
+    def acknowledge(self) -> list[Event]:
+        """Acknowledge the alarms.
+
+        Raises
+        ------
+        DataError
+            There is nothing to acknowledge.
+        """
+        return self._by_hand(self._desk.acknowledge, JournalKind.ACKNOWLEDGE)
+
+    def shelve(self) -> list[Event]:
+        """Put the alarms that stand aside for a time; raises `DataError` if there is none."""
+        return self._by_hand(self._desk.shelve, JournalKind.SHELVE)
+
+    def unshelve(self) -> list[Event]:
+        """Take the alarms from the shelf; raises `DataError` if none is there."""
+        return self._by_hand(self._desk.unshelve, JournalKind.UNSHELVE)
+
+    def _by_hand(self, act: Act, kind: JournalKind) -> list[Event]:
+        model_id = self._model_id()
+        changes = act(self.judged, model_id)
+        return [*changes, self._journal(kind, 0, model_id, '')]
+
+    def set_reference(self, given: Characteristic | None = None) -> list[Event]:
+        """Let the running curve, or one that is given, be what later ones are judged against.
+
+        One that is given stands in the journal whole, since no data of this run lead to it.
+
+        Raises
+        ------
+        DataError
+            There is no curve, or one of another input u.
+        """
+        curve = self.characteristic if given is None else given
+        if curve is None:
+            raise DataError(f'There is no curve that could become the reference. {self.cause}')
+        changes = self.reference.set(curve, self._last_ns, self.settings)
+        text = '' if given is None else json.dumps(to_json(given))
+        entry = self._journal(JournalKind.SET_REFERENCE, 0, curve.model_id, text)
+        return [ReferenceSet(curve), entry, *changes]
+
+    def restart(self, reason: str) -> list[Event]:
+        """Begin anew after the clock went back; curve, alarm and the rows before it stay.
+
+        The rows that the clock had passed are set aside with the next row, whose time tells which
+        those are; see `RollingWindow`.
+        """
+        pending = self._refits.pending_ns
+        events: list[Event] = [] if pending is None else self.refuse(pending, reason)
+        # What the curve stands on may have changed, and a fit that was running is lost.
+        self._refits.owe()
+        self._correction.restart()
+        self._went_back = True
+        events += self.diagnosing.restart(reason)
+        self._force.restart(reason)
+        return [*events, self._journal(JournalKind.RESET, 0, '', reason)]
+
+    def resume(self, reason: str) -> list[Event]:
+        """Ask again in its time for what was being computed when the monitor ended."""
+        self._refits.ask_again()
+        self.diagnosing.ask_again(reason)
+        return [self._journal(JournalKind.RESUMED, 0, self._model_id(), reason)]
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        own = {
+            'rows': self._rows,
+            'last_ns': self._last_ns,
+            'went_back': self._went_back,
+            'judged': list(self.judged),
+        }
+        return {**{name: part.snapshot() for name, part in self._parts().items()}, **own}
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state that was made with the same settings.
+
+        What was being computed then is awaited still.
+
+        Raises
+        ------
+        DataError
+            It does not fit; the monitor is not to be used then.
+        """
+        for name, part in self._parts().items():
+            part.restore(saved[name])
+        self._rows, self._last_ns = saved['rows'], saved['last_ns']
+        self._went_back = saved['went_back']
+        self.judged = Judged(*saved['judged'])
+
+    def _parts(self) -> dict[str, Continuing]:
+        return {
+            'correction': self._correction,
+            'segmenter': self._segmenter,
+            'window': self._window,
+            'alarm': self.alarm,
+            'force': self._force,
+            'refits': self._refits,
+            'reference': self.reference,
+            'diagnosing': self.diagnosing,
+        }
+
+    def check_clock(self) -> None:
+        """Raise `DataError` between a step back of the clock and the row that tells how far."""
+        if self._went_back:
+            raise DataError('The clock has just gone back; try again after the next sample.')
+
+    def _take(self, rows: Rows, events: list[Event]) -> tuple[int, bool]:
+        """Run rows up to the next segment's close through everything.
+
+        Returns the rows taken and whether a segment closed at the last of them.
+        """
+        segmented = self._segmenter.feed(
+            rows.time_ns, rows.u, rows.power_mw, rows.temperature_degc, most=1
+        )
+        n = segmented.rows
+        rows = rows.part(0, n)
+        if self._went_back:
+            self._went_back = False
+            self._window.go_back(int(rows.time_ns[0]))
+        self._window.append(
+            rows.time_ns, rows.u, rows.power_mw, rows.temperature_degc, rows.opening_percent,
+            rows.command_percent,
+        )  # fmt: skip
+        block = self._force.predict(rows, segmented.kinds)
+        self.diagnosing.watch(block, rows.temperature_degc, self.characteristic)
+        self._rows += n
+        self._last_ns = int(rows.time_ns[-1])
+        self.judged = Judged(self._last_ns, float(block.evidence[-1]), float(block.shift_mw[-1]))
+        self._say(block, segmented, events)
+        return n, bool(segmented.found)
+
+    def _say(self, block: PredictionBlock, segmented: Segmented, events: list[Event]) -> None:
+        """Append what the rows brought; a segment can only have closed at the last of them."""
+        events.append(block)
+        if self.characteristic is not None:
+            events += self._desk.feed(block)
+        self._close(segmented, events)
+
+    def _close(self, segmented: Segmented, events: list[Event]) -> None:
+        for _, found in segmented.found:
+            self._window.add_segment(found)
+            self._refits.segments_seen += 1
+            events.append(SegmentClosed(found.segment))
+
+    def _due(self, closed: bool, by_time: bool) -> bool:
+        """Tell whether a fit is to be asked for at this boundary."""
+        if not self._refits.due(self._last_ns, closed, by_time, self.settings):
+            return False
+        enough = self._window.special_samples >= self.settings.whole('min_fit_samples')
+        # Data under alarm would teach the curve the very fault it should show.
+        return enough and not self.alarm.active
+
+    def _ask(self, text: str = '') -> list[Event]:
+        request_ns = self._refits.ask(self._last_ns)
+        noise = self._segmenter.noise()
+        task = FitTask(
+            request_ns, self._window.contents(), self.settings, noise.input, noise.power_mw,
+            self._correction.held,
+        )  # fmt: skip
+        entry = self._journal(JournalKind.FIT_REQUESTED, request_ns, '', text)
+        return [entry, FitRequested(task)]
+
+    def _model_id(self) -> str:
+        return '' if self.characteristic is None else self.characteristic.model_id
+
+    def _journal(
+        self, kind: JournalKind, request_ns: int, model_id: str, text: str
+    ) -> JournalEntry:
+        return JournalEntry(self._last_ns, kind, request_ns, self._rows, model_id, text)

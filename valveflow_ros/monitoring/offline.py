@@ -1,0 +1,249 @@
+"""Drive the engine without a plant: fits in place, or where a journal says."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.characteristic_json import from_json
+from valveflow_ros.errors import DataError
+from valveflow_ros.fit.fit import fit
+from valveflow_ros.fit.fit_task import FitTask
+from valveflow_ros.monitoring.diagnosing import ASKED
+from valveflow_ros.monitoring.diagnosis_task import DiagnosisTask
+from valveflow_ros.monitoring.events import (
+    DiagnosisRequested,
+    Event,
+    FitRequested,
+    JournalEntry,
+    JournalKind,
+)
+from valveflow_ros.monitoring.monitor import BY_HAND, Monitor
+from valveflow_ros.records import Readings, SampleTable
+from valveflow_ros.signals.align import Aligned, Aligner
+
+Progress = Callable[[float, str], None]
+# What an operator did to the alarms.
+_AT_DESK = {
+    JournalKind.ACKNOWLEDGE: Monitor.acknowledge,
+    JournalKind.SHELVE: Monitor.shelve,
+    JournalKind.UNSHELVE: Monitor.unshelve,
+}
+CLOCK_BACK = 'The clock went back; the rows it had passed are set aside.'
+
+
+def _quiet(_share: float, _what: str) -> None:
+    """Show no progress."""
+
+
+def outcome_of(monitor: Monitor, task: FitTask) -> list[Event]:
+    """Compute a fit here and now, and hand it to the engine."""
+    try:
+        return monitor.adopt(task.request_ns, fit(task))
+    except DataError as error:
+        return monitor.refuse(task.request_ns, str(error))
+
+
+def align_all(aligner: Aligner, readings: Readings) -> Iterator[Aligned]:
+    """Yield all rows of a finished list of readings."""
+    yield aligner.feed(readings)
+    yield aligner.finish()
+
+
+def feed_rows(monitor: Monitor, table: SampleTable) -> list[Event]:
+    """Feed rows, computing every fit in place."""
+    events: list[Event] = []
+    done = 0
+    while done < len(table):
+        fed = monitor.feed(table.part(done, len(table)))
+        done += fed.rows
+        events += fed.events
+        for event in fed.events:
+            if isinstance(event, FitRequested):
+                events += outcome_of(monitor, event.task)
+    return events
+
+
+def feed_aligned(monitor: Monitor, aligned: Aligned) -> list[Event]:
+    """Feed rows with restarts of the clock among them, computing every fit in place."""
+    events: list[Event] = []
+    start = 0
+    for reset in aligned.resets.tolist():
+        events += feed_rows(monitor, aligned.table.part(start, reset))
+        events += monitor.restart(CLOCK_BACK)
+        start = reset
+    return events + feed_rows(monitor, aligned.table.part(start, len(aligned.table)))
+
+
+class JournalReplayer:
+    """Feed rows and repeat a live run's decisions at the boundaries its journal names.
+
+    Parameters
+    ----------
+    monitor : Monitor
+        Fresh, with the settings of the live run.
+    journal : sequence of JournalEntry
+        In the order written. What the engine says and asks for by itself comes anew
+        and is not repeated; everything else is.
+    diagnose : callable, optional
+        Computes a diagnosis and returns its content; without it none that the journal holds can
+        be repeated.
+    curves : callable, optional
+        Returns the curve of a name, where there is a quicker way than to compute it again.
+    left : list of str, optional
+        Takes why an entry cannot be repeated; without it the first such entry is an error.
+    """
+
+    def __init__(
+        self,
+        monitor: Monitor,
+        journal: Sequence[JournalEntry],
+        diagnose: Callable[[DiagnosisTask], str] | None = None,
+        curves: Callable[[str], Characteristic] | None = None,
+        left: list[str] | None = None,
+    ) -> None:
+        self._monitor = monitor
+        self._curves = curves
+        self._left = left
+        self._due = [entry for entry in journal if _from_outside(entry)]
+        self._tasks: dict[int, FitTask] = {}
+        self._diagnose = diagnose
+        self._diagnosis: DiagnosisTask | None = None
+        self._reset_at = -1
+
+    def feed(self, table: SampleTable) -> list[Event]:
+        """Feed rows; return the events."""
+        events: list[Event] = []
+        done = 0
+        while True:
+            events += self._repeat_due()
+            if done >= len(table):
+                return events
+            until = len(table)
+            if self._due:
+                until = min(until, done + self._due[0].rows - self._monitor.rows)
+            fed = self._monitor.feed(table.part(done, until))
+            done += fed.rows
+            events += fed.events
+            self._keep(fed.events)
+
+    def feed_aligned(self, aligned: Aligned) -> list[Event]:
+        """Feed rows with restarts of the clock among them; return the events.
+
+        A run that was killed may have left no line of the journal about the last one.
+        """
+        events: list[Event] = []
+        start = 0
+        for reset in aligned.resets.tolist():
+            events += self.feed(aligned.table.part(start, reset))
+            if self._reset_at != self._monitor.rows:
+                events += self._monitor.restart(CLOCK_BACK)
+            start = reset
+        return events + self.feed(aligned.table.part(start, len(aligned.table)))
+
+    def _keep(self, events: list[Event]) -> None:
+        for event in events:
+            if isinstance(event, DiagnosisRequested):
+                self._diagnosis = event.task
+        self._tasks.update(
+            (event.task.request_ns, event.task)
+            for event in events
+            if isinstance(event, FitRequested)
+        )
+
+    def _repeat_due(self) -> list[Event]:
+        events: list[Event] = []
+        while self._due and self._due[0].rows <= self._monitor.rows:
+            try:
+                events += self._repeat(self._due.pop(0))
+            except DataError as error:
+                if self._left is None:
+                    raise
+                self._left.append(str(error))
+        return events
+
+    @property
+    def due(self) -> int:
+        """Return how many entries of the journal wait for rows that did not come yet."""
+        return len(self._due)
+
+    def _repeat(self, entry: JournalEntry) -> list[Event]:
+        monitor = self._monitor
+        if entry.kind == JournalKind.FIT_REQUESTED:
+            events = monitor.request_fit()
+            self._keep(events)
+            return events
+        if entry.kind == JournalKind.DIAGNOSE:
+            events = monitor.request_diagnosis()
+            self._keep(events)
+            return events
+        if entry.kind == JournalKind.DIAGNOSED:
+            return self._conclude(entry)
+        if entry.kind == JournalKind.DIAGNOSIS_FAILED:
+            return monitor.diagnosing.refuse(entry.request_ns, entry.text)
+        if entry.kind == JournalKind.FIT_ADOPTED:
+            return self._adopt(entry)
+        if entry.kind == JournalKind.FIT_REFUSED:
+            self._tasks.pop(entry.request_ns, None)
+            return monitor.refuse(entry.request_ns, entry.text)
+        if entry.kind in _AT_DESK:
+            return _AT_DESK[entry.kind](monitor)
+        if entry.kind == JournalKind.RESET:
+            self._reset_at = monitor.rows
+            return monitor.restart(entry.text)
+        if entry.kind == JournalKind.RESUMED:
+            return monitor.resume(entry.text)
+        if entry.kind == JournalKind.SETTINGS:
+            return monitor.reconfigure(monitor.settings.changed(_held(entry, 'parameters')))
+        if entry.kind == JournalKind.SET_REFERENCE:
+            given = from_json(_held(entry, 'reference')) if entry.text else None
+            return monitor.set_reference(given)
+        return []
+
+    def _adopt(self, entry: JournalEntry) -> list[Event]:
+        """Compute the fit that was adopted; it must be the one that was."""
+        if self._curves is not None:
+            return self._monitor.adopt(entry.request_ns, self._curves(entry.model_id))
+        task = self._tasks.pop(entry.request_ns, None)
+        if task is None:
+            raise DataError(
+                f'The journal adopts curve {entry.model_id} for a request that never came: '
+                'the readings before it are not complete.'
+            )
+        found = fit(task)
+        if entry.model_id and found.model_id != entry.model_id:
+            raise DataError(
+                f'The fit gives curve {found.model_id} where the journal has {entry.model_id}: '
+                'the readings, the settings or the program are not those of the run.'
+            )
+        return self._monitor.adopt(entry.request_ns, found)
+
+    def _conclude(self, entry: JournalEntry) -> list[Event]:
+        """Compute the diagnosis that was published; the journal's line tells if it is the same."""
+        task, self._diagnosis = self._diagnosis, None
+        if task is None or task.request_ns != entry.request_ns:
+            raise DataError('The journal has a diagnosis that was never asked for.')
+        if self._diagnose is None:
+            raise DataError('The journal has a diagnosis, which cannot be repeated here.')
+        return self._monitor.diagnosing.adopt(entry.request_ns, self._diagnose(task))
+
+
+def _from_outside(entry: JournalEntry) -> bool:
+    """Tell whether the engine would not come to this by itself."""
+    if entry.kind == JournalKind.MISMATCH:
+        return False
+    if entry.kind == JournalKind.FIT_REQUESTED:
+        return entry.text == BY_HAND
+    return entry.kind != JournalKind.DIAGNOSE or entry.text == ASKED
+
+
+def _held(entry: JournalEntry, what: str) -> dict[str, object]:
+    """Return the JSON object a journal entry holds."""
+    try:
+        held = json.loads(entry.text)
+    except ValueError:
+        held = None
+    if not isinstance(held, dict):
+        raise DataError(f"The journal's change of {what} cannot be read: '{entry.text[:200]}'.")
+    return held

@@ -1,0 +1,312 @@
+"""What the running curve expects, row by row, and by how much the plant differs."""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from valveflow_ros.config import Settings
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.regional_kernel import (
+    TAP_0,
+    TAP_1,
+    TAP_2,
+    TAP_A,
+    TAP_WHOLE,
+    curve,
+    region_of,
+)
+from valveflow_ros.fit.chart import ResidualChart
+from valveflow_ros.jit import jit
+from valveflow_ros.records import NS_PER_S, ByteArray, FloatArray, IntArray
+from valveflow_ros.segments.segmenter_kernel import NO_DATA, SETTLED_SLOPE, SETTLED_STEADY
+from valveflow_ros.state import State, copies, put_back
+
+_LONGEST_DELAY_S = 600.0
+_AGE, _PLACE, _LAST_NS = range(3)
+_ANSWER, _AVERAGE = range(2)
+
+
+class PredictionState(enum.IntEnum):
+    """What a residual is worth; the same numbers stand in the message."""
+
+    UNKNOWN = 0
+    TRANSIENT = 1
+    STEADY = 2
+    SLOPE = 3
+    OUTSIDE = 4
+    BAD_DATA = 5
+
+
+@dataclass(frozen=True, slots=True)
+class PredictionBlock:
+    """Predictions for consecutive rows; all arrays have shape (n,).
+
+    Attributes
+    ----------
+    time_ns : int64
+    u : float64
+        Integrated input, % MPa^m.
+    measured_mw, static_mw, dynamic_mw, residual_mw : float64
+        NaN where unknown. The residual is measured minus dynamic prediction, or
+        minus static prediction in settled rows when no dynamics are known.
+    average_mw : float64
+        The running mean of the residual; NaN before the first.
+    evidence : float64
+        What the alarm judges: beyond 1 or -1 the plant has left the curve; NaN before the first.
+    shift_mw : float64
+        By how much, as the evidence sees it.
+    state : uint8
+        A `PredictionState`.
+    width_mw : float
+        95 % of single measurements lie within +- this of the prediction; NaN without a curve.
+    model_id : str
+    """
+
+    time_ns: IntArray
+    u: FloatArray
+    measured_mw: FloatArray
+    static_mw: FloatArray
+    dynamic_mw: FloatArray
+    residual_mw: FloatArray
+    average_mw: FloatArray
+    evidence: FloatArray
+    shift_mw: FloatArray
+    state: ByteArray
+    width_mw: float
+    model_id: str
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.time_ns)
+
+
+class _Filter(NamedTuple):
+    """The curve, the dynamics and the filter's state."""
+
+    knots: FloatArray
+    left: FloatArray
+    right: FloatArray
+    levels: FloatArray
+    taps: FloatArray  # (I, 7), empty when the dynamics are not known
+    settle: int  # rows
+    forget: float
+    gap_ns: int  # rows further apart than this have a gap between them
+    place: IntArray  # rows since the last gap, place in the ring, time of the last row
+    memory: FloatArray  # filter's answer, mean of the residual
+    past: FloatArray  # ring of flows
+
+
+class _Columns(NamedTuple):
+    """What is written for each row."""
+
+    static: FloatArray
+    dynamic: FloatArray
+    residual: FloatArray
+    average: FloatArray
+    state: ByteArray
+
+
+@jit
+def _filter(f: _Filter, x: float) -> None:
+    """Put one flow through the dynamics of its region."""
+    age = f.place[_AGE]
+    room = f.past.size
+    place = f.place[_PLACE]
+    f.past[place] = x
+    if f.taps.shape[0] > 0:
+        tap = f.taps[region_of(x, f.levels)]
+        whole = int(tap[TAP_WHOLE])
+        if age == 0:
+            f.memory[_ANSWER] = x
+        f.memory[_ANSWER] = (
+            tap[TAP_A] * f.memory[_ANSWER]
+            + tap[TAP_0] * f.past[(place - min(whole, age)) % room]
+            + tap[TAP_1] * f.past[(place - min(whole + 1, age)) % room]
+            + tap[TAP_2] * f.past[(place - min(whole + 2, age)) % room]
+        )
+    f.place[_PLACE] = (place + 1) % room
+    f.place[_AGE] = age + 1
+
+
+@jit
+def _state_of(inside: bool, kind: int) -> int:
+    """Return the `PredictionState` of a row with data."""
+    if not inside:
+        return 4
+    if kind == SETTLED_STEADY:
+        return 2
+    return 3 if kind == SETTLED_SLOPE else 1
+
+
+@jit
+def _predict(
+    time_ns: IntArray, u: FloatArray, y: FloatArray, kinds: ByteArray, f: _Filter, out: _Columns
+) -> None:
+    """Predict rows."""
+    known = f.taps.shape[0] > 0
+    for t in range(u.size):
+        out.static[t] = out.dynamic[t] = out.residual[t] = np.nan
+        out.average[t] = f.memory[_AVERAGE]
+        step_ns = time_ns[t] - f.place[_LAST_NS]
+        f.place[_LAST_NS] = time_ns[t]
+        if step_ns > f.gap_ns or step_ns <= 0:
+            f.place[_AGE] = 0
+            f.memory[_AVERAGE] = np.nan
+            out.average[t] = np.nan
+        if kinds[t] == NO_DATA or not (math.isfinite(u[t]) and math.isfinite(y[t])):
+            f.place[_AGE] = 0
+            out.state[t] = 5
+            continue
+        x = curve(u[t], f.knots, f.left, f.right)
+        inside = f.knots[0] <= u[t] <= f.knots[-1]
+        _filter(f, x)
+        out.state[t] = _state_of(inside, kinds[t])
+        if not inside:
+            continue
+        out.static[t] = x
+        if known and f.place[_AGE] > f.settle:
+            out.dynamic[t] = f.memory[_ANSWER]
+            out.residual[t] = y[t] - out.dynamic[t]
+        elif not known and kinds[t] != 0:
+            out.residual[t] = y[t] - x
+        else:
+            continue
+        mean = 0.0 if math.isnan(f.memory[_AVERAGE]) else f.memory[_AVERAGE]
+        f.memory[_AVERAGE] = f.forget * mean + (1.0 - f.forget) * out.residual[t]
+        out.average[t] = f.memory[_AVERAGE]
+
+
+class Predictor:
+    """Predict from one curve, recursively, in constant time a row.
+
+    Parameters
+    ----------
+    characteristic : Characteristic
+    step_s : float
+        Step of the rows.
+    settle_s : float
+        After a gap the dynamic prediction is not trusted for this long.
+    average_s : float
+        Time constant of the residual's running mean.
+    limit_mw : float
+        Where above zero, the evidence is the running mean's share of this limit; otherwise it is
+        that of the chart that came with the curve.
+    """
+
+    def __init__(
+        self,
+        characteristic: Characteristic,
+        step_s: float,
+        settle_s: float,
+        average_s: float,
+        limit_mw: float = 0.0,
+    ) -> None:
+        self.characteristic = characteristic
+        self.limit_mw = limit_mw
+        design = characteristic.residuals.chart
+        self._chart = None if design is None else ResidualChart(design, step_s)
+        m = characteristic.model
+        self._filter = _Filter(
+            m.knots, m.left, m.right, m.levels, m.taps(step_s),
+            settle=round(settle_s / step_s),
+            forget=math.exp(-step_s / average_s),
+            gap_ns=round(1.5 * step_s * NS_PER_S),
+            place=np.zeros(3, dtype=np.int64),
+            memory=np.array([0.0, math.nan]),
+            past=np.zeros(int(_LONGEST_DELAY_S / step_s) + 4),
+        )  # fmt: skip
+
+    @classmethod
+    def of(cls, characteristic: Characteristic, settings: Settings) -> Predictor:
+        """Return what predicts from a curve with these settings."""
+        return cls(
+            characteristic, settings.real('sample_period'), settings.settle_s,
+            settings.real('alarm_average'), settings.real('alarm_limit'),
+        )  # fmt: skip
+
+    @property
+    def warm_up_rows(self) -> int:
+        """Return how many rows bring the filter into its stride."""
+        return 2 * self._filter.settle + 1
+
+    def follow(self, other: Predictor) -> None:
+        """Take over the evidence that an earlier curve's chart had gathered."""
+        if self._chart is not None and other._chart is not None:
+            self._chart.follow(other._chart)
+
+    def warm_up(self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray) -> None:
+        """Run over rows of the past; the residual's mean starts afresh afterwards."""
+        kinds = np.full(len(u), SETTLED_STEADY, dtype=np.uint8)
+        self._rows(time_ns, u, power_mw, kinds)
+        self._filter.memory[_AVERAGE] = math.nan
+
+    def predict(
+        self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray, kinds: ByteArray
+    ) -> PredictionBlock:
+        """Predict rows of shape (n,); ``kinds`` are the segmenter's."""
+        out = self._rows(time_ns, u, power_mw, kinds)
+        evidence = shift = np.full(len(u), math.nan)
+        if self._chart is not None:
+            evidence, shift = self._chart.feed(time_ns, out.residual)
+        if self.limit_mw > 0.0:
+            evidence, shift = out.average / self.limit_mw, out.average
+        return PredictionBlock(
+            time_ns, u, power_mw, out.static, out.dynamic, out.residual, out.average, evidence,
+            shift, out.state, self.characteristic.residuals.width_mw,
+            self.characteristic.model_id,
+        )  # fmt: skip
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        chart = None if self._chart is None else self._chart.snapshot()
+        return {**copies(self._memory()), 'chart': chart}
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state of the same curve; raises `DataError` if it does not fit."""
+        put_back(self._memory(), saved)
+        if self._chart is not None:
+            self._chart.restore(saved['chart'])
+
+    def _memory(self) -> dict[str, FloatArray | IntArray]:
+        f = self._filter
+        return {'place': f.place, 'memory': f.memory, 'past': f.past}
+
+    def _rows(
+        self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray, kinds: ByteArray
+    ) -> _Columns:
+        n = len(u)
+        out = _Columns(
+            np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n, dtype=np.uint8)
+        )
+        _predict(time_ns, u, power_mw, kinds, self._filter, out)
+        return out
+
+
+def as_measured(block: PredictionBlock, measured_mw: FloatArray) -> PredictionBlock:
+    """Return the predictions of corrected rows as predictions of what was measured.
+
+    The residual stays; what the correction took out of the power is put back on both sides.
+    """
+    taken_out = measured_mw - block.measured_mw
+    return replace(
+        block, measured_mw=measured_mw, static_mw=block.static_mw + taken_out,
+        dynamic_mw=block.dynamic_mw + taken_out,
+    )  # fmt: skip
+
+
+def no_prediction(
+    time_ns: IntArray, u: FloatArray, power_mw: FloatArray, kinds: ByteArray
+) -> PredictionBlock:
+    """Return the block for rows before there is a curve."""
+    nan = np.full(len(u), math.nan)
+    state = np.where(
+        kinds == NO_DATA, int(PredictionState.BAD_DATA), int(PredictionState.UNKNOWN)
+    ).astype(np.uint8)
+    return PredictionBlock(
+        time_ns, u, power_mw, nan, nan, nan, nan, nan, nan, state, math.nan, ''
+    )  # fmt: skip

@@ -1,0 +1,258 @@
+"""The exact partition: the best J straight pieces through samples, for all J in one pass.
+
+Solves eqs. (19)-(23) of the paper. The samples are sorted by u, equal u are
+merged into one weighted level (a break inside equal u is meaningless), and the
+dynamic programme of `partition_layers` finds, for every J up to the largest,
+the breaks of least cost. Candidates are left out only where a proven lower
+bound (`partition_bounds`) shows that they cannot be better, so the result is
+the optimum and not an estimate.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from valveflow_ros.errors import DataError, ParameterError, TooFewSamplesError
+from valveflow_ros.partition.partition_layers import best_partitions, prepare
+from valveflow_ros.partition.partition_levels import Levels, make_levels
+from valveflow_ros.records import FloatArray, IntArray
+from valveflow_ros.threads import cores
+
+# A bound counts as reached within this share of the sum of squares about one line. It lies
+# ten times above the search's rounding: without it, exact ties (data without noise) would
+# all have to be looked at.
+_SLACK = 2e-14
+# The search's own cost and the cost of its breaks, recomputed from the samples, agree
+# within this share of Omega(1), or the result is not called certified.
+_AGREE = 1e-10
+# Below this many levels starting threads costs more than it gains.
+_SERIAL_BELOW = 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class FittedPiece:
+    """One piece of a partition, fitted by least squares, eq. (20).
+
+    Attributes
+    ----------
+    u_from, u_to : float
+        The piece's range in % MPa^m. A piece begins at its own first sample, as in
+        the paper, and ends where the next begins, so ranges join without gap.
+    slope : float
+        K_f in MW per unit of u.
+    intercept : float
+        C in MW.
+    samples : int
+    sse : float
+        Sum of squared residuals in MW^2.
+    slope_stderr, intercept_stderr : float
+        Standard errors for independent samples; NaN where two samples leave nothing
+        to judge them by.
+    """
+
+    u_from: float
+    u_to: float
+    slope: float
+    intercept: float
+    samples: int
+    sse: float
+    slope_stderr: float
+    intercept_stderr: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Partition:
+    """The best partitions into 1, 2, ... J_max pieces.
+
+    Attributes
+    ----------
+    cost : float64 (J_max,)
+        Omega(J) of eq. (19) in MW^2, recomputed in two passes from the samples.
+        Where the smallest piece binds, it can rise with J.
+    u, y : float64 (n,)
+        The samples in ascending order of u; read-only.
+    starts : tuple of int64 arrays
+        For each J the first sample of each piece, and n.
+    n_distinct : int
+        Number of different u.
+    certified : bool
+        The search's own costs agree with `cost`. With exact lower bounds this means:
+        no partition costs less than ``cost[J - 1] - tolerance``.
+    floor : float
+        Costs up to here, in MW^2, are rounding of the samples themselves.
+    limited : str
+        Why there are fewer partitions than asked for, as a sentence; else empty.
+    """
+
+    cost: FloatArray
+    u: FloatArray
+    y: FloatArray
+    starts: tuple[IntArray, ...]
+    n_distinct: int
+    certified: bool
+    floor: float
+    limited: str
+
+    @property
+    def n_samples(self) -> int:
+        """Return the number of samples."""
+        return len(self.u)
+
+    @property
+    def tolerance(self) -> float:
+        """Return in MW^2 how far a certified cost may lie above the optimum."""
+        return _AGREE * float(self.cost[0])
+
+    def breaks(self, pieces: int) -> IntArray:
+        """Return where the pieces begin among the sorted samples, and n: int64 (pieces + 1,)."""
+        if not 1 <= pieces <= len(self.starts):
+            raise DataError(
+                f'There is no partition into {pieces} pieces, only into 1 to {len(self.starts)}.'
+            )
+        return self.starts[pieces - 1]
+
+    def pieces(self, pieces: int) -> tuple[FittedPiece, ...]:
+        """Return the fitted pieces in ascending order of u."""
+        starts = self.breaks(pieces)
+        ends = [*self.u[starts[1:-1]].tolist(), float(self.u[-1])]
+        return tuple(
+            _fit_piece(self.u[a:b], self.y[a:b], float(self.u[a]), end)
+            for a, b, end in zip(starts[:-1], starts[1:], ends, strict=True)
+        )
+
+
+def partition(
+    u: ArrayLike,
+    y: ArrayLike,
+    max_pieces: int = 10,
+    min_distinct: int = 2,
+    *,
+    threads: int | None = None,
+) -> Partition:
+    """Partition samples into 1 .. ``max_pieces`` straight pieces, each exactly.
+
+    Parameters
+    ----------
+    u, y : array_like (n,)
+        Integrated input in % MPa^m and power in MW, in any order; not changed.
+    max_pieces : int
+        Largest J, R_max of the paper, at least 1. Fewer come out, and `Partition.limited`
+        says so, when there are fewer than ``max_pieces * min_distinct`` distinct u.
+    min_distinct : int
+        Fewest distinct u in a piece, at least 2: with one, a piece has no slope.
+    threads : int, optional
+        1 starts none. By default as many as the process may use, for large inputs.
+        The result does not depend on it.
+
+    Raises
+    ------
+    DataError
+        The arrays do not match, hold something that is not a finite number, or u
+        never changes.
+    TooFewSamplesError
+        There are fewer distinct u than one piece needs.
+    ParameterError
+        ``max_pieces``, ``min_distinct`` or ``threads`` is too small.
+
+    Notes
+    -----
+    Departures from the paper: equal u are merged before the search; a piece holds at
+    least ``min_distinct`` distinct u; a sample belongs to one piece only (in eqs.
+    (21)-(23) the sample at a break ends one piece and begins the next); u closer than
+    1e-9 of the range count as equal, also for the breaks.
+
+    Among partitions of equal cost any one may come out: the cost is unique, the breaks
+    are not.
+
+    Time grows slightly faster than n for each J in practice, O(J n^2) at worst; memory
+    is about 300 bytes a sample for 10 pieces.
+    """
+    _at_least('max_pieces', max_pieces, 1)
+    _at_least('min_distinct', min_distinct, 2)
+    _at_least('threads', 1 if threads is None else threads, 1)
+    levels = make_levels(u, y)
+    if len(levels) < min_distinct:
+        raise TooFewSamplesError('Distinct values of u for one piece', len(levels), min_distinct)
+    most = min(max_pieces, len(levels) // min_distinct)
+    if threads is None:
+        threads = cores() if len(levels) >= _SERIAL_BELOW else 1
+    slack = _SLACK * len(levels.u)  # the scaled sum of squares about one line
+    problem = prepare(levels.x, levels.residual, levels.weight, min_distinct, slack, threads)
+    found, starts = best_partitions(problem, most)
+    original = tuple(levels.first[s] for s in starts)
+    cost = np.array([_cost(levels.u, levels.y, s) for s in original])
+    return Partition(
+        cost=cost,
+        u=levels.u,
+        y=levels.y,
+        starts=original,
+        n_distinct=len(levels),
+        certified=_agree(levels, found, cost, starts),
+        floor=levels.floor,
+        limited=_limit(len(levels), most, max_pieces, min_distinct),
+    )
+
+
+def _agree(levels: Levels, found: FloatArray, cost: FloatArray, starts: list[IntArray]) -> bool:
+    """Say whether the search's costs are those of its breaks; rounding gone wrong shows here."""
+    if levels.rough:
+        # The search takes nearly equal u for equal: judge it on the problem it solved.
+        flat = np.repeat(levels.x, np.diff(levels.first))
+        cost = np.array([_cost(flat, levels.y, levels.first[s]) for s in starts])
+    claimed = found * levels.scale**2 + levels.within
+    return bool(np.all(np.abs(claimed - cost) <= _AGREE * cost[0] + levels.floor))
+
+
+def _at_least(name: str, value: int, least: int) -> None:
+    if not value >= least:
+        raise ParameterError(name, f'is {value}, but must be at least {least}')
+
+
+def _limit(distinct: int, most: int, asked: int, least: int) -> str:
+    if most == asked:
+        return ''
+    return (
+        f'{asked} pieces of {least} distinct u each were asked for, but there are only '
+        f'{distinct} distinct u: {most} is the largest number of pieces.'
+    )
+
+
+def _centred(u: FloatArray, y: FloatArray) -> tuple[float, float, float, float, float]:
+    """Return mean u, mean y, slope, spread of u and sum of squares about the line, in two passes.
+
+    No dot products: their last bits would depend on the number of threads.
+    """
+    mean_u = float((u - u[0]).mean() + u[0])
+    mean_y = float((y - y[0]).mean() + y[0])
+    du, dy = u - mean_u, y - mean_y
+    spread = float((du * du).sum())
+    slope = float((du * dy).sum()) / spread if spread > 0.0 else 0.0
+    rest = dy - slope * du
+    return mean_u, mean_y, slope, spread, float((rest * rest).sum())
+
+
+def _cost(u: FloatArray, y: FloatArray, starts: IntArray) -> float:
+    """Return the cost of a partition from the samples themselves."""
+    return sum(_centred(u[a:b], y[a:b])[4] for a, b in itertools.pairwise(starts))
+
+
+def _fit_piece(u: FloatArray, y: FloatArray, begin: float, end: float) -> FittedPiece:
+    """Fit one piece."""
+    mean_u, mean_y, slope, spread, sse = _centred(u, y)
+    n = len(u)
+    variance = sse / (n - 2) if n > 2 else math.nan
+    return FittedPiece(
+        u_from=begin,
+        u_to=end,
+        slope=slope,
+        intercept=mean_y - slope * mean_u,
+        samples=n,
+        sse=sse,
+        slope_stderr=math.sqrt(variance / spread),
+        intercept_stderr=math.sqrt(variance * (1.0 / n + mean_u * mean_u / spread)),
+    )

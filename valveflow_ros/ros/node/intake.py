@@ -1,0 +1,216 @@
+"""One look at all inputs: take, put in order, give each message its times."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import NamedTuple, Protocol
+
+from rosgraph_msgs.msg import Clock
+
+from valveflow_ros.ros.inputs import INPUT_ORDER, PLANT_SAMPLE, Decoder, Row, header_time_ns
+from valveflow_ros.ros.node.stamps import ClockTrack, LogClock
+from valveflow_ros.ros.node.tallies import Tally
+from valveflow_ros.ros.taking import DEPTH, Taken
+
+__all__ = ['Arrival', 'Clock', 'Intake']
+
+_MOST_CLOCKS = 16 * DEPTH
+# So many plain values wait for the first /clock, and so long: what waits is not on disk yet.
+MOST_EARLY = 16 * DEPTH
+EARLY_S = 5.0
+_PATIENCE_S = 0.03
+_CLOCK_PATIENCE_S = 0.2
+# A message may get its receipt time a moment before it can be taken.
+_IN_FLIGHT_NS = 200_000
+
+
+class Arrival(NamedTuple):
+    """A message of an input with the times it is logged at and belongs to."""
+
+    name: str
+    data: bytes
+    log_ns: int
+    time_ns: int
+
+
+class _Held(NamedTuple):
+    """A message taken and not given on yet: its place in the order, and when it was taken."""
+
+    received_ns: int
+    order: int
+    taken_s: float
+    name: str
+    taken: Taken
+
+
+class Source(Protocol):
+    """Something messages can be taken from."""
+
+    def take(self, most: int = DEPTH) -> list[Taken]:
+        """Return what has arrived."""
+
+
+class Intake:
+    """Collects arrivals in the one order in which they are recorded and fed.
+
+    Parameters
+    ----------
+    sources : mapping of str to Source
+        By the contract's names of the inputs.
+    decoder : Decoder
+    log_clock : LogClock
+        Shared with whoever else writes to the same log.
+    stamp_source : str
+        'source' or 'receive'; see the parameter of that name.
+    clock : Source, optional
+        /clock; if given, it gives every plain value its time.
+    watch : callable
+        Is shown the readings of each message, with the topic's name.
+
+    Notes
+    -----
+    Topics are looked at one after the other, and while a plant runs faster than
+    real time a later one would be ahead of an earlier one by many samples. So a
+    look gives only what was received before it began, and keeps the rest for
+    the next one. With a /clock a value waits until a clock message is there that
+    was sent after it, so that none sent before it can still be on its way; if
+    none comes, it does not wait for long.
+
+    What is sent before the very first clock message has no time yet. It waits for
+    that message, and is put before its time by as much as it was sent earlier. After
+    `EARLY_S`, or where more than `MOST_EARLY` wait, the oldest wait no longer and
+    are logged without a time, which is 0, and not fed.
+    """
+
+    def __init__(
+        self,
+        sources: Mapping[str, Source],
+        decoder: Decoder,
+        log_clock: LogClock,
+        stamp_source: str = 'source',
+        clock: Source | None = None,
+        watch: Callable[[str, list[Row]], None] = lambda _name, _rows: None,
+    ) -> None:
+        self._sources = dict(sources)
+        self._decoder = decoder
+        self._log_clock = log_clock
+        # Without a /clock ROS time is the machine's own.
+        self._by_receipt = stamp_source in ('receive', 'ros_time')
+        self._clock = clock
+        self._watch = watch
+        self._track = ClockTrack()
+        self._held: list[_Held] = []
+        self._early: deque[_Held] = deque()
+        self.tallies = {name: Tally() for name in self._sources}
+        self.clock_tally = Tally()
+
+    def collect(self, now_s: float, now_ns: int, last: bool = False) -> list[Arrival]:
+        """Return the arrivals of this look.
+
+        Parameters
+        ----------
+        now_s : float
+            Time by a clock that never goes back.
+        now_ns : int
+            Time by the machine's clock, for messages without a receipt time.
+        last : bool
+            Hold nothing back.
+        """
+        until_ns = now_ns - _IN_FLIGHT_NS
+        for name, source in self._sources.items():
+            found = source.take()
+            if not found:
+                continue
+            tally = self.tallies[name]
+            tally.note_arrival(len(found), now_s)
+            for taken in found:
+                tally.note_number(taken.sequence)
+                received_ns = taken.received_ns or now_ns
+                held = _Held(received_ns, INPUT_ORDER[name], now_s, name, taken)
+                self._hold(held)
+            if len(found) >= DEPTH:
+                # More is waiting there, received after the last of these.
+                until_ns = min(until_ns, received_ns)
+        if self._clock is not None:
+            self._follow_clock(self._clock, now_s)
+            self._let_go(now_s, last)
+        if not self._held:
+            return []
+        # By topic within one receipt time; a topic's own messages stay in their order.
+        self._held.sort(key=lambda held: held[:2])
+        count = len(self._held)
+        if not last:
+            waiting = (k for k, h in enumerate(self._held) if not self._due(h, until_ns, now_s))
+            count = next(waiting, count)
+        ready, self._held = self._held[:count], self._held[count:]
+        return [self._arrival(held) for held in ready]
+
+    def _hold(self, held: _Held) -> None:
+        """Keep a message for its turn; a plain value also for the first clock message."""
+        if self._clock is None or self._track.newest_ns or held.name == PLANT_SAMPLE:
+            self._held.append(held)
+            return
+        self._early.append(held)
+        self.tallies[held.name].waiting += 1
+
+    def _let_go(self, now_s: float, last: bool) -> None:
+        """End the wait for the first clock message: it has come, or they waited long enough."""
+        most = 0 if last or self._track.newest_ns else MOST_EARLY
+        while self._early and (
+            len(self._early) > most or now_s - self._early[0].taken_s > EARLY_S
+        ):
+            held = self._early.popleft()
+            self.tallies[held.name].waiting -= 1
+            self._held.append(held)
+
+    def _due(self, held: _Held, until_ns: int, now_s: float) -> bool:
+        waited_s = now_s - held.taken_s
+        if self._clock is None:
+            # Should the machine's clock have been set back, nothing waits for it.
+            return held.received_ns <= until_ns or waited_s > _PATIENCE_S
+        ready = held.received_ns <= until_ns and held.taken.source_ns < self._track.newest_ns
+        return ready or waited_s > _CLOCK_PATIENCE_S
+
+    def rows(self, arrivals: list[Arrival]) -> list[Row]:
+        """Return the readings in arrivals; what has no time or no meaning is counted."""
+        rows: list[Row] = []
+        for arrival in arrivals:
+            if arrival.time_ns <= 0:
+                self.tallies[arrival.name].without_time += 1
+                continue
+            try:
+                found = self._decoder.rows(arrival.name, arrival.data, arrival.time_ns)
+            except ValueError:
+                self.tallies[arrival.name].malformed += 1
+                continue
+            self._watch(arrival.name, found)
+            rows += found
+        return rows
+
+    def _follow_clock(self, clock: Source, now_s: float) -> None:
+        found = clock.take(_MOST_CLOCKS)
+        self.clock_tally.note_arrival(len(found), now_s)
+        for taken in found:
+            self.clock_tally.note_number(taken.sequence)
+            self._track.note(taken.source_ns, header_time_ns(taken.data))
+
+    def _arrival(self, held: _Held) -> Arrival:
+        received_ns, name, taken = held.received_ns, held.name, held.taken
+        if self._clock is not None:
+            time_ns = self._clock_time(name, taken)
+        elif self._by_receipt:
+            time_ns = received_ns
+        else:
+            time_ns = taken.source_ns or received_ns
+        time_ns = max(0, self._decoder.time_ns(name, taken.data, time_ns))
+        return Arrival(name, taken.data, self._log_clock.stamp(received_ns), time_ns)
+
+    def _clock_time(self, name: str, taken: Taken) -> int:
+        """Return what the clock showed when a message was sent, 0 while that is not known."""
+        lead_ns = self._track.lead_ns(taken.source_ns)
+        if not lead_ns:
+            return self._track.at(taken.source_ns)
+        if name != PLANT_SAMPLE:
+            self.tallies[name].before_clock += 1
+        return max(0, self._track.first_ns - lead_ns)

@@ -1,0 +1,1 @@
+"""Fits and diagnoses in a process of their own."""

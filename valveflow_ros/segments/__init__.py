@@ -1,0 +1,1 @@
+"""Special segments: found while the data stream by, and the rolling window that keeps them."""

@@ -1,0 +1,215 @@
+"""Find special segments while the data stream by (Section III.B of the paper)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from valveflow_ros.config import Settings
+from valveflow_ros.records import (
+    NS_PER_S,
+    ByteArray,
+    FloatArray,
+    IntArray,
+    SegmentKind,
+    SpecialSegment,
+)
+from valveflow_ros.segments import segmenter_kernel as kernel
+from valveflow_ros.segments.line import LINE_SIZE
+from valveflow_ros.segments.noise import BINS, WARM_UP
+from valveflow_ros.state import State, copies, put_back
+
+
+@dataclass(frozen=True, slots=True)
+class FoundSegment:
+    """A special segment and the rows it covers, counted from the first row ever fed."""
+
+    segment: SpecialSegment
+    first_row: int
+    end_row: int
+
+
+@dataclass(frozen=True, slots=True)
+class Segmented:
+    """What one call brought.
+
+    Attributes
+    ----------
+    kinds : uint8 (n,)
+        For each row what it is as far as could be told when it arrived:
+        `kernel.TRANSIENT`, `SETTLED_STEADY`, `SETTLED_SLOPE` or `NO_DATA`.
+    found : list of (row, FoundSegment)
+        Segments closed, each with the number of rows of this call it took.
+    """
+
+    kinds: ByteArray
+    found: list[tuple[int, FoundSegment]]
+
+    @property
+    def rows(self) -> int:
+        """Return the number of rows taken."""
+        return len(self.kinds)
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseLevel:
+    """The noise the thresholds stand on, as sd of block means about a line."""
+
+    input: float
+    power_mw: float
+    learnt: bool
+
+
+class Segmenter:
+    """Streaming segmentation in constant time a row and bounded memory.
+
+    Parameters
+    ----------
+    settings : Settings
+        Block length, transient, thresholds.
+
+    Notes
+    -----
+    Any cutting of the rows into calls of `feed` gives the same segments and
+    the same kinds, bit for bit.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        period = settings.real('sample_period')
+        rows = max(1, round(settings.real('block') / period))
+        block_s = rows * period
+
+        def in_blocks(seconds: float) -> int:
+            return math.ceil(seconds / block_s - 1e-9)
+
+        setting = np.zeros(kernel.SETTINGS_SIZE)
+        setting[kernel.BLOCK_ROWS] = rows
+        setting[kernel.SETTLE] = in_blocks(settings.settle_s)
+        setting[kernel.LONGEST] = max(6, in_blocks(settings.real('longest_segment')))
+        setting[kernel.STEADY_MIN] = max(3, in_blocks(settings.real('steady_min')))
+        setting[kernel.SLOPE_MIN] = max(3, in_blocks(settings.real('slope_min')))
+        # A ramp is seen only after it has left the noise: up to a minute belongs to it already.
+        setting[kernel.TRIM] = min(6, in_blocks(60.0))
+        setting[kernel.BREAK] = settings.real('break_limit')
+        setting[kernel.STEADY] = settings.real('steady_limit')
+        setting[kernel.SLOPE] = settings.real('slope_limit')
+        setting[kernel.NOISE_U] = settings.real('input_noise')
+        setting[kernel.NOISE_Y] = settings.real('power_noise')
+        setting[kernel.PERIOD_NS] = period * NS_PER_S
+        self._setting = setting
+        self._period_s = period
+        self._block_rows = rows
+        self._state = np.zeros(kernel.INT_STATE, dtype=np.int64)
+        self._state[kernel.SKIP] = int(setting[kernel.SETTLE])
+        self._state[kernel.LAST_NS] = -(2**62)
+        self._sums = np.zeros(kernel.SUMS)
+        self._lines = np.zeros((kernel.LINES, LINE_SIZE))
+        room = int(setting[kernel.LONGEST] + setting[kernel.SETTLE] + setting[kernel.TRIM]) + 32
+        self._blocks = np.zeros((3, room))
+        self._histograms = np.zeros((2, BINS))
+        self._found = np.zeros(kernel.SEG_SIZE)
+        self._number = 0
+
+    @property
+    def longest_rows(self) -> int:
+        """The most rows a segment can reach back from its close."""
+        return self._blocks.shape[1] * self._block_rows
+
+    def noise(self) -> NoiseLevel:
+        """Return the noise level in use now."""
+        given = self._setting[kernel.NOISE_U] > 0.0 and self._setting[kernel.NOISE_Y] > 0.0
+        learnt = bool(self._state[kernel.STRETCHES] >= WARM_UP)
+        u, y = kernel.noise_now(self._histograms, self._setting)
+        return NoiseLevel(float(u), float(y), learnt or bool(given))
+
+    def feed(
+        self,
+        time_ns: IntArray,
+        u: FloatArray,
+        power_mw: FloatArray,
+        temperature_degc: FloatArray,
+        most: int | None = None,
+    ) -> Segmented:
+        """Take rows; NaN in ``u`` or ``power_mw`` marks a row without usable data.
+
+        Parameters
+        ----------
+        time_ns : int64 (n,)
+        u : float64 (n,)
+            Integrated input, % MPa^m.
+        power_mw, temperature_degc : float64 (n,)
+        most : int, optional
+            Stop right after the row that closed this many segments; the rest
+            of the rows is not taken.
+        """
+        kinds = np.empty(len(u), dtype=np.uint8)
+        found: list[tuple[int, FoundSegment]] = []
+        done = 0
+        while done < len(u):
+            taken, closed = kernel.run(
+                time_ns[done:],
+                u[done:],
+                power_mw[done:],
+                temperature_degc[done:],
+                self._state,
+                self._sums,
+                self._lines,
+                self._blocks,
+                self._histograms,
+                self._setting,
+                kinds[done:],
+                self._found,
+            )
+            done += taken
+            if closed:
+                found.append((done, self._describe()))
+                if most is not None and len(found) >= most:
+                    break
+        return Segmented(kinds[:done], found)
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        return {**copies(self._memory()), 'number': self._number}
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state; raises `DataError` if it does not fit."""
+        put_back(self._memory(), saved)
+        self._number = int(saved['number'])
+
+    def _memory(self) -> dict[str, NDArray[Any]]:
+        return {
+            'state': self._state,
+            'sums': self._sums,
+            'lines': self._lines,
+            'blocks': self._blocks,
+            'histograms': self._histograms,
+        }
+
+    def _describe(self) -> FoundSegment:
+        """Turn the kernel's numbers into a record."""
+        f = self._found
+        first, end = int(f[kernel.SEG_FIRST]), int(f[kernel.SEG_END])
+        period_ns = round(self._period_s * NS_PER_S)
+        end_ns = int(self._state[kernel.END_NS])
+        half = 0.5 * ((end - first) / self._block_rows - 1.0)
+        self._number += 1
+        segment = SpecialSegment(
+            number=self._number,
+            kind=SegmentKind(int(f[kernel.SEG_KIND])),
+            start_ns=end_ns - (end - first - 1) * period_ns,
+            end_ns=end_ns,
+            samples=end - first,
+            u_start=float(f[kernel.SEG_U_MEAN] - half * f[kernel.SEG_U_SLOPE]),
+            u_end=float(f[kernel.SEG_U_MEAN] + half * f[kernel.SEG_U_SLOPE]),
+            u_rate_per_s=float(f[kernel.SEG_U_SLOPE] / (self._block_rows * self._period_s)),
+            u_rms=float(f[kernel.SEG_U_RMS]),
+            power_start_mw=float(f[kernel.SEG_Y_MEAN] - half * f[kernel.SEG_Y_SLOPE]),
+            power_end_mw=float(f[kernel.SEG_Y_MEAN] + half * f[kernel.SEG_Y_SLOPE]),
+            power_rms_mw=float(f[kernel.SEG_Y_RMS]),
+            temperature_mean_degc=float(f[kernel.SEG_T]),
+        )
+        return FoundSegment(segment, first, end)

@@ -1,0 +1,405 @@
+"""The rolling window of rows and special segments, in bounded memory."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from valveflow_ros.config import Settings
+from valveflow_ros.errors import DataError
+from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SegmentKind, SpecialSegment
+from valveflow_ros.segments.segment_state import found_of, found_values
+from valveflow_ros.segments.segmenter import FoundSegment
+from valveflow_ros.state import State
+
+_FIRST_ROOM = 16384
+# A clock that went back is believed when so much of the new time has come.
+_DOUBT_S = 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class WindowContents:
+    """A copy of what the window holds.
+
+    Attributes
+    ----------
+    time_ns : int64 (n,)
+    u, power_mw, temperature_degc : float64 (n,)
+        NaN in ``u`` or ``power_mw`` where a row has no usable data.
+    spans : int64 (k, 3)
+        Special segments as (first row, end row, kind), rows counted within these arrays.
+    opening_percent : float64 (n,) or (0,)
+        The opening that u was made from, NaN where it was not given; empty where unknown.
+    command_percent : float64 (n,) or (0,)
+        The commanded opening, NaN where there was none; empty where there never was.
+    """
+
+    time_ns: IntArray
+    u: FloatArray
+    power_mw: FloatArray
+    temperature_degc: FloatArray
+    spans: IntArray
+    opening_percent: FloatArray = field(default_factory=lambda: np.empty(0))
+    command_percent: FloatArray = field(default_factory=lambda: np.empty(0))
+
+    def special_rows(self) -> IntArray:
+        """Return the rows that lie in special segments, in order of time."""
+        if not len(self.spans):
+            return np.empty(0, dtype=np.int64)
+        return np.concatenate([np.arange(a, b, dtype=np.int64) for a, b, _ in self.spans])
+
+    def count(self, kind: SegmentKind) -> int:
+        """Return the number of segments of a kind."""
+        return int((self.spans[:, 2] == kind).sum())
+
+
+NO_ROWS = WindowContents(
+    np.empty(0, dtype=np.int64),
+    np.empty(0),
+    np.empty(0),
+    np.empty(0),
+    np.empty((0, 3), dtype=np.int64),
+)
+
+
+@dataclass(slots=True)
+class _Aside:
+    """Rows that the clock had passed when it went back to a time, and the segments among them."""
+
+    from_ns: int
+    time_ns: IntArray
+    number: IntArray
+    data: FloatArray
+    segments: list[FoundSegment]
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.time_ns)
+
+
+class RollingWindow:
+    """Rows of the last days, and the special segments among them.
+
+    Parameters
+    ----------
+    window_s, period_s : float
+        Length of the window and step of the rows; together they bound the memory.
+
+    Notes
+    -----
+    A clock that goes back may do so for good, or because a gateway has not heard the time yet.
+    So the rows it had passed are set aside. They come back when the time leaps over them by at
+    least half of what it went back, in place of the rows since; they are let go when as many
+    rows have come, or an hour of them.
+    What a leap ahead puts outside the window stays among the last rows, so many as fill a
+    window without gaps, and is inside again when the leap is taken back.
+    """
+
+    def __init__(self, window_s: float, period_s: float) -> None:
+        self._window_ns = round(window_s * NS_PER_S)
+        self._period_ns = round(period_s * NS_PER_S)
+        self._doubt = max(1, math.ceil(_DOUBT_S / period_s))
+        self._rows = max(16, math.ceil(window_s / period_s) + 1)
+        # Rows are dropped a sixteenth of the window at a time.
+        self._most_room = self._rows * 17 // 16 + 16
+        self._seen = 0
+        self._segments: deque[FoundSegment] = deque()
+        self._aside: _Aside | None = None
+        self._end = 0
+        self._clear()
+
+    @classmethod
+    def of(cls, settings: Settings) -> RollingWindow:
+        """Return an empty window of the length in the settings."""
+        return cls(86400.0 * settings.real('window_days'), settings.real('sample_period'))
+
+    def __len__(self) -> int:
+        """Return the number of rows held, without those set aside."""
+        return self._end
+
+    @property
+    def rows_seen(self) -> int:
+        """Return the number of rows ever appended; the next row's number."""
+        return self._seen
+
+    @property
+    def segments(self) -> int:
+        """Return the number of special segments inside the window."""
+        return len(self.special_segments())
+
+    def special_segments(self) -> tuple[SpecialSegment, ...]:
+        """Return the special segments inside the window, in order of time."""
+        return tuple(found.segment for found in self._inside())
+
+    @property
+    def special_samples(self) -> int:
+        """Return the number of samples in those segments."""
+        return sum(segment.samples for segment in self.special_segments())
+
+    @property
+    def span_s(self) -> float:
+        """Return the time from the oldest row inside the window to the end of the newest."""
+        if self._end == 0:
+            return 0.0
+        span_ns = int(self._time_ns[self._end - 1]) - int(self._time_ns[self._first()])
+        return (span_ns + self._period_ns) / NS_PER_S
+
+    def append(
+        self,
+        time_ns: IntArray,
+        u: FloatArray,
+        power_mw: FloatArray,
+        temperature_degc: FloatArray,
+        opening_percent: FloatArray | None = None,
+        command_percent: FloatArray | None = None,
+    ) -> None:
+        """Append rows that follow each other in time; those outside the window are forgotten."""
+        data = np.full((5, len(time_ns)), np.nan)
+        data[0], data[1], data[2] = u, power_mw, temperature_degc
+        if opening_percent is not None:
+            data[3] = opening_percent
+        if command_percent is not None:
+            data[4] = command_percent
+        number = np.arange(self._seen, self._seen + len(time_ns), dtype=np.int64)
+        self._seen += len(time_ns)
+        done = 0
+        while self._aside is not None and done < len(time_ns):
+            done = self._append_in_doubt(self._aside, time_ns, number, data, done)
+        self._add(time_ns[done:], number[done:], data[:, done:])
+        self._forget()
+
+    def add_segment(self, found: FoundSegment) -> None:
+        """Remember a special segment that has closed."""
+        aside = self._aside
+        if aside is not None and _has(aside.number, found.end_row - 1):
+            # It was open when the clock went back.
+            aside.segments.append(found)
+        elif _has(self._number[: self._end], found.end_row - 1):
+            self._segments.append(found)
+            self._forget()
+
+    def go_back(self, time_ns: int) -> None:
+        """Set aside the rows from a time on, to which the clock went back."""
+        self._drop_oldest()
+        cut = int(np.searchsorted(self._time_ns[: self._end], time_ns, side='left'))
+        old, stop = self._aside, self._end
+        if old is not None:
+            # What came since the clock went back before is neither here nor there.
+            stop = cut + int(np.searchsorted(self._number[cut : self._end], old.number[0]))
+        passed = _Aside(
+            time_ns, self._time_ns[cut:stop].copy(), self._number[cut:stop].copy(),
+            self._data[:, cut:stop].copy(), [],
+        )  # fmt: skip
+        newest = -1 if stop == cut else int(passed.number[-1])
+        stay: deque[FoundSegment] = deque()
+        for found in self._segments:
+            if found.segment.end_ns < time_ns:
+                stay.append(found)
+            elif found.end_row - 1 <= newest:
+                passed.segments.append(found)
+        self._segments = stay
+        self._end = cut
+        self._give_back_room()
+        if old is not None:
+            passed = _Aside(
+                min(time_ns, old.from_ns),
+                np.concatenate([passed.time_ns, old.time_ns]),
+                np.concatenate([passed.number, old.number]),
+                np.concatenate([passed.data, old.data], axis=1),
+                passed.segments + old.segments,
+            )
+        self._aside = passed if len(passed) else None
+
+    def numbers(self) -> IntArray:
+        """Return the numbers of the rows inside the window, counted from the first ever."""
+        return self._number[self._first() : self._end].copy()
+
+    def tail(self, rows: int) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Return copies of time, ``u`` and power of the last ``rows`` rows, or of all held."""
+        part = slice(max(0, self._end - rows), self._end)
+        return self._time_ns[part].copy(), self._data[0, part].copy(), self._data[1, part].copy()
+
+    def contents(self) -> WindowContents:
+        """Return a copy of the rows inside the window and their segments."""
+        if self._end == 0:
+            return NO_ROWS
+        inside = slice(self._first(), self._end)
+        number = self._number[inside]
+        spans = [
+            (*np.searchsorted(number, (s.first_row, s.end_row)).tolist(), int(s.segment.kind))
+            for s in self._inside()
+        ]
+        command = self._data[4, inside]
+        return WindowContents(
+            self._time_ns[inside].copy(),
+            self._data[0, inside].copy(),
+            self._data[1, inside].copy(),
+            self._data[2, inside].copy(),
+            np.array(spans, dtype=np.int64).reshape(-1, 3),
+            self._data[3, inside].copy(),
+            # Most units do not log it, and a snapshot goes to another process.
+            command.copy() if np.isfinite(command).any() else np.empty(0),
+        )
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        rows, aside = self._held(), self._aside
+        return {
+            'seen': self._seen,
+            **_plain(
+                _Aside(
+                    0, self._time_ns[rows], self._number[rows], self._data[:, rows],
+                    list(self._segments),
+                )
+            ),
+            'aside': aside and _plain(aside),
+        }  # fmt: skip
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state; raises `DataError` if it does not fit."""
+        rows, aside = _rows_of(saved), saved['aside']
+        self._clear()
+        self._seen = int(saved['seen'])
+        self._add(rows.time_ns, rows.number, rows.data)
+        self._segments = deque(rows.segments)
+        self._aside = aside and _rows_of(aside)
+
+    def _clear(self) -> None:
+        """Hold nothing."""
+        self._room = min(_FIRST_ROOM, self._most_room)
+        self._time_ns = np.empty(self._room, dtype=np.int64)
+        self._number = np.empty(self._room, dtype=np.int64)
+        self._data = np.empty((5, self._room))
+        self._end = 0
+
+    def _add(self, time_ns: IntArray, number: IntArray, data: FloatArray) -> None:
+        """Append rows to those held."""
+        done = 0
+        while done < len(time_ns):
+            if self._end == self._room:
+                self._make_room()
+            take = min(self._room - self._end, len(time_ns) - done)
+            part, place = slice(done, done + take), slice(self._end, self._end + take)
+            self._time_ns[place], self._number[place] = time_ns[part], number[part]
+            self._data[:, place] = data[:, part]
+            self._end += take
+            done += take
+
+    def _append_in_doubt(
+        self, aside: _Aside, time_ns: IntArray, number: IntArray, data: FloatArray, done: int
+    ) -> int:
+        """Append rows until it is settled whether the clock went back for good."""
+        # Rows that a further step back has thrown out count too, or it would never be settled.
+        since = int(number[done] - aside.number[-1]) - 1
+        enough = done + min(len(aside), self._doubt) - since
+        over = done + int(np.searchsorted(time_ns[done:], aside.time_ns[-1], side='right'))
+        until = min(enough, over, len(time_ns))
+        self._add(time_ns[done:until], number[done:until], data[:, done:until])
+        if until == enough:
+            self._aside = None
+        elif until == over and until < len(time_ns):
+            before_ns = self._time_ns[self._end - 1] if self._end else 0
+            self._aside = None
+            # Who returns leaps as far as the clock went back; less is a gap in the new time.
+            if time_ns[over] - before_ns > (aside.time_ns[-1] - aside.from_ns) // 2:
+                self._take_back(aside)
+        return until
+
+    def _take_back(self, aside: _Aside) -> None:
+        """Put the rows set aside in the place of those since."""
+        last = aside.number[-1]
+        self._end = int(np.searchsorted(self._number[: self._end], last))
+        self._segments = deque(s for s in self._segments if s.end_row - 1 <= last)
+        self._segments.extend(aside.segments)
+        self._add(aside.time_ns, aside.number, aside.data)
+
+    def _inside(self) -> list[FoundSegment]:
+        """Return the segments inside the window, in order of time."""
+        if not self._end:
+            return []
+        oldest = int(self._time_ns[self._end - 1]) - self._window_ns
+        return [found for found in self._segments if found.segment.start_ns > oldest]
+
+    def _held(self) -> slice:
+        """Return the places of the last rows, as many as a full window has."""
+        return slice(max(0, self._end - self._rows), self._end)
+
+    def _first(self) -> int:
+        """Return the place of the oldest row inside the window."""
+        if self._end == 0:
+            return 0
+        held = self._held()
+        oldest = self._time_ns[self._end - 1] - self._window_ns
+        return int(held.start + np.searchsorted(self._time_ns[held], oldest, side='right'))
+
+    def _make_room(self) -> None:
+        """Grow until the window fits, then drop the oldest rows many at a time."""
+        if self._room < self._most_room:
+            self._resize(min(self._most_room, 2 * self._room))
+            return
+        self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        """Keep as many rows as a full window has."""
+        if self._end <= self._rows:
+            return
+        held = self._held()
+        # One column at a time: a copy of all would be as large as the window itself.
+        for column in (self._time_ns, self._number, *self._data):
+            column[: self._rows] = column[held].copy()
+        self._end = self._rows
+
+    def _give_back_room(self) -> None:
+        """Need less memory where few rows are left, since those set aside need theirs."""
+        if self._room > _FIRST_ROOM and 4 * self._end < self._room:
+            self._resize(min(self._most_room, max(_FIRST_ROOM, 2 * self._end)))
+
+    def _resize(self, room: int) -> None:
+        end, self._room = self._end, room
+        time_ns, number, data = self._time_ns, self._number, self._data
+        self._time_ns, self._number = np.empty(room, np.int64), np.empty(room, np.int64)
+        self._data = np.empty((5, room))
+        self._time_ns[:end], self._number[:end] = time_ns[:end], number[:end]
+        self._data[:, :end] = data[:, :end]
+
+    def _forget(self) -> None:
+        """Let go of segments whose rows are gone."""
+        if not self._end:
+            return
+        first = int(self._number[self._held().start])
+        while self._segments and self._segments[0].first_row < first:
+            self._segments.popleft()
+
+
+def _has(numbers: IntArray, number: int) -> bool:
+    """Tell whether a row is among some."""
+    place = int(np.searchsorted(numbers, number))
+    return place < len(numbers) and int(numbers[place]) == number
+
+
+def _plain(rows: _Aside) -> State:
+    """Return rows and segments as plain values; most units do not log the command."""
+    command = rows.data[4]
+    return {
+        'from_ns': rows.from_ns,
+        'time_ns': rows.time_ns.copy(),
+        'number': rows.number.copy(),
+        'rows': rows.data[:4].copy(),
+        'command': command.copy() if np.isfinite(command).any() else np.empty(0),
+        'segments': [found_values(found) for found in rows.segments],
+    }
+
+
+def _rows_of(saved: State) -> _Aside:
+    """Return rows and segments of plain values; raises `DataError` if they do not fit."""
+    time_ns, number, rows, command = (saved[n] for n in ('time_ns', 'number', 'rows', 'command'))
+    n = len(time_ns)
+    if rows.shape != (4, n) or len(number) != n or len(command) not in (0, n):
+        raise DataError('The saved state has rows of different lengths.')
+    last = command if len(command) else np.full(n, np.nan)
+    segments = [found_of(values) for values in saved['segments']]
+    data = np.concatenate([rows, last[None]])
+    return _Aside(int(saved['from_ns']), time_ns, number, data, segments)

@@ -1,0 +1,1 @@
+"""Signals: alignment of readings into rows, and units."""
