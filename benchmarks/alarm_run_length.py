@@ -21,10 +21,9 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import lfilter
 
-from valveflow_ros.config import Settings
-from valveflow_ros.fit.chart import ChartDesign, ResidualChart
-from valveflow_ros.fit.run_length import design_chart
+from valveflow_ros.fit.residual_chart import ChartDesign, ResidualChart, design_chart
 from valveflow_ros.monitoring.alarms import AlarmState, ResidualAlarm
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, FloatArray
 
 RESULTS = Path(__file__).parent / 'results'

@@ -18,12 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.coverage_study import identify
-from valveflow_ros.config import Settings
-from valveflow_ros.fit.chart import ChartDesign, ResidualChart
-from valveflow_ros.fit.run_length import block_means, design_chart
+from valveflow_ros.fit.residual_chart import ChartDesign, ResidualChart, block_means, design_chart
 from valveflow_ros.monitoring.prediction import Predictor
-from valveflow_ros.plant.random_unit import random_unit
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
+from valveflow_ros.plant.unit import random_unit
 from valveflow_ros.records import NS_PER_S, Signal
 from valveflow_ros.signals.units import integrated_input
 

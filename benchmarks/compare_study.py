@@ -19,22 +19,25 @@ from pathlib import Path
 import numpy as np
 
 from valveflow_ros.baselines.comparison import Comparison, compare
-from valveflow_ros.baselines.data import other_data, samples_of
 from valveflow_ros.baselines.hammerstein import HammersteinModel
-from valveflow_ros.baselines.hammerstein_fit import grown
-from valveflow_ros.baselines.hammerstein_move import OUTPUT_ERROR, move
-from valveflow_ros.baselines.hammerstein_start import first_order, with_best_values
+from valveflow_ros.baselines.hammerstein_fit import (
+    OUTPUT_ERROR,
+    first_order,
+    grown,
+    move,
+    with_best_values,
+)
+from valveflow_ros.baselines.judged import other_data, samples_of
 from valveflow_ros.baselines.truth import Truth, curve_error
 from valveflow_ros.baselines.verdict import finding_of
-from valveflow_ros.config import Settings
 from valveflow_ros.fit.fit import fit
-from valveflow_ros.fit.fit_task import FitTask
 from valveflow_ros.fit.problem import Samples
+from valveflow_ros.fit.task import FitTask
 from valveflow_ros.monitoring.events import FitRequested
 from valveflow_ros.monitoring.monitor import Monitor
-from valveflow_ros.plant.random_unit import random_unit
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
-from valveflow_ros.plant.unit import UnitDescription
+from valveflow_ros.plant.unit import UnitDescription, random_unit
 from valveflow_ros.records import SegmentKind
 
 RESULTS = Path(__file__).parent / 'results'

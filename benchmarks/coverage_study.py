@@ -17,14 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.monitoring.events import FitRequested
 from valveflow_ros.monitoring.monitor import Monitor
-from valveflow_ros.plant.random_unit import random_unit
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
-from valveflow_ros.plant.unit import UnitDescription
+from valveflow_ros.plant.unit import UnitDescription, random_unit
 
 RESULTS = Path(__file__).parent / 'results'
 _Z95 = 1.959963984540054

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.plant.random_unit import random_unit
 from valveflow_ros.plant.spec import EffectSpec
-from valveflow_ros.plant.unit import UnitDescription
+from valveflow_ros.plant.unit import UnitDescription, random_unit
 
 PAPER_NOISE_MW, PAPER_RATED_MW = 3.0, 300.0
 

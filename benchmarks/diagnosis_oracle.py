@@ -9,15 +9,12 @@ import numpy as np
 from valveflow_ros.diagnosis.cause import Active
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.diagnose import Record
-from valveflow_ros.diagnosis.draws import held
-from valveflow_ros.diagnosis.evidence import colour
+from valveflow_ros.diagnosis.evidence import colour, rmse
 from valveflow_ros.diagnosis.extended import Extended
-from valveflow_ros.diagnosis.fitting import Task, improve, search_levels, whitening
-from valveflow_ros.diagnosis.gain import rmse
-from valveflow_ros.diagnosis.grid import make_scene
-from valveflow_ros.diagnosis.quality import faults
+from valveflow_ros.diagnosis.fitting import Task, held, improve, search_levels, whitening
+from valveflow_ros.diagnosis.record_faults import faults
 from valveflow_ros.diagnosis.result import Diagnosis
-from valveflow_ros.diagnosis.scene import ORDER
+from valveflow_ros.diagnosis.scene import ORDER, make_scene
 from valveflow_ros.plant.spec import EffectSpec
 
 

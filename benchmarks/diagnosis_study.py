@@ -31,15 +31,15 @@ from benchmarks.diagnosis_cases import (
 )
 from benchmarks.diagnosis_oracle import Oracle, oracle
 from benchmarks.diagnosis_outside import OUTSIDE, added_to
-from valveflow_ros.config import Settings
 from valveflow_ros.diagnosis.diagnose import Record, diagnose
-from valveflow_ros.diagnosis.grid import make_scene
 from valveflow_ros.diagnosis.result import Diagnosis
+from valveflow_ros.diagnosis.scene import make_scene
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.fit.fit import fit, outline
-from valveflow_ros.fit.fit_task import FitTask
+from valveflow_ros.fit.task import FitTask
 from valveflow_ros.monitoring.events import FitRequested, SegmentClosed
 from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import SimulatedLog, simulate
 from valveflow_ros.records import IntArray
 

@@ -17,13 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from valveflow_ros.config import Settings
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.monitoring.events import FitRequested
 from valveflow_ros.monitoring.monitor import Monitor
-from valveflow_ros.plant.random_unit import random_unit
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
+from valveflow_ros.plant.unit import random_unit
 
 RESULTS = Path(__file__).parent / 'results'
 FIRST_UNTOUCHED = 1000

@@ -22,13 +22,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks.diagnosis_cases import Case, hidden, null
-from valveflow_ros.config import PARAMETERS, Settings
-from valveflow_ros.curve.model import RegionalModel
+from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.monitoring.events import CurveAdopted
 from valveflow_ros.monitoring.mismatch import Mismatch
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_rows
 from valveflow_ros.monitoring.prediction import PredictionBlock
+from valveflow_ros.parameters import PARAMETERS, Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import Signal
 

@@ -3,7 +3,7 @@
     python -m benchmarks.pace [DAYS]
 
 Prints for each verb where its parts begin, as shares of its time: the numbers of
-``valveflow_ros/cli/pace.py``.
+``valveflow_ros/cli/console.py``.
 """
 
 from __future__ import annotations

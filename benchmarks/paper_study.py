@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import Piece
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.monitoring.events import FitRequested
 from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.unit import paper_curve
 from valveflow_ros.records import Readings, SampleTable, table_to_readings

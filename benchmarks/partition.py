@@ -30,9 +30,8 @@ import numpy as np
 
 from benchmarks.partition_certify import certify
 from benchmarks.partition_peers import against_peers
-from valveflow_ros.partition.partition import Partition, partition
-from valveflow_ros.partition.partition_layers import best_partitions, prepare
-from valveflow_ros.partition.partition_levels import make_levels
+from valveflow_ros.partition.partition import Partition, make_levels, partition
+from valveflow_ros.partition.search import best_partitions, prepare
 
 PIECES = 10
 RESULTS = Path(__file__).parent / 'results'

@@ -11,8 +11,8 @@ import time
 import numba
 import numpy as np
 
-from valveflow_ros.partition.partition_layers import layers, prepare
-from valveflow_ros.partition.partition_levels import make_levels
+from valveflow_ros.partition.partition import make_levels
+from valveflow_ros.partition.search import layers, prepare
 
 LANES = 16
 # In shares of the sum of squares about one line: what rounding of sums over 300,000 samples

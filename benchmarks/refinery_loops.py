@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from valveflow_ros.jit import jit
-from valveflow_ros.plant.actuator import stick_slip
+from valveflow_ros.numerics import jit
+from valveflow_ros.plant.loop import stick_slip
 from valveflow_ros.records import FloatArray
 
 ROWS, STEP_S = 751, 10.0

@@ -9,8 +9,8 @@ import numpy as np
 
 from benchmarks import segment_study as study
 from benchmarks.segment_truth import true_stretches
-from valveflow_ros.config import Settings
-from valveflow_ros.monitoring.feeding import Rows
+from valveflow_ros.monitoring.rows import Rows
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
 
 _COLOURS = {1: '#2b7bba', 2: '#d9822b'}

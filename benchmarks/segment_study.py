@@ -20,10 +20,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.segment_truth import Stretch, by_row, true_stretches
-from valveflow_ros.config import Settings
-from valveflow_ros.monitoring.feeding import Rows
-from valveflow_ros.plant.recorder import SimulatedLog
-from valveflow_ros.plant.simulator import simulate
+from valveflow_ros.monitoring.rows import Rows
+from valveflow_ros.parameters import Settings
+from valveflow_ros.plant.simulator import SimulatedLog, simulate
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.segments.segmenter import Segmenter

@@ -13,11 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from valveflow_ros.config import Settings
-from valveflow_ros.plant.chance import Source, generator
-from valveflow_ros.plant.programme import Pulses
-from valveflow_ros.plant.recorder import SimulatedLog
-from valveflow_ros.plant.simulator import WARM_UP_S
+from valveflow_ros.parameters import Settings
+from valveflow_ros.plant.plant import Pulses, Source, generator
+from valveflow_ros.plant.simulator import WARM_UP_S, SimulatedLog
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import SegmentKind
 

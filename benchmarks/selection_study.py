@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.selection_kinds import KINDS, Sampled, random_truth
 from valveflow_ros.partition.partition import partition
 from valveflow_ros.partition.selection import paper_rule, select
-from valveflow_ros.partition.selection_series import Series
+from valveflow_ros.partition.series import Series
 
 RESULTS = Path(__file__).parent / 'results'
 N, MOST, SHARE = 2000, 10, 0.01

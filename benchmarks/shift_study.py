@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.shift import Shift, judge_shift
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.monitoring.events import FitRequested, SegmentClosed
 from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.plant.unit import UnitDescription

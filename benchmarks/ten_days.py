@@ -26,7 +26,7 @@ import numpy as np
 
 from valveflow_ros.cli import engine
 from valveflow_ros.cli.log_input import steps_of
-from valveflow_ros.cli.parameters import settings_for
+from valveflow_ros.cli.options import settings_for
 from valveflow_ros.cli.report_words import columns
 from valveflow_ros.logs import open_log, write_samples
 from valveflow_ros.plant.simulator import simulate

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from valveflow_ros.config import Settings
 from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState
 from valveflow_ros.monitoring.events import CurveAdopted
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_rows
-from valveflow_ros.plant.random_unit import random_unit
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
+from valveflow_ros.plant.unit import random_unit
 
 RESULTS = Path(__file__).parent / 'results'
 _BLOCK = 3600

@@ -86,7 +86,7 @@ def diagnostics() -> str:
 
 def reasons() -> str:
     """Return why a reading is not taken, from the comments of the aligner."""
-    source = (_PACKAGE / 'signals' / 'align_kernel.py').read_text()
+    source = (_PACKAGE / 'signals' / 'align.py').read_text()
     block = source[source.index('REASONS = (') :].split(')')[0]
     rows = re.findall(r"'(\w+)',\s*# (.*)", block)
     return table(('counted as', 'means'), ((f'`{a.replace("_", " ")}`', b) for a, b in rows))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from valveflow_ros.cli.verbs import VERBS
-from valveflow_ros.config import TABLE, Parameter
+from valveflow_ros.parameters import TABLE, Parameter
 from valveflow_ros.records import SIGNALS
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -145,8 +145,8 @@ def _healthy(days: int, folder: Path) -> Any:
     from valveflow_ros.cli.console import Console
     from valveflow_ros.cli.identification import found_in
     from valveflow_ros.cli.log_input import open_input
-    from valveflow_ros.cli.mapping import read_mapping
-    from valveflow_ros.logs.tables.table_write import write_table
+    from valveflow_ros.cli.options import read_mapping
+    from valveflow_ros.logs.tables.write import write_table
     from valveflow_ros.plant.simulator import simulate
 
     path = folder / 'healthy.parquet'
@@ -161,9 +161,9 @@ def gather(name: str) -> dict[str, Any]:
     from valveflow_ros.cli.console import Console
     from valveflow_ros.cli.diagnosing import diagnosed_in
     from valveflow_ros.cli.log_input import open_input
-    from valveflow_ros.cli.mapping import read_mapping
-    from valveflow_ros.diagnosis.diagnosis_json import to_json
-    from valveflow_ros.logs.tables.table_write import write_table
+    from valveflow_ros.cli.options import read_mapping
+    from valveflow_ros.diagnosis.result import to_json
+    from valveflow_ros.logs.tables.write import write_table
     from valveflow_ros.plant.simulator import simulate
     from valveflow_ros.plant.spec import EffectSpec
 
@@ -195,9 +195,9 @@ def curve() -> dict[str, Any]:
     from valveflow_ros.cli.console import Console
     from valveflow_ros.cli.identification import found_in
     from valveflow_ros.cli.log_input import open_input
-    from valveflow_ros.cli.mapping import read_mapping
+    from valveflow_ros.cli.options import read_mapping
     from valveflow_ros.curve.characteristic_json import to_json
-    from valveflow_ros.logs.tables.table_write import write_table
+    from valveflow_ros.logs.tables.write import write_table
     from valveflow_ros.plant.simulator import simulate
     from valveflow_ros.report.curve import band
 

@@ -1,4 +1,4 @@
-"""The house's arrows: who may import whom, read from the sources themselves."""
+"""Who may import whom: between the folders, and between the modules inside each of them."""
 
 from __future__ import annotations
 
@@ -12,26 +12,35 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = 'valveflow_ros'
 HOUSE = ROOT / PACKAGE
 
-# A room of the house -> the rooms it may import from. '' is the package's own
-# __init__ with its version. A room may always import from itself.
+# In the order of the data: a folder, or a module at the top, may import from those before it
+# that are named, and from itself. '' is the package's own __init__.
+BASE = {'errors', 'records', 'parameters', 'numerics', 'state'}
+SIGNAL = BASE | {'signals'}
+SEGMENT = SIGNAL | {'segments', 'partition'}
+MODEL = SEGMENT | {'curve', 'fit'}
+METHOD = MODEL | {'monitoring', 'diagnosis', 'baselines', 'plant'}
+FACES = METHOD | {'logs', 'report'}
 ALLOWED: dict[str, set[str]] = {
     '': set(),
     'errors': set(),
     'records': {'errors'},
-    'config': {'errors', 'records'},
-    'core': {'errors', 'records', 'config'},
-    'diagnosis': {'errors', 'records', 'config', 'core'},
-    'compare': {'errors', 'records', 'config', 'core'},
-    'plant': {'errors', 'records', 'config', 'core'},
+    'parameters': {'errors', 'records'},
+    'numerics': {'errors', 'records'},
+    'state': {'errors', 'records'},
+    'signals': BASE,
+    'segments': SIGNAL,
+    'partition': SIGNAL,
+    'curve': SEGMENT,
+    'fit': SEGMENT | {'curve'},
+    'monitoring': MODEL,
+    'diagnosis': MODEL | {'monitoring'},
+    'baselines': MODEL | {'monitoring'},
+    'plant': BASE,
     'logs': {'errors', 'records'},
-    'report': {'errors', 'records', 'config', 'core', 'diagnosis', 'compare', 'plant'},
-    'cli': {
-        'errors', 'records', 'config', 'core', 'diagnosis', 'compare', 'plant', 'report', 'logs',
-    },
-    'ros': {
-        'errors', 'records', 'config', 'core', 'diagnosis', 'compare', 'plant', 'report', 'logs',
-    },
-}  # fmt: skip
+    'report': METHOD,
+    'cli': FACES,
+    'ros': FACES,
+}
 # What only a machine with ROS has; only ros/ may know it.
 ROS = {
     'ament_index_python',
@@ -50,7 +59,8 @@ ROS = {
 }
 # Time is an argument and files are for logs/: what would bring either in by another door.
 WORLDLY = {'asyncio', 'datetime', 'logging', 'pathlib', 'socket', 'subprocess', 'tempfile', 'time'}
-PURE = ('core', 'diagnosis', 'compare', 'plant')
+PURE = ('signals', 'segments', 'partition', 'curve', 'fit', 'monitoring', 'diagnosis',
+        'baselines', 'plant')  # fmt: skip
 
 
 def sources() -> list[Path]:
@@ -59,7 +69,7 @@ def sources() -> list[Path]:
 
 
 def room(path: Path) -> str:
-    """The room a file belongs to: its first folder, or its own name at the root."""
+    """The folder a file belongs to, or its own name at the top."""
     first = path.relative_to(HOUSE).parts[0]
     return '' if first == '__init__.py' else first.removesuffix('.py')
 
@@ -90,7 +100,7 @@ def imported(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def wrong_arrows(path: Path) -> list[str]:
-    """What a file imports from rooms it may not."""
+    """What a file imports from folders it may not."""
     here = room(path)
     allowed = ALLOWED[here] | {here, ''}
     wrong = []
@@ -104,7 +114,29 @@ def wrong_arrows(path: Path) -> list[str]:
     return wrong
 
 
-def test_every_room_is_known():
+def circles() -> list[list[str]]:
+    """Every set of modules that import one another in a circle, type checks included."""
+    names = {}
+    for path in sources():
+        name = '.'.join((PACKAGE, *path.relative_to(HOUSE).with_suffix('').parts))
+        names[name.removesuffix('.__init__')] = path
+    uses: dict[str, set[str]] = {}
+    for name, path in names.items():
+        found = {there for _, there in imported(path) if there in names and there != name}
+        # ``from a import b`` names the package a as well, where b is a module of it.
+        uses[name] = {n for n in found if not any(m.startswith(f'{n}.') for m in found)}
+    # What imports nothing that is left, or is imported by nothing that is left, is in no circle.
+    while ends := [
+        n for n in uses if not uses[n] or not any(n in there for there in uses.values())
+    ]:
+        for name in ends:
+            del uses[name]
+        for there in uses.values():
+            there.difference_update(ends)
+    return [[name, *sorted(there)] for name, there in sorted(uses.items())]
+
+
+def test_every_folder_is_known():
     """A new folder must be given its arrows here before it has any."""
     assert sources(), 'no sources found'
     assert {room(path) for path in sources()} <= set(ALLOWED)
@@ -112,6 +144,10 @@ def test_every_room_is_known():
 
 def test_arrows():
     assert [arrow for path in sources() for arrow in wrong_arrows(path)] == []
+
+
+def test_no_modules_import_one_another_in_a_circle():
+    assert circles() == []
 
 
 def test_only_ros_knows_ros():
@@ -125,7 +161,7 @@ def test_only_ros_knows_ros():
     assert wrong == []
 
 
-def test_the_pure_rooms_have_no_clock_and_no_files():
+def test_the_method_has_no_clock_and_no_files():
     wrong = [
         f'{path.relative_to(ROOT)}:{line} imports {name}'
         for path in sources()
@@ -134,6 +170,21 @@ def test_the_pure_rooms_have_no_clock_and_no_files():
         if name.split('.')[0] in WORLDLY
     ]
     assert wrong == []
+
+
+@pytest.fixture
+def house(monkeypatch, tmp_path):
+    """A function that writes a file into an empty package."""
+    monkeypatch.setattr(f'{__name__}.HOUSE', tmp_path / PACKAGE)
+    monkeypatch.setattr(f'{__name__}.ROOT', tmp_path)
+
+    def write(file: str, text: str) -> Path:
+        path = tmp_path / PACKAGE / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        return path
+
+    return write
 
 
 @pytest.mark.parametrize(
@@ -151,22 +202,34 @@ def test_the_pure_rooms_have_no_clock_and_no_files():
         ('cli/x.py', 'from valveflow_ros.logs import mcap', False),
         ('cli/x.py', 'from . import table', False),
         ('cli/x.py', 'from valveflow_ros import __version__', False),
-        ('core/x.py', 'from valveflow_ros.plant import unit', True),
-        ('core/x.py', 'from valveflow_ros.logs import mcap', True),
-        ('core/a/x.py', 'from ...plant import unit', True),
-        ('core/a/x.py', 'from ..units import u', False),
-        ('plant/x.py', 'from valveflow_ros.diagnosis import gain', True),
+        ('fit/x.py', 'from valveflow_ros.plant import unit', True),
+        ('fit/x.py', 'from valveflow_ros.monitoring import monitor', True),
+        ('fit/a/x.py', 'from ...plant import unit', True),
+        ('fit/a/x.py', 'from ..problem import Problem', False),
+        ('plant/x.py', 'from valveflow_ros.diagnosis import evidence', True),
         ('diagnosis/x.py', 'from valveflow_ros.plant import unit', True),
-        ('logs/x.py', 'from valveflow_ros.config import table', True),
+        ('logs/x.py', 'from valveflow_ros.parameters import TABLE', True),
         ('logs/x.py', 'from valveflow_ros.records import Readings', False),
-        ('records.py', 'from valveflow_ros.config import table', True),
+        ('records.py', 'from valveflow_ros.parameters import TABLE', True),
     ],
 )
-def test_the_reader_of_arrows_catches(file, text, caught, monkeypatch, tmp_path):
+def test_the_reader_of_arrows_catches(file, text, caught, house):
     """The reader itself is tried on arrows that are right and wrong."""
-    monkeypatch.setattr(f'{__name__}.HOUSE', tmp_path / PACKAGE)
-    monkeypatch.setattr(f'{__name__}.ROOT', tmp_path)
-    path = tmp_path / PACKAGE / file
-    path.parent.mkdir(parents=True)
-    path.write_text(text)
-    assert bool(wrong_arrows(path)) is caught
+    assert bool(wrong_arrows(house(file, text))) is caught
+
+
+@pytest.mark.parametrize(
+    ('b', 'caught'),
+    [
+        ('from valveflow_ros.fit.a import x', True),
+        ('def f():\n    from valveflow_ros.fit import a', True),
+        ('if TYPE_CHECKING:\n    from valveflow_ros.fit.a import x', True),
+        ('from valveflow_ros.curve.c import x', False),
+    ],
+)
+def test_the_finder_of_circles_catches(b, caught, house):
+    house('fit/__init__.py', '')
+    house('fit/a.py', 'from valveflow_ros.fit.b import y')
+    house('fit/b.py', b)
+    house('curve/c.py', '')
+    assert bool(circles()) is caught

@@ -109,7 +109,7 @@ def test_every_command_is_one_the_programs_take(block: Block) -> None:
 
 def _check_ros(words: list[str]) -> None:
     """Look at parameters and remaps of a node."""
-    from valveflow_ros.config import PARAMETERS
+    from valveflow_ros.parameters import PARAMETERS
     from valveflow_ros.records import SIGNALS
 
     topics = {s.topic for s in SIGNALS} | {'plant_sample'}
@@ -125,7 +125,7 @@ def _check_ros(words: list[str]) -> None:
 @pytest.mark.parametrize('block', [b for b in ALL if b.kind == 'yaml'], ids=str)
 def test_parameter_files_are_ones_the_monitor_takes(block: Block) -> None:
     yaml = pytest.importorskip('yaml')
-    from valveflow_ros.config import Settings
+    from valveflow_ros.parameters import Settings
 
     found = yaml.safe_load(block.text)
     (node,) = found.values()

@@ -10,8 +10,8 @@ from xml.etree import ElementTree
 import pytest
 
 from docs import make_pages, page_claims, page_effects, page_health, page_tables, picture_data
-from valveflow_ros.config import TABLE
 from valveflow_ros.diagnosis.causes import catalogue as causes
+from valveflow_ros.parameters import TABLE
 from valveflow_ros.plant.effects import catalogue as effects
 
 ROOT = Path(__file__).resolve().parent.parent

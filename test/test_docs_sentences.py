@@ -59,7 +59,7 @@ def test_every_quote_is_a_sentence_of_the_program(quote: str) -> None:
 
 def _spoken() -> Iterator[str]:
     """Yield the sentences that the health of the monitor says where something is not well."""
-    for name in ('input_health', 'work_health'):
+    for name in ('input_health', 'health'):
         tree = ast.parse((PACKAGE / 'ros' / 'node' / f'{name}.py').read_text())
         for node in ast.walk(tree):
             values: list[ast.expr] = []
@@ -73,7 +73,7 @@ def _spoken() -> Iterator[str]:
                 text = _template(values[1])
                 if text and text.strip(GAP):
                     yield text
-    tree = ast.parse((PACKAGE / 'fit' / 'fit_refusals.py').read_text())
+    tree = ast.parse((PACKAGE / 'fit' / 'task.py').read_text())
     for node in ast.walk(tree):
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
             yield from filter(None, (_template(a) for a in node.exc.args[:1]))

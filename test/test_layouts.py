@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from valveflow_ros.logs import Definitions
-from valveflow_ros.logs.mcap.msgdef import parse_all
+from valveflow_ros.logs.mcap.definitions import parse_all
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIG = ROOT / 'config'
@@ -122,8 +122,7 @@ def test_the_curve_of_foxglove_is_drawn_over_its_own_breakpoints():
 
 
 def test_alarms_are_named_as_the_engine_names_them():
-    from valveflow_ros.monitoring.alarms import ResidualAlarm
-    from valveflow_ros.monitoring.shift_alarm import ShiftAlarm
+    from valveflow_ros.monitoring.alarms import ResidualAlarm, ShiftAlarm
 
     text = (CONFIG / 'foxglove_layout.json').read_text()
     named = set(re.findall(r'name==\\"([^"\\]+)\\"', text))

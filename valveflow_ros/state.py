@@ -7,6 +7,9 @@ first one would have. What does not fit is refused, since a state half believed 
 
 from __future__ import annotations
 
+import hashlib
+import io
+import json
 from collections.abc import Mapping
 from typing import Any, Protocol
 
@@ -68,3 +71,84 @@ def put_back(arrays: Mapping[str, NDArray[Any]], saved: State) -> None:
             )
     for name, array in arrays.items():
         np.copyto(array, saved[name])
+
+
+# A state as bytes that tell by themselves whether they are whole; nothing in them is executed.
+
+
+FORMAT = b'valveflow-state'
+VERSION = 1
+_ARRAY = '$array'
+_DIGEST = 64
+
+
+def to_bytes(state: State) -> bytes:
+    """Return a state as a line with format, version and SHA-256, and an .npz archive.
+
+    Parameters
+    ----------
+    state : dict
+        Of numbers, texts, lists, dicts with text keys, and arrays.
+    """
+    arrays: list[NDArray[Any]] = []
+    text = json.dumps(_flat(state, arrays), separators=(',', ':'))
+    archive = io.BytesIO()
+    named = {f'a{k}': array for k, array in enumerate(arrays)}
+    np.savez(archive, tree=np.frombuffer(text.encode(), dtype=np.uint8), **named)  # type: ignore[arg-type]
+    content = archive.getbuffer()
+    digest = hashlib.sha256(content).hexdigest()
+    return b'%s %d %s\n' % (FORMAT, VERSION, digest.encode()) + content
+
+
+def from_bytes(data: bytes) -> State:
+    """Return the state in such bytes.
+
+    Raises
+    ------
+    DataError
+        They are cut off, changed, of another version, or something else altogether.
+    """
+    line, _, content = data.partition(b'\n')
+    words = line.split(b' ')
+    if len(words) != 3 or words[0] != FORMAT or len(words[2]) != _DIGEST:
+        raise DataError('The saved state is none, or its beginning is damaged.')
+    if words[1] != b'%d' % VERSION:
+        version = words[1][:20].decode(errors='replace')
+        raise DataError(f'The saved state has version {version}, this program reads {VERSION}.')
+    if hashlib.sha256(content).hexdigest().encode() != words[2]:
+        raise DataError('The saved state is damaged: its checksum is another one.')
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            tree = json.loads(archive['tree'].tobytes())
+            state = _full(tree, archive)
+    except Exception as error:  # noqa: BLE001 - zip, numpy and json raise what they like
+        reason = type(error).__name__
+        raise DataError(f'The saved state cannot be read ({reason}).') from None
+    if not isinstance(state, dict):
+        raise DataError('The saved state is none.')
+    return state
+
+
+def _flat(value: Any, arrays: list[NDArray[Any]]) -> Any:
+    """Return a value with its arrays put aside."""
+    if isinstance(value, np.ndarray):
+        arrays.append(value)
+        return {_ARRAY: len(arrays) - 1}
+    if isinstance(value, dict):
+        return {str(key): _flat(item, arrays) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_flat(item, arrays) for item in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    return value
+
+
+def _full(value: Any, archive: Any) -> Any:
+    """Return a value with its arrays back in place."""
+    if isinstance(value, dict):
+        if value.keys() == {_ARRAY}:
+            return archive[f'a{int(value[_ARRAY])}']
+        return {key: _full(item, archive) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_full(item, archive) for item in value]
+    return value

@@ -21,11 +21,11 @@ from valveflow_msgs.msg import Alarm
 
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import NS_PER_S, SampleTable
-from valveflow_ros.ros.demo_processes import ros_arguments
+from valveflow_ros.ros.demo import ros_arguments
 from valveflow_ros.ros.inputs import header_time_ns
 from valveflow_ros.ros.playing import Player
+from valveflow_ros.ros.polled_subscription import Taker
 from valveflow_ros.ros.simulator_steps import stamped_steps
-from valveflow_ros.ros.taking import Taker
 
 NAME = '/valveflow_monitor'
 HISTORY_DAYS = 0.3

@@ -52,12 +52,10 @@ _STATE = (
 TESTS: Mapping[str, tuple[str, ...]] = {
     'valveflow_ros/logs/mcap/recorder.py': _RECORDER,
     'valveflow_ros/logs/mcap/recorder_loop.py': _RECORDER,
-    'valveflow_ros/logs/mcap/ledger.py': _RECORDER,
     'valveflow_ros/logs/mcap/recover.py': _RECOVER,
     'valveflow_ros/logs/part_file.py': (*_RECOVER, _RECORDER[-1]),
-    'valveflow_ros/logs/mcap/chunk_builder.py': (*_RECORDER, _RECOVER[-1]),
-    'valveflow_ros/ros/node/state_folder.py': _STATE,
-    'valveflow_ros/state_bytes.py': _STATE,
+    'valveflow_ros/logs/mcap/chunk_file.py': (*_RECORDER, _RECOVER[-1]),
+    'valveflow_ros/ros/node/state_store.py': _STATE,
     'valveflow_ros/state.py': (*_STATE, 'test/core/test_continuing.py'),
 }
 

@@ -37,10 +37,10 @@ class Work:
     """The pieces of work, each over inputs that stand ready."""
 
     def __init__(self, folder: Path) -> None:
-        from valveflow_ros.config import Settings
         from valveflow_ros.logs import open_log
         from valveflow_ros.monitoring.events import FitRequested
         from valveflow_ros.monitoring.monitor import Monitor
+        from valveflow_ros.parameters import Settings
         from valveflow_ros.records import SampleTable
 
         self.folder = folder

@@ -14,7 +14,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from benchmarks.torture.trial import Options, Outcome
-from valveflow_ros.ros.demo_processes import ros_arguments
+from valveflow_ros.ros.demo import ros_arguments
 
 KILLS = 50
 SOON_S = 3.0

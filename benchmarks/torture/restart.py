@@ -22,7 +22,7 @@ from benchmarks.torture.trial import Options, Outcome
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.records import SampleTable
-from valveflow_ros.ros.demo_processes import ros_arguments
+from valveflow_ros.ros.demo import ros_arguments
 from valveflow_ros.ros.inputs import PLANT_SAMPLE
 from valveflow_ros.ros.playing import Player
 from valveflow_ros.ros.simulator_steps import stamped_steps

@@ -21,7 +21,7 @@ from std_msgs.msg import Float64
 from benchmarks.torture.stock import stock_count
 from benchmarks.torture.trial import Options, Outcome
 from valveflow_ros.records import SIGNALS
-from valveflow_ros.ros.demo_processes import ros_arguments
+from valveflow_ros.ros.demo import ros_arguments
 
 TRIALS = 24
 KINDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

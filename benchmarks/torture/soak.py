@@ -12,15 +12,15 @@ import numpy as np
 
 from benchmarks.torture.memory import MIB, descriptors, peak, resident, threads
 from benchmarks.torture.trial import Options, Outcome
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.errors import DataError
-from valveflow_ros.fit.fit_task import FitTask
+from valveflow_ros.fit.task import FitTask
 from valveflow_ros.monitoring.events import DiagnosisRequested, Event, FitRequested, SegmentClosed
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.prediction import PredictionBlock
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SampleTable
-from valveflow_ros.ros.worker.memory import give_back
+from valveflow_ros.ros.worker.worker import give_back
 
 DAYS = 365
 PERIOD_DAYS = 30

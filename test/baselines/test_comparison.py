@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from valveflow_ros.baselines import comparison
-from valveflow_ros.baselines.comparison import compare
-from valveflow_ros.baselines.comparison_json import to_json
-from valveflow_ros.baselines.holdout import part_of
-from valveflow_ros.baselines.judged import OtherData
+from valveflow_ros.baselines.comparison import compare, to_json
+from valveflow_ros.baselines.judged import OtherData, part_of
 from valveflow_ros.baselines.truth import read_truth
 from valveflow_ros.curve import characteristic_json
 from valveflow_ros.errors import DataError, TooFewSamplesError

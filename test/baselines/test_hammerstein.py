@@ -11,8 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from valveflow_ros.baselines.hammerstein import HammersteinModel, tangents
-from valveflow_ros.baselines.hammerstein_fit import fit_hammerstein, grown
-from valveflow_ros.baselines.hammerstein_start import knots_to_try, with_best_values
+from valveflow_ros.baselines.hammerstein_fit import (
+    fit_hammerstein,
+    grown,
+    knots_to_try,
+    with_best_values,
+)
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.fit.problem import Samples
 

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from valveflow_ros.baselines.judged import judge
-from valveflow_ros.baselines.proposed import trial_of
+from valveflow_ros.baselines.judged import judge, trial_of
 from valveflow_ros.baselines.verdict import (
     Finding,
     Outcome,

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from valveflow_ros.baselines.paired import (
+from valveflow_ros.baselines.judged import (
     over_blocks,
     over_samples,
     widening_of,

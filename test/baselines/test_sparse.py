@@ -11,10 +11,16 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from valveflow_ros.baselines import library
-from valveflow_ros.baselines.derivative import Form, equations, forms_for
-from valveflow_ros.baselines.holdout import part_of
-from valveflow_ros.baselines.sparse import THRESHOLDS, fit_sparse, thresholded
-from valveflow_ros.baselines.sparse_model import SparseModel
+from valveflow_ros.baselines.judged import part_of
+from valveflow_ros.baselines.sparse import (
+    THRESHOLDS,
+    Form,
+    SparseModel,
+    equations,
+    fit_sparse,
+    forms_for,
+    thresholded,
+)
 from valveflow_ros.fit.problem import Samples
 
 compiled = pytest.mark.skipif(

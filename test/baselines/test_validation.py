@@ -8,8 +8,7 @@ import os
 import numpy as np
 import pytest
 
-from valveflow_ros.baselines.validation import Verdict, validate
-from valveflow_ros.baselines.validation_json import to_json
+from valveflow_ros.baselines.validation import Verdict, to_json, validate
 from valveflow_ros.errors import DataError
 
 pytestmark = pytest.mark.skipif(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from valveflow_ros.logs import Definitions, RecordingWriter
-from valveflow_ros.logs.mcap.msgdef import Fields, parse_all
+from valveflow_ros.logs.mcap.definitions import Fields, parse_all
 
 START_NS = 1_700_000_000_000_000_000
 NODE = '/valveflow_monitor'

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from valveflow_ros.cli.log_input import open_input
-from valveflow_ros.cli.mapping import read_mapping
+from valveflow_ros.cli.options import read_mapping
 from valveflow_ros.cli.watching import cut_in_two
 
 pytestmark = pytest.mark.skipif(

@@ -9,7 +9,7 @@ import pytest
 
 from valveflow_ros.cli.completion_table import Kind, table
 from valveflow_ros.cli.verbs import VERBS
-from valveflow_ros.config import TABLE
+from valveflow_ros.parameters import TABLE
 from valveflow_ros.plant.effects import catalogue
 from valveflow_ros.records import SIGNALS
 

@@ -11,10 +11,10 @@ import pytest
 
 from valveflow_ros.cli.alignment import align
 from valveflow_ros.cli.engine import watch
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic_json import from_json
 from valveflow_ros.errors import DataError
 from valveflow_ros.logs import open_log, write_table
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import NS_PER_S, Readings, SampleTable, Signal, table_to_readings
 

@@ -14,13 +14,13 @@ from valveflow_ros.cli import import_table
 from valveflow_ros.cli.config_fit import Fitted, _units
 from valveflow_ros.cli.console import Console
 from valveflow_ros.cli.historian_open import LOOKING_ON, answered
-from valveflow_ros.cli.mapping import About, read_mapping
+from valveflow_ros.cli.options import About, read_mapping
 from valveflow_ros.cli.usage import Parser, add_common
 from valveflow_ros.errors import InputError
 from valveflow_ros.logs import open_log
-from valveflow_ros.logs.tables.historian_refusal import RefusedError, Remedy
+from valveflow_ros.logs.tables.refusal import RefusedError, Remedy
 from valveflow_ros.records import Signal
-from valveflow_ros.signals.unit_table import AIR_MPA, convert, unit_of
+from valveflow_ros.signals.units import AIR_MPA, convert, unit_of
 
 HEAD = 'Date,Valve position,Steam press,Steam temp,Gross MW'
 N = 120

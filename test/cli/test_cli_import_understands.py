@@ -9,7 +9,7 @@ import pytest
 
 from valveflow_ros.cli import historian
 from valveflow_ros.logs import open_log
-from valveflow_ros.logs.tables.tables import table_file
+from valveflow_ros.logs.tables.table import table_file
 from valveflow_ros.records import Signal
 
 GERMAN = 'Zeitstempel;Ventilstellung;Frischdampfdruck;FD-Temperatur;Bruttoleistung;Drehzahl'

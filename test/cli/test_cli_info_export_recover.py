@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from valveflow_ros.cli.alignment import align
 from valveflow_ros.cli.inspection import fates
-from valveflow_ros.config import Settings
 from valveflow_ros.logs import open_log, read_table
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Readings, Signal
 
 

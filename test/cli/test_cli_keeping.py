@@ -7,14 +7,12 @@ from argparse import Namespace
 
 import pytest
 
-from valveflow_ros.baselines import comparison_json, validation_json
+from valveflow_ros.baselines import comparison, validation
 from valveflow_ros.cli.console import Outcome
-from valveflow_ros.cli.file_marks import signed, writer
-from valveflow_ros.cli.files import write_texts
-from valveflow_ros.cli.keeping import REPORT, keep_others, renamed
+from valveflow_ros.cli.files import REPORT, keep_others, renamed, signed, write_texts, writer
 from valveflow_ros.cli.report_files import _others_pictures, with_report
-from valveflow_ros.curve import characteristic_json, shift_json
-from valveflow_ros.diagnosis import diagnosis_json
+from valveflow_ros.curve import characteristic_json, shift
+from valveflow_ros.diagnosis import result
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.report.page import Figure, Page, Section
 
@@ -141,8 +139,8 @@ def _denied(path):
 
 
 @pytest.mark.parametrize(('form', 'verb'), [
-    (characteristic_json, 'identify'), (shift_json, 'identify'), (diagnosis_json, 'diagnose'),
-    (comparison_json, 'compare'), (validation_json, 'validate'),
+    (characteristic_json, 'identify'), (shift, 'identify'), (result, 'diagnose'),
+    (comparison, 'compare'), (validation, 'validate'),
 ])  # fmt: skip
 def test_every_file_for_programs_tells_its_verb(tmp_path, form, verb):
     path = tmp_path / 'some.json'

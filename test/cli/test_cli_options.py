@@ -8,16 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from valveflow_ros.cli.mapping import read_mapping
-from valveflow_ros.cli.parameters import (
+from valveflow_ros.cli.options import (
     fitting,
+    read_mapping,
     read_parameters,
     sample_period,
     settings_for,
 )
 from valveflow_ros.cli.usage import UsageError
-from valveflow_ros.config import PARAMETERS, Settings, as_yaml
 from valveflow_ros.errors import InputError, RecordingError
+from valveflow_ros.parameters import PARAMETERS, Settings, as_yaml
 from valveflow_ros.records import SIGNALS, Signal
 from valveflow_ros.signals.units import UNITS, convert
 

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from valveflow_ros.cli import console
-from valveflow_ros.cli.pace import _PACES, pace_of
-from valveflow_ros.report.terminal.terminal_progress import Progress, in_words
+from valveflow_ros.cli.console import _PACES, pace_of
+from valveflow_ros.report.terminal.progress import Progress, in_words
 
 
 class Clock:

@@ -11,7 +11,7 @@ import pytest
 from valveflow_ros.cli.files import check_folder
 from valveflow_ros.cli.usage import Parser, UsageError
 from valveflow_ros.cli.verbs import VERBS, load
-from valveflow_ros.report.terminal import terminal_number
+from valveflow_ros.report.terminal import text
 
 
 def options_of(verb: str) -> list[Action]:
@@ -25,7 +25,7 @@ NUMBERS = [
     (verb, action)
     for verb, _, _ in VERBS
     for action in options_of(verb)
-    if getattr(action.type, '__module__', '') == terminal_number.__name__
+    if getattr(action.type, '__module__', '') == text.__name__
 ]
 
 

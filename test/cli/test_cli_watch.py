@@ -11,8 +11,8 @@ from monitor_recording import START_NS, Monitor, alarm, cdr, recording, stamp
 
 from valveflow_ros.cli import watch_run
 from valveflow_ros.cli.watch_log import LogWatch
-from valveflow_ros.report.terminal.terminal_board import AGE, HEALTH, KEPT, Board
-from valveflow_ros.report.terminal.terminal_frame import OK, STALE, WARN
+from valveflow_ros.report.terminal.board import AGE, HEALTH, KEPT, Board
+from valveflow_ros.report.terminal.frame import OK, STALE, WARN
 
 SECOND = 10**9
 

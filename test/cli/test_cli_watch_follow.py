@@ -12,7 +12,7 @@ from valveflow_ros.logs import open_log
 from valveflow_ros.logs.mcap.cdr import Decoder
 from valveflow_ros.logs.mcap.follow import Follower
 from valveflow_ros.logs.mcap.layout import Op
-from valveflow_ros.logs.mcap.seek import candidates
+from valveflow_ros.logs.mcap.scan import candidates
 from valveflow_ros.logs.source import Source
 
 SECOND = 10**9

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import START_NS, blocks_of, cuts, examples, frozen, grid_ns
 
-from valveflow_ros.config import Settings
 from valveflow_ros.monitoring.alarms import AlarmState, Judged, ResidualAlarm
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S
 
 LIMIT = 2.0

@@ -10,14 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import START_NS, blocks_of, cuts, examples, frozen, grid_ns
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.shift import PieceShift, Shift
-from valveflow_ros.monitoring.alarm_desk import AlarmDesk
-from valveflow_ros.monitoring.alarm_voice import BURIED
-from valveflow_ros.monitoring.alarms import AlarmState, Judged, ResidualAlarm
-from valveflow_ros.monitoring.shift_alarm import ShiftAlarm
+from valveflow_ros.monitoring.alarm import BURIED
+from valveflow_ros.monitoring.alarms import (
+    AlarmDesk,
+    AlarmState,
+    Judged,
+    ResidualAlarm,
+    ShiftAlarm,
+)
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S
-from valveflow_ros.state_bytes import from_bytes, to_bytes
+from valveflow_ros.state import from_bytes, to_bytes
 
 DAY_S = 86_400
 NORMAL, UNACKNOWLEDGED, ACKNOWLEDGED, RETURNED, SHELVED, SUPPRESSED, _ = AlarmState

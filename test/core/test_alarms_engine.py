@@ -25,15 +25,19 @@ from streams import (
     table_of,
 )
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.shift import PieceShift, Shift
 from valveflow_ros.errors import DataError
-from valveflow_ros.monitoring.alarm_desk import AlarmDesk
-from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState, ResidualAlarm
+from valveflow_ros.monitoring.alarms import (
+    AlarmChange,
+    AlarmDesk,
+    AlarmState,
+    ResidualAlarm,
+    ShiftAlarm,
+)
 from valveflow_ros.monitoring.events import JournalEntry, JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import JournalReplayer, feed_rows
-from valveflow_ros.monitoring.shift_alarm import ShiftAlarm
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.records import NS_PER_S, SampleTable, Signal

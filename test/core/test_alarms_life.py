@@ -10,12 +10,12 @@ import pytest
 from alarm_story import held_in
 from streams import START_NS
 
-from valveflow_ros.config import Settings
 from valveflow_ros.errors import DataError
-from valveflow_ros.monitoring.alarm_life import AlarmLife
+from valveflow_ros.monitoring.alarm import AlarmLife
 from valveflow_ros.monitoring.alarms import AlarmState, Priority, ResidualAlarm
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S
-from valveflow_ros.state_bytes import from_bytes, to_bytes
+from valveflow_ros.state import from_bytes, to_bytes
 
 DAY_S = 86_400
 NORMAL, UNACKNOWLEDGED, _, RETURNED, SHELVED, SUPPRESSED, _ = AlarmState

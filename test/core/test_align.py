@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from naive_stream import NaiveAligner
 from streams import START_NS, blocks_of, cuts, examples, needs_jit
 
-from valveflow_ros.config import Settings
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
     N_SIGNALS,
     NS_PER_S,

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import examples
 
-from valveflow_ros.curve.change_point import LEAST_SIDE, moment_of, scan
+from valveflow_ros.curve.segment_residual import LEAST_SIDE, moment_of, scan
 
 
 def series(seed, n, at=None, size=0.0):

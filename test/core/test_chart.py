@@ -9,8 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import START_NS, blocks_of, cuts, examples
 
-from valveflow_ros.fit.chart import ChartDesign, ResidualChart
-from valveflow_ros.fit.run_length import alarms, block_means, design_chart, limit_for, normal_limit
+from valveflow_ros.fit.residual_chart import (
+    ChartDesign,
+    ResidualChart,
+    alarms,
+    block_means,
+    design_chart,
+    limit_for,
+    normal_limit,
+)
 from valveflow_ros.records import NS_PER_S
 
 DESIGN = ChartDesign(60.0, 0.5, 1.5, (0.25, 1.0), (15.0, 5.0), 30.0)

@@ -19,8 +19,7 @@ from valveflow_ros.curve.characteristic import (
     ResidualStatistics,
     Source,
 )
-from valveflow_ros.curve.compensation import compensate
-from valveflow_ros.curve.inverse_points import spread, thin
+from valveflow_ros.curve.compensation import compensate, spread, thin
 from valveflow_ros.errors import DataError, InputError
 
 

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import examples
 
-from valveflow_ros.config import PARAMETERS, TABLE, Settings, as_yaml, parameter
 from valveflow_ros.errors import InputError, ParameterError, ValveflowError
+from valveflow_ros.parameters import PARAMETERS, TABLE, Settings, as_yaml, parameter
 
 NUMBERS = [row for row in TABLE if row.low is not None]
 TEXTS = [row for row in TABLE if isinstance(row.default, str)]

@@ -16,16 +16,16 @@ from streams import (
     table_harms,
 )
 
-from valveflow_ros.config import Settings
 from valveflow_ros.errors import DataError
+from valveflow_ros.monitoring.alarms import ShiftAlarm
+from valveflow_ros.monitoring.curves import Refits
 from valveflow_ros.monitoring.events import FitRequested
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import CLOCK_BACK, feed_rows
-from valveflow_ros.monitoring.refits import Refits
-from valveflow_ros.monitoring.shift_alarm import ShiftAlarm
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, Readings, table_to_readings
 from valveflow_ros.signals.align import Aligner
-from valveflow_ros.state_bytes import from_bytes, to_bytes
+from valveflow_ros.state import from_bytes, to_bytes
 
 SETTINGS = Settings(QUICK_MONITOR)
 N = 700

@@ -10,9 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import blocks_of, cuts, examples
 
-from valveflow_ros.config import Settings
 from valveflow_ros.errors import DataError
-from valveflow_ros.monitoring.diagnosing import ALARM, ASKED, FITS_AGAIN, NIGHTLY, Diagnosing
+from valveflow_ros.monitoring.diagnosis_requests import (
+    ALARM,
+    ASKED,
+    FITS_AGAIN,
+    NIGHTLY,
+    Diagnosing,
+)
 from valveflow_ros.monitoring.events import (
     Diagnosed,
     DiagnosisRequested,
@@ -20,6 +25,7 @@ from valveflow_ros.monitoring.events import (
     JournalKind,
 )
 from valveflow_ros.monitoring.mismatch import Misfit
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S
 from valveflow_ros.segments.window import RollingWindow, WindowContents
 

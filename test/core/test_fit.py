@@ -18,14 +18,14 @@ from streams import (
     simulated,
 )
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.fit.fit import fit, outline
-from valveflow_ros.fit.fit_task import FitTask
+from valveflow_ros.fit.task import FitTask
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_rows
+from valveflow_ros.parameters import Settings
 from valveflow_ros.segments.window import WindowContents
 
 STATIC = Settings({**QUICK_MONITOR, 'alarm_average': 10.0})

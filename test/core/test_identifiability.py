@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from streams import examples, grid_ns
 from test_characteristic import curve
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import Piece
 from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit
-from valveflow_ros.fit.fit_task import FitTask
-from valveflow_ros.fit.identifiability import support_of, with_support
+from valveflow_ros.fit.result import support_of, with_support
+from valveflow_ros.fit.task import FitTask
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.segments.window import WindowContents
 

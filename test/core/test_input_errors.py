@@ -7,8 +7,7 @@ import pytest
 from streams import lagged, needs_jit
 from test_refine import START, TRUE, measured
 
-from valveflow_ros.fit.input_errors import relative_noise
-from valveflow_ros.fit.refine import refine
+from valveflow_ros.fit.refine import refine, relative_noise
 
 
 def wandering(rng, n):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from naive_stream import leverage, straight_line
 from streams import examples
 
-from valveflow_ros.segments.line import LINE_SIZE, line_add, line_ahead, line_fit, line_reset
+from valveflow_ros.segments.kernel import LINE_SIZE, line_add, line_ahead, line_fit, line_reset
 
 values = st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=60)
 

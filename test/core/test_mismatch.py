@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import START_NS, blocks_of, cuts, examples, needs_jit, steps_and_ramps
 
-from valveflow_ros.config import PARAMETERS
-from valveflow_ros.curve.model import RegionalModel
-from valveflow_ros.monitoring import mismatch_kernel as k
+from valveflow_ros.curve.regional_model import RegionalModel
+from valveflow_ros.monitoring import mismatch as k
 from valveflow_ros.monitoring.mismatch import FLOOR, LEAST_BLOCKS, NAMES, NOTHING, Mismatch
 from valveflow_ros.monitoring.prediction import PredictionBlock
+from valveflow_ros.parameters import PARAMETERS
 from valveflow_ros.records import NS_PER_S
 
 STEP_S = 20.0

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from naive_stream import naive_curve, naive_respond
 from streams import examples, steps_and_ramps
 
-from valveflow_ros.curve.model import RegionalModel
+from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.fit.problem import Problem, Samples
 
 

@@ -19,12 +19,11 @@ from streams import (
     table_of,
 )
 
-from valveflow_ros.config import Settings
 from valveflow_ros.errors import DataError, ParameterError
-from valveflow_ros.fit.chart import ResidualChart
 from valveflow_ros.fit.fit import fit
+from valveflow_ros.fit.residual_chart import ResidualChart
 from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState
-from valveflow_ros.monitoring.curve_status import CurveStatus
+from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.events import (
     CurveAdopted,
     FitRequested,
@@ -35,6 +34,7 @@ from valveflow_ros.monitoring.events import (
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import CLOCK_BACK, feed_rows
 from valveflow_ros.monitoring.prediction import PredictionBlock, PredictionState
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SampleTable, Signal
 from valveflow_ros.segments.segmenter import Segmenter
 from valveflow_ros.signals.units import integrated_input

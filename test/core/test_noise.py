@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from naive_stream import noise_of
 from streams import examples
 
-from valveflow_ros.segments.noise import BINS, FORGET_AT, noise_add, noise_level
+from valveflow_ros.segments.kernel import BINS, FORGET_AT, noise_add, noise_level
 
 rms = st.one_of(st.floats(1e-7, 1e3), st.just(0.0))
 

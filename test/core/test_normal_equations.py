@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from valveflow_ros.fit.normal_kernel import square_sum
+from valveflow_ros.fit.kernels import square_sum
 from valveflow_ros.fit.whitening import normal_equations, whitened
 
 

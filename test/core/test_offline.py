@@ -20,7 +20,6 @@ from streams import (
     table_harms,
 )
 
-from valveflow_ros.config import Settings
 from valveflow_ros.errors import DataError, ValveflowError
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.monitoring.events import CurveAdopted, FitRequested, JournalEntry, JournalKind
@@ -32,6 +31,7 @@ from valveflow_ros.monitoring.offline import (
     feed_aligned,
     feed_rows,
 )
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, Readings, SampleTable, table_to_readings
 from valveflow_ros.signals.align import Aligner
 

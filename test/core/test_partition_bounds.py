@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from partition_kinds import KINDS, samples
 
-from valveflow_ros.partition.partition_bounds import SLOTS, fill_leaf_bounds, make_priors
-from valveflow_ros.partition.partition_levels import make_levels
-from valveflow_ros.partition.partition_lift import fill_node_bounds
-from valveflow_ros.partition.partition_moments import BRANCH, LEAF, blocks_moments, build_tree
+from valveflow_ros.partition.bounds import SLOTS, fill_leaf_bounds, fill_node_bounds, make_priors
+from valveflow_ros.partition.moments import BRANCH, LEAF, blocks_moments, build_tree
+from valveflow_ros.partition.partition import make_levels
 
 N = 17 * LEAF
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from partition_kinds import KINDS, samples
 
-from valveflow_ros.partition import partition_layers
-from valveflow_ros.partition.partition_layers import best_partitions, layers, prepare
-from valveflow_ros.partition.partition_levels import make_levels
+from valveflow_ros.partition import search
+from valveflow_ros.partition.partition import make_levels
+from valveflow_ros.partition.search import best_partitions, layers, prepare
 
 COMPILED = not numba.config.DISABLE_JIT
 PIECES = 10
@@ -111,10 +111,8 @@ def test_far_breaks_are_passed_over(kind, monkeypatch):
     """The work must stay far below every break for every end, also for exact ties."""
     levels = make_levels(*samples(kind, 20_000))
     opened = []
-    search = partition_layers.search_groups
-    monkeypatch.setattr(
-        partition_layers, 'search_groups', lambda *args: opened.append(search(*args))
-    )
+    original = search.search_groups
+    monkeypatch.setattr(search, 'search_groups', lambda *args: opened.append(original(*args)))
     best_partitions(problem(levels, 2), 4)
     groups = 20_000 / 64
     assert sum(opened) < 0.1 * 3 * groups * groups / 2

@@ -12,12 +12,7 @@ from test_characteristic import DYNAMICS, curve
 
 from valveflow_ros.monitoring.prediction import PredictionState, Predictor, no_prediction
 from valveflow_ros.records import NS_PER_S
-from valveflow_ros.segments.segmenter_kernel import (
-    NO_DATA,
-    SETTLED_SLOPE,
-    SETTLED_STEADY,
-    TRANSIENT,
-)
+from valveflow_ros.segments.kernel import NO_DATA, SETTLED_SLOPE, SETTLED_STEADY, TRANSIENT
 
 N = 260
 NAN = math.nan

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import examples
 
-from valveflow_ros.curve.model import RegionalModel
+from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.fit import problem as module
 from valveflow_ros.fit import whitening
 from valveflow_ros.fit.problem import Problem, Samples

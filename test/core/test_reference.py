@@ -19,15 +19,14 @@ from streams import (
     table_of,
 )
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.curve.shift import PieceShift, Shift
 from valveflow_ros.errors import DataError
-from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState
+from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState, ShiftAlarm
 from valveflow_ros.monitoring.events import CurveAdopted, JournalEntry, JournalKind, ReferenceSet
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import CLOCK_BACK, JournalReplayer, feed_rows
-from valveflow_ros.monitoring.shift_alarm import ShiftAlarm
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S
 
 # The residual alarm is out of the way: it would stop refits before the curve can move.

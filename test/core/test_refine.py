@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from streams import lagged, needs_jit, steps_and_ramps
 
-from valveflow_ros.curve.model import RegionalModel
+from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.fit.problem import Problem, Samples
 from valveflow_ros.fit.refine import refine
 from valveflow_ros.fit.whitening import whitened

@@ -23,15 +23,10 @@ from streams import (
     steps_and_ramps,
 )
 
-from valveflow_ros.config import Settings
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SegmentKind, Signal
+from valveflow_ros.segments.kernel import NO_DATA, SETTLED_SLOPE, SETTLED_STEADY, TRANSIENT
 from valveflow_ros.segments.segmenter import Segmenter
-from valveflow_ros.segments.segmenter_kernel import (
-    NO_DATA,
-    SETTLED_SLOPE,
-    SETTLED_STEADY,
-    TRANSIENT,
-)
 
 # Seconds instead of minutes, so that a few hundred rows hold many segments.
 QUICK = {

@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from selection_kinds import KINDS, SEEDS_FOR_TESTS, draw
 from streams import examples
 
-from valveflow_ros.fit.grow import KNEE_GAIN, confidence, shifted
+from valveflow_ros.fit.knots import KNEE_GAIN, confidence, shifted
 from valveflow_ros.partition.partition import partition
 from valveflow_ros.partition.selection import select
-from valveflow_ros.partition.selection_lines import Workshop, thinned
-from valveflow_ros.partition.selection_series import Series, describe
+from valveflow_ros.partition.series import Series, Workshop, describe, thinned
 
 COMPILED = not numba.config.DISABLE_JIT
 N = 2000 if COMPILED else 400

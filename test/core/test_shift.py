@@ -19,11 +19,11 @@ from valveflow_ros.curve.characteristic import (
     RegionDynamics,
     ResidualStatistics,
     Source,
+    curve_error,
+    piece_error,
 )
-from valveflow_ros.curve.line_error import curve_error, piece_error
 from valveflow_ros.curve.segment_residual import segment_residuals
-from valveflow_ros.curve.shift import ShiftLimits, judge_shift
-from valveflow_ros.curve.shift_json import shift_json
+from valveflow_ros.curve.shift import ShiftLimits, judge_shift, shift_json
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import NS_PER_S, SegmentKind, SpecialSegment
 

@@ -11,13 +11,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import INTERPRETED, START_NS, examples, grid_ns, table_of
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.curve.compensation import compensate
 from valveflow_ros.errors import DataError
-from valveflow_ros.fit.step_curve import ENOUGH, Points, broken_line, pooled
 from valveflow_ros.fit.step_levels import holds, long_run_sd, looks_like_step_test
-from valveflow_ros.fit.step_test import RULE, identify_step_test
+from valveflow_ros.fit.step_test import (
+    ENOUGH,
+    RULE,
+    Points,
+    broken_line,
+    identify_step_test,
+    pooled,
+)
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.step_test import StepPlan, step_test
 from valveflow_ros.plant.unit import paper_curve

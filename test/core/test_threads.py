@@ -4,21 +4,21 @@ import threading
 
 import pytest
 
-from valveflow_ros import threads
-from valveflow_ros.threads import ahead, share
+from valveflow_ros import numerics
+from valveflow_ros.numerics import ahead, share
 
 
 @pytest.fixture(params=[1, 2, 4])
 def on_cores(request, monkeypatch):
-    monkeypatch.setattr(threads, 'cores', lambda: request.param)
+    monkeypatch.setattr(numerics, 'cores', lambda: request.param)
     return request.param
 
 
 @pytest.mark.parametrize(('told', 'most'), [('1', 1), ('', 64), ('0', 1), ('nonsense', 64)])
 def test_numbas_limit_is_ours(monkeypatch, told, most):
-    monkeypatch.setattr(threads.os, 'sched_getaffinity', lambda _: set(range(64)), raising=False)
+    monkeypatch.setattr(numerics.os, 'sched_getaffinity', lambda _: set(range(64)), raising=False)
     monkeypatch.setenv('NUMBA_NUM_THREADS', told)
-    assert threads.cores() == most
+    assert numerics.cores() == most
 
 
 def numbers(n, seen, wrong_at=None):

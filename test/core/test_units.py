@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import examples
 
-from valveflow_ros.config import PARAMETERS
 from valveflow_ros.errors import InputError
+from valveflow_ros.parameters import PARAMETERS
 from valveflow_ros.records import SIGNALS, Signal
 from valveflow_ros.signals.units import UNITS, convert, integrated_input, unit_of
 

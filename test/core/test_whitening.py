@@ -10,9 +10,9 @@ from scipy.linalg import solve_toeplitz
 from scipy.signal import lfilter
 from streams import examples, needs_jit
 
-from valveflow_ros.curve.regional_kernel import lagged_products
+from valveflow_ros.curve.regional_model import lagged_products
 from valveflow_ros.fit.whitening import ORDER, fit_ar, inflation, whitened, yule_walker
-from valveflow_ros.sums import running_average
+from valveflow_ros.numerics import running_average
 
 seeds = st.integers(0, 2**32 - 1)
 

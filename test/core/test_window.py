@@ -9,7 +9,7 @@ from streams import START_NS, blocks_of, examples
 from valveflow_ros.records import NS_PER_S, SegmentKind, SpecialSegment
 from valveflow_ros.segments.segmenter import FoundSegment
 from valveflow_ros.segments.window import RollingWindow
-from valveflow_ros.state_bytes import from_bytes, to_bytes
+from valveflow_ros.state import from_bytes, to_bytes
 
 
 def segment(number, first, end, start_ns, kind=SegmentKind.STEADY):

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from valveflow_ros.curve.model import RegionalModel
+from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.diagnose import Record, diagnose
 from valveflow_ros.diagnosis.result import Diagnosis
 from valveflow_ros.plant.simulator import simulate

@@ -9,9 +9,9 @@ import pytest
 from diagnosis_records import masked, record, table, unit
 
 from valveflow_ros.diagnosis import actuator
-from valveflow_ros.diagnosis.actuator_sizes import sized
-from valveflow_ros.diagnosis.grid import make_scene
-from valveflow_ros.diagnosis.outside import notes
+from valveflow_ros.diagnosis.actuator import sized
+from valveflow_ros.diagnosis.diagnose import notes
+from valveflow_ros.diagnosis.scene import make_scene
 from valveflow_ros.records import Signal
 
 pytestmark = pytest.mark.skipif(

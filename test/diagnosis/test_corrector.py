@@ -16,13 +16,12 @@ from test_diagnosis_parts import TYPICAL
 from valveflow_ros.diagnosis.cause import Active
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.corrector import corrector_of
-from valveflow_ros.diagnosis.extended import Extended, answer
-from valveflow_ros.diagnosis.extended_model import ExtendedModel
-from valveflow_ros.diagnosis.grid import make_scene
+from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
+from valveflow_ros.diagnosis.scene import make_scene
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import NS_PER_S, Quality, SampleTable, Signal
 from valveflow_ros.signals.units import integrated_input
-from valveflow_ros.state_bytes import from_bytes, to_bytes
+from valveflow_ros.state import from_bytes, to_bytes
 
 pytestmark = pytest.mark.skipif(
     os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled loops'

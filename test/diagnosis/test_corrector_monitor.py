@@ -12,23 +12,22 @@ from diagnosis_records import EXPONENT, STEP_S, record, rough_model, table, unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.diagnosis.cause import Active
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.corrector import corrector_of
-from valveflow_ros.diagnosis.extended import Extended, answer
-from valveflow_ros.diagnosis.extended_model import ExtendedModel
-from valveflow_ros.diagnosis.grid import make_scene
-from valveflow_ros.diagnosis.on_top import freed, on_top
+from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
+from valveflow_ros.diagnosis.from_window import freed, on_top
+from valveflow_ros.diagnosis.scene import make_scene
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit
-from valveflow_ros.monitoring.corrector import Correction, Corrector
 from valveflow_ros.monitoring.events import FitRequested
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_rows
 from valveflow_ros.monitoring.prediction import PredictionBlock
+from valveflow_ros.monitoring.rows import Correction, Corrector
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import Quality, SampleTable, Signal
 
 pytestmark = pytest.mark.skipif(

@@ -13,16 +13,15 @@ from diagnosis_records import record, rough_model, table, unit
 from hypothesis import given
 from hypothesis import strategies as st
 
-from valveflow_ros.diagnosis import kernels, quality
+from valveflow_ros.diagnosis import kernels, record_faults
 from valveflow_ros.diagnosis.cause import Active, Stage, Told
 from valveflow_ros.diagnosis.causes import catalogue
-from valveflow_ros.diagnosis.diagnosis_json import model_from_json, model_json
-from valveflow_ros.diagnosis.extended import Extended, answer
+from valveflow_ros.diagnosis.evidence import sign_flip
+from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
 from valveflow_ros.diagnosis.fitting import Task, base_mask, base_tangents, cause_tangents
-from valveflow_ros.diagnosis.gain import sign_flip
-from valveflow_ros.diagnosis.grid import make_scene
-from valveflow_ros.diagnosis.scene import ORDER, SEALED_FOLD
-from valveflow_ros.diagnosis.simplify import simplified
+from valveflow_ros.diagnosis.result import model_from_json, model_to_json
+from valveflow_ros.diagnosis.scene import ORDER, SEALED_FOLD, make_scene
+from valveflow_ros.diagnosis.search import simplified
 from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.records import SampleTable, Signal
 
@@ -181,7 +180,7 @@ def test_scores_of_noise_have_even_chances():
 
 def test_a_clean_record_has_no_faults():
     samples = table(0.4, 2, (), unit())
-    bad, found = quality.faults(samples, 2.0)
+    bad, found = record_faults.faults(samples, 2.0)
     assert found == ()
     assert not bad.any()
 
@@ -192,7 +191,7 @@ def test_faults_are_masked_where_they_are():
     places = np.array([3000, 5001, 9000, 12000, 15000])
     values[places, Signal.GENERATED_POWER] += 60.0
     values[7000:8000, Signal.MAIN_STEAM_PRESSURE] = values[7000, Signal.MAIN_STEAM_PRESSURE]
-    bad, found = quality.faults(SampleTable(samples.time_ns, values, samples.quality), 2.0)
+    bad, found = record_faults.faults(SampleTable(samples.time_ns, values, samples.quality), 2.0)
     assert {(f.name, f.signal.signal) for f in found} == {
         ('spikes', Signal.GENERATED_POWER), ('flatline', Signal.MAIN_STEAM_PRESSURE),
     }  # fmt: skip
@@ -216,8 +215,10 @@ def test_the_extended_model_comes_back_from_its_file(scene):
         (Active(catalogue()['gain_step'], (0.006, 0.2)),
          Active(catalogue()['intervals'], (0.01,), (3600.0, 9000.0))),
     )  # fmt: skip
-    raw = json.loads(json.dumps(model_json(model, 1.125, 5, scene.reference)))
-    back, exponent, start_ns, reference = model_from_json(raw)
+    raw = json.loads(json.dumps(model_to_json(ExtendedModel(model, 1.125, 5, scene.reference))))
+    given = model_from_json(raw)
+    back, exponent = given.model, given.pressure_exponent
+    start_ns, reference = given.start_ns, given.reference
     assert (exponent, start_ns, reference) == (1.125, 5, scene.reference)
     np.testing.assert_array_equal(answer(scene, back), answer(scene, model))
 

@@ -12,12 +12,9 @@ from hypothesis import strategies as st
 
 from valveflow_ros.diagnosis.cause import Active, Kind
 from valveflow_ros.diagnosis.causes import catalogue
-from valveflow_ros.diagnosis.draws import beliefs, free, held
 from valveflow_ros.diagnosis.extended import Extended, answer
-from valveflow_ros.diagnosis.fitting import Task, whitening
-from valveflow_ros.diagnosis.grid import make_scene
-from valveflow_ros.diagnosis.scene import ORDER
-from valveflow_ros.diagnosis.sensor_noise import sensor_noise
+from valveflow_ros.diagnosis.fitting import Task, beliefs, free, held, whitening
+from valveflow_ros.diagnosis.scene import ORDER, make_scene, sensor_noise
 
 pytestmark = pytest.mark.skipif(
     os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled loops'

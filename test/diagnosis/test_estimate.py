@@ -9,14 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from valveflow_ros.diagnosis.cause import Active
+from valveflow_ros.diagnosis.cause import DAY_S, Active, Estimate, dates
 from valveflow_ros.diagnosis.causes import catalogue
-from valveflow_ros.diagnosis.diagnosis_json import cause_json
-from valveflow_ros.diagnosis.estimate import DAY_S, Estimate, dates
-from valveflow_ros.diagnosis.gain import Gain
-from valveflow_ros.diagnosis.result import NamedCause
+from valveflow_ros.diagnosis.evidence import Gain
+from valveflow_ros.diagnosis.result import NamedCause, cause_json
 from valveflow_ros.records import NS_PER_S
-from valveflow_ros.report.diagnosis_words import cells, times_in_effect
+from valveflow_ros.report.diagnosis_figures import cells, times_in_effect
 
 # 2025-03-01 00:00 UTC
 ORIGIN_NS = 1_740_787_200 * NS_PER_S

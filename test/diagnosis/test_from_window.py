@@ -8,13 +8,13 @@ from diagnosis_records import EXPONENT, STEP_S, table, unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from valveflow_ros.config import Settings
 from valveflow_ros.diagnosis.diagnose import Record, diagnose
-from valveflow_ros.diagnosis.diagnosis_json import to_json
 from valveflow_ros.diagnosis.from_window import diagnose_window, table_of
+from valveflow_ros.diagnosis.result import to_json
 from valveflow_ros.monitoring.events import DiagnosisRequested
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_rows
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SampleTable, Signal
 from valveflow_ros.segments.window import WindowContents
 from valveflow_ros.signals.units import integrated_input

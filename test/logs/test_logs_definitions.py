@@ -13,10 +13,16 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import Decoder, Definitions
-from valveflow_ros.logs.mcap.bundled import BUNDLED
+from valveflow_ros.logs.mcap.definitions import (
+    BUNDLED,
+    SEPARATOR,
+    Field,
+    full_name,
+    parse_all,
+    parse_fields,
+    type_hash,
+)
 from valveflow_ros.logs.mcap.layout import LayoutError
-from valveflow_ros.logs.mcap.msgdef import SEPARATOR, Field, full_name, parse_all, parse_fields
-from valveflow_ros.logs.mcap.type_hash import type_hash
 
 MESSAGES = Path(__file__).parents[2] / 'msg'
 OWN = sorted(f'valveflow_msgs/msg/{path.stem}' for path in MESSAGES.glob('*.msg'))

@@ -16,14 +16,21 @@ from log_files import (
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import Decoder, RecordingWriter, open_log
-from valveflow_ros.logs.limits import Limits
 from valveflow_ros.logs.mcap import recover
-from valveflow_ros.logs.mcap.chunk_builder import ChunkBuilder
-from valveflow_ros.logs.mcap.compression import Unpacker
-from valveflow_ros.logs.mcap.layout import MAGIC, Channel, LayoutError, Op, Schema, pack_header
-from valveflow_ros.logs.mcap.topic_book import REPEAT_CHUNKS, TableSchedule
-from valveflow_ros.logs.mcap.topic_table import TopicTable
+from valveflow_ros.logs.mcap.chunk_file import ChunkBuilder
+from valveflow_ros.logs.mcap.layout import (
+    MAGIC,
+    Channel,
+    LayoutError,
+    Op,
+    Schema,
+    Unpacker,
+    pack_header,
+)
+from valveflow_ros.logs.mcap.summary import TopicTable
+from valveflow_ros.logs.mcap.writer import REPEAT_CHUNKS, TableSchedule
 from valveflow_ros.logs.part_file import PartFile
+from valveflow_ros.logs.source import Limits
 from valveflow_ros.records import SIGNALS
 
 PACKED = zstandard.ZstdCompressor().compress(bytes(100))
@@ -161,7 +168,7 @@ def test_chunks_before_the_first_table_that_is_left_are_read(tmp_path):
 
 
 def test_more_of_one_time_than_can_wait_is_one_sentence(tmp_path, monkeypatch):
-    monkeypatch.setattr('valveflow_ros.logs.mcap.journal.MAX_WAITING_BYTES', 1 << 20)
+    monkeypatch.setattr('valveflow_ros.logs.mcap.reading.MAX_WAITING_BYTES', 1 << 20)
     with RecordingWriter(tmp_path / 'log', definitions=STOCK) as writer:
         writer.add_topic('/valve_opening', FLOAT64)
         writer.add_topic('/note', 'std_msgs/msg/String')

@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader
 from valveflow_ros.errors import DataError, RecordingError
 from valveflow_ros.logs import open_log, write_samples
 from valveflow_ros.logs.mcap.importing import strictly_increasing
-from valveflow_ros.logs.tables.historian_units import of_gauge, spelling
+from valveflow_ros.logs.tables.words import of_gauge, spelling
 from valveflow_ros.records import SIGNALS, SampleTable, table_to_readings
 
 

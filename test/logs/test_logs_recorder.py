@@ -19,7 +19,7 @@ from valveflow_ros.logs import (
     RecorderState,
     open_log,
 )
-from valveflow_ros.logs.mcap.ledger import DROPS_SHOWN_S, Ledger
+from valveflow_ros.logs.mcap.recorder_loop import DROPS_SHOWN_S, Ledger
 from valveflow_ros.logs.part_file import PartFile, is_held
 
 QUICK = RecorderSettings(

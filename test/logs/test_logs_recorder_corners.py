@@ -30,8 +30,7 @@ from valveflow_ros.logs import (
 )
 from valveflow_ros.logs.mcap import recover
 from valveflow_ros.logs.mcap.layout import Op
-from valveflow_ros.logs.mcap.ledger import Ledger
-from valveflow_ros.logs.mcap.recorder_loop import RecorderLoop
+from valveflow_ros.logs.mcap.recorder_loop import Ledger, RecorderLoop
 from valveflow_ros.logs.mcap.writer import Message
 from valveflow_ros.logs.part_file import PartFile, taken
 

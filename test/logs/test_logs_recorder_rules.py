@@ -26,12 +26,10 @@ from valveflow_ros.logs import (
     open_log,
 )
 from valveflow_ros.logs.mcap import recorder_loop
-from valveflow_ros.logs.mcap.chunk_builder import ChunkBuilder
-from valveflow_ros.logs.mcap.compression import ZSTD, Unpacker
-from valveflow_ros.logs.mcap.layout import CHUNK_HEAD, RECORD_HEAD, Op
-from valveflow_ros.logs.mcap.ledger import DROPS_SHOWN_S, Ledger
-from valveflow_ros.logs.mcap.qos import Qos
-from valveflow_ros.logs.mcap.recorder_loop import NewTopic, RecorderLoop
+from valveflow_ros.logs.mcap.chunk_file import ChunkBuilder
+from valveflow_ros.logs.mcap.layout import CHUNK_HEAD, RECORD_HEAD, ZSTD, Op, Unpacker
+from valveflow_ros.logs.mcap.recorder_loop import DROPS_SHOWN_S, Ledger, NewTopic, RecorderLoop
+from valveflow_ros.logs.mcap.writer import Qos
 
 STEP_S = 7.0
 

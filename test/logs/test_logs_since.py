@@ -11,7 +11,7 @@ from log_files import FLOAT64, START_NS, STOCK, float64
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import LogContents, RecordingWriter, messages_since, open_log
-from valveflow_ros.logs.mcap import since
+from valveflow_ros.logs.mcap import reading
 from valveflow_ros.logs.mcap.folder import Split, finished_files
 from valveflow_ros.logs.mcap.writer import Message
 
@@ -103,7 +103,7 @@ def test_a_split_that_is_finished_while_it_is_looked_for_is_read_under_its_new_n
 ) -> None:
     for path in folder.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
-    read = since.read_recording
+    read = reading.read_recording
     tries: list[list[Path]] = []
 
     def finished_meanwhile(wanted: list[Path], *more: Any) -> LogContents:
@@ -112,7 +112,7 @@ def test_a_split_that_is_finished_while_it_is_looked_for_is_read_under_its_new_n
             part.rename(part.with_suffix(''))
         return read(wanted, *more)
 
-    monkeypatch.setattr(since, 'read_recording', finished_meanwhile)
+    monkeypatch.setattr(reading, 'read_recording', finished_meanwhile)
     found = [m.log_time_ns for m in messages_since(tmp_path, START_NS + 500)]
     np.testing.assert_array_equal(found, START_NS + np.arange(501, N))
     assert len(tries) == 2

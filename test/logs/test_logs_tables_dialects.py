@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.logs import open_log, read_table
-from valveflow_ros.logs.tables.table_options import TableOptions
-from valveflow_ros.logs.tables.tables import table_file
+from valveflow_ros.logs.tables.refusal import TableOptions
+from valveflow_ros.logs.tables.table import table_file
 from valveflow_ros.records import SIGNALS, Signal
 
 START = dt.datetime(2026, 11, 22, 14, 5, 0)

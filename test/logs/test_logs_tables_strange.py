@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import open_log, read_table
-from valveflow_ros.logs.tables.historian_quality import foreign_quality
-from valveflow_ros.logs.tables.table_lines import LONGEST_LINE
+from valveflow_ros.logs.tables.cells import foreign_quality
+from valveflow_ros.logs.tables.file import LONGEST_LINE
 from valveflow_ros.records import Quality, Signal
 
 HEAD = 'time,valve position,ms pressure [MPa],ms temperature,MW'

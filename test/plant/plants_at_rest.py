@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from valveflow_ros.plant.recorder import SimulatedLog
+from valveflow_ros.plant.simulator import SimulatedLog
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.plant.step_test import StepPlan, step_test
 from valveflow_ros.plant.unit import UnitDescription

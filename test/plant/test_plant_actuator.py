@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from valveflow_ros.plant import actuator
-from valveflow_ros.plant.hooks import Bank
+from valveflow_ros.plant import loop
+from valveflow_ros.plant.effect import Bank
 
 paths = st.lists(st.floats(0.0, 100.0, width=32), min_size=1, max_size=60)
 widths = st.floats(0.0, 5.0, width=32)
@@ -16,9 +16,9 @@ widths = st.floats(0.0, 5.0, width=32)
 
 def through(bank: Bank, path: list[float], step_s: float = 1.0) -> np.ndarray:
     """Send a path through a bank that rests at its first value."""
-    settings = actuator.settings(bank, step_s)
-    positions = np.full(actuator.N_POSITIONS, path[0])
-    return np.array([actuator.move(v, positions, settings) for v in path])
+    settings = loop.settings(bank, step_s)
+    positions = np.full(loop.N_POSITIONS, path[0])
+    return np.array([loop.move(v, positions, settings) for v in path])
 
 
 @given(paths)

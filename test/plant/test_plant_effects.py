@@ -7,8 +7,7 @@ import pytest
 from plants_at_rest import DAYS, spec
 
 from valveflow_ros.plant.effects import catalogue
-from valveflow_ros.plant.recorder import SimulatedLog
-from valveflow_ros.plant.simulator import simulate
+from valveflow_ros.plant.simulator import SimulatedLog, simulate
 from valveflow_ros.plant.unit import Programme, UnitDescription
 from valveflow_ros.records import Signal
 

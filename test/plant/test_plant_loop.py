@@ -10,14 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from valveflow_ros.plant.hooks import DAY_S
-from valveflow_ros.plant.lag import lag_coefficients
-from valveflow_ros.plant.plant import Disturbance
-from valveflow_ros.plant.programme import LoadProgramme
-from valveflow_ros.plant.random_unit import random_unit
+from valveflow_ros.plant.effect import DAY_S
+from valveflow_ros.plant.loop import lag_coefficients
+from valveflow_ros.plant.plant import Disturbance, LoadProgramme
 from valveflow_ros.plant.simulator import WARM_UP_S, simulate
 from valveflow_ros.plant.spec import EffectSpec
-from valveflow_ros.plant.unit import Region, UnitDescription
+from valveflow_ros.plant.unit import Region, UnitDescription, random_unit
 
 
 @dataclass

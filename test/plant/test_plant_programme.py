@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from valveflow_ros.plant.hooks import DAY_S
-from valveflow_ros.plant.programme import LoadProgramme, Pulses, load_knots
-from valveflow_ros.plant.recorder import SimulatedLog
-from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate, simulate_parts
+from valveflow_ros.plant.effect import DAY_S
+from valveflow_ros.plant.plant import LoadProgramme, Pulses, load_knots
+from valveflow_ros.plant.simulator import DEFAULT_START_NS, SimulatedLog, simulate, simulate_parts
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.plant.unit import Noise, Programme, UnitDescription
 from valveflow_ros.records import NS_PER_S, Quality, Signal

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from valveflow_ros.plant.effects.spikes import spikes
+from valveflow_ros.plant.effects.record import spikes
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.plant.unit import UnitDescription

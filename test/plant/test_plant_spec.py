@@ -158,7 +158,7 @@ def test_the_log_says_what_was_active() -> None:
 
 
 NEW_FILE = """
-from valveflow_ros.config import Parameter
+from valveflow_ros.parameters import Parameter
 from valveflow_ros.plant.effect import Effect
 
 

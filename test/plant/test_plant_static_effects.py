@@ -9,7 +9,7 @@ import pytest
 from plants_at_rest import DAYS, at_rest, rest_points, spec
 
 from valveflow_ros.errors import InputError
-from valveflow_ros.plant.effects.intervals import intervals_s
+from valveflow_ros.plant.effects.changes import intervals_s
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.plant.unit import Programme, UnitDescription
 from valveflow_ros.records import NS_PER_S, Signal

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from valveflow_ros.errors import InputError
-from valveflow_ros.plant.random_unit import random_unit
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.plant.step_test import StepPlan, step_test
-from valveflow_ros.plant.unit import UnitDescription
+from valveflow_ros.plant.unit import UnitDescription, random_unit
 from valveflow_ros.records import Signal
 
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from valveflow_ros.errors import InputError
-from valveflow_ros.plant.random_unit import random_unit
 from valveflow_ros.plant.simulator import simulate, simulate_parts
-from valveflow_ros.plant.unit import Curve, Noise, Programme, Region, UnitDescription
+from valveflow_ros.plant.unit import Curve, Noise, Programme, Region, UnitDescription, random_unit
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from chromium import BROWSERS, Chromium, installed
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
@@ -17,6 +16,7 @@ from valveflow_ros.curve.characteristic import (
     ResidualStatistics,
     Source,
 )
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
     NS_PER_S,
     SIGNALS,

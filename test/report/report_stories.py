@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from valveflow_ros.curve.model import RegionalModel
-from valveflow_ros.diagnosis.estimate import Estimate
+from valveflow_ros.curve.regional_model import RegionalModel
+from valveflow_ros.diagnosis.cause import Estimate
+from valveflow_ros.diagnosis.evidence import Gain, SegmentGain
 from valveflow_ros.diagnosis.extended import Extended
-from valveflow_ros.diagnosis.gain import Gain, SegmentGain
-from valveflow_ros.diagnosis.residual_map import ResidualMap
 from valveflow_ros.diagnosis.result import NAMED, Diagnosis, NamedCause
 from valveflow_ros.diagnosis.scene import Reference
-from valveflow_ros.diagnosis.signature import Answer, Signature
-from valveflow_ros.monitoring.alarm_records import AlarmState
+from valveflow_ros.diagnosis.signature import Answer, ResidualMap, Signature
+from valveflow_ros.monitoring.alarm import AlarmState
 from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.diagnosis import Diagnosed
-from valveflow_ros.report.history_data import AlarmMoment, CurveMoment, DiagnosisMoment, History
+from valveflow_ros.report.history import AlarmMoment, CurveMoment, DiagnosisMoment, History
 
 START_NS = 1_700_000_000 * NS_PER_S
 HOUR_NS = 3600 * NS_PER_S

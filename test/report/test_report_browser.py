@@ -17,13 +17,13 @@ from report_stories import diagnosed, history
 from valveflow_ros.cli.comparing import compared
 from valveflow_ros.cli.console import Console
 from valveflow_ros.cli.main import main
-from valveflow_ros.cli.mapping import read_mapping
+from valveflow_ros.cli.options import read_mapping
 from valveflow_ros.cli.truth_file import read_truth_file
 from valveflow_ros.cli.validating import validated
 from valveflow_ros.report.comparison import comparison_page
-from valveflow_ros.report.comparison_validation import validation_page
 from valveflow_ros.report.diagnosis import diagnosis_page
 from valveflow_ros.report.identification import identification_page
+from valveflow_ros.report.validation import validation_page
 
 PHONE, DESKTOP = 390, 1280
 LEAST_PX = 14.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from valveflow_ros.curve.characteristic import Support
-from valveflow_ros.report.choice import confidence_table
+from valveflow_ros.report.answer import confidence_table
 from valveflow_ros.report.identification import identification_report
 
 

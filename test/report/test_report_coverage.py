@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from valveflow_ros.report.coverage import coverage_figure, presence, presence_figure
 from valveflow_ros.report.curve import curve_figure, last_range
+from valveflow_ros.report.data import coverage_figure, presence, presence_figure
 
 
 def test_hours_add_up_to_the_log(identified):

@@ -14,10 +14,9 @@ from valveflow_ros.curve.characteristic import HeldCause
 from valveflow_ros.diagnosis import causes
 from valveflow_ros.diagnosis.result import NOTHING
 from valveflow_ros.report.diagnosis import diagnosis_page
-from valveflow_ros.report.diagnosis_words import axis_titles, points_to
-from valveflow_ros.report.numbers import decimals
-from valveflow_ros.report.picture_data import plain_text
-from valveflow_ros.report.words import _FROM_THE_MEAN, held_words
+from valveflow_ros.report.diagnosis_figures import axis_titles, points_to
+from valveflow_ros.report.figure import plain_text
+from valveflow_ros.report.words import _FROM_THE_MEAN, decimals, held_words
 
 
 def words_of(text):

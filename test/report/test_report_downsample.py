@@ -8,13 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from valveflow_ros.records import SegmentKind, SpecialSegment
-from valveflow_ros.report.downsample import (
-    density,
-    envelope,
-    segment_path,
-    segment_rows,
-    thin,
-)
+from valveflow_ros.report.figure import density, envelope, segment_path, segment_rows, thin
 
 VALUES = hnp.arrays(
     np.float64, st.integers(1, 300), elements=st.floats(-1e6, 1e6) | st.just(np.nan)

@@ -16,9 +16,8 @@ from valveflow_ros.errors import InputError
 from valveflow_ros.report import drawing
 from valveflow_ros.report.diagnosis import diagnosis_page
 from valveflow_ros.report.drawing import figure_files, palette
-from valveflow_ros.report.figure import Figure, packed
+from valveflow_ros.report.figure import Figure, figure_csv, numbers, packed, plain_text
 from valveflow_ros.report.identification import identification_page
-from valveflow_ros.report.picture_data import figure_csv, numbers, plain_text
 
 
 @pytest.fixture(scope='module')

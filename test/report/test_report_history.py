@@ -11,16 +11,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from report_stories import HOUR_NS, KNOTS, START_NS, STEP_MW, history
 
-from valveflow_ros.monitoring.alarm_records import AlarmState
+from valveflow_ros.monitoring.alarm import AlarmState
 from valveflow_ros.report.history import (
+    AlarmMoment,
+    History,
+    alarms_table,
     curve_history_figure,
     followed,
     history_sections,
     largest_move,
     powers,
+    spans,
+    standing_s,
+    timeline_figure,
 )
-from valveflow_ros.report.history_data import AlarmMoment, History
-from valveflow_ros.report.timeline import alarms_table, spans, standing_s, timeline_figure
 
 
 def test_a_log_of_no_monitor_has_no_history():

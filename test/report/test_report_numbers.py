@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from valveflow_ros.report import numbers
+from valveflow_ros.report import words
 
 ANY = st.floats(allow_nan=True, allow_infinity=True)
 FINITE = st.floats(-1e12, 1e12)
@@ -22,8 +22,8 @@ def value_of(text):
 @given(ANY)
 def test_no_number_reads_nan_or_inf(value):
     for text in (
-        numbers.plain(value), numbers.decimals(value, 2), numbers.with_error(value, value),
-        numbers.interval(value, value), numbers.percent(value), numbers.duration(abs(value)),
+        words.plain(value), words.decimals(value, 2), words.with_error(value, value),
+        words.interval(value, value), words.percent(value), words.duration(abs(value)),
     ):  # fmt: skip
         assert not re.search(r'nan|inf', text)
         assert text
@@ -32,13 +32,13 @@ def test_no_number_reads_nan_or_inf(value):
 @given(FINITE, st.integers(1, 8))
 def test_plain_keeps_the_digits_asked_for(value, digits):
     assert math.isclose(
-        value_of(numbers.plain(value, digits)), value, rel_tol=0.6 * 10.0 ** (1 - digits)
+        value_of(words.plain(value, digits)), value, rel_tol=0.6 * 10.0 ** (1 - digits)
     )
 
 
 @given(st.floats(-1e5, 1e5), st.floats(1e-4, 1e3))
 def test_error_decides_the_digits(value, error):
-    text = numbers.with_error(value, error, 'MW')
+    text = words.with_error(value, error, 'MW')
     assert text.endswith(' MW')
     shown, spread = (value_of(part) for part in text.removesuffix(' MW').split(' ± '))
     assert abs(shown - value) <= 0.06 * error + 0.5
@@ -47,7 +47,7 @@ def test_error_decides_the_digits(value, error):
 
 @given(st.floats(0.0, 1e9))
 def test_a_duration_is_within_its_smaller_unit(seconds):
-    text = numbers.duration(seconds)
+    text = words.duration(seconds)
     sizes = {'d': 86400.0, 'h': 3600.0, 'min': 60.0, 's': 1.0}
     parts = re.findall(r'([0-9.e+-]+) (d|h|min|s)\b', text)
     assert 1 <= len(parts) <= 2
@@ -62,23 +62,23 @@ def test_a_duration_is_within_its_smaller_unit(seconds):
      (90000, '1 d 1 h'), (86399, '1 d')],
 )  # fmt: skip
 def test_durations(seconds, text):
-    assert numbers.duration(seconds) == text
+    assert words.duration(seconds) == text
 
 
 @given(st.floats(0.0, 1.0, exclude_max=True))
 def test_not_quite_all_never_reads_as_all(share):
-    assert numbers.percent(share) != '100 %'
+    assert words.percent(share) != '100 %'
 
 
 def test_small_things():
-    assert numbers.percent(1.0) == '100 %'
-    assert numbers.percent(0.99954) == '99.954 %'
-    assert numbers.with_error(0.2397, 0.00061) == '0.23970 ± 0.00061'
-    assert numbers.with_error(5.0, math.nan, 's') == '5.000 s'
-    assert numbers.decimals(-0.001, 1) == '0.0'
-    assert numbers.plain(-2.5) == '−2.500'
-    assert numbers.interval(1245.2, 1257.9) == '1245 to 1258'
-    assert numbers.counted(1, 'piece') == '1 piece'
-    assert numbers.counted(2300, 'piece') == '2\u202f300 pieces'
-    assert numbers.moment(0) == '1970-01-01 00:00:00 UTC'
-    assert 'since 1970' in numbers.moment(2**62 * 100)
+    assert words.percent(1.0) == '100 %'
+    assert words.percent(0.99954) == '99.954 %'
+    assert words.with_error(0.2397, 0.00061) == '0.23970 ± 0.00061'
+    assert words.with_error(5.0, math.nan, 's') == '5.000 s'
+    assert words.decimals(-0.001, 1) == '0.0'
+    assert words.plain(-2.5) == '−2.500'
+    assert words.interval(1245.2, 1257.9) == '1245 to 1258'
+    assert words.counted(1, 'piece') == '1 piece'
+    assert words.counted(2300, 'piece') == '2\u202f300 pieces'
+    assert words.moment(0) == '1970-01-01 00:00:00 UTC'
+    assert 'since 1970' in words.moment(2**62 * 100)

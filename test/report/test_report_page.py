@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 from report_stories import diagnosed, history
 
-from valveflow_ros.config import Settings
 from valveflow_ros.errors import InputError
-from valveflow_ros.report import library
+from valveflow_ros.parameters import Settings
+from valveflow_ros.report import page
 from valveflow_ros.report.curve import band
+from valveflow_ros.report.data import gaps, rejected, usable_share
 from valveflow_ros.report.diagnosis import diagnosis_page
 from valveflow_ros.report.figure import Figure, packed, rounded
 from valveflow_ros.report.identification import identification_page, identification_report
 from valveflow_ros.report.identified import Identified
-from valveflow_ros.report.library import packed_plotly, read_text
-from valveflow_ros.report.quality import gaps, rejected, usable_share
+from valveflow_ros.report.page import packed_plotly, read_text
 
 MEGABYTE = 1_000_000
 
@@ -246,20 +246,20 @@ def test_a_picture_cannot_close_its_script():
 
 
 def test_a_missing_library_is_one_sentence(monkeypatch, tmp_path):
-    library.packed_plotly.cache_clear()
+    page.packed_plotly.cache_clear()
     try:
-        monkeypatch.setattr(library, 'find_spec', lambda name: None)
+        monkeypatch.setattr(page, 'find_spec', lambda name: None)
         with pytest.raises(InputError, match='pip install plotly'):
-            library.packed_plotly()
+            page.packed_plotly()
 
         class Spec:
             origin = str(tmp_path / '__init__.py')
 
-        monkeypatch.setattr(library, 'find_spec', lambda name: Spec)
+        monkeypatch.setattr(page, 'find_spec', lambda name: Spec)
         with pytest.raises(InputError, match='incomplete'):
-            library.packed_plotly()
+            page.packed_plotly()
     finally:
-        library.packed_plotly.cache_clear()
+        page.packed_plotly.cache_clear()
 
 
 def test_pointing_at_anything_tells_a_unit(identified):

@@ -11,9 +11,9 @@ from report_stories import HOUR_NS, START_NS, history
 
 from valveflow_ros.cli.monitor_history import history_in
 from valveflow_ros.logs import Definitions, open_log
-from valveflow_ros.monitoring.alarm_records import AlarmState
+from valveflow_ros.monitoring.alarm import AlarmState
 from valveflow_ros.records import NS_PER_S
-from valveflow_ros.report.history_data import AlarmMoment
+from valveflow_ros.report.history import AlarmMoment
 
 
 def stamp(time_ns):

@@ -9,10 +9,9 @@ import pytest
 
 from valveflow_ros.curve.shift import judge_shift
 from valveflow_ros.records import Signal
+from valveflow_ros.report.curve import segments_figure, shift_section
 from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.identification import identification_report
-from valveflow_ros.report.segment_figure import segments_figure
-from valveflow_ros.report.shift import shift_section
 from valveflow_ros.signals.units import integrated_input
 
 

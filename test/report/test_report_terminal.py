@@ -9,11 +9,9 @@ import re
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from valveflow_ros.report.terminal import terminal_text
-from valveflow_ros.report.terminal.terminal_canvas import DOTS_X, DOTS_Y, Canvas
-from valveflow_ros.report.terminal.terminal_changes import changes
-from valveflow_ros.report.terminal.terminal_draw import screen
-from valveflow_ros.report.terminal.terminal_frame import (
+from valveflow_ros.report.terminal import text
+from valveflow_ros.report.terminal.draw import DOTS_X, DOTS_Y, Canvas, screen
+from valveflow_ros.report.terminal.frame import (
     AlarmView,
     CurveView,
     DiagnosisView,
@@ -21,7 +19,8 @@ from valveflow_ros.report.terminal.terminal_frame import (
     HealthView,
     SampleView,
 )
-from valveflow_ros.report.terminal.terminal_text import cells, clean, cut, painted, wrapped
+from valveflow_ros.report.terminal.screen import changes
+from valveflow_ros.report.terminal.text import cells, clean, cut, painted, wrapped
 
 SECOND = 10**9
 START = 1_700_000_000 * SECOND
@@ -189,10 +188,8 @@ def test_what_is_cut_is_as_long_as_it_may_be(text, width):
 
 def test_the_length_of_a_word_of_others_costs_nothing(monkeypatch):
     looked = []
-    count = terminal_text.cells
-    monkeypatch.setattr(
-        terminal_text, 'cells', lambda text: looked.append(len(text)) or count(text)
-    )
+    count = text.cells
+    monkeypatch.setattr(text, 'cells', lambda text: looked.append(len(text)) or count(text))
     assert cut('x' * 100_000, 60) == 'x' * 59 + '…'
     assert sum(looked) < 100
     assert len(clean('y ' * 100_000)) < 5000

@@ -9,7 +9,7 @@ import time
 from dataclasses import replace
 from typing import Any
 
-from valveflow_ros.config import Settings
+from valveflow_ros.parameters import Settings
 from valveflow_ros.ros.node.warmup import made_up_curve
 
 
@@ -92,7 +92,7 @@ def told(task: Any) -> Any:
 
 def diagnosed(task: Any) -> Any:
     """Return a small diagnosis at once."""
-    from valveflow_ros.monitoring.diagnosis_task import DiagnosisContent
+    from valveflow_ros.monitoring.events import DiagnosisContent
 
     content = {
         'verdict': 'nothing', 'sentence': 'The model explains the unit.', 'causes': [],

@@ -24,18 +24,17 @@ from valveflow_msgs.msg import (
 )
 from valveflow_msgs.msg import JournalEntry as JournalMessage
 
-from valveflow_ros.config import Settings
 from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState, Priority
-from valveflow_ros.monitoring.curve_status import CurveStatus
+from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.events import JournalEntry, JournalKind
 from valveflow_ros.monitoring.prediction import PredictionBlock, PredictionState
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, Quality, SegmentKind
 from valveflow_ros.records import SpecialSegment as SegmentRecord
 from valveflow_ros.ros import conversions
-from valveflow_ros.ros.encoding import encode
+from valveflow_ros.ros.conversions import encode
 from valveflow_ros.ros.node.warmup import made_up_curve
-from valveflow_ros.ros.prediction_bytes import prediction_bytes
-from valveflow_ros.ros.wire import clock_bytes, float64_bytes
+from valveflow_ros.ros.outputs import clock_bytes, float64_bytes, prediction_bytes
 
 times = st.integers(0, (1 << 31) * NS_PER_S - 1)
 texts = st.text(st.characters(exclude_characters='\x00', exclude_categories=['Cs']), max_size=20)

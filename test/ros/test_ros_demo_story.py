@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from valveflow_ros.ros.demo_story import Story, moment
+from valveflow_ros.ros.demo_watch import Story, moment
 
 HOUR = 3600 * 10**9
 T0 = 1_700_006_400 * 10**9  # 2023-11-15 00:00 UTC

@@ -18,25 +18,24 @@ from ros_helpers import Processes, wait_until
 from test_ros_live import SlowWorker, rows_of
 from valveflow_msgs.msg import Diagnosis
 
-from valveflow_ros.config import Settings
 from valveflow_ros.errors import DataError
-from valveflow_ros.monitoring.diagnosis_task import DiagnosisTask
 from valveflow_ros.monitoring.events import (
     Diagnosed,
     DiagnosisRequested,
+    DiagnosisTask,
     Event,
     JournalEntry,
     JournalKind,
 )
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import JournalReplayer
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import NS_PER_S, Readings, table_to_readings
-from valveflow_ros.ros import diagnosis_message
-from valveflow_ros.ros.chronicle import line_of
-from valveflow_ros.ros.diagnostics import Level
-from valveflow_ros.ros.node.diagnosis_health import diagnosis_item, model_item
+from valveflow_ros.ros import conversions
+from valveflow_ros.ros.diagnostics import Level, line_of
+from valveflow_ros.ros.node.health import diagnosis_item, model_item
 from valveflow_ros.ros.node.live import LiveEngine
 from valveflow_ros.ros.node.monitor_node import MonitorNode
 from valveflow_ros.ros.node.warmup import made_up_curve, made_up_task
@@ -112,7 +111,7 @@ def test_a_bad_result_is_a_sentence(job: str, words: str) -> None:
 
 
 def test_no_result_is_unknown_and_says_why() -> None:
-    message = diagnosis_message.of(Diagnosed(TASK, '', 'Because.'), 'unit 1')
+    message = conversions.of(Diagnosed(TASK, '', 'Because.'), 'unit 1')
     assert (message.verdict, message.sentence) == (Diagnosis.UNKNOWN, 'Because.')
     assert (message.model_id, message.header.frame_id) == (TASK.curve.model_id, 'unit 1')
     assert math.isnan(message.rmse_simulation)
@@ -121,7 +120,7 @@ def test_no_result_is_unknown_and_says_why() -> None:
     assert first.name == 'diagnosis'
     before = deserialize_message(first.data, Diagnosis)
     assert (before.verdict, before.model_id) == (Diagnosis.UNKNOWN, '')
-    assert before.sentence == diagnosis_message.NOT_YET
+    assert before.sentence == conversions.NOT_YET
 
 
 @pytest.fixture(scope='module')
@@ -169,7 +168,7 @@ def test_the_night_and_a_hand_bring_a_diagnosis(
                 if o.name == 'diagnosis']  # fmt: skip
     assert len(messages) == len(found) + 1
     content = json.loads(found[-1].content)
-    assert messages[-1].verdict == diagnosis_message.VERDICTS[content['verdict']]
+    assert messages[-1].verdict == conversions.VERDICTS[content['verdict']]
     assert messages[-1].sentence == content['sentence']
     assert [c.name for c in messages[-1].causes] == [c['name'] for c in content['causes']]
     assert {'gain_step', 'curve_step'} & {c['name'] for c in content['causes']}

@@ -26,17 +26,17 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 from valveflow_msgs.msg import Alarm, Diagnosis, FlowCharacteristic, JournalEntry, Prediction
 
-from valveflow_ros.config import Settings
 from valveflow_ros.logs import LogContents, RecordingWriter, open_log
 from valveflow_ros.monitoring.events import JournalKind
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import SIGNALS, SampleTable, Signal
 from valveflow_ros.ros.conversions import from_time
-from valveflow_ros.ros.demo_processes import ros_arguments
+from valveflow_ros.ros.demo import ros_arguments
+from valveflow_ros.ros.outputs import float64_bytes
 from valveflow_ros.ros.simulator_steps import effects_of
 from valveflow_ros.ros.verify import verify
-from valveflow_ros.ros.wire import float64_bytes
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 DAYS, SEED = 0.3, 7

@@ -13,14 +13,13 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_helpers import Processes, wait_until
 from std_msgs.msg import Float32, Float64
 
-from valveflow_ros.config import Settings
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Signal
-from valveflow_ros.ros.demo_processes import ros_arguments
+from valveflow_ros.ros.demo import ros_arguments
 from valveflow_ros.ros.diagnostics import Changes, Item, Level, array
 from valveflow_ros.ros.inputs import INPUTS, PLANT_SAMPLE
-from valveflow_ros.ros.node.graph import Publishers
-from valveflow_ros.ros.node.input_health import InputHealth
-from valveflow_ros.ros.node.tallies import Tally
+from valveflow_ros.ros.node.input_health import InputHealth, Publishers
+from valveflow_ros.ros.node.intake import Tally
 from valveflow_ros.signals.align import REASONS
 
 TOPICS = {topic.name: f'/plant/{topic.name}' for topic in INPUTS}

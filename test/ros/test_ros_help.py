@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from valveflow_ros.ros import demo_options, replay_main, watch_main
+from valveflow_ros.ros import demo, replay_main, watch_main
 
 _MODULES = ('monitor_main', 'simulator_main', 'replay_main', 'watch_main', 'demo')
 
@@ -38,11 +38,11 @@ def test_help_that_nobody_reads_to_its_end_is_no_accident(module):
         (replay_main.parser, ['x.mcap', '--wait', 'nan'], "such as --wait 60; 'nan' is not"),
         (watch_main.parser, ['--interval', '0'], "from 0.1 to 3600, such as --interval 5; '0' is"),
         (
-            demo_options.parser,
+            demo.parser,
             ['--output', 'd', '--days', '-1'],
             '--days must be a number of days',
         ),
-        (demo_options.parser, ['--output', 'd', '--seed', 'x'], "'x' is no whole number"),
+        (demo.parser, ['--output', 'd', '--seed', 'x'], "'x' is no whole number"),
     ],
 )
 def test_what_is_no_number_is_refused_in_words(parser, words, said, capsys):

@@ -8,16 +8,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from valveflow_msgs.msg import PlantSample
 
-from valveflow_ros.config import Settings
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
-from valveflow_ros.ros.conversions import to_time
-from valveflow_ros.ros.encoding import encode
+from valveflow_ros.ros.conversions import encode, to_time
 from valveflow_ros.ros.inputs import INPUT_ORDER, PLANT_SAMPLE, Decoder, header_time_ns
-from valveflow_ros.ros.node.intake import EARLY_S, MOST_EARLY, Arrival, Intake
-from valveflow_ros.ros.node.stamps import ClockTrack, LogClock
-from valveflow_ros.ros.node.tallies import Tally
-from valveflow_ros.ros.taking import DEPTH, Taken
-from valveflow_ros.ros.wire import clock_bytes, float64_bytes
+from valveflow_ros.ros.node.intake import (
+    EARLY_S,
+    MOST_EARLY,
+    Arrival,
+    ClockTrack,
+    Intake,
+    LogClock,
+    Tally,
+)
+from valveflow_ros.ros.outputs import clock_bytes, float64_bytes
+from valveflow_ros.ros.polled_subscription import DEPTH, Taken
 
 T0 = 1_700_000_000 * NS_PER_S
 NOW = T0 + NS_PER_S  # later than anything was received

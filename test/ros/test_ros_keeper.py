@@ -13,19 +13,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from valveflow_ros.config import Settings
 from valveflow_ros.errors import DataError, RecordingError
 from valveflow_ros.monitoring.events import CurveAdopted
+from valveflow_ros.parameters import Settings
 from valveflow_ros.ros.diagnostics import Level
-from valveflow_ros.ros.node.continuity import Continuity
-from valveflow_ros.ros.node.keeper import Keeper, folder_of
 from valveflow_ros.ros.node.live import LiveEngine
 from valveflow_ros.ros.node.recording import Recording
-from valveflow_ros.ros.node.state_folder import ASIDE, STATE, StateFolder, StateWriter
+from valveflow_ros.ros.node.restart import Continuity
+from valveflow_ros.ros.node.state_store import (
+    ASIDE,
+    STATE,
+    Keeper,
+    StateFolder,
+    StateWriter,
+    folder_of,
+)
 from valveflow_ros.ros.node.warmup import made_up_curve
 from valveflow_ros.ros.outputs import Outputs
-from valveflow_ros.ros.worker.outcome import Outcome
-from valveflow_ros.state_bytes import from_bytes, to_bytes
+from valveflow_ros.ros.worker.worker import Outcome
+from valveflow_ros.state import from_bytes, to_bytes
 
 ENGINE = {'numbers': np.arange(3.0)}
 
@@ -210,8 +216,8 @@ _WRITES = """
 import itertools, os, sys
 import numpy as np
 from pathlib import Path
-from valveflow_ros.state_bytes import to_bytes
-from valveflow_ros.ros.node.state_folder import StateFolder
+from valveflow_ros.state import to_bytes
+from valveflow_ros.ros.node.state_store import StateFolder
 for line in iter(sys.stdin.readline, ''):
     child = os.fork()
     if child:

@@ -17,8 +17,8 @@ from ros_helpers import wait_until
 from std_msgs.msg import Float32
 from std_srvs.srv import Trigger
 
-from valveflow_ros.config import TABLE
 from valveflow_ros.logs import open_log
+from valveflow_ros.parameters import TABLE
 from valveflow_ros.ros import simulator_steps
 from valveflow_ros.ros.node import monitor_node
 from valveflow_ros.ros.node.monitor_node import MonitorNode

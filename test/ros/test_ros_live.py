@@ -7,23 +7,21 @@ import pytest
 from rclpy.serialization import deserialize_message
 from valveflow_msgs.msg import Alarm
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.shift import PieceShift, Shift
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit
-from valveflow_ros.monitoring.alarm_desk import AlarmDesk
-from valveflow_ros.monitoring.alarms import ResidualAlarm
+from valveflow_ros.monitoring.alarms import AlarmDesk, ResidualAlarm, ShiftAlarm
 from valveflow_ros.monitoring.events import CurveAdopted, Event, JournalEntry, JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import JournalReplayer
-from valveflow_ros.monitoring.shift_alarm import ShiftAlarm
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.records import NS_PER_S, Readings, table_to_readings
 from valveflow_ros.ros.inputs import Row
 from valveflow_ros.ros.node.live import LiveEngine
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
 from valveflow_ros.ros.simulator_steps import effects_of
-from valveflow_ros.ros.worker.outcome import Outcome
+from valveflow_ros.ros.worker.worker import Outcome
 from valveflow_ros.signals.align import Aligner
 
 SETTINGS = Settings({'refit_period': 3600.0, 'refit_segments': 0, 'alarm_on_delay': 60.0})

@@ -10,31 +10,31 @@ import pytest
 from extended_file import extended_json, write_extended
 from ros_helpers import PATIENCE_S, Processes, wait_until
 
-from valveflow_ros.config import Settings
-from valveflow_ros.diagnosis.model_json import to_json
+from valveflow_ros.diagnosis.result import model_to_json
 from valveflow_ros.errors import ParameterError, RecordingError
 from valveflow_ros.logs import open_log
+from valveflow_ros.parameters import Settings
 from valveflow_ros.ros import verify as verifying
-from valveflow_ros.ros.demo_processes import ros_arguments
-from valveflow_ros.ros.node import model_file
+from valveflow_ros.ros.demo import ros_arguments
+from valveflow_ros.ros.node import given_files
 from valveflow_ros.ros.node.session import Session
 
 HELD = {'backlash': {'w_percent': 0.5}, 'gain_drift': {'g': 0.05}, 'clock': {'d_s': 3.0}}
 
 
 def test_a_model_is_read_from_its_file(tmp_path: Path) -> None:
-    assert model_file.extended_of(Settings()) is None
-    assert model_file.ready(None, Settings()) is None
-    assert model_file.attached(None) == {}
+    assert given_files.extended_of(Settings()) is None
+    assert given_files.ready(None, Settings()) is None
+    assert given_files.attached(None) == {}
     path = write_extended(tmp_path / 'extended_model.json', **HELD)
     settings = Settings({'model_file': str(path)})
-    given = model_file.extended_of(settings)
+    given = given_files.extended_of(settings)
     assert given is not None
-    assert to_json(given) == extended_json(**HELD)
-    corrector = model_file.ready(given, settings)
+    assert model_to_json(given) == extended_json(**HELD)
+    corrector = given_files.ready(given, settings)
     assert corrector is not None
     assert [h.name for h in corrector.held] == list(HELD)
-    kept = model_file.attached(given)[model_file.ATTACHMENT]
+    kept = given_files.attached(given)[given_files.ATTACHMENT]
     assert json.loads(kept) == extended_json(**HELD)
 
 
@@ -57,7 +57,7 @@ def test_a_bad_file_is_refused_with_a_sentence(
     if text is not None:
         path.write_text(text, encoding='utf-8', errors='surrogateescape')
     with pytest.raises(ParameterError) as caught:
-        model_file.extended_of(Settings({'model_file': str(path)}))
+        given_files.extended_of(Settings({'model_file': str(path)}))
     assert said in str(caught.value)
     assert str(caught.value).startswith("Parameter 'model_file' names")
 
@@ -98,7 +98,7 @@ def test_the_node_takes_causes_out_and_its_recording_repeats(
     assert result.identical, result.difference
     assert result.compared['prediction'] > 1500
     log = open_log(folder)
-    assert json.loads(log.attachments[model_file.ATTACHMENT]) == extended_json(**HELD)
+    assert json.loads(log.attachments[given_files.ATTACHMENT]) == extended_json(**HELD)
     # Rows as measured would have another u from the first one on.
     monkeypatch.setattr(verifying, '_corrector', lambda *_: None)
     assert 'Prediction number 1 differs' in verifying.verify(folder).difference
@@ -109,7 +109,7 @@ def test_a_recording_without_its_model_is_not_verified(tmp_path: Path) -> None:
     settings = Settings({'model_file': 'gone.json'})
     with pytest.raises(RecordingError, match='lacks the attachment'):
         verifying._corrector(log, settings)  # type: ignore[arg-type]
-    log.attachments = {model_file.ATTACHMENT: b'{}'}
+    log.attachments = {given_files.ATTACHMENT: b'{}'}
     with pytest.raises(RecordingError, match='an extended model that cannot be used'):
         verifying._corrector(log, settings)  # type: ignore[arg-type]
     assert verifying._corrector(log, Settings()) is None  # type: ignore[arg-type]

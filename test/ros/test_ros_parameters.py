@@ -12,8 +12,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from ros_helpers import wait_until
 
-from valveflow_ros.config import TABLE, Parameter, Settings, as_yaml
 from valveflow_ros.errors import ParameterError
+from valveflow_ros.parameters import TABLE, Parameter, Settings, as_yaml
 from valveflow_ros.ros import monitor_main
 from valveflow_ros.ros.declare import changed, declare, descriptor, unknown_overrides
 from valveflow_ros.ros.diagnostics import Level
@@ -293,7 +293,7 @@ def test_a_bad_parameter_file_is_one_sentence_and_status_1(
 
 def test_the_parameter_file_is_the_table() -> None:
     # After a change of the table:
-    #   python -c "from valveflow_ros.config import as_yaml; print(as_yaml(), end='')"
+    #   python -c "from valveflow_ros.parameters import as_yaml; print(as_yaml(), end='')"
     # goes to config/monitor.yaml.
     text = (ROOT / 'config' / 'monitor.yaml').read_text()
     assert text == as_yaml()

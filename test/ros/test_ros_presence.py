@@ -20,16 +20,16 @@ from rclpy.node import Node
 from ros_helpers import wait_until
 
 from valveflow_ros.ros import monitor_main
-from valveflow_ros.ros.presence import Presence
-from valveflow_ros.ros.stops import StopFlag, Stopped
+from valveflow_ros.ros.domain import Presence
+from valveflow_ros.ros.process import StopFlag, Stopped
 
 pytestmark = pytest.mark.ros
 # Shows itself, makes a node in the best of the contexts, and tells what is left of the start.
 JOIN = """
 import json, os, sys, time
 import rclpy
-from valveflow_ros.ros.presence import Presence
-from valveflow_ros.ros.transport import choose_transport
+from valveflow_ros.ros.domain import Presence
+from valveflow_ros.ros.domain import choose_transport
 choose_transport()
 def held():
     return [len(os.listdir(f'/proc/self/{what}')) for what in ('task', 'fd')]
@@ -175,7 +175,7 @@ def test_it_shows_itself_only_where_that_helps_and_is_allowed(
         made.append(Told(context, []))
         return made[-1]
 
-    name = 'valveflow_ros.ros.presence.get_rmw_implementation_identifier'
+    name = 'valveflow_ros.ros.domain.get_rmw_implementation_identifier'
     monkeypatch.setattr(name, lambda: middleware)
     monkeypatch.setattr(rclpy, 'create_node', create)
     presence = Presence([], environ=environ)

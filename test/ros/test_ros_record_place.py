@@ -6,8 +6,8 @@ import os
 
 import pytest
 
-from valveflow_ros.config import Settings
 from valveflow_ros.errors import RecordingError
+from valveflow_ros.parameters import Settings
 from valveflow_ros.ros.record_place import check_record_place
 
 

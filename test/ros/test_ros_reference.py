@@ -16,13 +16,12 @@ from ros_helpers import PATIENCE_S, Processes, wait_until
 from std_srvs.srv import Trigger
 from valveflow_msgs.msg import Alarm, FlowCharacteristic
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
 from valveflow_ros.curve.shift import judge_shift
 from valveflow_ros.errors import DataError, ParameterError
 from valveflow_ros.monitoring.alarms import AlarmState
-from valveflow_ros.monitoring.curve_status import CurveStatus
+from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.events import (
     CurveAdopted,
     Event,
@@ -32,11 +31,12 @@ from valveflow_ros.monitoring.events import (
 )
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import JournalReplayer, feed_rows
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.ros import conversions
-from valveflow_ros.ros.demo_processes import ros_arguments
-from valveflow_ros.ros.node.reference_file import reference_of
-from valveflow_ros.ros.node.work_health import reference_item
+from valveflow_ros.ros.demo import ros_arguments
+from valveflow_ros.ros.node.given_files import reference_of
+from valveflow_ros.ros.node.health import reference_item
 from valveflow_ros.ros.outputs import Outputs
 from valveflow_ros.ros.verify import verify
 

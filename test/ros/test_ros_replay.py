@@ -17,7 +17,9 @@ from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import NS_PER_S, SIGNALS, SampleTable, Signal
 from valveflow_ros.ros import replay_main, simulator_main
 from valveflow_ros.ros.inputs import INPUT_BY_NAME, header_time_ns
-from valveflow_ros.ros.node.stamps import ClockTrack
+from valveflow_ros.ros.node.intake import ClockTrack
+from valveflow_ros.ros.outputs import float64_bytes
+from valveflow_ros.ros.polled_subscription import Taken, Taker
 from valveflow_ros.ros.replay_steps import steps_of
 from valveflow_ros.ros.simulator_steps import (
     check_together,
@@ -26,8 +28,6 @@ from valveflow_ros.ros.simulator_steps import (
     stamped_steps,
     start_ns_of,
 )
-from valveflow_ros.ros.taking import Taken, Taker
-from valveflow_ros.ros.wire import float64_bytes
 
 REPLAY = 'valveflow_ros.ros.replay_main'
 TABLE = simulate(0.02, 3).table.part(0, 900)

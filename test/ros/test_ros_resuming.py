@@ -9,10 +9,10 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from valveflow_ros.config import Settings
 from valveflow_ros.logs import LoggedMessage
 from valveflow_ros.monitoring.monitor import Monitor
-from valveflow_ros.ros.node.resuming import Earlier, retrace
+from valveflow_ros.parameters import Settings
+from valveflow_ros.ros.node.restart import Earlier, retrace
 from valveflow_ros.ros.outputs import Output
 from valveflow_ros.signals.align import Aligner
 

@@ -20,15 +20,14 @@ from own_sockets import bound, family, readable
 from rclpy.parameter import Parameter as RosParameter
 from ros_helpers import PATIENCE_S, Processes, wait_until
 
-from valveflow_ros.config import TABLE, Settings
 from valveflow_ros.errors import ParameterError, RecordingError, ValveflowError
 from valveflow_ros.logs import Recorder, RecorderSettings, open_log
+from valveflow_ros.parameters import TABLE, Settings
 from valveflow_ros.ros import monitor_main, replay_main, secure_start, simulator_main
-from valveflow_ros.ros.node.model_file import extended_of
+from valveflow_ros.ros.node.given_files import extended_of, reference_of
 from valveflow_ros.ros.node.monitor_node import MonitorNode
 from valveflow_ros.ros.node.recording import Recording, new_folder
-from valveflow_ros.ros.node.reference_file import reference_of
-from valveflow_ros.ros.node.state_folder import LOCK, STATE, StateFolder
+from valveflow_ros.ros.node.state_store import LOCK, STATE, StateFolder
 from valveflow_ros.ros.secure_start import InsecureError, check_security
 
 pytestmark = pytest.mark.ros

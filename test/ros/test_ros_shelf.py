@@ -14,16 +14,16 @@ from ros_helpers import PATIENCE_S, Processes
 from test_ros_reference import Listener
 from valveflow_msgs.msg import Alarm
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic_json import to_json
 from valveflow_ros.monitoring.alarms import Judged, ResidualAlarm
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_rows
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import NS_PER_S
-from valveflow_ros.ros.demo_processes import ros_arguments
+from valveflow_ros.ros.demo import ros_arguments
 from valveflow_ros.ros.diagnostics import Item, Level
-from valveflow_ros.ros.node.work_health import alarm_item
+from valveflow_ros.ros.node.health import alarm_item
 from valveflow_ros.ros.verify import verify
 
 NERVOUS = {'alarm_on_delay': 0.0, 'alarm_off_delay': 0.0, 'alarm_suppress_time': 60.0}

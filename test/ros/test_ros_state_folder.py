@@ -10,15 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from valveflow_ros.config import Settings
 from valveflow_ros.errors import DataError, RecordingError
 from valveflow_ros.logs.mcap import recorder
-from valveflow_ros.ros.node import state_folder
-from valveflow_ros.ros.node.keeper import Keeper
-from valveflow_ros.ros.node.state_folder import STATE, InUseError, StateFolder, StateWriter
+from valveflow_ros.parameters import Settings
+from valveflow_ros.ros.node import state_store
+from valveflow_ros.ros.node.state_store import STATE, InUseError, Keeper, StateFolder, StateWriter
 from valveflow_ros.ros.node.warmup import made_up_curve
-from valveflow_ros.state import put_back
-from valveflow_ros.state_bytes import from_bytes, to_bytes
+from valveflow_ros.state import from_bytes, put_back, to_bytes
 
 CURVE = made_up_curve(Settings()).with_id()
 
@@ -27,7 +25,7 @@ def test_a_file_that_is_too_large_is_not_even_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = StateFolder(tmp_path)
-    monkeypatch.setattr(state_folder, '_MOST_BYTES', 3)
+    monkeypatch.setattr(state_store, '_MOST_BYTES', 3)
     folder.write(b'123')
     assert folder.read() == b'123'
     folder.write(b'1234')

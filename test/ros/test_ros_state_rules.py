@@ -21,13 +21,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from valveflow_ros.config import Settings
 from valveflow_ros.errors import DataError, RecordingError
-from valveflow_ros.ros.node import state_folder
-from valveflow_ros.ros.node.state_folder import LOCK, STATE, InUseError, StateFolder, StateWriter
+from valveflow_ros.parameters import Settings
+from valveflow_ros.ros.node import state_store
+from valveflow_ros.ros.node.state_store import LOCK, STATE, InUseError, StateFolder, StateWriter
 from valveflow_ros.ros.node.warmup import made_up_curve
-from valveflow_ros.state import ArrayMemory, copies, put_back
-from valveflow_ros.state_bytes import FORMAT, VERSION, from_bytes, to_bytes
+from valveflow_ros.state import (
+    FORMAT,
+    VERSION,
+    ArrayMemory,
+    copies,
+    from_bytes,
+    put_back,
+    to_bytes,
+)
 
 CURVE = made_up_curve(Settings()).with_id()
 
@@ -346,7 +353,7 @@ def test_a_pipe_in_the_place_of_a_state_makes_nobody_wait(folder: StateFolder) -
 def test_a_state_is_put_in_place_when_the_recording_is_ready_or_after_its_patience(
     folder: StateFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(state_folder, '_PATIENCE_S', 60.0)
+    monkeypatch.setattr(state_store, '_PATIENCE_S', 60.0)
     writer = StateWriter(folder)
     for answers in ([True], [False] * 3 + [True]):
         left = list(answers)
@@ -362,7 +369,7 @@ def test_a_state_is_put_in_place_when_the_recording_is_ready_or_after_its_patien
         # Until it is ready, what was there before is there.
         assert asked == [before] * len(answers)
         assert from_bytes(folder.read() or b'') == {'answers': answers}
-    monkeypatch.setattr(state_folder, '_PATIENCE_S', 0.3)
+    monkeypatch.setattr(state_store, '_PATIENCE_S', 0.3)
     begun = time.monotonic()
     writer.write({'never': 'ready'}, lambda: False)
     assert writer.busy
@@ -401,8 +408,8 @@ def test_what_cannot_be_written_is_said_in_the_systems_words_until_it_can(
 def test_an_end_waits_for_the_one_being_written_but_not_for_ever(
     folder: StateFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(state_folder, '_LONGEST_S', 0.05)
-    monkeypatch.setattr(state_folder, '_PATIENCE_S', 60.0)
+    monkeypatch.setattr(state_store, '_LONGEST_S', 0.05)
+    monkeypatch.setattr(state_store, '_PATIENCE_S', 60.0)
     go = threading.Event()
     writer = StateWriter(folder)
     writer.write({'late': 1}, go.is_set)
@@ -412,7 +419,7 @@ def test_an_end_waits_for_the_one_being_written_but_not_for_ever(
     assert writer.busy
     assert folder.read() is None
     go.set()
-    monkeypatch.setattr(state_folder, '_LONGEST_S', 20.0)
+    monkeypatch.setattr(state_store, '_LONGEST_S', 20.0)
     writer.finish()
     assert not writer.busy
     assert from_bytes(folder.read() or b'') == {'late': 1}

@@ -10,9 +10,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_helpers import wait_until
 from std_msgs.msg import Float64
 
-from valveflow_ros.ros.encoding import encode
-from valveflow_ros.ros.taking import DEPTH, Taken, Taker, can_poll
-from valveflow_ros.ros.wire import float64_bytes
+from valveflow_ros.ros.conversions import encode
+from valveflow_ros.ros.outputs import float64_bytes
+from valveflow_ros.ros.polled_subscription import DEPTH, Taken, Taker, can_poll
 
 pytestmark = pytest.mark.ros
 

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from valveflow_ros.ros.transport import choose_transport
+from valveflow_ros.ros.domain import choose_transport
 
 pytestmark = pytest.mark.ros
 FAST_DDS = 'rmw_fastrtps_cpp'
@@ -21,7 +21,7 @@ PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
 # Prints the files in /dev/shm that a node of Fast DDS maps into its process.
 NODE = """
 import rclpy
-from valveflow_ros.ros.transport import choose_transport
+from valveflow_ros.ros.domain import choose_transport
 choose_transport()
 rclpy.init()
 node = rclpy.create_node('transport_probe')

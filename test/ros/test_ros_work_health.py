@@ -8,15 +8,15 @@ from typing import Any
 
 import pytest
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import Characteristic, Support
 from valveflow_ros.curve.shift import judge_shift
-from valveflow_ros.fit.identifiability import NOT_REFINED
+from valveflow_ros.fit.result import NOT_REFINED
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_rows
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.ros.diagnostics import Item, Level
-from valveflow_ros.ros.node.work_health import fit_item, reference_item
+from valveflow_ros.ros.node.health import fit_item, reference_item
 
 SETTINGS = Settings({'refit_period': 3600.0, 'refit_segments': 0, 'alarm_limit': 500.0})
 WORKER: Any = SimpleNamespace(failures_in_a_row=0, busy_s=None, starts=1)

@@ -19,17 +19,22 @@ import psutil
 import pytest
 from ros_helpers import wait_until
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit
-from valveflow_ros.fit.fit_task import FitTask
-from valveflow_ros.monitoring.diagnosis_task import DiagnosisTask
+from valveflow_ros.fit.task import FitTask
+from valveflow_ros.monitoring.events import DiagnosisTask
+from valveflow_ros.parameters import Settings
 from valveflow_ros.ros.node.warmup import made_up_curve, made_up_task
-from valveflow_ros.ros.worker.frames import FrameReader, send
-from valveflow_ros.ros.worker.letters import result_letter, result_of, task_letter, task_of
-from valveflow_ros.ros.worker.outcome import Outcome
-from valveflow_ros.ros.worker.worker import FIT_JOB, FitWorker, memory
+from valveflow_ros.ros.worker.protocol import (
+    FrameReader,
+    result_letter,
+    result_of,
+    send,
+    task_letter,
+    task_of,
+)
+from valveflow_ros.ros.worker.worker import FIT_JOB, FitWorker, Outcome, memory
 from valveflow_ros.ros.worker.worker import worker as worker_module
 from valveflow_ros.segments.window import NO_ROWS
 from valveflow_ros.state import State
@@ -212,7 +217,7 @@ import sys
 import threading
 import time
 from valveflow_ros.ros.node.warmup import made_up_task
-from valveflow_ros.config import Settings
+from valveflow_ros.parameters import Settings
 from valveflow_ros.ros.worker.worker import FitWorker
 made = FitWorker(120.0, 'hurt_jobs:hangs')
 made.start()

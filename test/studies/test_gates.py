@@ -81,7 +81,7 @@ def test_nothing_is_judged_by_too_little(times: list[tuple[float, float]]) -> No
 # --- mistakes made on purpose ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize('module', ['state', 'logs/mcap/chunk_builder'])
+@pytest.mark.parametrize('module', ['state', 'logs/mcap/chunk_file'])
 def test_every_mistake_is_another_program_and_there_is_one(module: str) -> None:
     source = (ROOT / f'valveflow_ros/{module}.py').read_text('utf-8')
     found = list(mutants(module, source))

@@ -15,12 +15,163 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from valveflow_ros.baselines.hammerstein import HammersteinModel, tangents
-from valveflow_ros.baselines.hammerstein_move import OUTPUT_ERROR, move, search_delay
-from valveflow_ros.baselines.hammerstein_start import starts
-from valveflow_ros.baselines.holdout import cut_samples, run_mse
+from valveflow_ros.baselines.judged import cut_samples, run_mse
 from valveflow_ros.fit.problem import Samples
-from valveflow_ros.fit.whitening import fit_ar
+from valveflow_ros.fit.whitening import fit_ar, whitened
+from valveflow_ros.numerics import gram
 from valveflow_ros.records import FloatArray
+
+# Move all parameters of a Hammerstein model together, by the prediction error.
+
+
+OUTPUT_ERROR: FloatArray = np.empty(0)
+_NARROWEST = 0.004  # of the range of u: as narrow as the proposed method lets a piece be
+_DELAY_STEPS_S = (8.0, 4.0, 2.0, 1.0)
+
+
+def cost(samples: Samples, model: HammersteinModel, ar: FloatArray) -> float:
+    """Return the sum of squared prediction errors of the means."""
+    residual, _, weight = tangents(samples, model, columns=0)
+    e = whitened(residual, weight, ar)
+    return float((e * e).sum())
+
+
+def _possible(model: HammersteinModel) -> bool:
+    least = _NARROWEST * (model.knots[-1] - model.knots[0])
+    return bool(np.all(np.diff(model.knots) > least)) and model.stable()
+
+
+def move(
+    samples: Samples, model: HammersteinModel, ar: FloatArray, steps: int
+) -> tuple[HammersteinModel, float]:
+    """Levenberg-Marquardt over values, knots and both polynomials, the delay held.
+
+    Parameters
+    ----------
+    ar : float64 (k,)
+        Of the noise of the means; empty is the output error, which calls all noise white.
+    """
+    best = cost(samples, model, ar)
+    damping = 1e-4
+    for _ in range(steps):
+        residual, jacobian, weight = tangents(samples, model)
+        sums = gram(whitened(np.column_stack([jacobian, residual]), weight, ar))
+        trial = None
+        for _ in range(6):
+            step = _step(sums, damping)
+            candidate = model.unpack(model.pack() + step)
+            value = cost(samples, candidate, ar) if _possible(candidate) else np.inf
+            if value < best:
+                trial = candidate
+                break
+            damping *= 10.0
+        if trial is None:
+            break
+        gain, best, model = best - value, value, trial
+        damping = max(damping / 10.0, 1e-9)
+        if gain < 1e-6 * best:
+            break
+    return model, best
+
+
+def _step(sums: FloatArray, damping: float) -> FloatArray:
+    normal, slope = sums[:-1, :-1], sums[:-1, -1]
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-12 * np.diag(normal).max()))
+    normal = normal / np.outer(scale, scale) + damping * np.eye(len(scale))
+    return np.asarray(np.linalg.solve(normal, slope / scale) / scale)
+
+
+def search_delay(
+    samples: Samples, model: HammersteinModel, ar: FloatArray, best: float, steps: int = 4
+) -> tuple[HammersteinModel, float]:
+    """Move the delay by whole rows, everything else refitted, while that helps."""
+    rows = sorted({max(1, round(s / model.step_s)) for s in _DELAY_STEPS_S}, reverse=True)
+    for size in rows:
+        for sign in (1, -1):
+            while model.delay + sign * size >= 0:
+                shifted = replace(model, delay=model.delay + sign * size)
+                trial, value = move(samples, shifted, ar, steps)
+                if not value < best * (1.0 - 1e-7):
+                    break
+                model, best = trial, value
+    return model, best
+
+
+# Where the search for a Hammerstein model begins: least squares on a grid.
+
+
+_GRID_T_S = (3.0, 6.0, 12.0, 25.0, 50.0, 100.0, 200.0)
+_GRID_DELAY_S = (0.0, 5.0, 15.0, 30.0)
+_SEED = 20240229  # of the random knots; a fit is a pure function of its data
+_RANDOM_STARTS = 4
+_LEAST_PART = 0.05
+
+
+def knots_to_try(u: FloatArray, pieces: int) -> list[FloatArray]:
+    """Return sets of J + 1 knots over the range of ``u``: even, by quantiles, at random."""
+    low, high = float(u.min()), float(u.max())
+    even = np.linspace(low, high, pieces + 1)
+    by_share = np.quantile(u, np.linspace(0.0, 1.0, pieces + 1))
+    tried = [even, 0.5 * (even + by_share), _apart(by_share)]
+    rng = np.random.default_rng(_SEED)
+    for _ in range(_RANDOM_STARTS if pieces > 1 else 0):
+        widths = _LEAST_PART + rng.dirichlet(np.ones(pieces))
+        inner = low + (high - low) * np.cumsum(widths / widths.sum())[:-1]
+        tried.append(np.concatenate([[low], inner, [high]]))
+    return tried if pieces > 1 else tried[:1]
+
+
+def _apart(knots: FloatArray) -> FloatArray:
+    """Return knots that are nowhere closer than a twentieth of an even spacing."""
+    least = 0.05 * (knots[-1] - knots[0]) / (len(knots) - 1)
+    widths = np.maximum(np.diff(knots), least)
+    inner = knots[0] + (knots[-1] - knots[0]) * np.cumsum(widths / widths.sum())
+    return np.concatenate([knots[:1], inner[:-1], knots[-1:]])
+
+
+def first_order(
+    knots: FloatArray, time_constant_s: float, delay_s: float, step_s: float
+) -> HammersteinModel:
+    """Return a model with one pole and a flat curve."""
+    return HammersteinModel(
+        knots=knots, values=np.zeros(len(knots)), numerator=np.empty(0),
+        denominator=np.array([-np.exp(-step_s / time_constant_s)]),
+        delay=round(delay_s / step_s), step_s=step_s,
+    )  # fmt: skip
+
+
+def with_best_values(samples: Samples, model: HammersteinModel) -> tuple[HammersteinModel, float]:
+    """Return the model with the values at the knots that fit best, and its squared error.
+
+    For a given linear block and given knots the output is linear in the values.
+    """
+    zero = replace(model, values=np.zeros_like(model.values))
+    residual, jacobian, weight = tangents(samples, zero, columns=model.pieces + 1)
+    sums = gram(whitened(np.column_stack([jacobian, residual]), weight, np.empty(0)))
+    # A knot without samples beside it is not told by the data; it then takes the least value.
+    values = np.linalg.pinv(sums[:-1, :-1], rcond=1e-10, hermitian=True) @ sums[:-1, -1]
+    left = float(sums[-1, -1] - values @ sums[:-1, -1])
+    return replace(model, values=values), left
+
+
+def starts(samples: Samples, pieces: int) -> list[HammersteinModel]:
+    """Return one start for each set of knots, the best of the grid of (T, tau), best first.
+
+    Parameters
+    ----------
+    samples : Samples
+        May be coarse.
+    """
+    u = samples.u[samples.usable > 0]
+    found = []
+    for knots in knots_to_try(u, pieces):
+        tried = [
+            with_best_values(samples, first_order(knots, t, d, samples.step_s))
+            for t in _GRID_T_S for d in _GRID_DELAY_S
+        ]  # fmt: skip
+        found.append(min(tried, key=lambda pair: pair[1]))
+    return [model for model, _ in sorted(found, key=lambda pair: pair[1])]
+
 
 ORDERS = ((1, 1), (2, 2), (3, 3))  # taps n_b and poles n_f
 _KEPT_STARTS = 3

@@ -2,21 +2,164 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
+from scipy.special import stdtr, stdtrit
 
-from valveflow_ros.baselines.paired import (
-    PairedTest,
-    over_blocks,
-    over_samples,
-    widening_of,
-    with_effective_size,
-)
-from valveflow_ros.errors import DataError
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.fit.problem import Samples
-from valveflow_ros.records import BoolArray, FloatArray, IntArray, SegmentKind
+from valveflow_ros.fit.refine import least_rows
+from valveflow_ros.fit.whitening import inflation
+from valveflow_ros.parameters import Settings
+from valveflow_ros.records import BoolArray, ByteArray, FloatArray, IntArray, SegmentKind
+from valveflow_ros.segments.window import WindowContents
+
+# Is a mean difference zero? Paired t tests that count samples, and ones that do not.
+#
+# The paper's test takes each sample of a segment for independent (its reference
+# [38]). At 1 Hz the noise of the power is correlated over a minute or more, so that
+# test sees ten or a hundred times the evidence there is. Beside it stand tests
+# that count what the samples are worth.
+
+
+_LONGEST_S = 300.0
+
+
+@dataclass(frozen=True, slots=True)
+class PairedTest:
+    """A t test of a mean difference against zero.
+
+    Attributes
+    ----------
+    mean : float
+    stderr : float
+    t : float
+    p_value : float
+        Two-sided.
+    effective : float
+        Number of independent values the data are worth; degrees of freedom are one less.
+    """
+
+    mean: float
+    stderr: float
+    t: float
+    p_value: float
+    effective: float
+
+    def interval(self, level: float = 0.05) -> tuple[float, float]:
+        """Return the range the mean lies in with confidence 1 - ``level``; NaN if not known."""
+        if not (math.isfinite(self.stderr) and self.effective > 1.0):
+            return math.nan, math.nan
+        reach = float(stdtrit(self.effective - 1.0, 1.0 - 0.5 * level)) * self.stderr
+        return self.mean - reach, self.mean + reach
+
+    def zero_is_rejected(self, level: float = 0.05) -> bool:
+        """Tell whether zero is ruled out; a test that could not be done rules nothing out."""
+        return self.p_value < level
+
+
+def _test(mean: float, stderr: float, effective: float) -> PairedTest:
+    if not (math.isfinite(mean) and math.isfinite(stderr) and effective > 1.0):
+        return PairedTest(mean, math.nan, math.nan, math.nan, effective)
+    if stderr == 0.0:
+        t = math.copysign(math.inf, mean) if mean else 0.0
+        return PairedTest(mean, 0.0, t, 0.0 if mean else 1.0, effective)
+    t = mean / stderr
+    return PairedTest(mean, stderr, t, float(2.0 * stdtr(effective - 1.0, -abs(t))), effective)
+
+
+def over_samples(difference: FloatArray) -> PairedTest:
+    """Test as the paper does: each sample counts.
+
+    Parameters
+    ----------
+    difference : float64 (n,)
+    """
+    return with_effective_size(difference, 1.0)
+
+
+def with_effective_size(difference: FloatArray, widening: float) -> PairedTest:
+    """Test with n / widening independent values.
+
+    Parameters
+    ----------
+    difference : float64 (n,)
+    widening : float
+        How many times the variance of a long mean exceeds that of independent samples.
+
+    Notes
+    -----
+    A stretch that is worth fewer than two values gives no verdict (NaN).
+    """
+    n = len(difference)
+    effective = n / max(widening, 1.0)
+    if n < 2 or effective < 2.0:
+        mean = float(difference.mean()) if n else math.nan
+        return PairedTest(mean, math.nan, math.nan, math.nan, effective)
+    stderr = float(difference.std(ddof=1)) / math.sqrt(effective)
+    return _test(float(difference.mean()), stderr, effective)
+
+
+def over_blocks(blocks: FloatArray) -> PairedTest:
+    """Test means of blocks, allowing for correlation from block to block.
+
+    Parameters
+    ----------
+    blocks : float64 (k,)
+        In order of time; one value a block, such as a segment.
+
+    Notes
+    -----
+    The variance is that of Newey and West with Bartlett weights over
+    ``4 (k / 100)^(2/9)`` lags; it may widen the ordinary one, never narrow it.
+    """
+    k = len(blocks)
+    if k < 2:
+        return _test(float(blocks.mean()) if k else math.nan, math.nan, float(k))
+    e = blocks - blocks.mean()
+    own = float(e @ e) / k
+    lags = min(k - 1, math.floor(4.0 * (k / 100.0) ** (2.0 / 9.0)))
+    long_run = own
+    for lag in range(1, lags + 1):
+        long_run += 2.0 * (1.0 - lag / (lags + 1.0)) * float(e[lag:] @ e[:-lag]) / k
+    long_run = max(own, long_run)
+    effective = k * own / long_run if long_run > 0.0 else float(k)
+    return _test(float(blocks.mean()), math.sqrt(long_run / (k - 1)), effective)
+
+
+def widening_of(residual: FloatArray, spans: IntArray, step_s: float) -> float:
+    """Return how many times correlation in time widens the variance of a mean.
+
+    Parameters
+    ----------
+    residual : float64 (n,)
+    spans : int64 (k, 2)
+        First and end row of the stretches that count; rows of different stretches are
+        not taken for neighbours.
+    step_s : float
+
+    Notes
+    -----
+    The stretches are pooled, about their common mean: about its own mean each would
+    look less correlated than it is. So a misfit that changes from stretch to stretch
+    counts as correlation, on the cautious side.
+    """
+    if not len(spans):
+        return 1.0
+    parts = [residual[a:b] for a, b in spans[:, :2].tolist()]
+    mean = float(np.concatenate(parts).mean())
+    series = np.concatenate([np.append(part - mean, 0.0) for part in parts])
+    weight = np.concatenate(
+        [np.append(np.ones(len(part), dtype=np.uint8), np.uint8(0)) for part in parts]
+    )
+    half = float(np.median(spans[:, 1] - spans[:, 0])) / 2.0
+    return inflation(series, weight, max(1, int(min(_LONGEST_S / step_s, half))))
+
 
 _LEAST_ROWS = 10  # of a segment that can be judged
 
@@ -246,3 +389,128 @@ def _score(difference: FloatArray, widening: float) -> Score:
         none = PairedTest(float('nan'), float('nan'), float('nan'), float('nan'), 0.0)
         return Score(mse, none, none)
     return Score(mse, over_samples(difference), with_effective_size(difference, widening))
+
+
+# Rows of a log in the form every method of the comparison takes them.
+
+
+def samples_of(contents: WindowContents, settings: Settings) -> Samples:
+    """Return the rows of a window.
+
+    A row without opening, pressure or power is not usable; a jump in time is a
+    gap even where no row stands in it.
+    """
+    usable = (np.isfinite(contents.u) & np.isfinite(contents.power_mw)).astype(np.uint8)
+    step_s = settings.real('sample_period')
+    usable[1:][np.diff(contents.time_ns) > 1.5e9 * step_s] = 0
+    return Samples(
+        u=np.where(usable > 0, contents.u, 0.0),
+        power_mw=np.where(usable > 0, contents.power_mw, 0.0),
+        usable=usable,
+        step_s=step_s,
+        settle_s=settings.settle_s,
+        group=max(1, round(settings.real('block') / step_s)),
+    )
+
+
+def other_data(contents: WindowContents, settings: Settings) -> OtherData:
+    """Return the rows of a window with its special segments, to judge by."""
+    return OtherData(samples_of(contents, settings), contents.time_ns, contents.spans)
+
+
+# A part of the identification data held back to choose between candidates.
+
+
+LEARN_SHARE = 0.7
+_LEAST_OF_PART = 0.1  # of the settled rows needed altogether, in each part
+
+
+class Runnable(Protocol):
+    """A model that can be run over measured inputs."""
+
+    def run(self, samples: Samples) -> tuple[FloatArray, ByteArray]:
+        """Return the simulated power in MW and where it has settled."""
+
+
+def part_of(samples: Samples, start: int, end: int) -> Samples:
+    """Return the rows ``[start, end)``."""
+    cut = slice(start, end)
+    return replace(
+        samples, u=samples.u[cut], power_mw=samples.power_mw[cut], usable=samples.usable[cut]
+    )
+
+
+def cut_samples(samples: Samples) -> tuple[Samples, Samples]:
+    """Return the part to learn from and the later part to choose by.
+
+    Raises
+    ------
+    TooFewSamplesError
+        Too few usable rows, or too few that lie far enough behind a gap: altogether, or in one
+        of the two parts.
+    """
+    usable = int(samples.usable.sum())
+    least = least_rows(samples.step_s)
+    if usable < least:
+        raise TooFewSamplesError('Rows with opening, pressure and power', usable, least)
+    _settled_enough(samples, least)
+    cut = round(LEARN_SHARE * samples.means) * samples.group
+    learn, judge = part_of(samples, 0, cut), part_of(samples, cut, len(samples.u))
+    for part in (learn, judge):
+        _settled_enough(part, round(_LEAST_OF_PART * least))
+    return learn, judge
+
+
+def _settled_enough(samples: Samples, least: int) -> None:
+    # As coarse as searches take them: a mean counts only if all its rows do.
+    coarse = samples.coarser()
+    factor = round(coarse.step_s / samples.step_s)
+    settled = settled_rows(coarse)[: coarse.means * coarse.group]
+    means = settled.reshape(coarse.means, coarse.group).all(axis=1)
+    have = int(means.sum()) * coarse.group * factor
+    if have < least:
+        raise TooFewSamplesError(
+            'Rows that follow each other for longer than the transient', have, least
+        )
+
+
+def settled_rows(samples: Samples) -> BoolArray:
+    """Return where a row is usable and lies farther behind a gap than the transient lasts."""
+    place = np.arange(1, len(samples.u) + 1)
+    last = np.maximum.accumulate(np.where(samples.usable > 0, 0, place))
+    return np.asarray(place - last > round(samples.settle_s / samples.step_s))
+
+
+def run_mse(model: Runnable, samples: Samples) -> float:
+    """Return the mean squared error in MW^2 of a free run; infinite where it runs away."""
+    answer, settled = model.run(samples)
+    keep = settled > 0
+    if not keep.any():
+        return float('inf')
+    error = samples.power_mw[keep] - answer[keep]
+    with np.errstate(over='ignore', invalid='ignore'):
+        value = float(np.mean(error**2))
+    return value if np.isfinite(value) else float('inf')
+
+
+# What an identified characteristic predicts on other data, and where it may be judged.
+
+
+def dynamic(characteristic: Characteristic, samples: Samples) -> FloatArray:
+    """Return the power that curve and regional dynamics simulate, MW, shape (n,)."""
+    model = characteristic.model
+    return model.respond(samples.u, samples.usable, samples.step_s, samples.settle_s)[0]
+
+
+def trial_of(other: OtherData, characteristic: Characteristic) -> Trial:
+    """Return the measured data with the rows that can be judged.
+
+    These are the same for every method: inside the range of u the proposed curve is known
+    for, and as far behind a gap as the slowest dynamics allowed for.
+    """
+    samples = other.samples
+    flat = characteristic.model
+    good = samples.usable > 0
+    good &= (samples.u >= flat.knots[0]) & (samples.u <= flat.knots[-1])
+    good &= settled_rows(samples)
+    return Trial(other.time_ns, samples.u, samples.power_mw, good, other.spans, samples.step_s)

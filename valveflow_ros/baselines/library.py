@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from valveflow_ros.jit import jit
+from valveflow_ros.numerics import jit
 from valveflow_ros.records import ByteArray, FloatArray
 
 NAMES = (

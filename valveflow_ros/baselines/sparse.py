@@ -9,18 +9,207 @@ simulated from the first.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import savgol_coeffs
 
 from valveflow_ros.baselines import library
-from valveflow_ros.baselines.derivative import Form, equations, forms_for
-from valveflow_ros.baselines.holdout import cut_samples, run_mse
-from valveflow_ros.baselines.sparse_model import SparseModel
+from valveflow_ros.baselines.judged import cut_samples, run_mse
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.problem import Samples
-from valveflow_ros.records import BoolArray, FloatArray
+from valveflow_ros.records import BoolArray, ByteArray, FloatArray, IntArray
+
+# A sparse model of the power: an ordinary differential equation, and where it rests.
+
+
+_START_S = 30.0  # power averaged to begin with after a gap
+_PLACES = 400  # inputs at which the rest is searched, at least
+_FINE_U = 0.25  # farthest apart where the rest swings with sin u or cos u: 25 to a period
+_SWINGING = tuple(library.NAMES.index(name) for name in ('sin u', 'cos u'))
+_GRID = 1500  # places at which a change of sign is looked for
+
+
+@dataclass(frozen=True, slots=True)
+class SparseModel:
+    """y' = xi . theta(y, u).
+
+    Attributes
+    ----------
+    xi : float64 (14,)
+        MW/s per unit of each function; 0 is absent.
+    u_from, u_to, power_from, power_to : float
+        What the data it was made from covered.
+    power_mean : float
+        Their mean power.
+    step_s : float
+    """
+
+    xi: FloatArray
+    u_from: float
+    u_to: float
+    power_from: float
+    power_to: float
+    power_mean: float
+    step_s: float
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Return the names of the functions that are there."""
+        return tuple(n for n, x in zip(library.NAMES, self.xi, strict=True) if x != 0.0)
+
+    def run(self, samples: Samples) -> tuple[FloatArray, ByteArray]:
+        """Return the simulated power in MW and where it has settled, shapes (n,).
+
+        After a gap it begins at the measured power of the first half minute.
+        """
+        rows = max(1, round(_START_S / samples.step_s))
+        begin = np.full(len(samples.u), self.power_mean)
+        starts = np.flatnonzero(np.diff(samples.usable.astype(np.int8), prepend=0) == 1)
+        for t in starts:
+            part = slice(t, t + rows)
+            begin[t] = np.mean(samples.power_mw[part][samples.usable[part] > 0])
+        answer = np.empty(len(samples.u))
+        settled = np.empty(len(samples.u), dtype=np.uint8)
+        library.simulate(
+            samples.u, samples.usable, begin, self.xi, samples.step_s,
+            round(samples.settle_s / samples.step_s), answer, settled,
+        )  # fmt: skip
+        return answer, settled
+
+    def static(self, u: FloatArray) -> FloatArray:
+        """Return the power at which the model rests; NaN where it rests nowhere.
+
+        A rest is a power where y' falls through zero. Where there are several, the
+        curve goes on to the nearest from the middle of the data outwards. It is
+        searched at evenly spaced inputs and straight between them, so ``u`` should hold no
+        rows of gaps: they stretch the range that is searched.
+        """
+        u = np.asarray(u, dtype=np.float64)
+        low, high = min(self.u_from, float(u.min())), max(self.u_to, float(u.max()))
+        swings = bool(np.any(self.xi[list(_SWINGING)] != 0.0))
+        count = math.ceil((high - low) / _FINE_U) + 1 if swings else 0
+        places = np.linspace(low, high, max(_PLACES, count))
+        return np.asarray(np.interp(u, places, self._rests(places)))
+
+    def _rests(self, places: FloatArray) -> FloatArray:
+        reach = 0.25 * (self.power_to - self.power_from)
+        y = np.linspace(self.power_from - reach, self.power_to + reach, _GRID)
+        curve = np.full(len(places), np.nan)
+        middle = int(np.argmin(np.abs(places - 0.5 * (self.u_from + self.u_to))))
+        for order in (range(middle, len(places)), range(middle, -1, -1)):
+            near = curve[middle] if np.isfinite(curve[middle]) else self.power_mean
+            for k in order:
+                curve[k] = _rest(self.xi, float(places[k]), y, near)
+                near = curve[k] if np.isfinite(curve[k]) else near
+        return curve
+
+
+def _rest(xi: FloatArray, u: float, y: FloatArray, near: float) -> float:
+    """Return the stable rest nearest to ``near``, NaN if there is none."""
+    values = library.columns(y, np.full(len(y), u)) @ xi
+    falls = np.flatnonzero((values[:-1] > 0.0) & (values[1:] <= 0.0))
+    if not len(falls):
+        return float('nan')
+    share = values[falls] / (values[falls] - values[falls + 1])
+    rests = y[falls] + share * (y[1] - y[0])
+    return float(rests[np.argmin(np.abs(rests - near))])
+
+
+# Equations for sparse identification: by derivatives of smoothed data, or in weak form.
+#
+# A derivative of noisy power is mostly noise. Either the data are smoothed by
+# local polynomials (Savitzky and Golay) and the polynomial is differentiated, or
+# both sides are multiplied by a smooth test function that vanishes at the ends of
+# a window and integrated, which moves the derivative from the data to the test function.
+
+
+_ORDER = 2  # of the local polynomials
+_STEEP = 4  # phi = (1 - s^2)^4: smooth enough that its derivative vanishes at the ends too
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """How the equations are made.
+
+    Attributes
+    ----------
+    kind : str
+        'derivative' or 'weak'.
+    window_s : float
+        Width of the window.
+    """
+
+    kind: str
+    window_s: float
+
+
+_WINDOWS_S = (5.0, 11.0, 21.0, 61.0)
+_WINDOWS_ROWS = (5, 7, 11, 21)  # where rows are too far apart for such windows
+_FAR_S = 5.0
+
+
+def forms_for(step_s: float) -> tuple[Form, ...]:
+    """Return what to try for rows ``step_s`` apart."""
+    windows: tuple[float, ...] = _WINDOWS_S
+    if step_s > _FAR_S:
+        windows = tuple(rows * step_s for rows in _WINDOWS_ROWS)
+    return tuple(Form(kind, w) for kind in ('derivative', 'weak') for w in windows)
+
+
+def half_width(form: Form, step_s: float) -> int:
+    """Return how many rows a window reaches to each side, at least two."""
+    return max(2, round(0.5 * form.window_s / step_s))
+
+
+def equations(samples: Samples, form: Form) -> FloatArray:
+    """Return rows ``[theta | y']``, shape (k, 15); both sides may be integrals.
+
+    Windows overlap by half; what is nearer says little new.
+    """
+    half = half_width(form, samples.step_s)
+    make = _weak if form.kind == 'weak' else _derivative
+    if len(samples.u) <= 2 * half:
+        return np.empty((0, library.SIZE + 1))
+    centres = np.arange(half, len(samples.u) - half, half, dtype=np.int64)
+    return make(samples, half, centres)
+
+
+def _whole(usable: ByteArray, half: int, centres: IntArray) -> IntArray:
+    """Return the centres whose window has no gap."""
+    missing = np.concatenate([[0], np.cumsum(usable == 0)])
+    return np.asarray(centres[missing[centres + half + 1] == missing[centres - half]])
+
+
+def _convolved(values: FloatArray, weights: FloatArray, centres: IntArray) -> FloatArray:
+    smoothed = np.convolve(values, weights, mode='valid')
+    return np.asarray(smoothed[centres - len(weights) // 2])
+
+
+def _derivative(samples: Samples, half: int, centres: IntArray) -> FloatArray:
+    centres = _whole(samples.usable, half, centres)
+    size, step = 2 * half + 1, samples.step_s
+    value = savgol_coeffs(size, _ORDER)
+    slope = savgol_coeffs(size, _ORDER, deriv=1, delta=step)
+    y = _convolved(samples.power_mw, value, centres)
+    u = _convolved(samples.u, value, centres)
+    return np.column_stack([library.columns(y, u), _convolved(samples.power_mw, slope, centres)])
+
+
+def _weak(samples: Samples, half: int, centres: IntArray) -> FloatArray:
+    s = np.arange(-half, half + 1) / (half + 1.0)
+    test = (1.0 - s**2) ** _STEEP
+    slope = -2.0 * _STEEP * s * (1.0 - s**2) ** (_STEEP - 1) / ((half + 1.0) * samples.step_s)
+    total = test.sum()
+    out = np.empty((len(centres), library.SIZE + 1))
+    rows = library.weak_rows(
+        samples.power_mw, library.columns(samples.power_mw, samples.u), samples.usable,
+        centres, test / total, slope / total, out,
+    )  # fmt: skip
+    return out[:rows]
+
 
 THRESHOLDS = (0.0, *np.geomspace(1e-3, 1e3, 31).tolist())
 _SPARE = 1.01  # a sparser model may be this much worse than the best

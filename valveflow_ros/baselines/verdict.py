@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from valveflow_ros.baselines.judged import Judgement, Trial
-from valveflow_ros.baselines.paired import PairedTest, over_blocks
+from valveflow_ros.baselines.judged import Judgement, PairedTest, Trial, over_blocks
 from valveflow_ros.records import FloatArray, SegmentKind
 
 BASELINES = ('hammerstein', 'sparse')

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from valveflow_ros.config import Settings
-from valveflow_ros.monitoring.corrector import Corrector
+from valveflow_ros.monitoring.rows import Corrector
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import IntArray, Readings, SampleTable
 from valveflow_ros.signals.align import Aligned, Aligner
 

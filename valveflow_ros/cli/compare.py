@@ -6,8 +6,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
-from valveflow_ros.cli.parameter_options import add_parameters
+from valveflow_ros.cli.options import MAPPING_HELP, add_mapping, add_parameters, read_mapping
 from valveflow_ros.cli.report_files import add_report_files, check_report_files, with_report
 
 _DESCRIPTION = """\
@@ -54,7 +53,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     console.progress(0.0, 'starting')
     from valveflow_ros.cli.comparing import compared, outcome, texts
     from valveflow_ros.cli.files import check_folder
-    from valveflow_ros.cli.parameters import read_parameters
+    from valveflow_ros.cli.options import read_parameters
     from valveflow_ros.cli.truth_file import read_truth_file
     from valveflow_ros.report.comparison import comparison_page
 

@@ -7,23 +7,28 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from valveflow_ros.baselines.comparison import compare
-from valveflow_ros.baselines.comparison_json import to_json
-from valveflow_ros.baselines.data import other_data, samples_of
+from valveflow_ros.baselines.comparison import compare, to_json
+from valveflow_ros.baselines.judged import other_data, samples_of
 from valveflow_ros.baselines.truth import Truth
 from valveflow_ros.cli import engine
 from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.mapping import Mapping as Columns
+from valveflow_ros.cli.options import LogMapping as Columns
 from valveflow_ros.cli.report_words import columns
 from valveflow_ros.cli.watching import Seen, cut_in_two, read, see
-from valveflow_ros.config import PARAMETERS
+from valveflow_ros.parameters import PARAMETERS
 from valveflow_ros.records import SegmentKind
-from valveflow_ros.report.comparison_csv import curves_csv, parameters_csv, segments_csv
-from valveflow_ros.report.comparison_data import LABELS, METHODS, PREDICTIONS, Compared
-from valveflow_ros.report.comparison_tables import mse_cell
-from valveflow_ros.report.comparison_words import data_words, finding_words
-from valveflow_ros.report.numbers import decimals, plain
-from valveflow_ros.report.words import input_unit_plain
+from valveflow_ros.report.comparison import data_words, finding_words
+from valveflow_ros.report.comparison_tables import (
+    LABELS,
+    METHODS,
+    PREDICTIONS,
+    Compared,
+    curves_csv,
+    mse_cell,
+    parameters_csv,
+    segments_csv,
+)
+from valveflow_ros.report.words import decimals, input_unit_plain, plain
 
 
 def compared(

@@ -7,7 +7,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.report.terminal.terminal_number import number, whole
+from valveflow_ros.report.terminal.text import number, whole
 
 _DESCRIPTION = """\
 Write the inverse of a flow characteristic as a table: the integrated input u that gives a

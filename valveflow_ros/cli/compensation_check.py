@@ -8,7 +8,7 @@ from collections.abc import Callable
 from valveflow_ros.cli.compensation_table import within
 from valveflow_ros.curve.compensation import Compensation, corner_count
 from valveflow_ros.errors import DataError
-from valveflow_ros.report.numbers import counted
+from valveflow_ros.report.words import counted
 
 
 def check(made: Compensation, tolerance_mw: float, again: Callable[[int], Compensation]) -> None:

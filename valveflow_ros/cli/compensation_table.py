@@ -15,7 +15,7 @@ from valveflow_ros.cli.files import whole_file
 from valveflow_ros.cli.report_words import columns
 from valveflow_ros.curve.compensation import Compensation
 from valveflow_ros.records import FloatArray
-from valveflow_ros.report.numbers import counted, decimals, plain
+from valveflow_ros.report.words import counted, decimals, plain
 
 
 def columns_of(made: Compensation, pressures: Sequence[float]) -> dict[str, FloatArray]:

@@ -88,7 +88,7 @@ def _option(action: argparse.Action, known: dict[str, tuple[str, ...]]) -> Optio
 
 def _known() -> dict[str, tuple[str, ...]]:
     """Return the names that may follow an option, by its long form."""
-    from valveflow_ros.config import TABLE
+    from valveflow_ros.parameters import TABLE
     from valveflow_ros.plant.effects import catalogue
     from valveflow_ros.records import SIGNALS
 

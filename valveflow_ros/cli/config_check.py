@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from valveflow_ros.cli.console import Outcome
-from valveflow_ros.cli.parameters import read_parameters
-from valveflow_ros.config import PARAMETERS, Settings, Value
+from valveflow_ros.cli.options import read_parameters
 from valveflow_ros.errors import InputError, ParameterError, counted
+from valveflow_ros.parameters import PARAMETERS, Settings, Value
 
 
 def check(file: Path) -> Outcome:

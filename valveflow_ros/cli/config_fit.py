@@ -10,19 +10,19 @@ import numpy as np
 from valveflow_ros.cli.alignment import Progress, aligned_blocks
 from valveflow_ros.cli.console import Console
 from valveflow_ros.cli.log_input import LogInput, steps_of
-from valveflow_ros.cli.parameters import fitting
-from valveflow_ros.config import PARAMETERS, Settings, Value
+from valveflow_ros.cli.options import fitting
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.monitoring.events import FitRequested
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_aligned
+from valveflow_ros.parameters import PARAMETERS, Settings, Value
 from valveflow_ros.records import SIGNALS
-from valveflow_ros.report.numbers import duration
-from valveflow_ros.report.terminal.terminal_text import clean
+from valveflow_ros.report.terminal.text import clean
+from valveflow_ros.report.words import duration
 from valveflow_ros.signals.align import Aligner
-from valveflow_ros.signals.unit_table import air_in
+from valveflow_ros.signals.units import air_in
 
 # A transient cut short spoils segments, one too long only costs some: up in small steps,
 # down in large ones.

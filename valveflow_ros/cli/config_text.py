@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from valveflow_ros import __version__
 from valveflow_ros.cli.config_fit import Fitted
-from valveflow_ros.config import TABLE, Settings, as_yaml
-from valveflow_ros.report.terminal.terminal_text import clean
+from valveflow_ros.parameters import TABLE, Settings, as_yaml
+from valveflow_ros.report.terminal.text import clean
 
 
 def parameter_file(source: str, found: Fitted) -> str:

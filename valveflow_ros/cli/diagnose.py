@@ -6,8 +6,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
-from valveflow_ros.cli.parameter_options import add_parameters
+from valveflow_ros.cli.options import MAPPING_HELP, add_mapping, add_parameters, read_mapping
 from valveflow_ros.cli.report_files import (
     add_report_files,
     check_report_files,
@@ -55,7 +54,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     from valveflow_ros.cli.files import check_folder
     from valveflow_ros.cli.log_input import open_input
     from valveflow_ros.cli.model_file import check_exponent
-    from valveflow_ros.cli.parameters import read_parameters
+    from valveflow_ros.cli.options import read_parameters
     from valveflow_ros.report.diagnosis import diagnosis_page
 
     given = read_parameters(options.params, options.pairs)

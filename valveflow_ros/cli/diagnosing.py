@@ -12,31 +12,35 @@ import numpy as np
 
 from valveflow_ros.cli import engine
 from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.file_marks import signed
+from valveflow_ros.cli.files import signed
 from valveflow_ros.cli.first_run import SENTENCE, is_first_run
 from valveflow_ros.cli.log_input import LogInput, steps_of
 from valveflow_ros.cli.model_file import read_either
 from valveflow_ros.cli.monitor_history import history_in
-from valveflow_ros.cli.parameters import settings_for
+from valveflow_ros.cli.options import settings_for
 from valveflow_ros.cli.report_words import columns
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import Characteristic
-from valveflow_ros.curve.model import RegionalModel
+from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.diagnose import Record, diagnose
-from valveflow_ros.diagnosis.diagnosis_json import model_json, to_json
-from valveflow_ros.diagnosis.extended_model import ExtendedModel
-from valveflow_ros.diagnosis.first_model import first_model
-from valveflow_ros.diagnosis.on_top import on_top
-from valveflow_ros.diagnosis.result import NAMED, NOTHING, UNEXPLAINED, Diagnosis
-from valveflow_ros.diagnosis.views import Views, views
+from valveflow_ros.diagnosis.extended import ExtendedModel
+from valveflow_ros.diagnosis.from_window import first_model, on_top
+from valveflow_ros.diagnosis.result import (
+    NAMED,
+    NOTHING,
+    UNEXPLAINED,
+    Diagnosis,
+    model_to_json,
+    to_json,
+)
+from valveflow_ros.diagnosis.signature import Views, views
 from valveflow_ros.errors import DataError
-from valveflow_ros.monitoring.corrector import Corrector
+from valveflow_ros.monitoring.rows import Corrector
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SIGNALS, IntArray, SampleTable
 from valveflow_ros.report.diagnosis import Diagnosed
-from valveflow_ros.report.diagnosis_words import cells
-from valveflow_ros.report.numbers import decimals
-from valveflow_ros.report.words import held_words
+from valveflow_ros.report.diagnosis_figures import cells
+from valveflow_ros.report.words import decimals, held_words
 
 _BLIND = 'cannot be judged'
 _VERDICTS = {
@@ -210,8 +214,8 @@ def _complete(table: SampleTable) -> bool:
 def texts(found: Result) -> dict[str, str]:
     """Return the files for programs by name."""
     d, page = found.page.diagnosis, found.page
-    model = model_json(d.final, found.exponent, page.start_ns, d.reference, found.on_top_of)
-    extended = signed(model, 'diagnose')
+    model = ExtendedModel(d.final, found.exponent, page.start_ns, d.reference, found.on_top_of)
+    extended = signed(model_to_json(model), 'diagnose')
     return {
         'diagnosis.json': json.dumps(to_json(d), indent=2, allow_nan=False) + '\n',
         'extended_model.json': json.dumps(extended, indent=2, allow_nan=False) + '\n',

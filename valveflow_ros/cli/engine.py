@@ -7,22 +7,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from valveflow_ros.cli.alignment import Progress, aligned_blocks, corrected, quiet
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import Characteristic
-from valveflow_ros.curve.model import RegionalModel
+from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit, outline
-from valveflow_ros.fit.fit_task import FitTask
-from valveflow_ros.monitoring.corrector import Corrector
+from valveflow_ros.fit.task import FitTask
 from valveflow_ros.monitoring.events import FitRequested
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_aligned
+from valveflow_ros.monitoring.rows import Corrector
+from valveflow_ros.numerics import ahead
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SIGNALS, IntArray, Readings, SampleTable, SpecialSegment
-from valveflow_ros.report.numbers import duration
-from valveflow_ros.report.quality import REASON_WORDS
-from valveflow_ros.segments.noise import WARM_UP, WINDOW
+from valveflow_ros.report.data import REASON_WORDS
+from valveflow_ros.report.words import duration
+from valveflow_ros.segments.kernel import WARM_UP, WINDOW
 from valveflow_ros.signals.align import Aligner
-from valveflow_ros.threads import ahead
 
 _NEEDED = tuple(i for i in SIGNALS if i.required and i.topic != 'main_steam_temperature')
 

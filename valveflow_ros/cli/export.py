@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
+from valveflow_ros.cli.options import MAPPING_HELP, add_mapping, read_mapping
 
 _DESCRIPTION = """\
 Write a log as a table with one row a sample: the rows the engine sees, in its units. Where a
@@ -39,11 +39,11 @@ def run(options: Namespace, console: Console) -> Outcome:
     from valveflow_ros.cli.alignment import align
     from valveflow_ros.cli.files import check_output
     from valveflow_ros.cli.log_input import open_input, steps_of
+    from valveflow_ros.cli.options import read_parameters, settings_for
     from valveflow_ros.cli.outputs import TABLES, write_log
-    from valveflow_ros.cli.parameters import read_parameters, settings_for
     from valveflow_ros.cli.report_words import rejected_words
     from valveflow_ros.errors import DataError
-    from valveflow_ros.report.numbers import counted, duration, moment
+    from valveflow_ros.report.words import counted, duration, moment
 
     given = read_parameters(None, options.pairs)
     check_output(options.output, TABLES, source=options.log, overwrite=options.overwrite)

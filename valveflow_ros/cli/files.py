@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from valveflow_ros.errors import RecordingError
 
@@ -131,3 +134,155 @@ def check_output(
         raise RecordingError(path, 'is the log that is read; choose another name for the output')
     if not overwrite and path.stat().st_size:
         raise RecordingError(path, 'exists already; add --overwrite to replace it')
+
+
+# By what a file of results tells which verb wrote it.
+
+
+# The head of our pages and files, and the columns of our tables, stand well within.
+_HEAD = 4096
+_PAGE = re.compile(rb'<meta name="generator" content="valveflow ([a-z]+) ')
+_FORMAT = re.compile(rb'\A\{\s*"format":\s*"valveflow/([a-z_]+)"')
+_WRITTEN_BY = re.compile(
+    rb'\A\{\s*"format":\s*"valveflow/extended_model",\s*"written_by":\s*"([a-z]+)"'
+)
+_FORMATS = {
+    'characteristic': 'identify',
+    'shift': 'identify',
+    'diagnosis': 'diagnose',
+    'comparison': 'compare',
+    'validation': 'validate',
+}
+_TABLES = {
+    'compare': re.compile(
+        rb'\A(segment,kind,(\S*,)?proposed\.|method,piece,slope,intercept,|u,(\w+,)*proposed\b)'
+    ),
+    'validate': re.compile(rb'\Asegment,kind,(\S*,)?curve\.'),
+}
+
+
+def signed(content: Mapping[str, Any], verb: str) -> dict[str, Any]:
+    """Return the content of an extended model with the verb that writes it, near its head.
+
+    Two verbs write one, and its format alone does not tell which.
+    """
+    return {'format': content['format'], 'written_by': verb, **content}
+
+
+def writer(path: Path) -> str:
+    """Return the verb that wrote a file, empty if that is not sure."""
+    try:
+        with path.open('rb') as file:
+            head = file.read(_HEAD)
+    except OSError:
+        return ''
+    if path.suffix == '.html':
+        found = _PAGE.search(head)
+        return found[1].decode() if found else ''
+    if path.suffix == '.json':
+        if found := _WRITTEN_BY.match(head):
+            return found[1].decode()
+        found = _FORMAT.match(head)
+        return _FORMATS.get(found[1].decode(), '') if found else ''
+    first = head.partition(b'\n')[0]
+    return next((verb for verb, columns in _TABLES.items() if columns.match(first)), '')
+
+
+# What stands in a folder of results already: kept, unless the same verb wrote it.
+
+
+REPORT = 'report.html'
+# A file that is not ours, or of a version that did not say.
+_UNKNOWN = 'before'
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What another verb or somebody else had written, and where it stands now.
+
+    Attributes
+    ----------
+    names : mapping of str to str
+        Old names to new ones.
+    verb : str
+        Whose report was kept, empty if none was or that cannot be told.
+    old : str
+        An earlier report of the verb at work that stands beside the new one, or empty.
+    """
+
+    names: Mapping[str, str] = field(default_factory=dict)
+    verb: str = ''
+    old: str = ''
+
+    def words(self) -> str:
+        """Return one line for a person; empty if there is nothing to say."""
+        told = []
+        for name, new in self.names.items():
+            report = f'report of valveflow {self.verb}' if self.verb else 'report'
+            what = f'The {report}' if name == REPORT else f'The {name}'
+            told.append(f'{what} that was there is now {new}.')
+        if self.old:
+            told.append(f'{self.old} is of an earlier run; the new one is {REPORT}.')
+        return ' '.join(told)
+
+
+def keep_others(folder: Path, verb: str, names: Collection[str]) -> Kept:
+    """Copy what ``verb`` is about to replace and has not surely written itself.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder of results; it need not exist.
+    verb : str
+        Whose results are to be written.
+    names : collection of str
+        Of the files to be written.
+
+    Raises
+    ------
+    RecordingError
+        A copy cannot be made; nothing has been replaced then.
+    """
+    kept: dict[str, str] = {}
+    # The report is named first.
+    for name in sorted(names, key=lambda n: n != REPORT):
+        if not (folder / name).is_file():
+            continue
+        theirs = writer(folder / name)
+        if theirs == verb:
+            continue
+        kept[name] = _free(folder, name, theirs, names)
+        write_texts(folder, {kept[name]: _content(folder / name)})
+    own = renamed(REPORT, verb)
+    old = own if writer(folder / own) == verb else ''
+    return Kept(kept, writer(folder / REPORT) if REPORT in kept else '', old)
+
+
+def renamed(name: str, mark: str) -> str:
+    """Return ``report_identify.html`` for ``report.html``."""
+    path = Path(name)
+    return f'{path.stem}_{mark}{path.suffix}'
+
+
+def _free(folder: Path, name: str, verb: str, taken: Collection[str]) -> str:
+    """Return a name for a copy: one that is free, or holds an older copy of the same verb."""
+    mark = verb or _UNKNOWN
+    new, number = renamed(name, mark), 1
+    while new in taken or (os.path.lexists(folder / new) and not _same(folder / new, verb)):
+        number += 1
+        new = renamed(name, f'{mark}_{number}')
+    return new
+
+
+def _same(path: Path, verb: str) -> bool:
+    return bool(verb) and path.is_file() and writer(path) == verb
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(
+            path, f'cannot be read to keep it ({reason}); choose another -o DIR'
+        ) from None

@@ -13,7 +13,7 @@ def first_facts(path: Path) -> str:
     """Return a sentence from the summary of a large finished recording, else nothing."""
     from valveflow_ros.logs.mcap.summary import read_summary
     from valveflow_ros.logs.source import Source
-    from valveflow_ros.report.numbers import count, duration, moment
+    from valveflow_ros.report.words import count, duration, moment
 
     if path.suffix.lower() != '.mcap':
         return ''

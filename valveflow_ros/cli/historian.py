@@ -2,33 +2,37 @@
 
 from __future__ import annotations
 
+import json
+import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from valveflow_ros.cli.console import Console
-from valveflow_ros.cli.constant_signals import check_constants, with_constants
-from valveflow_ros.cli.historian_facts import Imported, SignalSource, Tally
 from valveflow_ros.cli.historian_open import joined
-from valveflow_ros.cli.historian_order import Ordered
-from valveflow_ros.cli.historian_spool import Spool
 from valveflow_ros.cli.log_input import (
     advice,
     air_note,
+    check_constants,
+    doubt,
     names_for,
     refuse_guesses,
     unit_for,
     unknown_unit,
+    with_constants,
 )
-from valveflow_ros.cli.mapping import Mapping
-from valveflow_ros.cli.plausible import doubt
-from valveflow_ros.config import Settings
+from valveflow_ros.cli.options import LogMapping
 from valveflow_ros.errors import DataError, InputError, RecordingError
 from valveflow_ros.logs.reader import TABLE_SUFFIXES
-from valveflow_ros.logs.tables.historian_refusal import RefusedError
-from valveflow_ros.logs.tables.table_reader import RawBlock, TableReader
+from valveflow_ros.logs.tables.reader import RawBlock, TableReader
+from valveflow_ros.logs.tables.refusal import RefusedError
+from valveflow_ros.logs.tables.table import order_note
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
     SIGNALS,
     ByteArray,
@@ -40,8 +44,290 @@ from valveflow_ros.records import (
     Signal,
     table_to_readings,
 )
-from valveflow_ros.report.quality import gaps
-from valveflow_ros.signals.unit_table import convert
+from valveflow_ros.report.data import Gap, gaps
+from valveflow_ros.signals.units import convert
+
+# What is to be told of a table that was imported.
+
+
+_SAMPLE = 500_000  # so many values are enough to judge a unit by
+
+
+@dataclass(frozen=True, slots=True)
+class SignalSource:
+    """Where one signal comes from; ``low`` and ``high`` in the engine's unit.
+
+    ``words`` counts what stands in cells in place of numbers, the most frequent
+    first; ``empty`` counts cells that are empty or say so; ``ground`` says why the
+    column was chosen, where that had to be found out; ``air`` what is added to a gauge
+    pressure.
+    """
+
+    topic: str
+    column: str
+    written_unit: str
+    unit: str
+    low: float
+    high: float
+    missing: int
+    constant: bool
+    words: dict[str, int] = field(default_factory=dict)
+    empty: int = 0
+    ground: str = ''
+    air: str = ''
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """A table that was understood.
+
+    Attributes
+    ----------
+    sources : list of SignalSource
+        In the order of `Signal`.
+    rows_read, rows, duplicates : int
+        Rows of the file with a readable time, those used, and those left out
+        for having one that stood there before.
+    period_s : float
+        Median step.
+    span_ns : tuple of int
+        First and last time.
+    gaps : list of Gap
+        The longest first.
+    ignored : tuple of str
+        Columns that were not used.
+    notes : tuple of str
+        Sentences of the reader.
+    time_zone : str
+        The zone the times were taken to be in.
+    time_words : str
+        How the times are written.
+    """
+
+    path: Path
+    sources: list[SignalSource]
+    rows_read: int
+    rows: int
+    duplicates: int
+    period_s: float
+    span_ns: tuple[int, int]
+    gaps: list[Gap]
+    ignored: tuple[str, ...]
+    notes: tuple[str, ...]
+    time_zone: str
+    time_words: str = ''
+
+    def summary(self) -> dict[str, Any]:
+        """Return everything, for a program."""
+        return {
+            'source': str(self.path),
+            'rows': self.rows,
+            'rows_read': self.rows_read,
+            'duplicates': self.duplicates,
+            'period_s': self.period_s,
+            'start_ns': self.span_ns[0],
+            'end_ns': self.span_ns[1],
+            'time_zone': self.time_zone,
+            'gaps': len(self.gaps),
+            'signals': [asdict(source) for source in self.sources],
+            'ignored': list(self.ignored),
+            'notes': list(self.notes),
+        }
+
+    def as_json(self) -> str:
+        """Return the summary as the text that goes into the log; the file's name only."""
+        content = {**self.summary(), 'source': self.path.name}
+        finite = [
+            {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in s.items()}
+            for s in content['signals']
+        ]
+        return json.dumps({**content, 'signals': finite}, indent=2, allow_nan=False)
+
+
+class Tally:
+    """Range and a sample of a column that passes by in blocks."""
+
+    def __init__(self) -> None:
+        self.low = self.high = float('nan')
+        self.known = 0
+        self.missing = 0
+        self._parts: list[FloatArray] = []
+        self._stride = 1
+
+    def add(self, values: FloatArray) -> None:
+        """Count a block, values as they stand in the file."""
+        finite = values[np.isfinite(values)]
+        self.known += len(finite)
+        self.missing += len(values) - len(finite)
+        if not len(finite):
+            return
+        self.low = float(np.fmin(self.low, finite.min()))
+        self.high = float(np.fmax(self.high, finite.max()))
+        self._parts.append(finite[:: self._stride].copy())
+        if sum(map(len, self._parts)) > _SAMPLE:
+            self._stride *= 2
+            self._parts = [np.concatenate(self._parts)[::2].copy()]
+
+    def sample(self) -> FloatArray:
+        """Return values that stand for all, the lowest and the highest among them."""
+        ends = [np.array([self.low, self.high])] if self.known else []
+        return np.concatenate([*self._parts, *ends]) if self._parts else np.empty(0)
+
+
+# In which order the rows of a table are taken, and which are left out.
+
+
+@dataclass(frozen=True, slots=True)
+class Ordered:
+    """In which order the rows of a file are to be taken.
+
+    Attributes
+    ----------
+    time_ns : int64 (n,)
+        In the order of the file.
+    order : int64 (m,) or None
+        Rows to be taken; ``None``: all, as they stand.
+    duplicates : int
+        Rows left out for having a time that stood there before.
+    sorted_how : str
+        A sentence, if the rows had to be sorted.
+    """
+
+    time_ns: IntArray
+    order: IntArray | None
+    duplicates: int = 0
+    sorted_how: str = ''
+
+    @classmethod
+    def of(cls, time_ns: IntArray, long: bool) -> Ordered:
+        """Sort the times; of a table with a row a value no time is one too many."""
+        steps = np.diff(time_ns)
+        order, how = None, ''
+        if (steps < 0).any():
+            newest_first = bool((steps <= 0).all())
+            how = '' if long else order_note(newest_first)
+            order = np.arange(len(time_ns))
+            if newest_first:
+                order = order[::-1]
+            order = order[np.argsort(time_ns[order], kind='stable')]
+            steps = np.diff(time_ns[order])
+        again = 0 if long else int((steps == 0).sum())
+        if again:
+            order = np.arange(len(time_ns)) if order is None else order
+            order = order[np.r_[True, steps != 0]]
+        return cls(time_ns, order, again, how)
+
+    @property
+    def rows_read(self) -> int:
+        """Return how many rows have a time."""
+        return len(self.time_ns)
+
+    @property
+    def rows(self) -> int:
+        """Return how many rows are taken."""
+        return len(self.time_ns) if self.order is None else len(self.order)
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """Return the first and the last time."""
+        return int(self.time_ns.min()), int(self.time_ns.max())
+
+    @property
+    def period_s(self) -> float:
+        """Return the median step between different times, 0 if there is none."""
+        steps = np.diff(self.distinct())
+        return float(np.median(steps)) / 1e9 if len(steps) else 0.0
+
+    def distinct(self) -> IntArray:
+        """Return the different times in their order."""
+        times = self.time_ns if self.order is None else self.time_ns[self.order]
+        return times[np.r_[True, np.diff(times) > 0]]
+
+    def blocks(self, size: int) -> Iterator[tuple[IntArray, slice | IntArray]]:
+        """Yield times and rows in the order of time."""
+        for start in range(0, self.rows, size):
+            if self.order is None:
+                part = slice(start, min(start + size, self.rows))
+                yield self.time_ns[part], part
+            else:
+                rows = self.order[start : start + size]
+                yield self.time_ns[rows], rows
+
+
+# Keeps the numbers of a long table on disk while its times decide their order.
+
+
+Array = NDArray[Any]
+
+
+class Spool:
+    """Columns in unnamed files, which vanish with the process.
+
+    Parameters
+    ----------
+    folder : Path
+        Where there is room for them: beside the log that is to be written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._files: dict[str, tuple[IO[bytes], np.dtype[Any]]] = {}
+
+    def append(self, name: str, values: Array) -> None:
+        """Add values to the end of a column.
+
+        Raises
+        ------
+        RecordingError
+            If the disk is full.
+        """
+        if name not in self._files:
+            self._files[name] = (self._file(), values.dtype)
+        file, dtype = self._files[name]
+        with _said(self._folder):
+            file.write(np.ascontiguousarray(values, dtype).data.cast('B'))
+
+    def holds(self, name: str) -> bool:
+        """Tell whether there is such a column."""
+        return name in self._files
+
+    def take(self, name: str, rows: slice | IntArray) -> Array:
+        """Return some rows of a column: a stretch, or any rows in any order."""
+        file, dtype = self._files[name]
+        if isinstance(rows, slice):
+            return self._stretch(file, dtype, rows.start, rows.stop)
+        low, high = int(rows.min()), int(rows.max()) + 1
+        if high - low <= 4 * len(rows):
+            return self._stretch(file, dtype, low, high)[rows - low]
+        file.flush()
+        everything: Array = np.memmap(file, dtype, 'r')
+        return np.array(everything[rows])
+
+    def close(self) -> None:
+        """Give the space back."""
+        for file, _ in self._files.values():
+            file.close()
+
+    def _file(self) -> IO[bytes]:
+        # It lives as long as this object; `close` ends it.
+        with _said(self._folder):
+            return tempfile.TemporaryFile(dir=self._folder)
+
+    def _stretch(self, file: IO[bytes], dtype: np.dtype[Any], start: int, stop: int) -> Array:
+        with _said(self._folder):
+            file.seek(start * dtype.itemsize)
+            raw = file.read((stop - start) * dtype.itemsize)
+        return np.frombuffer(raw, dtype)
+
+
+@contextmanager
+def _said(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(folder, f'has no room for the work ({reason})') from None
+
 
 _ROWS = 200_000  # in memory at a time
 _BY_COLUMN = {info.column: info for info in SIGNALS}
@@ -69,7 +355,7 @@ class Historian:
     """
 
     def __init__(
-        self, path: Path, mapping: Mapping, console: Console, *, strict: bool = False
+        self, path: Path, mapping: LogMapping, console: Console, *, strict: bool = False
     ) -> None:
         if path.suffix.lower() not in TABLE_SUFFIXES:
             raise RecordingError(path, 'is no .csv, .xlsx or .parquet table')
@@ -274,7 +560,7 @@ class Historian:
         return sources
 
 
-def _reader(path: Path, mapping: Mapping) -> TableReader:
+def _reader(path: Path, mapping: LogMapping) -> TableReader:
     columns, strange = names_for(mapping)
     try:
         return TableReader(path, columns, list(mapping.constants), mapping.table)

@@ -7,8 +7,8 @@ from argparse import Namespace
 from pathlib import Path
 
 from valveflow_ros.cli.historian_open import subject
-from valveflow_ros.cli.mapping import About, read_mapping
-from valveflow_ros.logs.tables.historian_refusal import THEIRS, RefusedError, Remedy, quoted
+from valveflow_ros.cli.options import About, read_mapping
+from valveflow_ros.logs.tables.refusal import THEIRS, RefusedError, Remedy, quoted
 
 _FLAGS = ('dry_run', 'overwrite', 'quiet', 'json')
 # Of these the table shows that one is needed, and not which.

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TypeVar
 
-from valveflow_ros.cli.mapping import Constant, Mapping, read_mapping
+from valveflow_ros.cli.options import Constant, LogMapping, read_mapping
 from valveflow_ros.cli.usage import UsageError
 from valveflow_ros.errors import ValveflowError
-from valveflow_ros.logs.tables.historian_refusal import THEIRS, RefusedError, Remedy
+from valveflow_ros.logs.tables.refusal import THEIRS, RefusedError, Remedy
 
 Result = TypeVar('Result')
 _TABLE = {'time-zone': 'time_zone', 'date-order': 'date_order', 'decimal': 'decimal',
@@ -29,9 +29,9 @@ LOOKING_ON = 'looking for what else the table leaves open'
 
 def looked_through(
     path: object,
-    look: Callable[[Mapping], Result],
-    mapping: Mapping,
-    again: Callable[[Mapping], object] | None = None,
+    look: Callable[[LogMapping], Result],
+    mapping: LogMapping,
+    again: Callable[[LogMapping], object] | None = None,
 ) -> Result:
     """Return what a look gives; where it is refused, look on as if the person had answered.
 
@@ -73,7 +73,7 @@ def looked_through(
     raise RefusedError(path, problems, _newest(remedies), last=True) from None
 
 
-def answered(mapping: Mapping, remedies: Iterable[Remedy]) -> Mapping:
+def answered(mapping: LogMapping, remedies: Iterable[Remedy]) -> LogMapping:
     """Return the mapping with these options added; what is not known yet is left out of the look.
 
     Raises
@@ -94,7 +94,7 @@ def answered(mapping: Mapping, remedies: Iterable[Remedy]) -> Mapping:
             constants[name] = Constant(name, _USUAL[name], '')
         else:
             columns[name] = column
-    return Mapping(columns, constants, table)
+    return LogMapping(columns, constants, table)
 
 
 def joined(path: object, refused: list[RefusedError]) -> RefusedError:

@@ -11,39 +11,38 @@ from typing import Any
 
 from valveflow_ros.cli import engine
 from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.file_marks import signed
+from valveflow_ros.cli.files import signed
 from valveflow_ros.cli.first_run import SENTENCE, is_first_run
 from valveflow_ros.cli.log_input import LogInput, steps_of
 from valveflow_ros.cli.manual_test import advice_for, found_in_step_test, refusal
 from valveflow_ros.cli.monitor_history import history_in
-from valveflow_ros.cli.parameters import settings_for
+from valveflow_ros.cli.options import settings_for
 from valveflow_ros.cli.report_words import columns, rejected_words
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
-from valveflow_ros.curve.shift import ShiftLimits, judge_shift
-from valveflow_ros.curve.shift_json import shift_json
-from valveflow_ros.diagnosis import model_json
+from valveflow_ros.curve.shift import ShiftLimits, judge_shift, shift_json
+from valveflow_ros.diagnosis import result
 from valveflow_ros.diagnosis.corrector import corrector_of
-from valveflow_ros.diagnosis.extended import Extended
-from valveflow_ros.diagnosis.extended_model import ExtendedModel
+from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
 from valveflow_ros.errors import DataError
-from valveflow_ros.monitoring.corrector import Corrector
+from valveflow_ros.monitoring.rows import Corrector
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.answer import doubt, explained, opening_gain, temperature_words
+from valveflow_ros.report.data import rejected
 from valveflow_ros.report.identified import Identified
-from valveflow_ros.report.numbers import (
+from valveflow_ros.report.words import (
     count,
     counted,
     decimals,
+    held_words,
+    input_unit_plain,
     interval,
     moment,
     percent,
     plain,
     with_error,
 )
-from valveflow_ros.report.quality import rejected
-from valveflow_ros.report.words import held_words, input_unit_plain
 
 
 def found_in(
@@ -129,7 +128,7 @@ def texts(found: Identified, extended: ExtendedModel | None = None) -> dict[str,
         files['shift.json'] = told + '\n'
     if extended is not None and found.characteristic.dynamics:
         anew = Extended(found.characteristic.model, extended.model.active)
-        model = signed(model_json.to_json(replace(extended, model=anew)), 'identify')
+        model = signed(result.model_to_json(replace(extended, model=anew)), 'identify')
         files['extended_model.json'] = json.dumps(model, indent=2) + '\n'
     return files
 

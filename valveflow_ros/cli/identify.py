@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
-from valveflow_ros.cli.parameter_options import add_parameters
+from valveflow_ros.cli.options import MAPPING_HELP, add_mapping, add_parameters, read_mapping
 from valveflow_ros.cli.report_files import (
     add_report_files,
     check_report_files,
@@ -73,7 +72,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     from valveflow_ros.cli.identification import found_in, judged, outcome, texts
     from valveflow_ros.cli.log_input import open_input
     from valveflow_ros.cli.model_file import check_exponent, read_extended, read_model
-    from valveflow_ros.cli.parameters import read_parameters
+    from valveflow_ros.cli.options import read_parameters
     from valveflow_ros.report.identification import identification_page
 
     given = read_parameters(options.params, options.pairs)

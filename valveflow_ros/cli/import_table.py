@@ -9,14 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.mapping import MAPPING_HELP, Mapping, add_mapping, read_mapping
+from valveflow_ros.cli.options import MAPPING_HELP, LogMapping, add_mapping, read_mapping
 from valveflow_ros.cli.usage import UsageError
 
 if TYPE_CHECKING:
-    from valveflow_ros.cli.historian import Historian
-    from valveflow_ros.cli.historian_facts import Imported, SignalSource
-    from valveflow_ros.cli.historian_order import Ordered
-    from valveflow_ros.cli.historian_spool import Spool
+    from valveflow_ros.cli.historian import Historian, Imported, Ordered, SignalSource, Spool
 
 _DESCRIPTION = """\
 Read a table exported from a historian (CSV, Excel or Parquet; a column a signal, or a row a
@@ -62,12 +59,12 @@ def run(options: Namespace, console: Console) -> Outcome:
     from valveflow_ros.cli.historian_open import looked_through
     from valveflow_ros.cli.outputs import check_log
     from valveflow_ros.errors import InputError
-    from valveflow_ros.logs.tables.historian_refusal import RefusedError
+    from valveflow_ros.logs.tables.refusal import RefusedError
 
     if options.output is not None:
         check_log(options.output, source=options.table, overwrite=options.overwrite)
 
-    def look(said: Mapping) -> Outcome:
+    def look(said: LogMapping) -> Outcome:
         return _imported(options, said, console)
 
     try:
@@ -78,7 +75,7 @@ def run(options: Namespace, console: Console) -> Outcome:
         raise InputError(told(refused, options)) from None
 
 
-def _looked(table: Path, console: Console, mapping: Mapping) -> None:
+def _looked(table: Path, console: Console, mapping: LogMapping) -> None:
     """Read a table for what else is open, and say nothing of what is understood."""
     from valveflow_ros.cli.historian import Historian
     from valveflow_ros.cli.historian_open import LOOKING_ON
@@ -88,9 +85,8 @@ def _looked(table: Path, console: Console, mapping: Mapping) -> None:
         Historian(table, mapping, Console(nowhere, nowhere, quiet=True), strict=True).read(None)
 
 
-def _imported(options: Namespace, mapping: Mapping, console: Console) -> Outcome:
-    from valveflow_ros.cli.historian import Historian
-    from valveflow_ros.cli.historian_spool import Spool
+def _imported(options: Namespace, mapping: LogMapping, console: Console) -> Outcome:
+    from valveflow_ros.cli.historian import Historian, Spool
 
     console.progress(0.05, 'looking at the table')
     historian = Historian(options.table, mapping, console)
@@ -150,7 +146,7 @@ def _outcome(imported: Imported, written: Path | None, long: bool) -> Outcome:
 def _understood(imported: Imported, long: bool) -> list[str]:
     """Return what a person should check before trusting the log."""
     from valveflow_ros.cli.report_words import columns
-    from valveflow_ros.report.numbers import count, counted, duration, moment
+    from valveflow_ros.report.words import count, counted, duration, moment
 
     first, last = imported.span_ns
     # In a long table a row is one value of one signal.
@@ -197,7 +193,7 @@ def _rows(imported: Imported) -> list[list[str]]:
 
 
 def _row(source: SignalSource) -> list[str]:
-    from valveflow_ros.report.numbers import counted, plain
+    from valveflow_ros.report.words import counted, plain
 
     if source.constant:
         return ['(constant)', source.topic, 'as you said', '', plain(source.low), source.unit, '']

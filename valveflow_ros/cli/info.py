@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
+from valveflow_ros.cli.options import MAPPING_HELP, add_mapping, read_mapping
 
 _DESCRIPTION = """\
 Look into a log before working with it: its span, topics and rates, the range of each signal,

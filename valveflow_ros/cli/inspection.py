@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from valveflow_ros.cli.log_input import LogInput, steps_of_each
-from valveflow_ros.cli.parameters import settings_for
-from valveflow_ros.cli.plausible import limits
+from valveflow_ros.cli.log_input import LogInput, limits, steps_of_each
+from valveflow_ros.cli.options import settings_for
 from valveflow_ros.cli.report_words import columns, rejected_words
-from valveflow_ros.config import Settings
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Readings, Signal
-from valveflow_ros.report.numbers import count, counted, duration, moment, plain
-from valveflow_ros.report.quality import Gap, gaps
+from valveflow_ros.report.data import Gap, gaps
+from valveflow_ros.report.words import count, counted, duration, moment, plain
 
 _GAP_STEPS = 3.5  # a pause of more than this many usual steps is a gap
 

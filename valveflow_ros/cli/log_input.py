@@ -10,18 +10,169 @@ from pathlib import Path
 import numpy as np
 
 from valveflow_ros.cli.console import Console
-from valveflow_ros.cli.constant_signals import check_constants, with_constants
 from valveflow_ros.cli.historian_open import LOOKING_ON, looked_through
-from valveflow_ros.cli.mapping import Column, Mapping
-from valveflow_ros.cli.plausible import Doubt, doubt
+from valveflow_ros.cli.options import Column, LogMapping
 from valveflow_ros.cli.usage import UsageError
-from valveflow_ros.config import Settings
-from valveflow_ros.errors import InputError
+from valveflow_ros.errors import DataError, InputError
 from valveflow_ros.logs import LogContents, open_log
-from valveflow_ros.logs.tables.historian_match import choosing, option
-from valveflow_ros.logs.tables.historian_refusal import THEIRS, RefusedError
-from valveflow_ros.records import SIGNALS, Readings, Signal
-from valveflow_ros.signals.unit_table import UNITS, air_in, convert, known_units
+from valveflow_ros.logs.tables.match import choosing, option
+from valveflow_ros.logs.tables.refusal import THEIRS, RefusedError
+from valveflow_ros.parameters import Settings
+from valveflow_ros.records import SIGNALS, FloatArray, Quality, Readings, Signal
+from valveflow_ros.signals.units import UNITS, air_in, convert, known_units, unit_of
+
+# Values that cannot be what their unit says, and the unit they look like.
+
+
+# What the signals of a steam unit in operation usually read, in engine units.
+_USUAL = {
+    Signal.VALVE_OPENING: (3.0, 102.0),
+    Signal.MAIN_STEAM_PRESSURE: (2.0, 35.0),
+    Signal.MAIN_STEAM_TEMPERATURE: (350.0, 680.0),
+    Signal.GENERATED_POWER: (3.0, 1800.0),
+    Signal.VALVE_COMMAND: (3.0, 102.0),
+}
+_MANY = 0.02  # share of impossible values that is worth a word
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """A signal whose values do not suit its unit.
+
+    Attributes
+    ----------
+    signal : Signal
+    impossible : float
+        Share of its values that the engine will reject.
+    looks_like : str
+        The unit that would suit, empty if none does.
+    sentence : str
+        What to tell a person, without the option that would help.
+    """
+
+    signal: Signal
+    impossible: float
+    looks_like: str
+    sentence: str
+
+
+def limits(signal: Signal, settings: Settings) -> tuple[float, float]:
+    """Return the range outside of which a value is rejected."""
+    name = 'valve_opening' if signal == Signal.VALVE_COMMAND else SIGNALS[signal].topic
+    return settings.real(f'{name}_low'), settings.real(f'{name}_high')
+
+
+def doubt(signal: Signal, written: FloatArray, unit: str, settings: Settings) -> Doubt | None:
+    """Judge the values of one signal.
+
+    Parameters
+    ----------
+    written : float64 (n,)
+        As they stand in the log.
+    unit : str
+        The unit they are taken to have.
+    """
+    written = written[np.isfinite(written)]
+    if not len(written):
+        return None
+    low, high = limits(signal, settings)
+    taken = unit_of(signal, unit)
+    values = written * taken.scale + taken.offset
+    impossible = float(((values < low) | (values > high)).mean())
+    looks_like = _better_unit(signal, written, unit, (low, high))
+    if impossible < _MANY and not looks_like:
+        return None
+    info = SIGNALS[signal]
+    runs = f'its values run from {written.min():g} to {written.max():g}'
+    if impossible >= _MANY:
+        share = 'all' if impossible == 1.0 else f'{100.0 * impossible:.0f} %'
+        sentence = (
+            f'{info.topic}: {runs} and are taken as {unit}; {share} of them are impossible '
+            f'(outside {low:g} to {high:g} {info.unit}) and will be rejected.'
+        )
+    else:
+        sentence = f'{info.topic}: {runs} and are taken as {unit}, which is unusual.'
+    if looks_like:
+        sentence += f' They look like {looks_like}.'
+    return Doubt(signal, impossible, looks_like, sentence)
+
+
+def _better_unit(
+    signal: Signal, written: FloatArray, unit: str, allowed: tuple[float, float]
+) -> str:
+    """Return the unit in which the values would be usual when in their own they are not."""
+    middle = float(np.median(written))
+    low, high = _USUAL[signal]
+
+    def usual(name: str) -> bool:
+        other = unit_of(signal, name)
+        values = written * other.scale + other.offset
+        inside = (values >= allowed[0]) & (values <= allowed[1])
+        return low <= middle * other.scale + other.offset <= high and bool(inside.mean() > 0.95)
+
+    own = unit_of(signal, unit)
+    if usual(unit):
+        return ''
+    for name, other in UNITS[signal].items():
+        if other != own and usual(name):
+            return name
+    return ''
+
+
+# Signals that were not logged: what a person says of them stands beside every reading.
+
+
+def check_constants(constants: dict[Signal, float]) -> None:
+    """Refuse constants that the engine would reject at each row.
+
+    Raises
+    ------
+    UsageError
+    """
+    settings = Settings()
+    for signal, value in constants.items():
+        low, high = limits(signal, settings)
+        if not low <= value <= high:
+            info = SIGNALS[signal]
+            others = ', '.join(list(UNITS[signal])[1:])
+            raise UsageError(
+                f'--constant {info.topic}: {value:g} {info.unit} is impossible ({low:g} to '
+                f'{high:g} {info.unit}); for another unit write {info.topic}=VALUE:UNIT with one '
+                f'of {others}.'
+            )
+
+
+def with_constants(readings: Readings, constants: dict[Signal, float]) -> Readings:
+    """Put each constant beside every reading of a measured signal.
+
+    Raises
+    ------
+    DataError
+        If no signal is measured.
+    """
+    if not constants:
+        return readings
+    kept = ~np.isin(readings.signal, [int(s) for s in constants])
+    readings = Readings(
+        readings.time_ns[kept], readings.signal[kept], readings.value[kept],
+        readings.quality[kept],
+    )  # fmt: skip
+    measured = [i.signal for i in SIGNALS if i.required and i.signal not in constants]
+    lead = next((s for s in measured if (readings.signal == s).any()), None)
+    if lead is None:
+        raise DataError('Every signal is a constant or missing; nothing is left to learn from.')
+    beside = np.flatnonzero(readings.signal == lead)
+    for signal, value in sorted(constants.items()):
+        n = len(beside)
+        readings = Readings(
+            np.insert(readings.time_ns, beside, readings.time_ns[beside]),
+            np.insert(readings.signal, beside, np.full(n, int(signal), dtype=np.int8)),
+            np.insert(readings.value, beside, np.full(n, value)),
+            np.insert(readings.quality, beside, np.full(n, int(Quality.GOOD), dtype=np.uint8)),
+        )
+        beside = beside + np.arange(1, n + 1)
+    return readings
+
 
 # A column is not the signal it is named after if most of its values cannot be.
 _MOST = 0.5
@@ -57,7 +208,7 @@ class LogInput:
         return '' if signal in self.constants else self.contents.signals.get(signal, '')
 
 
-def open_input(path: Path, mapping: Mapping, console: Console) -> LogInput:
+def open_input(path: Path, mapping: LogMapping, console: Console) -> LogInput:
     """Open a log, convert it, and say aloud what looks wrong.
 
     Raises
@@ -91,10 +242,10 @@ def open_input(path: Path, mapping: Mapping, console: Console) -> LogInput:
     return LogInput(contents, with_constants(readings, constants), units, constants, doubts)
 
 
-def open_with(path: Path, mapping: Mapping, console: Console) -> LogContents:
+def open_with(path: Path, mapping: LogMapping, console: Console) -> LogContents:
     """Open a log under the names of ``--column``; raises like `open_input`."""
 
-    def look(said: Mapping) -> LogContents:
+    def look(said: LogMapping) -> LogContents:
         columns, strange = names_for(said)
         try:
             return open_log(path, columns=columns, absent=list(said.constants), table=said.table)
@@ -103,14 +254,14 @@ def open_with(path: Path, mapping: Mapping, console: Console) -> LogContents:
                 raise
             raise unknown_unit(strange[0]) from error
 
-    def again(said: Mapping) -> LogContents:
+    def again(said: LogMapping) -> LogContents:
         console.progress(0.02, LOOKING_ON)
         return look(said)
 
     return looked_through(path, look, mapping, again)
 
 
-def names_for(mapping: Mapping) -> tuple[dict[str, str], list[Column]]:
+def names_for(mapping: LogMapping) -> tuple[dict[str, str], list[Column]]:
     """Return contract name to their name, and the columns whose unit is unknown.
 
     Where what follows the last colon is no unit, the colon is taken to belong
@@ -134,7 +285,7 @@ def _is_known(column: Column) -> bool:
     return not column.unit or column.unit in known_units(_BY_TOPIC[column.name].signal)
 
 
-def unit_for(signal: Signal, mapping: Mapping, told: dict[Signal, str] | None = None) -> str:
+def unit_for(signal: Signal, mapping: LogMapping, told: dict[Signal, str] | None = None) -> str:
     """Return the unit a signal of the log is taken to have.
 
     What the person says stands above what the recording says of itself, and

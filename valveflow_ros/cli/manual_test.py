@@ -10,11 +10,11 @@ from valveflow_ros.cli import engine
 from valveflow_ros.cli.alignment import align, quiet
 from valveflow_ros.cli.console import Console
 from valveflow_ros.cli.log_input import LogInput, steps_of
-from valveflow_ros.cli.parameters import settings_for
-from valveflow_ros.config import Settings
+from valveflow_ros.cli.options import settings_for
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.step_levels import looks_like_step_test
 from valveflow_ros.fit.step_test import identify_step_test
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import Readings, SampleTable
 from valveflow_ros.report.identified import Identified
 

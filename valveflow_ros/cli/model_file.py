@@ -13,7 +13,7 @@ from valveflow_ros.curve.characteristic_json import FORMAT, from_json
 from valveflow_ros.errors import DataError, RecordingError
 
 if TYPE_CHECKING:
-    from valveflow_ros.diagnosis.extended_model import ExtendedModel
+    from valveflow_ros.diagnosis.extended import ExtendedModel
 
 _MOST_BYTES = 50_000_000
 _CURVE, _EXTENDED = 'characteristic.json', 'extended_model.json'
@@ -88,9 +88,9 @@ def model_path(path: Path, names: tuple[str, ...] = (_CURVE, _EXTENDED)) -> Path
 def _of_json(raw: object) -> Characteristic | ExtendedModel:
     if not isinstance(raw, dict) or raw.get('format') == FORMAT:
         return from_json(raw)
-    from valveflow_ros.diagnosis import model_json
+    from valveflow_ros.diagnosis import result
 
-    return model_json.from_json(raw) if model_json.is_model(raw) else from_json(raw)
+    return result.model_from_json(raw) if result.is_model(raw) else from_json(raw)
 
 
 def check_exponent(

@@ -10,9 +10,9 @@ import numpy as np
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import LogContents
-from valveflow_ros.monitoring.alarm_records import AlarmState
+from valveflow_ros.monitoring.alarm import AlarmState
 from valveflow_ros.records import NS_PER_S
-from valveflow_ros.report.history_data import AlarmMoment, CurveMoment, DiagnosisMoment, History
+from valveflow_ros.report.history import AlarmMoment, CurveMoment, DiagnosisMoment, History
 
 _CURVE = 'valveflow_msgs/msg/FlowCharacteristic'
 _ALARM = 'valveflow_msgs/msg/Alarm'

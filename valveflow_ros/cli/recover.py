@@ -30,7 +30,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     """Recover and say what was kept."""
     from valveflow_ros.cli.files import check_output
     from valveflow_ros.logs.mcap import recover
-    from valveflow_ros.report.numbers import count, counted
+    from valveflow_ros.report.words import count, counted
 
     check_output(options.output, ('.mcap',), source=options.broken)
     console.progress(0.0, 'recovering')

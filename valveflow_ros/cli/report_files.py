@@ -74,8 +74,7 @@ def with_report(
     RecordingError
         They cannot be written.
     """
-    from valveflow_ros.cli.files import write_texts
-    from valveflow_ros.cli.keeping import REPORT, keep_others
+    from valveflow_ros.cli.files import REPORT, keep_others, write_texts
 
     content = {**texts, REPORT: page.to_html()}
     beside = _pictures_and_tables(options, page)
@@ -124,7 +123,7 @@ def _pictures_and_tables(
     """Return what was asked for beside the report: by folder, then by name."""
     made: dict[str, Mapping[str, str] | Mapping[str, bytes]] = {}
     if options.table:
-        from valveflow_ros.report.picture_data import figure_csv
+        from valveflow_ros.report.figure import figure_csv
 
         made[TABLES] = {f'{f.name}.csv': figure_csv(f) for f in page.figures}
     if options.figures:

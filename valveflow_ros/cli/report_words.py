@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from valveflow_ros.report.numbers import count
-from valveflow_ros.report.quality import REASON_WORDS, rejected
+from valveflow_ros.report.data import REASON_WORDS, rejected
+from valveflow_ros.report.words import count
 
 
 def rejected_words(counts: Mapping[str, Mapping[str, int]]) -> str:

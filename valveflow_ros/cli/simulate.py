@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.report.terminal.terminal_number import number, whole
+from valveflow_ros.report.terminal.text import number, whole
 
 if TYPE_CHECKING:
-    from valveflow_ros.plant.recorder import SimulatedLog
+    from valveflow_ros.plant.simulator import SimulatedLog
     from valveflow_ros.plant.spec import EffectSpec
 
 _DESCRIPTION = """\
@@ -146,7 +146,7 @@ def _truth(log: SimulatedLog, options: Namespace) -> dict[str, Any]:
 
 
 def _text(log: SimulatedLog, options: Namespace, written: Path) -> str:
-    from valveflow_ros.report.numbers import count, counted, duration, plain
+    from valveflow_ros.report.words import count, counted, duration, plain
 
     curve = log.unit.curve
     lines = [

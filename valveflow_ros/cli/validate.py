@@ -6,10 +6,9 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.mapping import MAPPING_HELP, add_mapping, read_mapping
-from valveflow_ros.cli.parameter_options import add_parameters
+from valveflow_ros.cli.options import MAPPING_HELP, add_mapping, add_parameters, read_mapping
 from valveflow_ros.cli.report_files import add_report_files, check_report_files, with_report
-from valveflow_ros.report.terminal.terminal_number import number
+from valveflow_ros.report.terminal.text import number
 
 _DESCRIPTION = """\
 Hold a characteristic against a log it was not made from: in each steady-state and
@@ -55,9 +54,9 @@ def run(options: Namespace, console: Console) -> Outcome:
     console.progress(0.0, 'starting')
     from valveflow_ros.cli.files import check_folder
     from valveflow_ros.cli.model_file import check_exponent, read_either, read_model
-    from valveflow_ros.cli.parameters import read_parameters
+    from valveflow_ros.cli.options import read_parameters
     from valveflow_ros.cli.validating import outcome, refuse_two, texts, validated
-    from valveflow_ros.report.comparison_validation import validation_page
+    from valveflow_ros.report.validation import validation_page
 
     given = read_parameters(options.params, options.pairs)
     check_folder(options.output)

@@ -8,27 +8,27 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from valveflow_ros.baselines.data import other_data
-from valveflow_ros.baselines.validation import validate
-from valveflow_ros.baselines.validation_json import to_json
+from valveflow_ros.baselines.judged import other_data
+from valveflow_ros.baselines.validation import to_json, validate
 from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.mapping import Mapping as Columns
 from valveflow_ros.cli.model_file import model_path
+from valveflow_ros.cli.options import LogMapping as Columns
 from valveflow_ros.cli.report_words import columns
 from valveflow_ros.cli.usage import UsageError
 from valveflow_ros.cli.watching import read, see
 from valveflow_ros.curve.characteristic import Characteristic
-from valveflow_ros.diagnosis.extended_model import ExtendedModel
+from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.records import SegmentKind
-from valveflow_ros.report.comparison_csv import segments_csv
-from valveflow_ros.report.comparison_validation import (
-    LABELS,
-    OUTSIDE_FLAG,
-    Validated,
-    verdict_words,
+from valveflow_ros.report.comparison_tables import segments_csv
+from valveflow_ros.report.validation import LABELS, OUTSIDE_FLAG, Validated, verdict_words
+from valveflow_ros.report.words import (
+    decimals,
+    held_words,
+    input_unit_plain,
+    interval,
+    percent,
+    plain,
 )
-from valveflow_ros.report.numbers import decimals, interval, percent, plain
-from valveflow_ros.report.words import held_words, input_unit_plain
 
 
 def refuse_two(model: Characteristic | ExtendedModel, against: Characteristic | None) -> None:

@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.report.terminal.terminal_number import number
+from valveflow_ros.report.terminal.text import number
 
 _DESCRIPTION = """\
 Show how a monitor is doing, drawn anew once a second: the curve with today's operating point,

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from valveflow_ros.cli.plausible import limits
-from valveflow_ros.config import Settings
+from valveflow_ros.cli.log_input import limits
 from valveflow_ros.errors import ValveflowError
-from valveflow_ros.logs.mcap.found import Rows
+from valveflow_ros.logs.mcap.gather import Rows
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
-from valveflow_ros.report.numbers import counted, duration, plain
-from valveflow_ros.report.terminal.terminal_frame import OK, STALE, WARN, HealthView
+from valveflow_ros.report.terminal.frame import OK, STALE, WARN, HealthView
+from valveflow_ros.report.words import counted, duration, plain
 from valveflow_ros.signals.units import UNITS, convert
 
 _SILENT_S = 5.0

@@ -9,18 +9,10 @@ from pathlib import Path
 
 from valveflow_ros.cli.watch_inputs import InputWatch
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs.mcap.follow import Batch, Follower
-from valveflow_ros.logs.mcap.pick import Picker, Raw
-from valveflow_ros.report.numbers import counted, duration
-from valveflow_ros.report.terminal.terminal_board import (
-    ALARM,
-    CURVE,
-    DIAGNOSIS,
-    KEPT,
-    PREDICTION,
-    Board,
-)
-from valveflow_ros.report.terminal.terminal_frame import OK, WARN, Frame, HealthView
+from valveflow_ros.logs.mcap.follow import Batch, Follower, Picker, Raw
+from valveflow_ros.report.terminal.board import ALARM, CURVE, DIAGNOSIS, KEPT, PREDICTION, Board
+from valveflow_ros.report.terminal.frame import OK, WARN, Frame, HealthView
+from valveflow_ros.report.words import counted, duration
 
 _PARAMETERS = 'parameters.json'
 _MANY = 1 << 30

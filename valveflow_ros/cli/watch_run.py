@@ -13,7 +13,7 @@ from valveflow_ros.cli.console import Console, Outcome
 from valveflow_ros.cli.usage import UsageError
 from valveflow_ros.cli.watch_log import LogWatch
 from valveflow_ros.errors import DataError
-from valveflow_ros.report.terminal.terminal_screen import Screen
+from valveflow_ros.report.terminal.screen import Screen
 
 _MODULE = 'valveflow_ros.ros.watch_main'
 _TABLES = ('.csv', '.tsv', '.txt', '.parquet', '.pq', '.xlsx')

@@ -11,12 +11,12 @@ from valveflow_ros.cli import engine
 from valveflow_ros.cli.console import Console
 from valveflow_ros.cli.first_run import SENTENCE, is_first_run
 from valveflow_ros.cli.log_input import LogInput, open_input, steps_of
-from valveflow_ros.cli.mapping import Mapping as Columns
-from valveflow_ros.cli.parameters import settings_for
-from valveflow_ros.config import Settings
+from valveflow_ros.cli.options import LogMapping as Columns
+from valveflow_ros.cli.options import settings_for
 from valveflow_ros.diagnosis.corrector import corrector_of
-from valveflow_ros.diagnosis.extended_model import ExtendedModel
+from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.errors import DataError
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, Readings
 from valveflow_ros.segments.window import WindowContents
 

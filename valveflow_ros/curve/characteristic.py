@@ -9,10 +9,39 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from valveflow_ros.curve.chart_design import ChartDesign
-from valveflow_ros.curve.model import RegionalModel
+from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.errors import DataError
-from valveflow_ros.records import FloatArray
+from valveflow_ros.records import FloatArray, IntArray
+
+# What a chart was designed for; apart from its kernels, for whoever only reads models.
+
+
+@dataclass(frozen=True, slots=True)
+class ChartDesign:
+    """What a chart needs to know of the residual it watches.
+
+    Attributes
+    ----------
+    block_s : float
+        Length of a block.
+    correlation : float
+        From block to block, 0 <= correlation < 1.
+    innovation_mw : float
+        sd of a block mean given the one before.
+    slack : tuple of float
+        What each sum lets pass per block, in innovations: for small and for large shifts.
+    limit : tuple of float
+        Where each sum raises the alarm, in innovations.
+    run_length_days : float
+        Mean time between false alarms that the limits were set for.
+    """
+
+    block_s: float
+    correlation: float
+    innovation_mw: float
+    slack: tuple[float, float]
+    limit: tuple[float, float]
+    run_length_days: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,3 +249,47 @@ def _rising_points(m: RegionalModel) -> tuple[FloatArray, FloatArray]:
             points += [(reached, begin), (low, begin), (float(m.right[k]), float(m.knots[k + 1]))]
     points = [points[0], *(b for a, b in itertools.pairwise(points) if a != b)]
     return np.array([x for x, _ in points]), np.array([u for _, u in points])
+
+
+# How far off a curve may be at one u, told from the two standard errors of its pieces.
+
+
+def piece_error(piece: Piece, u: FloatArray) -> FloatArray:
+    """Return the standard error of a piece's line at ``u`` in MW.
+
+    Parameters
+    ----------
+    piece : Piece
+    u : float64 (n,)
+        Integrated input, % MPa^m.
+
+    Returns
+    -------
+    float64 (n,)
+        NaN where the slope's error is not known.
+
+    Notes
+    -----
+    A line through samples with mean m and variance v of u has the error
+    ``slope_stderr * sqrt((u - m)^2 + v)``. Slope and intercept errors alone do not say
+    where m is (their difference is one of large numbers), so the samples are taken to be
+    spread evenly over the piece: m is its middle and v a twelfth of its width squared.
+    """
+    u = np.asarray(u, dtype=np.float64)
+    width, middle = piece.u_to - piece.u_from, 0.5 * (piece.u_from + piece.u_to)
+    return np.asarray(piece.slope_stderr * np.sqrt((u - middle) ** 2 + width**2 / 12.0))
+
+
+def piece_of(curve: Characteristic, u: FloatArray) -> IntArray:
+    """Return the index of the piece at each ``u``; beyond the ends the outer pieces."""
+    return np.asarray(np.searchsorted(curve.breakpoints[1:-1], u, side='right'))
+
+
+def curve_error(curve: Characteristic, u: FloatArray) -> FloatArray:
+    """Return the standard error of F(u) in MW, shape of ``u``; see `piece_error`."""
+    u = np.asarray(u, dtype=np.float64)
+    index = piece_of(curve, u)
+    error = np.full(u.shape, math.nan)
+    for k, piece in enumerate(curve.pieces):
+        error[index == k] = piece_error(piece, u[index == k])
+    return error

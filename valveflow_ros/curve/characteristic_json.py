@@ -7,17 +7,49 @@ from typing import Any
 
 from valveflow_ros.curve.characteristic import (
     Characteristic,
+    ChartDesign,
     Choice,
+    HeldCause,
     Piece,
     RegionDynamics,
     ResidualStatistics,
     Source,
     Support,
 )
-from valveflow_ros.curve.chart_design import ChartDesign
-from valveflow_ros.curve.held_json import held_from, held_json
 from valveflow_ros.curve.json_field import Field
 from valveflow_ros.errors import DataError
+
+# Causes held while a curve was fitted, as JSON.
+
+
+def held_json(held: tuple[HeldCause, ...]) -> dict[str, Any]:
+    """Return the causes under their key; a curve without any has no such key."""
+    if not held:
+        return {}
+    return {
+        'held': [{'name': h.name, 'values': dict(h.values), 'sentence': h.sentence} for h in held]
+    }
+
+
+def held_from(field: Field | None) -> tuple[HeldCause, ...]:
+    """Read what `held_json` wrote.
+
+    Raises
+    ------
+    DataError
+        It is not that; the sentence names the place.
+    """
+    if field is None:
+        return ()
+    return tuple(
+        HeldCause(
+            f.key('name').text(),
+            tuple((name, value.real()) for name, value in f.key('values').members()),
+            f.key('sentence').text(),
+        )
+        for f in field.items()
+    )
+
 
 FORMAT = 'valveflow/characteristic'
 VERSION = 1

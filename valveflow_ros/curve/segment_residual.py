@@ -2,15 +2,170 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtri, stdtr
 
-from valveflow_ros.curve.change_point import scan
-from valveflow_ros.curve.characteristic import Characteristic
-from valveflow_ros.curve.line_error import piece_of
+from valveflow_ros.curve.characteristic import Characteristic, piece_of
 from valveflow_ros.records import FloatArray, IntArray, SegmentKind, SpecialSegment
+
+# At which moment a series changed its mean, and how sure that is.
+
+
+LEAST_SIDE = 4  # members on either side of a change
+_LARGEST_RHO = 0.9
+_LEAST_VARIANCE = 1e-200  # without any noise; z^2 stays a number
+_FAR = 38.0  # normal deviates whose density is no number any more
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """One change of the mean, looked for at every place.
+
+    Attributes
+    ----------
+    place : int
+        Members before the change.
+    p_value : float
+        Chance of so clear a change anywhere, if there were none.
+    before, after : float
+        Weighted means on both sides, the unit of the series.
+    after_error : float
+        Standard error of ``after``.
+    likelihood : float64 (n + 1,)
+        Log-likelihood of a change after so many members, against none; -inf where not tried.
+    """
+
+    place: int
+    p_value: float
+    before: float
+    after: float
+    after_error: float
+    likelihood: FloatArray
+
+
+def scan(values: FloatArray, weights: FloatArray, first: int = 0) -> Scan | None:
+    """Look for one change of the mean; None for a series too short to have one.
+
+    Parameters
+    ----------
+    values : float64 (n,)
+        In order of time.
+    weights : float64 (n,)
+        Inverse variances up to a factor.
+    first : int
+        Changes with fewer members before them are not looked for.
+
+    Notes
+    -----
+    The statistic is the two-sample z of each split, its variance taken at the best split
+    and widened for the correlation of neighbours that is left there. The chance of its
+    maximum under no change is the one of a standardised Brownian bridge (James, James and
+    Siegmund 1987), ``b phi(b) ((1 - b^-2) log T + 4 b^-2)`` with
+    ``T = s1 (1 - s0) / (s0 (1 - s1))`` for splits between the shares s0 and s1 of the weight.
+    """
+    n = len(values)
+    first = max(first, LEAST_SIDE)
+    if n < first + LEAST_SIDE:
+        return None
+    share = np.cumsum(weights) / np.sum(weights)
+    total = np.cumsum(weights * values)
+    places = np.arange(first, n - LEAST_SIDE + 1)
+    s = share[places - 1]
+    before = total[places - 1] / (s * weights.sum())
+    after = (total[-1] - total[places - 1]) / ((1.0 - s) * weights.sum())
+    gain = weights.sum() * s * (1.0 - s) * (after - before) ** 2
+    k = int(np.argmax(gain))
+    place = int(places[k])
+    rest = values - np.where(np.arange(n) < place, before[k], after[k])
+    variance = _variance(rest, weights) * _widening(rest)
+    z = np.sqrt(gain / variance)
+    b = _as_normal(float(z[k]), n - 2)
+    likelihood = np.full(n + 1, -math.inf)
+    likelihood[places] = 0.5 * z**2
+    return Scan(
+        place, _chance(b, float(s[0]), float(s[-1])), float(before[k]), float(after[k]),
+        math.sqrt(variance / float(weights[place:].sum())), likelihood,
+    )  # fmt: skip
+
+
+def _variance(rest: FloatArray, weights: FloatArray) -> float:
+    """Return the variance of a member of weight 1."""
+    return max(float(np.sum(weights * rest**2)) / max(len(rest) - 2, 1), _LEAST_VARIANCE)
+
+
+def _widening(rest: FloatArray) -> float:
+    """Return by how much correlation of neighbours widens the variance of a long mean."""
+    power = float(np.sum(rest**2))
+    if power <= 0.0:
+        return 1.0
+    rho = float(np.sum(rest[1:] * rest[:-1])) / power
+    rho = min(max(rho, 0.0), _LARGEST_RHO)
+    return (1.0 + rho) / (1.0 - rho)
+
+
+def _as_normal(t: float, freedom: int) -> float:
+    """Return the normal deviate as rare as ``t`` of Student's distribution."""
+    chance = float(stdtr(freedom, -t))
+    tail = math.log(chance) if chance > 0.0 else -math.inf
+    # Far out the tail of the normal is log-quadratic; its inverse there is not in the tables.
+    return float(-ndtri(math.exp(tail))) if tail > -600.0 else math.sqrt(-2.0 * tail)
+
+
+def _chance(b: float, low: float, high: float) -> float:
+    """Return the chance that the maximum over splits exceeds ``b``."""
+    if b < 1.0:
+        return 1.0
+    if b > _FAR:
+        return 0.0
+    spread = math.log(max(high * (1.0 - low) / (low * (1.0 - high)), 1.0))
+    density = math.exp(-0.5 * b * b) / math.sqrt(2.0 * math.pi)
+    return min(1.0, b * density * ((1.0 - b**-2) * spread + 4.0 * b**-2))
+
+
+def moment_of(
+    times_ns: list[IntArray], scans: list[Scan], share: float = 0.95
+) -> tuple[int, int, int]:
+    """Return when several series changed together, with the ends of an interval.
+
+    Parameters
+    ----------
+    times_ns : list of int64 (n,)
+        Times of the members of each series.
+    scans : list of Scan
+        One a series, at least one.
+    share : float
+        Of the probability inside the interval.
+
+    Returns
+    -------
+    tuple of int
+        Median, lower and upper end of the time's distribution, ns. Before the data every
+        moment between two members is taken to be as likely as any other, by its length.
+        Series without a moment in common did not change together: then the surest of them
+        tells. 0, 0, 0 if no moment can be told.
+    """
+    edges = np.unique(np.concatenate(times_ns))
+    likelihood = np.zeros(len(edges) - 1)
+    for times, found in zip(times_ns, scans, strict=True):
+        # A change inside ]edge, next edge[ leaves so many members of this series before it.
+        count = np.searchsorted(times, edges[:-1], side='right')
+        likelihood += found.likelihood[count]
+    if not np.isfinite(likelihood).any():
+        if len(scans) == 1:
+            return 0, 0, 0
+        surest = min(range(len(scans)), key=lambda k: scans[k].p_value)
+        return moment_of([times_ns[surest]], [scans[surest]], share)
+    mass = np.exp(likelihood - likelihood.max()) * np.diff(edges)
+    reached = np.concatenate([[0.0], np.cumsum(mass) / mass.sum()])
+    tail = 0.5 * (1.0 - share)
+    offset = np.interp([0.5, tail, 1.0 - tail], reached, (edges - edges[0]).astype(np.float64))
+    middle, low, high = (int(edges[0]) + int(v) for v in offset)
+    return middle, low, high
+
 
 _MOST_WEIGHT = 900.0
 _KNOWN = 0.01  # chance below which a change within the reference's data is taken for one

@@ -5,21 +5,114 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from valveflow_ros.curve.change_point import LEAST_SIDE, Scan, moment_of, scan
-from valveflow_ros.curve.characteristic import Characteristic, Piece
-from valveflow_ros.curve.line_error import curve_error
+from valveflow_ros.curve.characteristic import Characteristic, Piece, curve_error
 from valveflow_ros.curve.segment_residual import (
+    LEAST_SIDE,
+    Scan,
     SegmentResiduals,
     after_known_changes,
+    moment_of,
+    scan,
     segment_residuals,
 )
-from valveflow_ros.curve.shift_words import shift_sentence
 from valveflow_ros.errors import DataError
-from valveflow_ros.records import IntArray, SpecialSegment
+from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SpecialSegment
+
+# The judgement of a shift in words an operator understands.
+
+
+_SURE = 0.9999
+
+
+def shift_sentence(shift: Shift, knots: FloatArray) -> str:
+    """Say which piece moved, by how much, since when and how surely; or that none did.
+
+    Parameters
+    ----------
+    shift : Shift
+    knots : float64 (J + 1,)
+        Of the reference; less of it than all may have been compared.
+    """
+    return _judgement(shift) + _compared(shift, float(knots[0]), float(knots[-1]))
+
+
+def _compared(shift: Shift, first: float, last: float) -> str:
+    """Say what was compared if it is not the whole reference."""
+    known = [p for p in shift.pieces if math.isfinite(p.u_from)]
+    low, high = min(p.u_from for p in known), max(p.u_to for p in known)
+    if low <= first and high >= last:
+        return ''
+    return f' Compared is u {low:.0f} to {high:.0f} of its u {first:.0f} to {last:.0f}.'
+
+
+def _judgement(shift: Shift) -> str:
+    known = [p for p in shift.pieces if math.isfinite(p.middle_mw)]
+    reference = f'the reference of {day(shift.reference_ns)}'
+    worst = shift.largest
+    if worst is None:
+        smallest = [p.smallest_mw for p in known if math.isfinite(p.smallest_mw)]
+        if not smallest:
+            return f'No shift against {reference} is seen, but no error of the curves is known.'
+        low, high = min(smallest), max(smallest)
+        span = f'{low:.1f}' if f'{low:.1f}' == f'{high:.1f}' else f'{low:.1f} to {high:.1f}'
+        return (
+            f'The curve agrees with {reference}; a shift of {span} MW, by piece, '
+            'would have been seen.'
+        )
+    number = shift.pieces.index(worst) + 1
+    side = 'more' if worst.shift_mw > 0.0 else 'less'
+    others = [k + 1 for k, p in enumerate(shift.pieces) if p.moved and k + 1 != number]
+    return (
+        f'Piece {number} (u {worst.u_from:.0f} to {worst.u_to:.0f}) gives '
+        f'{abs(worst.shift_mw):.1f} MW ({abs(worst.percent):.1f} %) {side} than {reference}, '
+        f'{_since_words(shift)}, confidence {_confidence(worst)}.{_others(shift, others)}'
+    )
+
+
+def day(time_ns: int) -> str:
+    """Write a date; a time that is not known says so."""
+    return _at(time_ns, 'D') if time_ns > 0 else 'unknown date'
+
+
+def minute(time_ns: int) -> str:
+    """Write a date with hours and minutes, UTC."""
+    return _at(time_ns, 'm').replace('T', ' ') + ' UTC'
+
+
+def _at(time_ns: int, unit: Literal['D', 'm']) -> str:
+    return str(np.datetime64(time_ns // NS_PER_S, 's').astype(f'datetime64[{unit}]'))
+
+
+def _since_words(shift: Shift) -> str:
+    if shift.since_ns > 0:
+        return (
+            f'since about {minute(shift.since_ns)} (between {minute(shift.since_low_ns)} and '
+            f'{minute(shift.since_high_ns)})'
+        )
+    if shift.reference_ns >= shift.first_ns > 0:
+        return 'since when cannot be told (the reference was made from the same days)'
+    if shift.first_ns > 0:
+        return f'with no change seen since {minute(shift.first_ns)}, so from before that'
+    return 'since when is not known'
+
+
+def _confidence(piece: PieceShift) -> str:
+    if piece.confidence > _SURE:
+        return f'above {100.0 * _SURE:.2f} %'
+    return f'{100.0 * piece.confidence:.2f} %'
+
+
+def _others(shift: Shift, numbers: list[int]) -> str:
+    if not numbers:
+        return ''
+    told = ', '.join(f'piece {k} by {shift.pieces[k - 1].shift_mw:+.1f} MW' for k in numbers)
+    return f' {told[0].upper()}{told[1:]} too.'
+
 
 # The errors of curves assume that samples spread evenly over a piece and that all noise is
 # soon forgotten. With a slow wander of 1 MW differences of clean plants were 1.8 times larger
@@ -297,3 +390,52 @@ def _since(
             times.append(residuals.time_ns)
             used.append(found)
     return moment_of(times, used) if used else (0, 0, 0)
+
+
+# The judgement of a shift as JSON: what ``shift.json`` holds.
+
+
+FORMAT = 'valveflow/shift'
+VERSION = 1
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _piece_json(piece: PieceShift) -> dict[str, Any]:
+    return {
+        'u_from': _number(piece.u_from),
+        'u_to': _number(piece.u_to),
+        'moved': piece.moved,
+        'shift_mw': _number(piece.shift_mw),
+        'shift_percent': _number(piece.percent),
+        'confidence': _number(piece.confidence),
+        'p_value': _number(piece.p_value),
+        'middle_mw': _number(piece.middle_mw),
+        'middle_stderr_mw': _number(piece.error_mw),
+        'low_mw': _number(piece.low_mw),
+        'high_mw': _number(piece.high_mw),
+        'now_mw': _number(piece.now_mw),
+        'now_stderr_mw': _number(piece.now_error_mw),
+        'flow_mw': _number(piece.flow_mw),
+        'smallest_seen_mw': _number(piece.smallest_mw),
+    }
+
+
+def shift_json(shift: Shift) -> dict[str, Any]:
+    """Return the content of ``shift.json``; what is not known is null."""
+    return {
+        'format': FORMAT,
+        'version': VERSION,
+        'reference_model_id': shift.reference_id,
+        'model_id': shift.model_id,
+        'reference_end_ns': shift.reference_ns,
+        'moved': shift.moved,
+        'sentence': shift.sentence,
+        'since_ns': shift.since_ns or None,
+        'since_low_ns': shift.since_low_ns or None,
+        'since_high_ns': shift.since_high_ns or None,
+        'judged_from_ns': shift.first_ns or None,
+        'pieces': [_piece_json(piece) for piece in shift.pieces],
+    }

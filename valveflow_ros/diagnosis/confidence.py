@@ -16,16 +16,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from valveflow_ros.diagnosis.cause import Kind, Stage, Unknown
+from valveflow_ros.diagnosis.cause import Estimate, Kind, Stage, Unknown
 from valveflow_ros.diagnosis.causes import catalogue
-from valveflow_ros.diagnosis.draws import free
-from valveflow_ros.diagnosis.estimate import Estimate
 from valveflow_ros.diagnosis.evidence import colour, long_run_variance
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import (
     Task,
     base_tangents,
     cause_tangents,
+    free,
     level_tangents,
 )
 from valveflow_ros.records import FloatArray

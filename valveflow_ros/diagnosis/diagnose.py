@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.curve.model import RegionalModel
-from valveflow_ros.diagnosis.bench import Bench
+from valveflow_ros.curve.regional_model import RegionalModel
+from valveflow_ros.diagnosis import actuator
+from valveflow_ros.diagnosis.cause import Estimate, Told
+from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.confidence import Certainty
+from valveflow_ros.diagnosis.evidence import (
+    Gain,
+    by_segment,
+    inferred,
+    noise_floor,
+    rmse,
+    sealed_gain,
+)
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import Task, improve, search_levels, search_lines
-from valveflow_ros.diagnosis.gain import by_segment, noise_floor, rmse
-from valveflow_ros.diagnosis.grid import make_scene
-from valveflow_ros.diagnosis.hidden import inferred
-from valveflow_ros.diagnosis.outside import actuator_cause, notes, record_causes
-from valveflow_ros.diagnosis.period import Period, period
-from valveflow_ros.diagnosis.quality import Fault, faults
+from valveflow_ros.diagnosis.record_faults import Fault, faults
 from valveflow_ros.diagnosis.result import (
     NAMED,
     NOTHING,
@@ -25,14 +31,119 @@ from valveflow_ros.diagnosis.result import (
     Disturbance,
     NamedCause,
 )
-from valveflow_ros.diagnosis.scene import ORDER, Scene
-from valveflow_ros.diagnosis.sealed import confirm, gains_of, steps
-from valveflow_ros.diagnosis.search import Found, Progress, search
-from valveflow_ros.diagnosis.simplify import simplified
-from valveflow_ros.diagnosis.structure import Structure, structure
-from valveflow_ros.diagnosis.wander import Wander, wander
+from valveflow_ros.diagnosis.scene import ORDER, Scene, make_scene
+from valveflow_ros.diagnosis.screening import Bench
+from valveflow_ros.diagnosis.search import Found, Progress, search, simplified
+from valveflow_ros.diagnosis.structure import Period, Structure, Wander, period, structure, wander
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import BoolArray, FloatArray, IntArray, SampleTable
+
+# The sealed blocks, opened once: what each cause is worth there, and whether that stands.
+#
+# A name that the open blocks suggest stands only if blocks nothing was fitted to confirm it at
+# the 5 % level, the number of causes tried taken into account.
+
+
+LARGEST_P = 0.05
+
+
+def confirm(found: Found) -> None:
+    """Take back names that the sealed blocks do not confirm, the least likely first."""
+    while found.model.active:
+        gains = gains_of(found, steps(found))
+        worst = max(range(len(gains)), key=lambda k: gains[k].p_value)
+        if gains[worst].p_value <= LARGEST_P:
+            return
+        name = found.model.active[worst].name
+        found.model, _ = improve(found.task, found.model.without(name), 3)
+        found.near.pop(name, None)
+        found.evidence.pop(name, None)
+        found.reasons[name] = (
+            'blocks of time that were kept out of the search do not confirm it (a gain as large '
+            f'there has a chance of {gains[worst].p_value:.2g})'
+        )
+
+
+def steps(found: Found) -> list[Extended]:
+    """Return the models with one cause more each, fitted to the open blocks."""
+    models = [found.plain]
+    for k in range(1, len(found.model.active)):
+        part = replace(found.model, active=found.model.active[:k])
+        models.append(improve(found.task, part, 2)[0])
+    return models + ([found.model] if found.model.active else [])
+
+
+def gains_of(found: Found, models: list[Extended]) -> list[Gain]:
+    """Return what each cause brings on the sealed blocks, over those found before it."""
+    return [sealed_gain(found.task, a, b, found.tried) for a, b in itertools.pairwise(models)]
+
+
+# Causes that are found without the model of the unit: in the actuator and in the record.
+
+
+_BETWEEN = 'Between the commanded and the measured opening: '
+_SLACK = 'The valve follows only after a slack of {w_percent:.2g} % of opening is taken up.'
+
+
+def actuator_cause(found: Found) -> tuple[NamedCause, ...]:
+    """Return the fault between command and position sensor, its size in MW of power."""
+    scene = found.task.scene
+    fault = actuator.judge(scene)
+    if fault is None or fault.name in found.model.names:
+        return ()
+    cause = catalogue()[fault.name]
+    units = {u.name: u.unit for u in cause.unknowns}
+    base = found.model.base
+    x = base.static(scene.u[scene.usable > 0])
+    rise = float(np.ptp(x) / max(np.ptp(scene.u[scene.usable > 0]), 1e-9))
+    per_percent = rise * float(np.nanmean(scene.density))
+    gain = Gain(fault.rms_before * per_percent, fault.rms_after * per_percent, fault.p_value)
+    values = {k: v for k, (v, _, _) in fault.parameters.items()}
+    return (
+        NamedCause(
+            fault.name,
+            _BETWEEN
+            + (_SLACK.format(**values) if 'w_percent' in values else cause.sentence(Told(values))),
+            {k: Estimate(*v, units[k]) for k, v in fault.parameters.items()},
+            gain,
+            cause.experiment,
+        ),
+    )
+
+
+def record_causes(
+    raw: Scene | None, found: Found, wrong: tuple[Fault, ...]
+) -> tuple[NamedCause, ...]:
+    """Return faults of the record as causes; before: with the rows that were not believed."""
+    if raw is None:
+        return ()
+    before = rmse(replace(found.task, scene=raw), found.model, raw.sealed_rows)
+    after = rmse(found.task, found.model, found.task.scene.sealed_rows)
+    gain = Gain(before, after, float('nan'))
+    out = []
+    for name in dict.fromkeys(f.name for f in wrong):
+        mine = [f for f in wrong if f.name == name]
+        parameters = {k: v for f in mine for k, v in _fault_parameters(f).items()}
+        out.append(NamedCause(name, ' '.join(f.sentence for f in mine), parameters, gain))
+    return tuple(out)
+
+
+def _fault_parameters(fault: Fault) -> dict[str, Estimate]:
+    unknown = float('nan')
+    unit = 's' if fault.name == 'flatline' else fault.signal.unit
+    return {
+        f'{fault.signal.topic}_rows': Estimate(float(fault.rows), unknown, unknown, 'rows'),
+        f'{fault.signal.topic}_size': Estimate(fault.size, unknown, unknown, unit),
+    }
+
+
+def notes(scene: Scene) -> tuple[str, ...]:
+    """Say what could not be judged for want of a command."""
+    why = actuator.hindered(scene)
+    if not why:
+        return ()
+    return (f'Faults between command and position sensor cannot be judged: {why}.',)
+
 
 _LEAST_SPREAD = 0.01
 _LAST_STEPS = 10  # knots go slowly beside a bump

@@ -3,17 +3,119 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 
-from valveflow_ros.curve.model import RegionalModel
+from valveflow_ros.curve.characteristic import HeldCause
+from valveflow_ros.curve.regional_model import RegionalModel
+from valveflow_ros.diagnosis.cause import Stage
+from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.diagnose import Record, diagnose
-from valveflow_ros.diagnosis.diagnosis_json import to_json
-from valveflow_ros.diagnosis.first_model import first_model
-from valveflow_ros.diagnosis.on_top import freed
-from valveflow_ros.monitoring.diagnosis_task import DiagnosisContent, DiagnosisTask
-from valveflow_ros.records import FloatArray, IntArray, SampleTable, Signal
+from valveflow_ros.diagnosis.extended import ExtendedModel
+from valveflow_ros.diagnosis.result import to_json
+from valveflow_ros.errors import DataError
+from valveflow_ros.fit.problem import Samples
+from valveflow_ros.fit.refine import refine
+from valveflow_ros.monitoring.events import DiagnosisContent, DiagnosisTask
+from valveflow_ros.records import FloatArray, IntArray, Quality, SampleTable, Signal
 from valveflow_ros.segments.window import WindowContents
+from valveflow_ros.signals.units import integrated_input
+
+# A model to begin with where special segments give none.
+
+
+_PIECES, _MOST = 4, 6
+_LEAST_SPREAD = 0.02
+
+
+def first_model(
+    table: SampleTable, step_s: float, exponent: float, settle_s: float
+) -> RegionalModel:
+    """Fit curve and dynamics to all rows, beginning with a regression on hats of u.
+
+    Raises
+    ------
+    DataError
+        The valve hardly moves, or too little was measured.
+    """
+    u = integrated_input(
+        table.column(Signal.VALVE_OPENING), table.column(Signal.MAIN_STEAM_PRESSURE), exponent
+    )
+    power = table.column(Signal.GENERATED_POWER)
+    usable = np.isfinite(u) & np.isfinite(power)
+    if usable.sum() < 1000:
+        raise DataError('Too few rows have opening, pressure and power together.')
+    knots = np.quantile(u[usable], np.linspace(0.0, 1.0, _PIECES + 1))
+    if knots[-1] - knots[0] < _LEAST_SPREAD * abs(knots[-1]):
+        raise DataError('The valve hardly moves in this record: there is nothing to compare.')
+    values = _hats(u[usable], knots, power[usable])
+    start = RegionalModel(
+        knots, values[:-1].copy(), values[1:].copy(), np.empty(0), np.ones(1), np.zeros(1)
+    )
+    flags = usable.astype(np.uint8)
+    flags[1:][np.diff(table.time_ns) > 1.5e9 * step_s] = 0
+    samples = Samples(
+        np.where(usable, u, 0.0), np.where(usable, power, 0.0), flags, step_s, settle_s,
+        max(1, round(10.0 / step_s)),
+    )  # fmt: skip
+    return refine(samples, start, _MOST).model
+
+
+def _hats(u: FloatArray, knots: FloatArray, power: FloatArray) -> FloatArray:
+    """Return the least squares values at the knots."""
+    knots += np.arange(len(knots)) * 1e-6 * (knots[-1] - knots[0])
+    table = np.column_stack([np.interp(u, knots, row) for row in np.eye(len(knots))])
+    return np.asarray(np.linalg.lstsq(table, power, rcond=None)[0])
+
+
+# A record freed of the causes of an earlier model, to be diagnosed on top of it.
+
+
+def on_top(record: Record, earlier: ExtendedModel, measured: SampleTable) -> Record:
+    """Return the record with what a diagnosis on top of an earlier model needs.
+
+    Parameters
+    ----------
+    record : Record
+        Its table was freed of the causes of ``earlier``.
+    measured : SampleTable
+        The rows of the record before that.
+
+    Notes
+    -----
+    Where the opening was changed it is no longer the position that a command leads to, so
+    the command is left out: it would show the earlier cause again.
+    """
+    rows = record.table
+    if _changes_opening(earlier):
+        values, quality = rows.values.copy(), rows.quality.copy()
+        values[:, Signal.VALVE_COMMAND] = np.nan
+        quality[:, Signal.VALVE_COMMAND] = Quality.BAD
+        rows = SampleTable(rows.time_ns, values, quality)
+    return replace(record, table=rows, measured=measured)
+
+
+def freed(record: Record, held: tuple[HeldCause, ...]) -> Record:
+    """Return a record whose rows were freed of causes, where those as measured are gone.
+
+    A stop or a slack that was taken into the opening lets it rest for hours, which is no dead
+    transmitter: faults of the opening are not looked for then.
+    """
+    if not any(catalogue()[h.name].stage == Stage.OPENING for h in held):
+        return record
+    values, quality = record.table.values.copy(), record.table.quality.copy()
+    values[:, Signal.VALVE_OPENING] = np.nan
+    quality[:, Signal.VALVE_OPENING] = Quality.BAD
+    return replace(record, measured=SampleTable(record.table.time_ns, values, quality))
+
+
+def _changes_opening(model: ExtendedModel | None) -> bool:
+    return model is not None and (
+        any(a.cause.stage in (Stage.OPENING, Stage.INPUT) for a in model.model.active)
+        or _changes_opening(model.on_top_of)
+    )
+
 
 # A pressure that u was made of and that is made of u again differs in its last bits, which would
 # hide that it stood still.

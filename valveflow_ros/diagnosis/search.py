@@ -5,24 +5,166 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from valveflow_ros.diagnosis.bench import Bench
-from valveflow_ros.diagnosis.bumps import without_bumps
+import numpy as np
+
+from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import Active, Start
 from valveflow_ros.diagnosis.causes import catalogue
-from valveflow_ros.diagnosis.draws import held
 from valveflow_ros.diagnosis.evidence import Evidence, colour, weigh
-from valveflow_ros.diagnosis.extended import Extended
+from valveflow_ros.diagnosis.extended import Drive, Extended, answer, drive
 from valveflow_ros.diagnosis.fitting import (
     Task,
     base_tangents,
+    held,
     improve,
     search_levels,
     search_lines,
     settle,
 )
-from valveflow_ros.diagnosis.rebuild import rebuilt
 from valveflow_ros.diagnosis.scene import Scene
+from valveflow_ros.diagnosis.screening import Bench
+from valveflow_ros.errors import TooFewSamplesError
+from valveflow_ros.fit.problem import Samples
+from valveflow_ros.fit.refine import search as search_plain
 from valveflow_ros.records import FloatArray
+
+# The plain simulation: few distinct pieces.
+#
+# A curve found by prediction error has as many knees as pay. A shallow one is no valve point
+# but part of a shape, and would hide `curve_shape` inside the model.
+
+
+SHALLOW = 0.2  # change of slope relative to the larger one
+_JUMP_MW = 0.01
+
+
+def simplified(model: RegionalModel) -> RegionalModel:
+    """Return the curve without its shallow knees, the shallowest first; jumps stay."""
+    while model.pieces > 1:
+        slopes = model.slopes()
+        larger = np.maximum(np.abs(slopes[1:]), np.abs(slopes[:-1]))
+        bend = np.abs(np.diff(slopes)) / np.maximum(larger, 1e-12)
+        bend[np.abs(model.left[1:] - model.right[:-1]) > _JUMP_MW] = np.inf
+        weakest = int(np.argmin(bend))
+        if bend[weakest] >= SHALLOW:
+            return model
+        model = without_knot(model, weakest + 1)
+    return model
+
+
+def without_knot(model: RegionalModel, knot: int) -> RegionalModel:
+    """Return the curve with the two pieces at an inner knot made one."""
+    return replace(
+        model,
+        knots=np.delete(model.knots, knot),
+        left=np.delete(model.left, knot),
+        right=np.delete(model.right, knot - 1),
+    )
+
+
+# Knees of the plain curve that are no valve points but the middle of a bump.
+#
+# A curve found by prediction error puts a knee wherever one pays, in the middle of a bump too,
+# and `curve_shape` would find nothing left. Such a knee bends the other way than both its
+# neighbours. It is given up where a bump in its place does as well.
+
+
+_WIDTHS = (0.5, 0.8, 1.2)  # of the shorter piece beside the knee
+_PLACES = (-0.15, 0.0, 0.15)
+
+
+def without_bumps(task: Task, plain: Extended) -> tuple[Task, Extended]:
+    """Return the plain model without knees that a bump would replace, fitted again."""
+    for knot in _suspects(plain):
+        smaller = replace(plain, base=simplified(without_knot(plain.base, knot)))
+        if _as_good(task, plain, smaller, float(plain.base.knots[knot]), _width(plain, knot)):
+            task, smaller, _ = settle(task, smaller, rounds=1, steps=4)
+            return without_bumps(task, smaller)
+    return task, plain
+
+
+def _suspects(plain: Extended) -> list[int]:
+    """Return inner knots that bend against both neighbours."""
+    bend = np.sign(np.diff(plain.base.slopes()))
+    return [
+        k + 1 for k in range(1, len(bend) - 1) if bend[k] == -bend[k - 1] == -bend[k + 1] != 0.0
+    ]
+
+
+def _width(plain: Extended, knot: int) -> float:
+    knots = plain.base.knots
+    return float(min(knots[knot] - knots[knot - 1], knots[knot + 1] - knots[knot]))
+
+
+def _as_good(task: Task, plain: Extended, smaller: Extended, u: float, width: float) -> bool:
+    """Tell whether a bump at ``u`` brings the smaller model to the cost of the plain one."""
+    bench, cause = Bench(task, smaller), catalogue()['curve_shape']
+    gain = max(
+        bench.scaled_height(cause, (u + place * width, share * width)).gain
+        for share in _WIDTHS
+        for place in _PLACES
+    )
+    return bench.floor - 2.0 * bench.variance * gain <= task.cost(plain)
+
+
+# Curve and regions found anew behind a strong cause.
+#
+# A cause that moves the power by as much as the noise leads the identification astray: regions
+# are missed, knees are put where none is. Seen through the cause, the record is that of the
+# plant without it, and pieces and regions are searched for again as in an identification.
+
+
+_MORE_PIECES, _MOST = 3, 8
+_EACH = 5.0  # log-likelihood that each number more of curve and regions must bring
+
+
+def rebuilt(task: Task, model: Extended) -> tuple[Task, Extended]:
+    """Return the model on a curve and regions of its own if they do better, else as it is."""
+    try:
+        base = simplified(search_plain(_seen_through(task, model), _rich(model.base), _MOST))
+    except (TooFewSamplesError, np.linalg.LinAlgError):
+        return task, model
+    if base.pieces == model.base.pieces and base.regions == model.base.regions:
+        return task, model
+    task_new, other, cost = settle(task, replace(model, base=base), rounds=1, steps=4)
+    # Both under one whitening: the better model's.
+    variance = cost / max(int(task.rows.sum()), 1)
+    before = task_new.cost(model) / (2.0 * variance) + _EACH * len(model.base.pack())
+    after = task_new.cost(other) / (2.0 * variance) + _EACH * len(other.base.pack())
+    return (task_new, other) if after < before else (task, model)
+
+
+def _seen_through(task: Task, model: Extended) -> Samples:
+    """Return the record as it would be without the causes; sealed blocks are left out."""
+    scene = task.scene
+    driven = drive(scene, model)
+    plain = answer(scene, model.without_causes(), Drive(driven.u, None, None))
+    power = scene.power - (answer(scene, model) - plain)
+    rows = np.repeat(task.rows, scene.group)
+    return Samples(
+        u=driven.u,
+        power_mw=np.repeat(np.where(task.rows, power, 0.0), scene.group),
+        usable=(rows & (scene.usable > 0)).astype(np.uint8),
+        step_s=scene.step_s,
+        settle_s=scene.settle_s,
+        group=scene.group,
+    )
+
+
+def _rich(base: RegionalModel) -> RegionalModel:
+    """Return the curve with its widest pieces cut in two, to be pruned."""
+    for _ in range(_MORE_PIECES):
+        k = int(np.argmax(np.diff(base.knots)))
+        middle = 0.5 * (base.knots[k] + base.knots[k + 1])
+        value = 0.5 * (base.left[k] + base.right[k])
+        base = replace(
+            base,
+            knots=np.insert(base.knots, k + 1, middle),
+            left=np.insert(base.left, k + 1, value),
+            right=np.insert(base.right, k, value),
+        )
+    return base
+
 
 Progress = Callable[[float, str], None]
 

@@ -13,10 +13,12 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import Task
 from valveflow_ros.diagnosis.scene import FOLDS, SEALED_FOLD
+from valveflow_ros.diagnosis.screening import Bench
 from valveflow_ros.fit.whitening import inflation
 from valveflow_ros.records import BoolArray, FloatArray
 
@@ -200,3 +202,116 @@ def _tabulated(task: Task, series: FloatArray, values: dict[str, FloatArray]) ->
     good_ones = [s for s in tried if s.gain >= _ENOUGH * best.gain]
     fewest = min(len(s.variables) for s in good_ones)
     return max((s for s in good_ones if len(s.variables) == fewest), key=lambda s: s.gain)
+
+
+# A hidden period: one line of the residual's spectrum far above its neighbours.
+
+
+LARGEST_P = 1e-5
+_MEAN_S = 60.0
+_NEIGHBOURS = 101
+_SHORTEST_S, _LONGEST_S = 240.0, 5.5 * 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class Period:
+    """The strongest line: its period in s, the chance of one as strong, its variance in MW^2."""
+
+    period_s: float
+    p_value: float
+    variance_mw2: float
+
+    @property
+    def there(self) -> bool:
+        """Tell whether it is more than chance."""
+        return self.p_value < LARGEST_P
+
+    @property
+    def words(self) -> str:
+        """Return it as a variable to be named."""
+        return f'time, with a period of {self.period_s / 60.0:.3g} min'
+
+
+def period(task: Task, model: Extended) -> Period:
+    """Test the largest ordinate of the periodogram (Fisher's test, on a floor of its own).
+
+    Each ordinate is divided by the median of its neighbours, which flattens the spectrum
+    of any smooth noise; then ordinates are exponential and the largest of n exceeds
+    z by chance with probability n exp(-z).
+    """
+    scene = task.scene
+    rows = max(1, round(_MEAN_S / scene.mean_s))
+    m = len(scene.power) // rows
+    rest = np.where(scene.scored, task.residual(model), 0.0)[: m * rows]
+    rest = rest.reshape(m, rows).mean(axis=1)
+    rest = rest - rest.mean()
+    power = np.abs(np.fft.rfft(rest * np.hanning(m))) ** 2
+    width = min(_NEIGHBOURS, max(5, len(power) // 8 * 2 + 1))
+    floor = median_filter(power, width, mode='nearest') / np.log(2.0)
+    ratio = power / np.maximum(floor, 1e-300)
+    span = m * rows * scene.mean_s
+    ratio[: int(span / _LONGEST_S) + 1] = 0.0
+    ratio[int(span / _SHORTEST_S) :] = 0.0
+    k = int(np.argmax(ratio))
+    # The window makes neighbours alike; they count as one and a half each.
+    chance = min(1.0, len(power) * float(np.exp(-min(ratio[k] / 1.3, 700.0))))
+    near = slice(max(k - 2, 0), k + 3)
+    share = float(np.maximum(power[near] - floor[near], 0.0).sum())
+    variance = 2.0 * share / (m * float((np.hanning(m) ** 2).sum()))
+    return Period(span / max(k, 1), chance, variance)
+
+
+# A slow wander of the power that is no cause: coal, vacuum, ambient.
+
+
+LEAST_WANDER_GAIN = 16.0
+_WIDTHS_H = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+_WANDER_SHRINK = (0.3, 1.0, 3.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Wander:
+    """How the level of the power wanders.
+
+    Attributes
+    ----------
+    gain : float
+        Log-likelihood gained on sub-blocks whose level was estimated from others.
+    rms_mw, time_scale_s : float
+    level : float64 (subs,)
+        The relative level of each sub-block.
+    """
+
+    gain: float
+    rms_mw: float
+    time_scale_s: float
+    level: FloatArray
+
+    @property
+    def there(self) -> bool:
+        """Tell whether it is more than chance."""
+        return self.gain > LEAST_WANDER_GAIN
+
+
+def wander(bench: Bench) -> Wander:
+    """Estimate the level of each sub-block from its neighbours, and what that is worth.
+
+    Kernels of several widths are tried; each sub-block is predicted without itself, so that
+    what the noise does inside it cannot pay.
+    """
+    own, toward = bench.gain_by_sub()
+    middle_h = bench.scene.sub_middle_s / 3600.0
+    distance = np.abs(middle_h[:, None] - middle_h[None, :])
+    np.fill_diagonal(distance, np.inf)
+    usual = float(np.median(own[own > 0.0])) if np.any(own > 0.0) else 1.0
+    best = Wander(0.0, 0.0, 0.0, np.zeros(len(own)))
+    for width in _WIDTHS_H:
+        weight = np.exp(-0.5 * (distance / width) ** 2)
+        for shrink in _WANDER_SHRINK:
+            level = (weight @ toward) / (weight @ own + shrink * usual)
+            gain = float(np.sum(2.0 * level * toward - level**2 * own)) / (2.0 * bench.variance)
+            if gain > best.gain:
+                power = float(np.mean(bench.here[bench.scene.scored]))
+                rms = float(np.sqrt(np.mean(level[own > 0.0] ** 2))) * power
+                best = Wander(gain, rms, width * 3600.0, level)
+    return best

@@ -15,24 +15,23 @@ from valveflow_ros.curve.characteristic import (
     ResidualStatistics,
     Source,
 )
-from valveflow_ros.curve.model import RegionalModel
+from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.errors import DataError, TooFewSamplesError
-from valveflow_ros.fit.fit_refusals import (
+from valveflow_ros.fit.problem import Samples
+from valveflow_ros.fit.refine import refine, search
+from valveflow_ros.fit.result import NOT_REFINED, from_refined, residual_statistics, with_support
+from valveflow_ros.fit.task import (
+    FitTask,
     carries_a_curve,
     enough_samples,
     evaluate,
     input_moved,
     valve_moved,
 )
-from valveflow_ros.fit.fit_result import from_refined, residual_statistics
-from valveflow_ros.fit.fit_task import FitTask
-from valveflow_ros.fit.identifiability import NOT_REFINED, with_support
-from valveflow_ros.fit.problem import Samples
-from valveflow_ros.fit.refine import refine, search
 from valveflow_ros.fit.whitening import inflation
 from valveflow_ros.partition.partition import Partition, partition
 from valveflow_ros.partition.selection import select
-from valveflow_ros.partition.selection_series import Series
+from valveflow_ros.partition.series import Series
 from valveflow_ros.records import ByteArray, FloatArray, SegmentKind
 from valveflow_ros.segments.window import WindowContents
 

@@ -7,12 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.curve.model import RegionalModel
-from valveflow_ros.fit.answer_kernel import answer_residual
-from valveflow_ros.fit.normal_kernel import normal_sums, square_sum
-from valveflow_ros.fit.tangent_kernel import tangents
+from valveflow_ros.curve.regional_model import RegionalModel
+from valveflow_ros.fit.kernels import answer_residual, normal_sums, square_sum, tangents
+from valveflow_ros.numerics import cores, runs, share
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
-from valveflow_ros.threads import cores, runs, share
 
 # What reacts to the power within the rows averaged, as a load controller does, would be
 # taken for dynamics of the valve: so in the end few rows are averaged.

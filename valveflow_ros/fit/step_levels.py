@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from valveflow_ros.config import Settings
 from valveflow_ros.fit.whitening import yule_walker
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SampleTable, Signal
 
 _LEAST_STEP_PERCENT = 0.3  # smaller moves of the opening are wander within a level

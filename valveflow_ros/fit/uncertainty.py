@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from valveflow_ros.curve.model import RegionalModel
+from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.fit.problem import Problem
 from valveflow_ros.fit.whitening import normal_equations
+from valveflow_ros.numerics import gram
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
-from valveflow_ros.sums import gram
 
 _MOST_BLOCKS = 60
 _LEAST_IN_BLOCK_S = 500.0

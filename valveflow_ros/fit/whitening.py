@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from valveflow_ros.curve.regional_kernel import lagged_products, whiten
-from valveflow_ros.fit.normal_kernel import normal_sums
+from valveflow_ros.curve.regional_model import lagged_products, whiten
+from valveflow_ros.fit.kernels import normal_sums
+from valveflow_ros.numerics import cores, runs, share
 from valveflow_ros.records import ByteArray, FloatArray
-from valveflow_ros.threads import cores, runs, share
 
 ORDER = 4
 _LARGEST_SUM = 0.95

@@ -17,11 +17,11 @@ from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.contents import LogContents
 from valveflow_ros.logs.mcap.folder import METADATA_NAME, in_order
 from valveflow_ros.logs.mcap.layout import MAGIC
-from valveflow_ros.logs.mcap.mcap_log import read_recording
+from valveflow_ros.logs.mcap.reading import read_recording
 from valveflow_ros.logs.part_file import PART_SUFFIX
 from valveflow_ros.logs.source import Source, os_problem
-from valveflow_ros.logs.tables.table_options import AS_SEEN, TableOptions
-from valveflow_ros.logs.tables.tables import open_table
+from valveflow_ros.logs.tables.refusal import AS_SEEN, TableOptions
+from valveflow_ros.logs.tables.table import open_table
 
 MAX_METADATA_BYTES = 16 << 20
 TABLE_SUFFIXES = ('.csv', '.tsv', '.txt', '.parquet', '.pq', '.xlsx', '.xlsm')

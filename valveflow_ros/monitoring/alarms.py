@@ -3,16 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from valveflow_ros.config import Settings
-from valveflow_ros.jit import jit
-from valveflow_ros.monitoring.alarm_records import AlarmChange, AlarmState, Judged, Priority
-from valveflow_ros.monitoring.alarm_voice import Content, VoicedAlarm
+from valveflow_ros.curve.shift import PieceShift, Shift
+from valveflow_ros.errors import DataError
+from valveflow_ros.monitoring.alarm import (
+    AlarmChange,
+    AlarmState,
+    Content,
+    Judged,
+    Priority,
+    VoicedAlarm,
+)
+from valveflow_ros.numerics import jit
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
 from valveflow_ros.state import State, put_back
+
+if TYPE_CHECKING:
+    from valveflow_ros.monitoring.prediction import PredictionBlock
+
 
 __all__ = ['AlarmChange', 'AlarmState', 'Judged', 'Priority', 'ResidualAlarm']
 
@@ -264,3 +277,218 @@ def _sentence(state: AlarmState, shift_mw: float) -> str:
     if state == AlarmState.RETURNED_UNACKNOWLEDGED:
         return 'The unit follows the valve curve again; acknowledge to clear the alarm.'
     return 'The unit follows the valve curve.'
+
+
+# The alarm on a shift of the curve: the states of the residual alarm, one judgement a curve.
+
+
+# A shift that was seen is over only when it is ten times less sure than it had to be.
+_DOUBT = 10.0
+# Share of a moved piece that must be judged unmoved: the ends of a curve, and its knots, lie
+# a little elsewhere in every window.
+_COVERED = 0.8
+
+
+class ShiftAlarm(VoicedAlarm):
+    """Follow the judgements of adopted curves against the reference.
+
+    Notes
+    -----
+    ISA-18.2 states as of the residual alarm, but without delays: a curve stands on days of data,
+    and for the same reason it is suppressed by a curve that cannot be judged, not by minutes of
+    bad data. A piece that moved and left the window with its load is not known to be back: the
+    alarm stands until its u are judged again, or until there is a new reference.
+
+    Parameters
+    ----------
+    settings : Settings, optional
+        Those given with a judgement are taken from then on.
+    """
+
+    NAME = 'curve_shift'
+
+    def __init__(self, settings: Settings | None = None) -> None:
+        self._value = 0.0
+        self._limit = 0.0
+        self._sentence = ''
+        self._problem = ''
+        self._ranges: list[tuple[float, float]] = []
+        super().__init__(settings or Settings())
+
+    @property
+    def ranges(self) -> tuple[tuple[float, float], ...]:
+        """Return from which u to which u pieces moved that were not judged unmoved since."""
+        return tuple(self._ranges)
+
+    def judge(self, shift: Shift, time_ns: int, settings: Settings) -> list[AlarmChange]:
+        """Take a judgement; return the change it makes, if any."""
+        self.configure(settings)
+        self._life.resume()
+        worst = shift.largest
+        if worst is not None:
+            self._value, self._limit = worst.shift_mw, worst.smallest_mw
+            self._sentence = shift.sentence
+        self._remember(shift, settings)
+        if not self.active and worst is not None:
+            self._life.begin(time_ns)
+        doubt = any(_stands(p, settings) for p in shift.pieces)
+        if self.active and not doubt and not self._ranges:
+            self._end(shift.sentence)
+        return self._tell(time_ns, shift.model_id)
+
+    def unjudged(
+        self, problem: str, time_ns: int, model_id: str, settings: Settings
+    ) -> list[AlarmChange]:
+        """Be suppressed, since a curve could not be judged, until the next one is."""
+        self.configure(settings)
+        self._problem = problem
+        self._life.suppress()
+        return self._tell(time_ns, model_id)
+
+    def end(
+        self, sentence: str, time_ns: int, model_id: str, settings: Settings
+    ) -> list[AlarmChange]:
+        """Let the condition be over, as with a new reference."""
+        self.configure(settings)
+        self._life.resume()
+        if self.active:
+            self._end(sentence)
+        return self._tell(time_ns, model_id)
+
+    def _end(self, sentence: str) -> None:
+        self._ranges = []
+        self._sentence, self._value = sentence, 0.0
+        self._life.end(self._latch)
+
+    def _remember(self, shift: Shift, settings: Settings) -> None:
+        """Remember the ranges that moved; forget older ones that are judged anew."""
+        settled = [
+            p for p in shift.pieces
+            if p.moved or (math.isfinite(p.smallest_mw) and not _stands(p, settings))
+        ]  # fmt: skip
+        self._ranges = [r for r in self._ranges if not _covered(r, settled)]
+        self._ranges += [(p.u_from, p.u_to) for p in shift.pieces if p.moved]
+
+    def _content(self, state: AlarmState) -> Content:
+        sentence = self._sentence or 'No piece of the curve is known to have moved.'
+        if state == AlarmState.ACKNOWLEDGED:
+            sentence = f'Acknowledged. {sentence}'
+        elif state == AlarmState.RETURNED_UNACKNOWLEDGED:
+            sentence = f'{sentence} Acknowledge to clear the alarm.'
+        return Content(self._value, self._limit, 'MW', sentence)
+
+    def _blind(self) -> str:
+        return f'The curve could not be judged against its reference: {self._problem}'
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        return {
+            **super().snapshot(),
+            'value': self._value,
+            'limit': self._limit,
+            'sentence': self._sentence,
+            'problem': self._problem,
+            'ranges': [list(r) for r in self._ranges],
+        }
+
+    def restore(self, saved: State) -> None:
+        """Go on from a snapshot."""
+        super().restore(saved)
+        self._value, self._limit = saved['value'], saved['limit']
+        self._sentence, self._problem = saved['sentence'], saved['problem']
+        self._ranges = [(r[0], r[1]) for r in saved['ranges']]
+
+
+def _covered(span: tuple[float, float], pieces: list[PieceShift]) -> bool:
+    """Tell whether pieces cover nearly all of a range of u."""
+    low, high = span
+    inside = sum(max(0.0, min(p.u_to, high) - max(p.u_from, low)) for p in pieces)
+    return inside >= _COVERED * (high - low)
+
+
+def _stands(piece: PieceShift, settings: Settings) -> bool:
+    """Tell whether a shift that was seen before is still there."""
+    chance = min(1.0, _DOUBT * (1.0 - settings.real('shift_confidence')))
+    least = (1.0 - settings.real('alarm_dead_band')) * settings.real('shift_least')
+    return piece.p_value < chance and abs(piece.shift_mw) >= least
+
+
+# Where the alarms come together: fed in the order of the rows, handled by an operator.
+
+
+# Something an operator does: what was judged last, and by which curve, in; changes out.
+Act = Callable[[Judged, str], list[AlarmChange]]
+
+
+class AlarmDesk:
+    """Hold all alarms of the monitor.
+
+    Parameters
+    ----------
+    residual : ResidualAlarm
+    shift : ShiftAlarm
+    """
+
+    def __init__(self, residual: ResidualAlarm, shift: ShiftAlarm) -> None:
+        self._residual, self._shift = residual, shift
+        self._all = residual, shift
+        for alarm in self._all:
+            alarm.stand_beside(self._all)
+
+    def configure(self, settings: Settings) -> None:
+        """Take new settings; states and counters stay."""
+        for alarm in self._all:
+            alarm.configure(settings)
+
+    def feed(self, block: PredictionBlock) -> list[AlarmChange]:
+        """Judge predicted rows; return what changes, in the order of the rows."""
+        judged = np.where(np.isfinite(block.residual_mw), block.evidence, np.nan)
+        changes = self._residual.feed(
+            block.time_ns, judged, block.shift_mw, block.model_id, [self._shift]
+        )
+        return [change for _, change in changes]
+
+    def acknowledge(self, judged: Judged, model_id: str) -> list[AlarmChange]:
+        """Acknowledge all alarms.
+
+        Raises
+        ------
+        DataError
+            There is nothing to acknowledge.
+        """
+        self._residual.judged = judged
+        changes = [c for a in self._all for c in a.acknowledge(judged.time_ns, model_id)]
+        if not changes:
+            raise DataError('There is no alarm to acknowledge.')
+        return changes
+
+    def shelve(self, judged: Judged, model_id: str) -> list[AlarmChange]:
+        """Put all alarms that stand aside for a time.
+
+        Raises
+        ------
+        DataError
+            None stands that is not shelved already.
+        """
+        self._residual.judged = judged
+        done = [alarm.shelve(judged.time_ns, model_id) for alarm in self._all]
+        return _changes(done, 'There is no alarm to shelve.')
+
+    def unshelve(self, judged: Judged, model_id: str) -> list[AlarmChange]:
+        """Take all alarms from the shelf; one that the flood limit holds back comes later.
+
+        Raises
+        ------
+        DataError
+            None is shelved.
+        """
+        self._residual.judged = judged
+        done = [alarm.unshelve(judged.time_ns, model_id) for alarm in self._all]
+        return _changes(done, 'There is no shelved alarm.')
+
+
+def _changes(done: list[tuple[bool, list[AlarmChange]]], otherwise: str) -> list[AlarmChange]:
+    """Return the changes of all alarms; say so if nothing was done to any."""
+    if not any(did for did, _ in done):
+        raise DataError(otherwise)
+    return [change for _, changes in done for change in changes]

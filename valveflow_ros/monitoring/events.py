@@ -3,15 +3,53 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.shift import Shift
-from valveflow_ros.fit.fit_task import FitTask
+from valveflow_ros.fit.task import FitTask
 from valveflow_ros.monitoring.alarms import AlarmChange
-from valveflow_ros.monitoring.diagnosis_task import DiagnosisTask
 from valveflow_ros.monitoring.prediction import PredictionBlock
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SpecialSegment
+from valveflow_ros.segments.window import NO_ROWS, WindowContents
+
+# What a diagnosis is asked to do.
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosisTask:
+    """Everything a diagnosis depends on.
+
+    Attributes
+    ----------
+    request_ns : int
+        Time of the row after which it was asked for; its name.
+    contents : WindowContents
+    settings : Settings
+    curve : Characteristic
+        The curve in force, from which the diagnosis begins.
+    window_end_ns : int
+        Time of the newest row in the window.
+    """
+
+    request_ns: int
+    contents: WindowContents
+    settings: Settings
+    curve: Characteristic
+    window_end_ns: int
+
+    def without_data(self) -> DiagnosisTask:
+        """Return a copy that keeps no rows, for whoever only wants to know what was asked."""
+        return replace(self, contents=NO_ROWS)
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosisContent:
+    """What a diagnosis gave: the window's newest row, and what `diagnosis.json` would hold."""
+
+    window_end_ns: int
+    text: str
 
 
 class JournalKind(enum.IntEnum):

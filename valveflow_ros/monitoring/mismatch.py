@@ -17,11 +17,214 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from valveflow_ros.curve.model import RegionalModel
-from valveflow_ros.monitoring import mismatch_kernel as k
+from valveflow_ros.curve.regional_model import RegionalModel, curve
 from valveflow_ros.monitoring.prediction import PredictionBlock
+from valveflow_ros.numerics import jit
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
 from valveflow_ros.state import State, copies, put_back
+
+# One pass over rows: means of a minute, what they say, and sums that forget.
+
+
+MINUTE_NS = 60 * NS_PER_S
+BLOCK_NS = 7200 * NS_PER_S
+_DAY_NS = 86400 * NS_PER_S
+MEMORY_BLOCKS = 36.0  # three days
+_MEMORY_MINUTES = 4320.0
+BINS = 12
+OFFSET, GAIN, INPUT, TEMPERATURE, COSINE, SINE, DIRECTION, LAG_LOW, LAG_HIGH = range(9)
+MOVE = 9  # answers to the move of this minute, of the one before and of the one before that
+MOVES = 3
+BIN = MOVE + MOVES
+FEATURES = BIN + BINS
+# Half the band in which a change of u is no move, as a share of u.
+_PLAY = 0.005
+
+# What a block adds up for each statistic (block), and the sums over blocks that forget (kept).
+S, Q, N = range(3)
+(SUM_S, SUM_Q, SUM_N, SUM_SS, SUM_SQ, SUM_QQ, NEXT_SS, NEXT_SQ, NEXT_QS, NEXT_QQ, LAST_S,
+ LAST_Q) = range(12)  # fmt: skip
+KEPT = 12
+# Of the minute at hand.
+_R, _X, _D, _U, _T, _GOOD, _WARM = range(7)
+MINUTE = 7
+# Numbers that live on: squares of the residual and their count, both forgetting; the mean
+# temperature and its weight; the middle of the play; the flows of the last minutes.
+POWER, COUNT, MEAN_T, WEIGHT_T, PLAY, PAST = range(6)
+STATE = PAST + MOVES + 1
+AT_MINUTE, AT_BLOCK, BLOCKS = range(3)
+
+
+@jit
+def _forget_past(state: FloatArray) -> None:
+    state[PAST : PAST + MOVES + 1] = np.nan
+
+
+@jit
+def _play(state: FloatArray, u: float) -> float:
+    """Move the play along; return where in it u stands, -1 falling to 1 rising."""
+    half = _PLAY * abs(u)
+    if half == 0.0:
+        return 0.0
+    middle = state[PLAY]
+    if math.isnan(middle):
+        middle = u
+    middle = min(max(middle, u - half), u + half)
+    state[PLAY] = middle
+    return float((u - middle) / half)
+
+
+@jit
+def _warm(state: FloatArray, minute: FloatArray) -> float:
+    """Return the mean temperature less its mean so far, which this minute then joins."""
+    if minute[_WARM] == 0.0:
+        return 0.0
+    t = minute[_T] / minute[_WARM]
+    off = t - state[MEAN_T] if state[WEIGHT_T] > 0.0 else 0.0
+    state[WEIGHT_T] = min(state[WEIGHT_T] + 1.0, _MEMORY_MINUTES)
+    state[MEAN_T] += (t - state[MEAN_T]) / state[WEIGHT_T]
+    return float(off)
+
+
+@jit
+def _features(
+    middle_ns: int, minute: FloatArray, state: FloatArray, knots: FloatArray, left: FloatArray,
+    right: FloatArray, z: FloatArray,
+) -> None:  # fmt: skip
+    """Write what the residual of a minute would be in proportion to, statistic by statistic."""
+    good = minute[_GOOD]
+    x, answer, u = minute[_X] / good, minute[_D] / good, minute[_U] / good
+    low, high = knots[0], knots[-1]
+    step = 1e-3 * (high - low)
+    below, above = max(low, u - step), min(high, u + step)
+    rise = curve(above, knots, left, right) - curve(below, knots, left, right)
+    swing = u * rise / max(above - below, 1e-12)
+    whole = max(abs(right[-1]), abs(left[0]), 1e-9)
+    share = min(max((u - low) / (high - low), 0.0), 1.0)
+    z[:] = 0.0
+    z[OFFSET] = 1.0
+    z[GAIN] = x / whole
+    z[INPUT] = swing / whole
+    z[TEMPERATURE] = _warm(state, minute) * x / whole
+    angle = 2.0 * math.pi * (middle_ns % _DAY_NS) / _DAY_NS
+    z[COSINE] = math.cos(angle) * x / whole
+    z[SINE] = math.sin(angle) * x / whole
+    z[DIRECTION] = _play(state, u) * swing / whole
+    if math.isfinite(answer):
+        z[LAG_LOW if share < 0.5 else LAG_HIGH] = x - answer
+    for k in range(MOVES, 0, -1):
+        state[PAST + k] = state[PAST + k - 1]
+    state[PAST] = x
+    for k in range(MOVES):
+        move = state[PAST + k] - state[PAST + k + 1]
+        z[MOVE + k] = move if math.isfinite(move) else 0.0
+    place = share * (BINS - 1)
+    k = min(int(place), BINS - 2)
+    z[BIN + k] = 1.0 - (place - k)
+    z[BIN + k + 1] = place - k
+
+
+@jit
+def _end_minute(
+    middle_ns: int, minute: FloatArray, state: FloatArray, knots: FloatArray, left: FloatArray,
+    right: FloatArray, block: FloatArray, z: FloatArray,
+) -> None:  # fmt: skip
+    """Add a whole minute to the block."""
+    _features(middle_ns, minute, state, knots, left, right, z)
+    r = minute[_R] / minute[_GOOD]
+    state[POWER] += r * r
+    state[COUNT] += 1.0
+    for j in range(FEATURES):
+        if z[j] != 0.0:
+            block[j, S] += r * z[j]
+            block[j, Q] += z[j] * z[j]
+            block[j, N] += 1.0
+
+
+@jit
+def _end_block(follows: int, block: FloatArray, kept: FloatArray, state: FloatArray) -> None:
+    """Add a block to the sums that forget; ``follows`` is how many blocks on the next one is."""
+    forget = math.exp(-follows / MEMORY_BLOCKS)
+    twice = forget * forget
+    state[POWER] *= forget
+    state[COUNT] *= forget
+    for j in range(FEATURES):
+        k = kept[j]
+        s, q = block[j, S], block[j, Q]
+        before_s, before_q = k[LAST_S], k[LAST_Q]
+        k[SUM_S] = forget * (k[SUM_S] + s)
+        k[SUM_Q] = forget * (k[SUM_Q] + q)
+        k[SUM_N] = forget * (k[SUM_N] + block[j, N])
+        k[SUM_SS] = twice * (k[SUM_SS] + s * s)
+        k[SUM_SQ] = twice * (k[SUM_SQ] + s * q)
+        k[SUM_QQ] = twice * (k[SUM_QQ] + q * q)
+        k[NEXT_SS] = twice * (k[NEXT_SS] + s * before_s)
+        k[NEXT_SQ] = twice * (k[NEXT_SQ] + s * before_q)
+        k[NEXT_QS] = twice * (k[NEXT_QS] + q * before_s)
+        k[NEXT_QQ] = twice * (k[NEXT_QQ] + q * before_q)
+        k[LAST_S], k[LAST_Q] = (s, q) if follows == 1 else (0.0, 0.0)
+    block[:] = 0.0
+
+
+@jit
+def run(
+    time_ns: IntArray,
+    u: FloatArray,
+    temperature: FloatArray,
+    static: FloatArray,
+    dynamic: FloatArray,
+    residual: FloatArray,
+    minute_ns: int,
+    least: int,
+    knots: FloatArray,
+    left: FloatArray,
+    right: FloatArray,
+    place: IntArray,
+    minute: FloatArray,
+    state: FloatArray,
+    block: FloatArray,
+    kept: FloatArray,
+    z: FloatArray,
+) -> None:
+    """Run rows; a minute and a block are judged by the first row behind them.
+
+    Parameters
+    ----------
+    minute_ns : int
+        Length of a minute; longer than one where rows are rarer.
+    least : int
+        Rows without which a minute does not count.
+    place : int64 (3,)
+        Number of the minute and of the block at hand, -1 before the first, and blocks ended.
+    minute (MINUTE,), state (STATE,), block (FEATURES, 3), kept (FEATURES, KEPT), z (FEATURES,)
+        The memory, and room.
+    """
+    for t in range(u.size):
+        now = time_ns[t] // minute_ns
+        if now != place[AT_MINUTE]:
+            if minute[_GOOD] >= least:
+                middle_ns = place[AT_MINUTE] * minute_ns + minute_ns // 2
+                _end_minute(middle_ns, minute, state, knots, left, right, block, z)
+            else:
+                _forget_past(state)
+            if now != place[AT_MINUTE] + 1:
+                _forget_past(state)
+            minute[:] = 0.0
+            here = time_ns[t] // BLOCK_NS
+            if place[AT_BLOCK] >= 0 and here > place[AT_BLOCK]:
+                _end_block(here - place[AT_BLOCK], block, kept, state)
+                place[BLOCKS] += 1
+            place[AT_MINUTE], place[AT_BLOCK] = now, here
+        if math.isfinite(residual[t]):
+            minute[_GOOD] += 1.0
+            minute[_R] += residual[t]
+            minute[_X] += static[t]
+            minute[_D] += dynamic[t]
+            minute[_U] += u[t]
+            if math.isfinite(temperature[t]):
+                minute[_T] += temperature[t]
+                minute[_WARM] += 1.0
+
 
 # What is below this share of the residual's sd is not worth a word, however sure it is.
 FLOOR = 0.05
@@ -30,8 +233,8 @@ LEAST_BLOCKS = 10.0
 NAMES = (
     'offset', 'gain', 'input', 'temperature', 'time of day (cosine)', 'time of day (sine)',
     'direction', 'lag at low load', 'lag at high load',
-    *(f'move {minutes} min ago' for minutes in range(k.MOVES)),
-    *(f'bin {number} of u' for number in range(k.BINS)),
+    *(f'move {minutes} min ago' for minutes in range(MOVES)),
+    *(f'bin {number} of u' for number in range(BINS)),
 )  # fmt: skip
 
 
@@ -67,13 +270,13 @@ class Mismatch:
     """
 
     def __init__(self, step_s: float) -> None:
-        self._minute_ns = max(k.MINUTE_NS, round(step_s * NS_PER_S))
+        self._minute_ns = max(MINUTE_NS, round(step_s * NS_PER_S))
         self._least = max(1, math.ceil(0.5 * self._minute_ns / NS_PER_S / step_s))
         self._place = np.array([-1, -1, 0], dtype=np.int64)
-        self._minute, self._z = np.zeros(k.MINUTE), np.zeros(k.FEATURES)
-        self._state = np.zeros(k.STATE)
-        self._state[k.PLAY :] = math.nan
-        self._block, self._kept = np.zeros((k.FEATURES, 3)), np.zeros((k.FEATURES, k.KEPT))
+        self._minute, self._z = np.zeros(MINUTE), np.zeros(FEATURES)
+        self._state = np.zeros(STATE)
+        self._state[PLAY:] = math.nan
+        self._block, self._kept = np.zeros((FEATURES, 3)), np.zeros((FEATURES, KEPT))
         self._ends = 0.0, 0.0
 
     def feed(
@@ -89,7 +292,7 @@ class Mismatch:
         model : RegionalModel
         """
         self._ends = float(model.knots[0]), float(model.knots[-1])
-        k.run(
+        run(
             block.time_ns, block.u, temperature_degc, block.static_mw, block.dynamic_mw,
             block.residual_mw, self._minute_ns, self._least, model.knots, model.left, model.right,
             self._place, self._minute, self._state, self._block, self._kept, self._z,
@@ -138,24 +341,24 @@ class Mismatch:
     def _size(self) -> FloatArray:
         """Return the root mean square of what each statistic is in proportion to."""
         kept = self._kept
-        count = np.maximum(kept[:, k.SUM_N], 1.0)
-        return np.asarray(np.sqrt(kept[:, k.SUM_Q] / count))
+        count = np.maximum(kept[:, SUM_N], 1.0)
+        return np.asarray(np.sqrt(kept[:, SUM_Q] / count))
 
     def _estimates(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return estimates, their standard errors, and how many blocks they rest on."""
         kept = self._kept
-        q, qq = kept[:, k.SUM_Q], kept[:, k.SUM_QQ]
+        q, qq = kept[:, SUM_Q], kept[:, SUM_QQ]
         there = (q > 0.0) & (qq > 0.0)
         q = np.where(there, q, 1.0)
-        theta = np.where(there, kept[:, k.SUM_S] / q, 0.0)
-        own = kept[:, k.SUM_SS] - 2.0 * theta * kept[:, k.SUM_SQ] + theta**2 * qq
+        theta = np.where(there, kept[:, SUM_S] / q, 0.0)
+        own = kept[:, SUM_SS] - 2.0 * theta * kept[:, SUM_SQ] + theta**2 * qq
         cross = (
-            kept[:, k.NEXT_SS] - theta * (kept[:, k.NEXT_SQ] + kept[:, k.NEXT_QS])
-            + theta**2 * kept[:, k.NEXT_QQ]
+            kept[:, NEXT_SS] - theta * (kept[:, NEXT_SQ] + kept[:, NEXT_QS])
+            + theta**2 * kept[:, NEXT_QQ]
         )  # fmt: skip
         own = np.maximum(own, 0.0)
         variance = np.maximum(own, own + 2.0 * cross) / q**2
-        noise = math.sqrt(self._state[k.POWER] / max(self._state[k.COUNT], 1.0))
+        noise = math.sqrt(self._state[POWER] / max(self._state[COUNT], 1.0))
         floor = FLOOR * noise / np.where(there, self._size(), 1.0)
         spread = np.where(there, np.sqrt(variance + floor**2), 0.0)
         return theta, spread, np.where(there, q**2 / np.where(there, qq, 1.0), 0.0)
@@ -163,20 +366,20 @@ class Mismatch:
     def _hint(self, j: int, effect: float) -> str:
         """Say what a statistic means; ``effect`` in MW."""
         size, side = f'{abs(effect):.2g} MW', 'more' if effect > 0.0 else 'less'
-        if j >= k.BIN:
+        if j >= BIN:
             low, high = self._ends
-            at = low + (high - low) * (j - k.BIN) / (k.BINS - 1)
+            at = low + (high - low) * (j - BIN) / (BINS - 1)
             return f'around u = {at:.0f} the unit gives {size} {side} than it says'
-        if j >= k.MOVE:
+        if j >= MOVE:
             return f'in the minutes after a move the power is off by {size}'
-        if j in (k.LAG_LOW, k.LAG_HIGH):
+        if j in (LAG_LOW, LAG_HIGH):
             how = 'faster' if effect > 0.0 else 'slower'
-            return f'the power follows moves {how} at {"low" if j == k.LAG_LOW else "high"} load'
-        if j == k.DIRECTION:
+            return f'the power follows moves {how} at {"low" if j == LAG_LOW else "high"} load'
+        if j == DIRECTION:
             return f'opening and closing to the same place differ by {2.0 * abs(effect):.2g} MW'
         return {
-            k.OFFSET: f'the unit gives {size} {side} than it says',
-            k.GAIN: f'the unit gives {size} {side}, in proportion to the load',
-            k.INPUT: f'the unit gives {size} {side} where the curve is steep',
-            k.TEMPERATURE: f'the power goes with the main steam temperature, by {size}',
+            OFFSET: f'the unit gives {size} {side} than it says',
+            GAIN: f'the unit gives {size} {side}, in proportion to the load',
+            INPUT: f'the unit gives {size} {side} where the curve is steep',
+            TEMPERATURE: f'the power goes with the main steam temperature, by {size}',
         }.get(j, f'the power swings with the time of day, by {size}')

@@ -5,17 +5,13 @@ from __future__ import annotations
 import json
 import math
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
 from valveflow_ros.errors import DataError
-from valveflow_ros.fit.fit_task import FitTask
-from valveflow_ros.monitoring.alarm_desk import Act, AlarmDesk
-from valveflow_ros.monitoring.alarms import Judged, ResidualAlarm
-from valveflow_ros.monitoring.corrector import Correction, Corrector
-from valveflow_ros.monitoring.curve_in_force import CurveInForce
-from valveflow_ros.monitoring.curve_status import CurveStatus
-from valveflow_ros.monitoring.diagnosing import Diagnosing
+from valveflow_ros.fit.task import FitTask
+from valveflow_ros.monitoring.alarms import Act, AlarmDesk, Judged, ResidualAlarm
+from valveflow_ros.monitoring.curves import CurveInForce, CurveStatus, ReferenceKeeper, Refits
+from valveflow_ros.monitoring.diagnosis_requests import Diagnosing
 from valveflow_ros.monitoring.events import (
     CurveAdopted,
     Event,
@@ -25,10 +21,9 @@ from valveflow_ros.monitoring.events import (
     ReferenceSet,
     SegmentClosed,
 )
-from valveflow_ros.monitoring.feeding import Fed, Rows
 from valveflow_ros.monitoring.prediction import PredictionBlock
-from valveflow_ros.monitoring.reference import ReferenceKeeper
-from valveflow_ros.monitoring.refits import Refits
+from valveflow_ros.monitoring.rows import Correction, Corrector, Fed, Rows
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import IntArray, SampleTable, SpecialSegment
 from valveflow_ros.segments.segmenter import NoiseLevel, Segmented, Segmenter
 from valveflow_ros.segments.window import RollingWindow

@@ -9,11 +9,11 @@ from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import from_json
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit
-from valveflow_ros.fit.fit_task import FitTask
-from valveflow_ros.monitoring.diagnosing import ASKED
-from valveflow_ros.monitoring.diagnosis_task import DiagnosisTask
+from valveflow_ros.fit.task import FitTask
+from valveflow_ros.monitoring.diagnosis_requests import ASKED
 from valveflow_ros.monitoring.events import (
     DiagnosisRequested,
+    DiagnosisTask,
     Event,
     FitRequested,
     JournalEntry,

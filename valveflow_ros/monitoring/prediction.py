@@ -9,9 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import Characteristic
-from valveflow_ros.curve.regional_kernel import (
+from valveflow_ros.curve.regional_model import (
     TAP_0,
     TAP_1,
     TAP_2,
@@ -20,10 +19,11 @@ from valveflow_ros.curve.regional_kernel import (
     curve,
     region_of,
 )
-from valveflow_ros.fit.chart import ResidualChart
-from valveflow_ros.jit import jit
+from valveflow_ros.fit.residual_chart import ResidualChart
+from valveflow_ros.numerics import jit
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, ByteArray, FloatArray, IntArray
-from valveflow_ros.segments.segmenter_kernel import NO_DATA, SETTLED_SLOPE, SETTLED_STEADY
+from valveflow_ros.segments.kernel import NO_DATA, SETTLED_SLOPE, SETTLED_STEADY
 from valveflow_ros.state import State, copies, put_back
 
 _LONGEST_DELAY_S = 600.0

@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from valveflow_ros.errors import DataError, InputError, ParameterError
-from valveflow_ros.partition.evidence import Evidence, weigh
 from valveflow_ros.partition.partition import Partition
-from valveflow_ros.partition.selection_series import Series
+from valveflow_ros.partition.series import Evidence, Series, weigh
 from valveflow_ros.records import FloatArray
 
 # A break counts as real when it lowers the cost by more than this many times ln n times the

@@ -2,16 +2,210 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from valveflow_ros.jit import jit
-from valveflow_ros.plant import actuator
-from valveflow_ros.plant.flow import FlowLaw, added, flow_law, interpolate, nozzle_factor
-from valveflow_ros.plant.hooks import Hooks
-from valveflow_ros.plant.lag import answer, lag_coefficients, lag_table
+from valveflow_ros.numerics import jit
+from valveflow_ros.plant.effect import AddedCurve, Bank, Hooks
+from valveflow_ros.plant.unit import Region
 from valveflow_ros.records import FloatArray
+
+# The actuator's faults as operators on a moving position, one sample after the other.
+
+
+# One remembered position each: after the rate limit, the stick-slip, the slack.
+N_POSITIONS = 3
+
+
+def settings(bank: Bank, step_s: float) -> FloatArray:
+    """Return what `move` wants: largest step, slip-off and slip-to distance, top, half slack."""
+    off = (bank.band_percent + bank.jump_percent) / 2.0
+    to = (bank.band_percent - bank.jump_percent) / 2.0
+    return np.array(
+        [
+            bank.rate_percent_per_s * step_s,
+            off,
+            to,
+            bank.top_percent,
+            bank.slack_percent / 2.0,
+        ]
+    )
+
+
+@jit
+def rate_limited(wanted: float, before: float, largest: float) -> float:
+    """Move towards ``wanted`` by at most ``largest``."""
+    if wanted > before + largest:
+        return before + largest
+    if wanted < before - largest:
+        return before - largest
+    return wanted
+
+
+@jit
+def stick_slip(wanted: float, before: float, off: float, to: float) -> float:
+    """Stay until the pull exceeds ``off`` = (S + J)/2, then slip to ``to`` = (S - J)/2 from it.
+
+    He's two-parameter form of the stick band S and the slip jump J; without a
+    jump it is a dead band of width S.
+    """
+    pull = wanted - before
+    if pull > off:
+        return wanted - to
+    if pull < -off:
+        return wanted + to
+    return before
+
+
+@jit
+def play(wanted: float, before: float, half: float) -> float:
+    """Follow only when pushed by either flank of a slack of width ``2 half``."""
+    return min(max(before, wanted - half), wanted + half)
+
+
+@jit
+def move(wanted: float, positions: FloatArray, bank: FloatArray) -> float:
+    """Return where a bank lets the position go, remembering its inner positions.
+
+    Servo first, then the friction of the stem, its upper stop, the slack of the linkage.
+    """
+    positions[0] = rate_limited(wanted, positions[0], bank[0])
+    positions[1] = stick_slip(positions[0], positions[1], bank[1], bank[2])
+    positions[2] = play(min(positions[1], bank[3]), positions[2], bank[4])
+    return float(positions[2])
+
+
+# First-order lags with delay, exact for an input that is straight between two samples.
+
+
+def lag_coefficients(time_s: float, step_s: float) -> tuple[float, float, float]:
+    """Return (a, b, c) of ``y[t] = a y[t-1] + b x[t-1] + c x[t]``; a time of 0 is no lag.
+
+    The paper gives G_i in continuous time, eq. (31). Between two samples the
+    input of a valve on a ramp is straight, so a ramp is answered late by
+    exactly T + tau at any sample period, as eq. (13) says.
+    """
+    if time_s == 0.0:
+        return 0.0, 0.0, 1.0
+    a = math.exp(-step_s / time_s)
+    mean = (1.0 - a) * time_s / step_s
+    return a, mean - a, 1.0 - mean
+
+
+def lag_table(regions: tuple[Region, ...], step_s: float) -> tuple[FloatArray, int]:
+    """Return rows (power_to, a, b, c, delay in samples) and how many past samples they need."""
+    rows = [
+        (r.power_to_mw, *lag_coefficients(r.time_constant_s, step_s), r.delay_s / step_s)
+        for r in regions
+    ]
+    return np.array(rows), int(max(row[4] for row in rows)) + 3
+
+
+@jit
+def _late(flow: FloatArray, now: int, delay: float) -> float:
+    """Return the flow ``delay`` samples before ``now``, linear between samples."""
+    whole = int(delay)
+    part = delay - whole
+    return float(flow[now - whole] * (1.0 - part) + flow[now - whole - 1] * part)
+
+
+@jit
+def answer(flow: FloatArray, now: int, before: float, lags: FloatArray) -> float:
+    """Return the answer of G_i at ``now``, i being the region of the present flow, eq. (3)."""
+    i = 0
+    while i < lags.shape[0] - 1 and flow[now] >= lags[i, 0]:
+        i += 1
+    old = _late(flow, now - 1, lags[i, 4])
+    new = _late(flow, now, lags[i, 4])
+    return float(lags[i, 1] * before + lags[i, 2] * old + lags[i, 3] * new)
+
+
+# From the plug's opening to steam power: eqs. (1) and (2), and what effects change in them.
+
+
+# Beyond it the ellipse would end in no flow at all.
+_LARGEST_RATIO = 0.98
+
+
+class FlowLaw(NamedTuple):
+    """The curve, what is added to it, and the nozzle.
+
+    ``added_u``, ``added_x`` (k, m) and ``added_from_s`` (k,) are curves on top
+    of F; ``nozzle`` is (kappa, critical ratio, and the sliding pressure as
+    pressure at no load and rise per MW).
+    """
+
+    curve_u: FloatArray
+    curve_x: FloatArray
+    added_u: FloatArray
+    added_x: FloatArray
+    added_from_s: FloatArray
+    nozzle: FloatArray
+
+
+def _same_length(curves: list[AddedCurve]) -> tuple[FloatArray, FloatArray]:
+    """Return curves as two tables; short ones get further points on their level end."""
+    m = max((c.u.size for c in curves), default=2)
+    u, x = np.zeros((len(curves), m)), np.zeros((len(curves), m))
+    for k, curve in enumerate(curves):
+        missing = m - curve.u.size
+        u[k] = np.append(curve.u, curve.u[-1] + 1.0 + np.arange(missing))
+        x[k] = np.append(curve.x_mw, np.full(missing, curve.x_mw[-1]))
+    return u, x
+
+
+def flow_law(hooks: Hooks) -> FlowLaw:
+    """Collect the flow law of a run from its hooks."""
+    plan = hooks.unit.programme
+    curve_x, curve_u = hooks.unit.curve.inverse_table()
+    rise = plan.pressure_rise_mpa / plan.pressure_span_mw
+    at_no_load = plan.pressure_low_mpa - rise * plan.load_low_mw
+    nozzle = (hooks.kappa_mpa_per_mw, hooks.critical_ratio, at_no_load, rise)
+    since = np.array([curve.from_s for curve in hooks.added_curves])
+    return FlowLaw(curve_u, curve_x, *_same_length(hooks.added_curves), since, np.array(nozzle))
+
+
+@jit
+def interpolate(x: float, xs: FloatArray, ys: FloatArray) -> float:
+    """Interpolate linearly; beyond the ends the outer pieces go on."""
+    k = 0
+    while k < xs.size - 2 and x >= xs[k + 1]:
+        k += 1
+    return float(ys[k] + (ys[k + 1] - ys[k]) * (x - xs[k]) / (xs[k + 1] - xs[k]))
+
+
+@jit
+def subcritical_factor(ratio: float, critical: float) -> float:
+    """Return the flow relative to the choked flow at a pressure ratio behind/before."""
+    if ratio <= critical:
+        return 1.0
+    share = (min(ratio, _LARGEST_RATIO) - critical) / (1.0 - critical)
+    return float(np.sqrt(1.0 - share * share))
+
+
+@jit
+def nozzle_factor(x: float, pressure: float, nozzle: FloatArray) -> float:
+    """Return what the pressure behind the valve makes of u, against the sliding line."""
+    kappa, critical = nozzle[0], nozzle[1]
+    if kappa == 0.0:
+        return 1.0
+    usual = subcritical_factor(kappa * x / (nozzle[2] + nozzle[3] * x), critical)
+    return float(subcritical_factor(kappa * x / pressure, critical) / usual)
+
+
+@jit
+def added(
+    u: float, time_s: float, curve_u: FloatArray, curve_x: FloatArray, from_s: FloatArray
+) -> float:
+    """Return the sum in MW of the added curves that have begun."""
+    total = 0.0
+    for k in range(from_s.size):
+        if time_s >= from_s[k]:
+            inside = min(max(u, curve_u[k, 0]), curve_u[k, -1])
+            total += interpolate(inside, curve_u[k], curve_x[k])
+    return total
 
 
 class Series(NamedTuple):
@@ -99,8 +293,8 @@ def _run(series: Series, law: Law, memory: Memory, flow: FloatArray, out: FloatA
     for t in range(n):
         load, density = series.load[t], series.density[t]
         command = _command(load, series.moves[t], density, correction, curve, control[4])
-        sensor = actuator.move(command, memory.before_sensor, law.before_sensor)
-        plug = actuator.move(sensor, memory.after_sensor, law.after_sensor)
+        sensor = move(command, memory.before_sensor, law.before_sensor)
+        plug = move(sensor, memory.after_sensor, law.after_sensor)
         u = plug * density * series.input_gain[t]
         u *= nozzle_factor(
             interpolate(u, curve.curve_u, curve.curve_x), series.pressure[t], curve.nozzle
@@ -148,7 +342,7 @@ class ClosedLoop:
         opening = _command(
             load, series.moves[0], series.density[0], 0.0, self._law.flow, self._law.control[4]
         )
-        resting = np.full(actuator.N_POSITIONS, opening)
+        resting = np.full(N_POSITIONS, opening)
         return Memory(np.array([0.0, load, load]), resting, resting.copy())
 
 
@@ -169,6 +363,6 @@ def _law(hooks: Hooks, lags: FloatArray, manual: bool) -> Law:
         np.array(control),
         lags,
         np.array(reheater),
-        actuator.settings(hooks.before_sensor, h),
-        actuator.settings(hooks.after_sensor, h),
+        settings(hooks.before_sensor, h),
+        settings(hooks.after_sensor, h),
     )

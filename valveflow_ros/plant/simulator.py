@@ -2,16 +2,142 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
 
 from valveflow_ros.errors import InputError
-from valveflow_ros.plant.hooks import DAY_S, Hooks, clock_at_ns
-from valveflow_ros.plant.plant import Plant
-from valveflow_ros.plant.programme import LoadProgramme
-from valveflow_ros.plant.recorder import Recorder, SimulatedLog
+from valveflow_ros.plant.effect import DAY_S, Hooks, Written, clock_at_ns
+from valveflow_ros.plant.plant import LoadProgramme, Plant, Rows
 from valveflow_ros.plant.spec import EffectSpec, install
 from valveflow_ros.plant.unit import UnitDescription
-from valveflow_ros.records import NS_PER_S
+from valveflow_ros.records import NS_PER_S, FloatArray, SampleTable, Signal
+
+# What the historian keeps of a plant: stamps, rounding, faults of the record.
+
+
+DECIMALS = {
+    Signal.VALVE_OPENING: 2,
+    Signal.MAIN_STEAM_PRESSURE: 3,
+    Signal.MAIN_STEAM_TEMPERATURE: 1,
+    Signal.GENERATED_POWER: 2,
+    Signal.VALVE_COMMAND: 2,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedLog:
+    """What the instruments wrote, and the truth behind it.
+
+    Where the power is stamped early or late (`clock`), its truth and its
+    noise stand in the rows where it was stamped. So but for faults of the
+    record, the power in the table is ``true_power_mw + noise_mw``, rounded.
+
+    Attributes
+    ----------
+    table : SampleTable
+        Opening, pressure, temperature, power and command, rounded as a historian does.
+        The command is the output of the controller, before anything in the actuator.
+    true_u : float64 (n,)
+        The integrated input that really acted on the curve, % MPa^m.
+    true_power_mw : float64 (n,)
+        Power without noise.
+    load_mw : float64 (n,)
+        The load set point.
+    unit : UnitDescription
+        The unit that was simulated, without its effects.
+    noise_mw : float64 (n,)
+        The disturbance of the power that was drawn.
+    plug_percent : float64 (n,)
+        The true position of the plug.
+    active : tuple of EffectSpec
+        What was switched on, with the values of all parameters.
+    """
+
+    table: SampleTable
+    true_u: FloatArray
+    true_power_mw: FloatArray
+    load_mw: FloatArray
+    unit: UnitDescription
+    noise_mw: FloatArray
+    plug_percent: FloatArray
+    active: tuple[EffectSpec, ...] = ()
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.table)
+
+    @classmethod
+    def joined(cls, parts: list[SimulatedLog]) -> SimulatedLog:
+        """Join the parts of one run."""
+        first = parts[0]
+        return cls(
+            SampleTable.concatenate([part.table for part in parts]),
+            np.concatenate([part.true_u for part in parts]),
+            np.concatenate([part.true_power_mw for part in parts]),
+            np.concatenate([part.load_mw for part in parts]),
+            first.unit,
+            np.concatenate([part.noise_mw for part in parts]),
+            np.concatenate([part.plug_percent for part in parts]),
+            first.active,
+        )
+
+
+class Recorder:
+    """Turns the rows of a plant into tables; knows how early the power is stamped."""
+
+    def __init__(self, hooks: Hooks, start_ns: int, active: tuple[EffectSpec, ...]) -> None:
+        self._hooks = hooks
+        self._start_ns = start_ns
+        self._active = active
+        self._shift = hooks.lead_s / hooks.unit.sample_period_s
+        self.ahead = max(0, math.ceil(self._shift))
+        self.behind = max(0, math.ceil(-self._shift))
+
+    def parts(
+        self, plant: Plant, warm_up: int, rows: int, part_rows: int
+    ) -> Iterator[SimulatedLog]:
+        """Run the plant and yield its record in parts of at most ``part_rows``."""
+        window = plant.advance(warm_up + self.ahead)
+        for first in range(0, rows, part_rows):
+            kept = window.command.size - self.ahead - self.behind
+            window = window.part(kept, window.command.size)
+            count = min(part_rows, rows - first)
+            window = window.followed_by(plant.advance(count))
+            yield self._part(window, first, count)
+
+    def _part(self, window: Rows, first: int, count: int) -> SimulatedLog:
+        """Write rows ``[first, first + count)``, which begin at ``behind`` in the window."""
+        unit = self._hooks.unit
+        rows = window.part(self.behind, self.behind + count)
+        power, noise = self._stamped(window.power, count), self._stamped(window.noise, count)
+        columns = {
+            Signal.VALVE_OPENING: rows.opening_read,
+            Signal.MAIN_STEAM_PRESSURE: rows.pressure_read,
+            Signal.MAIN_STEAM_TEMPERATURE: rows.temperature_read,
+            Signal.GENERATED_POWER: power + noise,
+            Signal.VALVE_COMMAND: rows.command,
+        }
+        columns = {s: np.round(column, DECIMALS[s]) for s, column in columns.items()}
+        time_s = np.arange(first, first + count, dtype=np.float64) * unit.sample_period_s
+        for change in self._hooks.writing:
+            change(Written(time_s, columns))
+        time_ns = self._start_ns + np.round(time_s * NS_PER_S).astype(np.int64)
+        table = SampleTable.from_columns(time_ns, columns)
+        return SimulatedLog(table, rows.u, power, rows.load, unit, noise, rows.plug, self._active)
+
+    def _stamped(self, column: FloatArray, count: int) -> FloatArray:
+        """Return the values that carry the stamps of the rows, linear between samples."""
+        whole = math.floor(self._shift)
+        part = self._shift - whole
+        first = self.behind + whole
+        if part == 0.0:
+            return column[first : first + count]
+        later = column[first + 1 : first + 1 + count]
+        return column[first : first + count] * (1.0 - part) + later * part
+
 
 __all__ = ['DEFAULT_START_NS', 'WARM_UP_S', 'SimulatedLog', 'simulate', 'simulate_parts']
 

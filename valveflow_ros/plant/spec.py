@@ -6,11 +6,10 @@ import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from valveflow_ros.config import Parameter, Value
 from valveflow_ros.errors import InputError, ParameterError
-from valveflow_ros.plant.effect import Effect, Values
+from valveflow_ros.parameters import Parameter, Value
+from valveflow_ros.plant.effect import DAY_S, Effect, Hooks, Values
 from valveflow_ros.plant.effects import catalogue
-from valveflow_ros.plant.hooks import DAY_S, Hooks
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,15 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from valveflow_ros.errors import InputError
-from valveflow_ros.plant.chance import Source, Wander, generator
-from valveflow_ros.plant.hooks import DAY_S, Hooks, clock_at_ns
-from valveflow_ros.plant.plant import Plant
-from valveflow_ros.plant.programme import Outside
-from valveflow_ros.plant.recorder import SimulatedLog
+from valveflow_ros.plant.effect import DAY_S, Hooks, clock_at_ns
+from valveflow_ros.plant.plant import Outside, Plant, Source, Wander, generator
 from valveflow_ros.plant.simulator import (
     DEFAULT_START_NS,
     LONGEST_DAYS,
     WARM_UP_S,
+    SimulatedLog,
     prepare,
 )
 from valveflow_ros.plant.spec import EffectSpec

@@ -7,17 +7,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from valveflow_ros import __version__
-from valveflow_ros.diagnosis.residual_map import ResidualMap
 from valveflow_ros.diagnosis.result import NAMED, NOTHING, Diagnosis, NamedCause
-from valveflow_ros.diagnosis.signature import Answer, Signature
-from valveflow_ros.report.diagnosis_figures import answer_figure, segments_figure, signature_figure
-from valveflow_ros.report.diagnosis_map import map_figure
-from valveflow_ros.report.diagnosis_words import cells, times_in_effect, variable
+from valveflow_ros.diagnosis.signature import Answer, ResidualMap, Signature
+from valveflow_ros.report.diagnosis_figures import (
+    answer_figure,
+    cells,
+    map_figure,
+    segments_figure,
+    signature_figure,
+    times_in_effect,
+    variable,
+)
 from valveflow_ros.report.figure import Figure
-from valveflow_ros.report.history import history_sections
-from valveflow_ros.report.history_data import History
-from valveflow_ros.report.numbers import counted, decimals, moment, percent, plain
+from valveflow_ros.report.history import History, history_sections
 from valveflow_ros.report.page import Page, Section, notice, paragraph, table, text
+from valveflow_ros.report.words import counted, decimals, moment, percent, plain
 
 _HOW = (
     'Means of bins with equally many minutes. A model that is right stays in the band, here and '

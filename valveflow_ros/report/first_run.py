@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 SENTENCE = 'The engine is compiled for this machine now, once; that takes about a minute.'
-_ROOMS = ('jit', 'sums', 'signals', 'segments', 'partition', 'curve', 'fit', 'monitoring')
+_ROOMS = ('numerics', 'signals', 'segments', 'partition', 'curve', 'fit', 'monitoring')
 _ENGINE = tuple(f'valveflow_ros.{room}' for room in _ROOMS)
 # Some are only ever compiled into others, or for tests.
 _FEW = 0.05

@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 from valveflow_ros import __version__
-from valveflow_ros.config import PARAMETERS
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.fit.step_test import RULE
+from valveflow_ros.parameters import PARAMETERS
 from valveflow_ros.report.answer import (
     answer_words,
     breakpoints_table,
+    choice_figure,
+    confidence_table,
+    dynamics_figure,
+    dynamics_table,
     pieces_table,
     temperature_words,
     window_words,
 )
-from valveflow_ros.report.choice import choice_figure, confidence_table
-from valveflow_ros.report.coverage import coverage_figure, presence_figure
-from valveflow_ros.report.curve import curve_figure
-from valveflow_ros.report.dynamics import dynamics_figure, dynamics_table
+from valveflow_ros.report.curve import curve_figure, segments_figure, shift_section
+from valveflow_ros.report.data import (
+    coverage_figure,
+    presence_figure,
+    quality_table,
+    quality_words,
+    signals_figure,
+)
 from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.history import history_sections
 from valveflow_ros.report.identified import Identified
-from valveflow_ros.report.numbers import moment, plain
 from valveflow_ros.report.page import Page, Section, paragraph, table, text
-from valveflow_ros.report.quality import quality_table, quality_words
-from valveflow_ros.report.segment_figure import segments_figure
-from valveflow_ros.report.shift import shift_section
-from valveflow_ros.report.signals import signals_figure
+from valveflow_ros.report.words import moment, plain
 
 
 def identification_report(data: Identified) -> str:

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.shift import Shift
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
     FloatArray,
     IntArray,
@@ -18,8 +18,8 @@ from valveflow_ros.records import (
     Signal,
     SpecialSegment,
 )
-from valveflow_ros.report.downsample import segment_rows
-from valveflow_ros.report.history_data import History
+from valveflow_ros.report.figure import segment_rows
+from valveflow_ros.report.history import History
 from valveflow_ros.signals.units import integrated_input
 
 

@@ -3,10 +3,125 @@
 from __future__ import annotations
 
 import math
+from datetime import datetime, timezone
 from fractions import Fraction
 
 from valveflow_ros.curve.characteristic import HeldCause
-from valveflow_ros.report.numbers import plain
+from valveflow_ros.records import NS_PER_S
+
+# Numbers as people read them: rounded by what they are worth, with their unit.
+
+
+UNKNOWN = 'unknown'
+_MINUS = '−'
+
+
+def plain(value: float, digits: int = 4) -> str:
+    """Write ``value`` with that many significant digits, never in powers of ten if readable.
+
+    NaN and infinity become the word 'unknown'.
+    """
+    if not math.isfinite(value):
+        return UNKNOWN
+    if value == 0.0:
+        return '0'
+    exponent = math.floor(math.log10(abs(value)))
+    if -4 <= exponent < 7:
+        rounded = round(value, digits - 1 - exponent)
+        text = f'{rounded:.{max(0, digits - 1 - exponent)}f}'
+    else:
+        text = f'{value:.{digits - 1}e}'
+    return text.replace('-', _MINUS) if value < 0.0 else text
+
+
+def decimals(value: float, places: int) -> str:
+    """Write ``value`` with a fixed number of decimals; 'unknown' if it is not finite."""
+    if not math.isfinite(value):
+        return UNKNOWN
+    text = f'{value:.{places}f}'
+    if float(text) == 0.0:
+        text = text.lstrip('-')
+    return text.replace('-', _MINUS)
+
+
+def places_for(error: float, digits: int = 2) -> int:
+    """Return the decimals at which an error shows ``digits`` significant digits."""
+    if not math.isfinite(error) or error <= 0.0:
+        return 0
+    return max(0, digits - 1 - math.floor(math.log10(error)))
+
+
+def with_error(value: float, error: float, unit: str = '') -> str:
+    """Write 'value ± error', both rounded to two digits of the error.
+
+    Without a known error the value stands alone, with four digits.
+    """
+    tail = f' {unit}' if unit else ''
+    if not math.isfinite(value):
+        return UNKNOWN
+    if not math.isfinite(error) or error <= 0.0:
+        return plain(value) + tail
+    places = places_for(error)
+    return f'{decimals(value, places)} ± {decimals(error, places)}{tail}'
+
+
+def interval(low: float, high: float) -> str:
+    """Write 'low to high' with the digits its width deserves; 'unknown' if an end is."""
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return UNKNOWN
+    places = places_for(high - low)
+    return f'{decimals(low, places)} to {decimals(high, places)}'
+
+
+def count(value: int) -> str:
+    """Write a whole number in groups of three."""
+    return f'{value:,}'.replace(',', '\u202f')
+
+
+def counted(value: int, one: str, many: str = '') -> str:
+    """Write a number and its noun: '1 piece', '4 pieces'."""
+    return f'{count(value)} {one if value == 1 else many or one + "s"}'
+
+
+def percent(share: float, digits: int = 3) -> str:
+    """Write a share of one in percent; a share that is not quite all never reads as all."""
+    if not math.isfinite(share):
+        return UNKNOWN
+    if 0.99 < share < 1.0:
+        # Near all of it, what is missing decides how many digits are worth writing.
+        places = places_for(100.0 * (1.0 - share))
+        return f'{decimals(100.0 * share, places)} %' if places <= 4 else '> 99.99 %'
+    return f'{plain(100.0 * share, digits)} %'
+
+
+def duration(seconds: float) -> str:
+    """Write a length of time with its two largest units: '9 d 23 h', '12 min 5 s', '0.5 s'."""
+    if not math.isfinite(seconds):
+        return UNKNOWN
+    if seconds < 60.0:
+        return f'{seconds:.3g} s'
+    sizes = ((86400, 'd'), (3600, 'h'), (60, 'min'), (1, 's'))
+    large = next(k for k, (size, _) in enumerate(sizes) if seconds >= size)
+    small = min(large + 1, len(sizes) - 1)
+    # Rounded to the smaller unit, so that ten days less a second read as ten days.
+    left = round(seconds / sizes[small][0]) * sizes[small][0]
+    parts = []
+    for size, name in sizes[: small + 1]:
+        number, left = divmod(left, size)
+        if number:
+            parts.append(f'{number} {name}')
+    return ' '.join(parts[:2])
+
+
+def moment(time_ns: int) -> str:
+    """Write a time as '2023-11-15 00:00:00 UTC'."""
+    second = time_ns // NS_PER_S
+    try:
+        at = datetime.fromtimestamp(second, tz=timezone.utc)
+    except (OverflowError, OSError, ValueError):
+        return f'{second} s since 1970'
+    return f'{at:%Y-%m-%d %H:%M:%S} UTC'
+
 
 _DATED = ('t0_days',)  # parameters that are moments
 

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import functools
+import json
 import math
-from collections.abc import Sequence
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension
-from valveflow_msgs.msg import Alarm, FlowCharacteristic
+from valveflow_msgs.msg import Alarm, Diagnosis, DiagnosisCause, FlowCharacteristic
 from valveflow_msgs.msg import JournalEntry as JournalMessage
 from valveflow_msgs.msg import SpecialSegment as SegmentMessage
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.shift import Shift
 from valveflow_ros.monitoring.alarms import AlarmChange
-from valveflow_ros.monitoring.curve_status import CurveStatus
-from valveflow_ros.monitoring.events import JournalEntry, JournalKind
+from valveflow_ros.monitoring.curves import CurveStatus
+from valveflow_ros.monitoring.events import Diagnosed, DiagnosisTask, JournalEntry, JournalKind
 from valveflow_ros.records import NS_PER_S, FloatArray, SpecialSegment
 
 # The latest time whose seconds a stamp can hold.
@@ -191,3 +195,183 @@ def plain_array(values: FloatArray | Sequence[float], label: str) -> Float64Mult
     message = Float64MultiArray(data=numbers)
     message.layout.dim = [MultiArrayDimension(label=label, size=len(numbers), stride=len(numbers))]
     return message
+
+
+# Messages as CDR bytes that depend on nothing but their fields.
+#
+# The middleware's own serialiser leaves whatever was in memory between fields
+# that need alignment, so two equal messages may differ in their bytes. What is
+# recorded here is to be compared byte for byte, and is to carry nothing of the
+# process's memory; so the bytes between fields are zero.
+
+
+_HEAD = b'\x00\x01\x00\x00'  # plain CDR, little endian
+_LENGTH = struct.Struct('<I')
+_CODES = {
+    'boolean': '?', 'int8': 'b', 'uint8': 'B', 'int16': 'h', 'uint16': 'H', 'int32': 'i',
+    'uint32': 'I', 'int64': 'q', 'uint64': 'Q', 'float': 'f', 'double': 'd',
+}  # fmt: skip
+
+_Writer = Callable[[bytearray, Any], None]
+
+
+def encode(message: Any) -> bytes:
+    """Return a message as it goes over the wire.
+
+    Raises
+    ------
+    TypeError
+        A field is of a kind that none of our messages has.
+    """
+    out = bytearray()
+    _write_message(out, message)
+    return _HEAD + out
+
+
+def _write_message(out: bytearray, message: Any) -> None:
+    for name, write in _plan(type(message)):
+        write(out, getattr(message, name))
+
+
+@functools.cache
+def _plan(kind: type) -> tuple[tuple[str, _Writer], ...]:
+    fields: dict[str, str] = kind.get_fields_and_field_types()  # type: ignore[attr-defined]
+    return tuple((name, _writer(text)) for name, text in fields.items())
+
+
+def _writer(text: str) -> _Writer:
+    if text.startswith('sequence<') and ',' not in text:
+        return _sequence_writer(text[len('sequence<') : -1])
+    if text == 'string':
+        return _write_string
+    if text == 'octet':
+        return _write_octet
+    if text in _CODES:
+        return _number_writer(_CODES[text])
+    if '/' in text and '[' not in text and '<' not in text:
+        return _write_message
+    raise TypeError(f"fields of type '{text}' are not supported")
+
+
+def _number_writer(code: str) -> _Writer:
+    layout = struct.Struct(f'<{code}')
+    size = layout.size
+
+    def write(out: bytearray, value: Any) -> None:
+        out += bytes(-len(out) % size)
+        out += layout.pack(value)
+
+    return write
+
+
+def _sequence_writer(element: str) -> _Writer:
+    write = _writer(element)
+    code = _CODES.get(element)
+
+    def one_by_one(out: bytearray, values: Any) -> None:
+        out += bytes(-len(out) % 4)
+        out += _LENGTH.pack(len(values))
+        for value in values:
+            write(out, value)
+
+    def at_once(out: bytearray, values: Any) -> None:
+        out += bytes(-len(out) % 4)
+        out += _LENGTH.pack(len(values))
+        if len(values):
+            out += bytes(-len(out) % struct.calcsize(f'<{code}'))
+            out += struct.pack(f'<{len(values)}{code}', *values)
+
+    return one_by_one if code is None else at_once
+
+
+def _write_string(out: bytearray, value: Any) -> None:
+    data = value.encode()
+    out += bytes(-len(out) % 4)
+    out += _LENGTH.pack(len(data) + 1)
+    out += data
+    out.append(0)
+
+
+def _write_octet(out: bytearray, value: Any) -> None:
+    out += value
+
+
+# A diagnosis as a message.
+
+
+NOT_YET = 'Not diagnosed yet: a diagnosis needs a curve and a day of data.'
+VERDICTS = {
+    'nothing': Diagnosis.NOTHING,
+    'named': Diagnosis.NAMED,
+    'unexplained': Diagnosis.UNEXPLAINED,
+}
+
+
+def unknown(sentence: str, tag: str, task: DiagnosisTask | None = None) -> Diagnosis:
+    """Return the message that says why there is no result."""
+    nan = math.nan
+    return Diagnosis(
+        header=header(0 if task is None else task.window_end_ns, tag),
+        model_id='' if task is None else task.curve.model_id,
+        verdict=Diagnosis.UNKNOWN,
+        sentence=sentence,
+        disturbance_rms_mw=nan,
+        disturbance_time_scale_s=nan,
+        rmse_simulation=nan,
+        rmse_extended=nan,
+        rmse_noise_floor=nan,
+    )
+
+
+def of(event: Diagnosed, tag: str) -> Diagnosis:
+    """Return what a diagnosis gave as a message."""
+    if not event.content:
+        return unknown(event.reason, tag, event.task)
+    return diagnosis(json.loads(event.content), event.task, tag)
+
+
+def diagnosis(content: Mapping[str, Any], task: DiagnosisTask, tag: str) -> Diagnosis:
+    """Return what `diagnosis.json` would hold as a message.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError, AssertionError
+        It is not whole.
+    """
+    message = unknown(str(content['sentence']), tag, task)
+    message.verdict = VERDICTS[content['verdict']]
+    message.causes = [_cause(cause) for cause in content['causes']]
+    message.not_told_apart = [str(name) for name in content['not_told_apart']]
+    message.unexplained_by = [str(name) for name in content['unexplained_by']]
+    message.rejected_names = [str(put_away['name']) for put_away in content['rejected']]
+    message.rejected_reasons = [str(put_away['reason']) for put_away in content['rejected']]
+    disturbance = content['disturbance']
+    if disturbance is not None:
+        message.disturbance_rms_mw = _number(disturbance['rms_mw'])
+        message.disturbance_time_scale_s = _number(disturbance['time_scale_s'])
+    message.rmse_simulation = _number(content['rmse_simulation'])
+    message.rmse_extended = _number(content['rmse_extended'])
+    message.rmse_noise_floor = _number(content['rmse_noise_floor'])
+    return message
+
+
+def _cause(cause: Mapping[str, Any]) -> DiagnosisCause:
+    parameters, gain = cause['parameters'], cause['gain']
+    return DiagnosisCause(
+        name=str(cause['name']),
+        sentence=str(cause['sentence']),
+        parameter_names=[str(name) for name in parameters],
+        parameter_values=[_number(p['value']) for p in parameters.values()],
+        parameter_lows=[_number(p['low']) for p in parameters.values()],
+        parameter_highs=[_number(p['high']) for p in parameters.values()],
+        parameter_units=[str(p['unit']) for p in parameters.values()],
+        rmse_before_mw=_number(gain['rmse_before']),
+        rmse_after_mw=_number(gain['rmse_after']),
+        reduction=_number(gain['reduction']),
+        p_value=_number(gain['p_value']),
+    )
+
+
+def _number(value: float | None) -> float:
+    """JSON's null is a number that is not known."""
+    return math.nan if value is None else float(value)

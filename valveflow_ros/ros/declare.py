@@ -8,8 +8,8 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from valveflow_ros.config import PARAMETERS, TABLE, Parameter, Settings, Value, parameter
 from valveflow_ros.errors import ParameterError
+from valveflow_ros.parameters import PARAMETERS, TABLE, Parameter, Settings, Value, parameter
 
 # What ROS itself puts among the parameters of every node.
 _SIM_TIME = 'use_sim_time'

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import rclpy
@@ -20,13 +22,119 @@ from valveflow_ros.errors import ValveflowError, counted
 from valveflow_ros.plant.simulator import DEFAULT_START_NS
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.report.first_run import SENTENCE, is_first_run
+from valveflow_ros.report.terminal.text import number, whole
 from valveflow_ros.ros.conversions import from_time
-from valveflow_ros.ros.demo_options import parser
-from valveflow_ros.ros.demo_processes import Process, ros_arguments
-from valveflow_ros.ros.demo_story import Story, moment
-from valveflow_ros.ros.demo_watch import Watch
-from valveflow_ros.ros.sentences import with_place
-from valveflow_ros.ros.stops import StopFlag
+from valveflow_ros.ros.demo_watch import Story, Watch, moment
+from valveflow_ros.ros.process import Parser, StopFlag, with_place
+
+# The command line of the demo.
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the description of the command line."""
+    made = Parser(
+        prog='python -m valveflow_ros.ros.demo',
+        description='Run a simulated plant and the monitor as two ROS 2 processes, switch a '
+        'fault on, and show what the monitor says and records.',
+    )
+    made.add_argument('--output', type=Path, required=True, metavar='DIR', help='for all results')
+    made.add_argument(
+        '--days', metavar='D', default=3.0, help='of plant (default: 3)',
+        type=number('a number of days', 0, 400, '--days 3', above=True),
+    )  # fmt: skip
+    made.add_argument(
+        '--seed', metavar='N', default=1, help='of the plant (default: 1)',
+        type=whole('a whole number', 0, None, '--seed 1'),
+    )  # fmt: skip
+    made.add_argument(
+        '--rate',
+        metavar='R',
+        type=number('plant seconds in a second', 0, 1e6, '--rate 600'),
+        default=0.0,
+        help='plant seconds in a second; 0: as fast as the monitor takes it (default: 0)',
+    )
+    return made
+
+
+# The demo's processes: started with their output in files, and ended in order.
+
+
+_PATIENCE_S = 10.0
+
+
+def ros_arguments(parameters: Mapping[str, object]) -> list[str]:
+    """Return parameters as they follow a node's command."""
+    words = ['--ros-args']
+    for name, value in parameters.items():
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        words += ['-p', f'{name}:={text}']
+    return words
+
+
+class Process:
+    """A module of ours as a process of its own.
+
+    Parameters
+    ----------
+    name : str
+        For sentences and the name of the log file.
+    module : str
+    arguments : list of str
+    folder : Path
+        Where the log file goes.
+    environment : mapping
+    """
+
+    def __init__(
+        self,
+        name: str,
+        module: str,
+        arguments: list[str],
+        folder: Path,
+        environment: Mapping[str, str],
+    ) -> None:
+        self.name = name
+        self.log = folder / f'{name}.log'
+        with self.log.open('wb') as out:
+            self._process = subprocess.Popen(
+                [sys.executable, '-m', module, *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                env=dict(environment),
+                # Ctrl-C comes to the demo alone, which then ends the others in order.
+                start_new_session=True,
+            )
+
+    @property
+    def status(self) -> int | None:
+        """Return the exit status, None while it runs."""
+        return self._process.poll()
+
+    def must_run(self) -> None:
+        """Raise `ValveflowError` with its last words if it has ended with an error."""
+        if self.status:
+            raise ValveflowError(
+                f'The process {self.name} ended with status {self.status}: {self.last_line()}'
+            )
+
+    def last_line(self) -> str:
+        """Return the last line of its output."""
+        lines = self.log.read_text(errors='replace').strip().splitlines()
+        return lines[-1] if lines else f'it said nothing (see {self.log})'
+
+    def end(self) -> int:
+        """Ask it to end, wait, and return its exit status; doing it again changes nothing."""
+        if self.status is None:
+            self._process.send_signal(signal.SIGTERM)
+            try:
+                self._process.wait(_PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(self._process.pid, signal.SIGKILL)
+                self._process.wait()
+        return self._process.returncode
+
 
 _DAY_NS = 86400 * 10**9
 _FAULT = 'curve_step'

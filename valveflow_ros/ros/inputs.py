@@ -11,7 +11,7 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import Float64
 from valveflow_msgs.msg import PlantSample
 
-from valveflow_ros.config import Settings
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
 from valveflow_ros.signals.units import UNITS, Unit, unit_of
 

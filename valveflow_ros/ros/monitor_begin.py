@@ -6,14 +6,19 @@ import importlib
 import sys
 from collections.abc import Sequence
 
-from valveflow_ros.config import TABLE
 from valveflow_ros.errors import ValveflowError
-from valveflow_ros.ros.presence import Presence
+from valveflow_ros.parameters import TABLE
+from valveflow_ros.ros.domain import Presence, choose_transport
+from valveflow_ros.ros.process import (
+    StopFlag,
+    Stopped,
+    one_line,
+    show,
+    usage,
+    wants_help,
+    with_place,
+)
 from valveflow_ros.ros.secure_start import check_security
-from valveflow_ros.ros.sentences import one_line, with_place
-from valveflow_ros.ros.stops import StopFlag, Stopped
-from valveflow_ros.ros.transport import choose_transport
-from valveflow_ros.ros.usage import show, usage, wants_help
 
 _ABOUT = """usage: monitor [--ros-args ...]
 

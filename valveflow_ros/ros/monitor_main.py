@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from valveflow_ros.ros.stops import StopFlag, Stopped
+from valveflow_ros.ros.process import StopFlag, Stopped
 
 
 def main(args: Sequence[str] | None = None) -> int:

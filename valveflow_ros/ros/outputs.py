@@ -6,6 +6,8 @@ compares it with what comes out when a recording is fed again.
 
 from __future__ import annotations
 
+import functools
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -23,15 +25,65 @@ from valveflow_msgs.msg import (
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.shift import Shift
 from valveflow_ros.monitoring import events as engine
-from valveflow_ros.monitoring.alarm_voice import BURIED
+from valveflow_ros.monitoring.alarm import BURIED
 from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState
-from valveflow_ros.monitoring.curve_status import CurveStatus
+from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.events import JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.prediction import PredictionBlock
-from valveflow_ros.ros import conversions, diagnosis_message
-from valveflow_ros.ros.encoding import encode
-from valveflow_ros.ros.prediction_bytes import prediction_bytes
+from valveflow_ros.records import NS_PER_S
+from valveflow_ros.ros import conversions
+from valveflow_ros.ros.conversions import LAST_NS, encode
+
+# Predictions as bytes, made without a message object.
+#
+# There is one for every sample, and with a plant running thousands of times
+# faster than real time a message object a row would be the monitor's largest
+# cost. What comes out equals `encoding.encode` of the message; a test holds the
+# two, and the order of the fields in Prediction.msg, together.
+
+
+_HEAD = b'\x00\x01\x00\x00'  # plain CDR, little endian
+
+
+@functools.lru_cache(maxsize=16)
+def _layout(tag_bytes: int, model_bytes: int) -> struct.Struct:
+    """Return the layout of a row's message for texts of these lengths, zero bytes included."""
+    size = 12 + tag_bytes + 1
+    before_model = -size % 4
+    size += before_model + 4 + model_bytes
+    before_numbers = -size % 8
+    return struct.Struct(f'<4siII{tag_bytes}sB{before_model}xI{model_bytes}s{before_numbers}x10d')
+
+
+def prediction_bytes(block: PredictionBlock, tag: str) -> Iterator[tuple[int, bytes]]:
+    """Yield the message of each row with the row's time in ns."""
+    frame, model = tag.encode() + b'\x00', block.model_id.encode() + b'\x00'
+    pack = _layout(len(frame), len(model)).pack
+    expected = block.measured_mw - block.residual_mw
+    columns = (
+        block.time_ns, block.state, block.u, block.measured_mw, block.static_mw,
+        block.dynamic_mw, block.residual_mw, block.average_mw, expected - block.width_mw,
+        expected + block.width_mw, block.evidence, block.shift_mw,
+    )  # fmt: skip
+    for row in zip(*(column.tolist() for column in columns), strict=True):
+        time_ns, state, *numbers = row
+        sec, nanosec = divmod(min(max(time_ns, 0), LAST_NS), NS_PER_S)
+        yield (
+            time_ns,
+            pack(
+                _HEAD,
+                sec,
+                nanosec,
+                len(frame),
+                frame,
+                state,
+                len(model),
+                model,
+                *numbers,
+            ),
+        )
+
 
 NO_CURVE_YET = 'No curve yet: not enough special segments.'
 
@@ -168,7 +220,7 @@ class Outputs:
         """Yield the messages that stand on the latched topics."""
         yield from self._curve_messages()
         if self._diagnosed is None:
-            message = diagnosis_message.unknown(diagnosis_message.NOT_YET, self._tag)
+            message = conversions.unknown(conversions.NOT_YET, self._tag)
             yield _output('diagnosis', message, 0)
         else:
             yield self._diagnosis(self._diagnosed)
@@ -181,7 +233,7 @@ class Outputs:
                 yield _output('alarms', conversions.alarm(change, self._tag), change.time_ns)
 
     def _diagnosis(self, event: engine.Diagnosed) -> Output:
-        message = diagnosis_message.of(event, self._tag)
+        message = conversions.of(event, self._tag)
         return _output('diagnosis', message, event.task.window_end_ns)
 
     def _note(self, entry: engine.JournalEntry) -> bool:
@@ -214,3 +266,23 @@ class Outputs:
 
 def _output(name: str, message: Any, time_ns: int) -> Output:
     return Output(name, encode(message), max(0, time_ns))
+
+
+# Small messages as the bytes that go over the wire, made without a message object.
+
+
+_LITTLE_ENDIAN = b'\x00\x01\x00\x00'
+_FLOAT64 = struct.Struct('<d')
+_TIME = struct.Struct('<iI')
+_LAST_S = (1 << 31) - 1
+
+
+def float64_bytes(value: float) -> bytes:
+    """Return a std_msgs/Float64."""
+    return _LITTLE_ENDIAN + _FLOAT64.pack(value)
+
+
+def clock_bytes(time_ns: int) -> bytes:
+    """Return a rosgraph_msgs/Clock; times before 1970 or after 2038 become the nearest one."""
+    seconds, nanoseconds = divmod(max(time_ns, 0), NS_PER_S)
+    return _LITTLE_ENDIAN + _TIME.pack(min(seconds, _LAST_S), nanoseconds)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 
-from valveflow_ros.config import Settings
 from valveflow_ros.errors import RecordingError
+from valveflow_ros.parameters import Settings
 from valveflow_ros.ros.node.recording import DEFAULT_FOLDER, at_home
 
 

@@ -14,15 +14,13 @@ from rclpy.utilities import remove_ros_args
 
 from valveflow_ros.errors import ValveflowError, counted
 from valveflow_ros.logs import open_log
-from valveflow_ros.report.terminal.terminal_number import number
-from valveflow_ros.report.terminal.terminal_progress import Progress
+from valveflow_ros.report.terminal.progress import Progress
+from valveflow_ros.report.terminal.text import number
+from valveflow_ros.ros.domain import choose_transport
 from valveflow_ros.ros.playing import Player
+from valveflow_ros.ros.process import Parser, StopFlag, one_line, with_place
 from valveflow_ros.ros.replay_steps import steps_of
 from valveflow_ros.ros.secure_start import check_security
-from valveflow_ros.ros.sentences import one_line, with_place
-from valveflow_ros.ros.stops import StopFlag
-from valveflow_ros.ros.transport import choose_transport
-from valveflow_ros.ros.usage import Parser
 from valveflow_ros.ros.verify import verify
 
 # As a shell tells of a process that Ctrl-C has ended.

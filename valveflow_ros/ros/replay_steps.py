@@ -10,8 +10,8 @@ from valveflow_ros.logs import LogContents
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.ros.inputs import INPUT_BY_NAME, PLANT_SAMPLE, header_time_ns
 from valveflow_ros.ros.node.recording import TOPICS
+from valveflow_ros.ros.outputs import float64_bytes
 from valveflow_ros.ros.playing import Step
-from valveflow_ros.ros.wire import float64_bytes
 
 
 def input_topics(log: LogContents) -> dict[str, str]:

@@ -18,7 +18,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import get_rmw_implementation_identifier
 
 from valveflow_ros.errors import InputError
-from valveflow_ros.ros.sentences import one_line
+from valveflow_ros.ros.process import one_line
 
 _ENABLE, _STRATEGY = 'ROS_SECURITY_ENABLE', 'ROS_SECURITY_STRATEGY'
 _KEYSTORE = 'ROS_SECURITY_KEYSTORE'

@@ -17,13 +17,11 @@ from valveflow_ros.plant.simulator import simulate_parts
 from valveflow_ros.records import SIGNALS, SampleTable, Signal
 from valveflow_ros.ros import simulator_steps as steps
 from valveflow_ros.ros.declare import declare, unknown_overrides
+from valveflow_ros.ros.domain import choose_transport
 from valveflow_ros.ros.inputs import PLANT_SAMPLE
 from valveflow_ros.ros.playing import Player, Step
+from valveflow_ros.ros.process import StopFlag, one_line, show, usage, wants_help, with_place
 from valveflow_ros.ros.secure_start import check_security
-from valveflow_ros.ros.sentences import one_line, with_place
-from valveflow_ros.ros.stops import StopFlag
-from valveflow_ros.ros.transport import choose_transport
-from valveflow_ros.ros.usage import show, usage, wants_help
 
 _EFFECTS = ParameterDescriptor(
     description='What is wrong with the plant: texts of the form name or name:key=value,... as '

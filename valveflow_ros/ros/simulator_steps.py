@@ -7,16 +7,15 @@ from datetime import datetime, timezone
 
 from valveflow_msgs.msg import PlantSample
 
-from valveflow_ros.config import Parameter
 from valveflow_ros.errors import ParameterError
+from valveflow_ros.parameters import Parameter
 from valveflow_ros.plant.simulator import DEFAULT_START_NS
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.records import N_SIGNALS, NS_PER_S, SIGNALS, SampleTable, Signal
-from valveflow_ros.ros.conversions import header
-from valveflow_ros.ros.encoding import encode
+from valveflow_ros.ros.conversions import encode, header
 from valveflow_ros.ros.inputs import PLANT_SAMPLE
+from valveflow_ros.ros.outputs import float64_bytes
 from valveflow_ros.ros.playing import Step
-from valveflow_ros.ros.wire import float64_bytes
 
 TABLE: tuple[Parameter, ...] = (
     Parameter('days', 10.0, 'd', 'How long the plant is simulated.', 0.001, 400.0),

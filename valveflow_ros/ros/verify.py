@@ -13,19 +13,24 @@ from typing import Any
 from rclpy.serialization import deserialize_message
 from valveflow_msgs.msg import JournalEntry as JournalMessage
 
-from valveflow_ros.config import Settings
-from valveflow_ros.diagnosis import model_json
+from valveflow_ros.diagnosis import result
 from valveflow_ros.errors import DataError, RecordingError, ValveflowError, counted
 from valveflow_ros.logs import LogContents, LoggedMessage, open_log
-from valveflow_ros.monitoring.corrector import Corrector
-from valveflow_ros.monitoring.diagnosis_task import DiagnosisContent, DiagnosisTask
-from valveflow_ros.monitoring.events import Event, JournalEntry, JournalKind
+from valveflow_ros.monitoring.events import (
+    DiagnosisContent,
+    DiagnosisTask,
+    Event,
+    JournalEntry,
+    JournalKind,
+)
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import JournalReplayer
+from valveflow_ros.monitoring.rows import Corrector
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import Readings
 from valveflow_ros.ros import conversions
 from valveflow_ros.ros.inputs import Decoder, Row
-from valveflow_ros.ros.node import model_file
+from valveflow_ros.ros.node import given_files
 from valveflow_ros.ros.node.recording import PARAMETERS, TOPICS
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
 from valveflow_ros.ros.worker.worker import DiagnosisWorker
@@ -160,13 +165,13 @@ def _corrector(log: LogContents, settings: Settings) -> Corrector | None:
     RecordingError
         The model is not in the recording, or cannot be used.
     """
-    if not settings.text(model_file.PARAMETER):
+    if not settings.text(given_files.PARAMETER):
         return None
     try:
-        given = model_json.from_json(json.loads(log.attachments[model_file.ATTACHMENT]))
-        return model_file.ready(given, settings)
+        given = result.model_from_json(json.loads(log.attachments[given_files.ATTACHMENT]))
+        return given_files.ready(given, settings)
     except KeyError:
-        problem = f"lacks the attachment '{model_file.ATTACHMENT}' that its run was made with"
+        problem = f"lacks the attachment '{given_files.ATTACHMENT}' that its run was made with"
         raise RecordingError(log.path, problem) from None
     except (ValueError, ValveflowError) as error:
         problem = f'holds an extended model that cannot be used ({str(error).rstrip(".")})'

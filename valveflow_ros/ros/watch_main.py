@@ -18,14 +18,13 @@ from rclpy.utilities import remove_ros_args
 from std_srvs.srv import Trigger
 
 from valveflow_ros.errors import ValveflowError
-from valveflow_ros.report.terminal.terminal_board import CURVE, HEALTH
-from valveflow_ros.report.terminal.terminal_number import number
-from valveflow_ros.report.terminal.terminal_screen import Screen
+from valveflow_ros.report.terminal.board import CURVE, HEALTH
+from valveflow_ros.report.terminal.screen import Screen
+from valveflow_ros.report.terminal.text import number
+from valveflow_ros.ros.domain import choose_transport
+from valveflow_ros.ros.process import Parser, one_line, with_place
 from valveflow_ros.ros.secure_start import check_security
-from valveflow_ros.ros.sentences import one_line, with_place
 from valveflow_ros.ros.services import SERVICES
-from valveflow_ros.ros.transport import choose_transport
-from valveflow_ros.ros.usage import Parser
 from valveflow_ros.ros.watch_node import WatchNode
 
 _LOOK_S = 0.5

@@ -11,7 +11,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from valveflow_msgs.msg import Alarm, Diagnosis, FlowCharacteristic, Prediction
 
-from valveflow_ros.report.terminal.terminal_board import (
+from valveflow_ros.report.terminal.board import (
     ALARM,
     CURVE,
     DIAGNOSIS,
@@ -20,7 +20,7 @@ from valveflow_ros.report.terminal.terminal_board import (
     PREDICTION,
     Board,
 )
-from valveflow_ros.report.terminal.terminal_frame import Frame
+from valveflow_ros.report.terminal.frame import Frame
 
 _LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # A sample that is lost here is lost to the eye only.

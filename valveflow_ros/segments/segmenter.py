@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from valveflow_ros.config import Settings
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
     NS_PER_S,
     ByteArray,
@@ -18,9 +18,8 @@ from valveflow_ros.records import (
     SegmentKind,
     SpecialSegment,
 )
-from valveflow_ros.segments import segmenter_kernel as kernel
-from valveflow_ros.segments.line import LINE_SIZE
-from valveflow_ros.segments.noise import BINS, WARM_UP
+from valveflow_ros.segments import kernel as kernel
+from valveflow_ros.segments.kernel import BINS, LINE_SIZE, WARM_UP
 from valveflow_ros.state import State, copies, put_back
 
 

@@ -14,33 +14,336 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from valveflow_ros.config import Settings
+from valveflow_ros.numerics import inlined, jit
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
     N_SIGNALS,
     NS_PER_S,
     SIGNALS,
+    ByteArray,
+    FloatArray,
     IntArray,
     Quality,
     Readings,
     SampleTable,
     Signal,
 )
-from valveflow_ros.signals.align_kernel import (
-    BEHIND_CONFIRMED,
-    NEVER,
-    NEWEST,
-    REASONS,
-    Rows,
-    Rules,
-    State,
-    align,
-)
 from valveflow_ros.state import ArrayMemory
+
+# The loop that turns readings into rows; see `valveflow_ros.signals.align` for the rules.
+
+
+REASONS = (
+    'accepted',  # taken into the table
+    'not_finite',  # NaN or infinite
+    'bad_quality',  # the sender itself calls it bad
+    'impossible',  # outside the plausible range of its signal
+    'duplicate',  # same stamp as the one before
+    'out_of_order',  # older than the newest of its own signal
+    'time_outlier',  # stamp impossible, or far from everybody else's and not confirmed
+    'late',  # taken, but rows it belonged to were closed already
+)
+_ACCEPTED, _NOT_FINITE, _BAD, _IMPOSSIBLE, _DUPLICATE, _ORDER, _OUTLIER, _LATE = range(8)
+
+_AHEAD_CONFIRMED = 3  # instants that must agree before a leap forward is believed
+BEHIND_CONFIRMED = 20  # and before the clock is believed to have gone back
+NEVER = np.iinfo(np.int64).min
+_LATEST_NS = 2**62  # the year 2116; later stamps would overflow
+
+# Places in the clock.
+_NEXT, NEWEST, _WAITING, _BELIEVED, _RESETS = range(5)
+
+
+class State(NamedTuple):
+    """All the kernel remembers, as arrays it writes."""
+
+    clock: IntArray  # next row, newest stamp accepted, readings waiting, of them believed, resets
+    newest_ns: IntArray  # (5,) newest stamp of each signal
+    held_ns: IntArray  # (5,) the newest value not after the next row
+    held: FloatArray
+    held_quality: ByteArray
+    open_row: IntArray  # (5, spare) values for rows still open: number of the row, stamp, value
+    open_ns: IntArray
+    open_value: FloatArray
+    open_quality: ByteArray
+    wait_ns: IntArray  # readings far off in time, waiting for others like them
+    wait_signal: IntArray
+    wait: FloatArray
+    wait_quality: ByteArray
+    counts: IntArray  # (5, reasons)
+
+
+class Rules(NamedTuple):
+    """What the kernel goes by."""
+
+    limits: FloatArray  # (5, 2) plausible range of each signal
+    required: ByteArray  # (5,)
+    period_ns: int
+    lateness_ns: int
+    hold_ns: int
+    jump_ns: int
+    spare: int  # rows that may stand open at a time
+
+
+class Rows(NamedTuple):
+    """Room for what comes out."""
+
+    time_ns: IntArray
+    values: FloatArray
+    quality: ByteArray
+    resets: IntArray
+
+
+@inlined
+def _accept(state: State, rules: Rules, time_ns: int, s: int, v: float, q: int) -> None:
+    """Take one checked reading: hold it, or keep it for the open row it belongs to."""
+    if time_ns <= state.newest_ns[s]:
+        why = _DUPLICATE if time_ns == state.newest_ns[s] else _ORDER
+        state.counts[s, why] += 1
+        return
+    clock = state.clock
+    row = -((-time_ns) // rules.period_ns)
+    if clock[_NEXT] == NEVER:
+        clock[_NEXT] = row * rules.period_ns
+    elif time_ns <= clock[_NEXT] - rules.period_ns:
+        state.counts[s, _LATE] += 1
+    state.newest_ns[s] = time_ns
+    state.counts[s, _ACCEPTED] += 1
+    clock[NEWEST] = max(clock[NEWEST], time_ns)
+    if time_ns <= clock[_NEXT]:
+        state.held_ns[s], state.held[s], state.held_quality[s] = time_ns, v, q
+        return
+    k = row % rules.spare
+    state.open_row[s, k], state.open_ns[s, k] = row, time_ns
+    state.open_value[s, k], state.open_quality[s, k] = v, q
+
+
+@inlined
+def _can_close(state: State, rules: Rules) -> bool:
+    """Tell whether the next row can no longer change."""
+    tick = state.clock[_NEXT]
+    if state.clock[NEWEST] >= tick + rules.lateness_ns:
+        return True
+    for s in range(state.newest_ns.size):
+        # An optional signal is waited for only while it is being sent.
+        expected = rules.required[s] or state.newest_ns[s] >= tick - rules.hold_ns
+        if expected and state.newest_ns[s] < tick:
+            return False
+    return True
+
+
+@inlined
+def _close(state: State, rules: Rules, rows: Rows, place: int, coming_ns: int) -> bool:
+    """Write the next row, if anybody has spoken lately, and go on to the one after it.
+
+    ``coming_ns`` is the stamp of a reading that is about to be accepted.
+    """
+    tick = state.clock[_NEXT]
+    number = tick // rules.period_ns
+    k = number % rules.spare
+    alive = False
+    for s in range(state.held_ns.size):
+        if state.open_row[s, k] == number and state.open_ns[s, k] > state.held_ns[s]:
+            state.held_ns[s], state.held[s] = state.open_ns[s, k], state.open_value[s, k]
+            state.held_quality[s] = state.open_quality[s, k]
+        if tick - rules.hold_ns <= state.held_ns[s] <= tick:
+            rows.values[place, s] = state.held[s]
+            rows.quality[place, s] = state.held_quality[s]
+            alive = True
+        else:
+            rows.values[place, s] = np.nan
+            rows.quality[place, s] = 2
+    state.clock[_NEXT] = tick + rules.period_ns
+    if alive:
+        rows.time_ns[place] = tick
+        return True
+    # Nobody has spoken for long: the grid goes on where somebody does.
+    first = coming_ns
+    for s in range(state.held_ns.size):
+        for j in range(rules.spare):
+            if state.open_row[s, j] > number:
+                first = min(first, state.open_ns[s, j])
+    if first != _LATEST_NS:
+        row = -((-first) // rules.period_ns)
+        state.clock[_NEXT] = max(tick + rules.period_ns, row * rules.period_ns)
+    return False
+
+
+@jit
+def _drop_waiting(state: State) -> None:
+    """Count the readings that waited in vain."""
+    for k in range(state.clock[_WAITING]):
+        state.counts[state.wait_signal[k], _OUTLIER] += 1
+    state.clock[_WAITING] = 0
+
+
+@jit
+def _wait(state: State, rules: Rules, time_ns: int, s: int, v: float, q: int) -> int:
+    """Let a reading far off in time wait; 1 when a leap ahead is confirmed, -1 one back."""
+    clock = state.clock
+    if clock[_WAITING] > 0:
+        last = state.wait_ns[clock[_WAITING] - 1]
+        if abs(time_ns - last) > rules.jump_ns:
+            _drop_waiting(state)
+    n = clock[_WAITING]
+    state.wait_ns[n], state.wait_signal[n] = time_ns, s
+    state.wait[n], state.wait_quality[n] = v, q
+    clock[_WAITING] = n + 1
+    ahead = time_ns > clock[NEWEST]
+    # The values of one instant must not confirm each other: what counts is instants.
+    instants = 1
+    for k in range(1, n + 1):
+        if state.wait_ns[k] != state.wait_ns[k - 1]:
+            instants += 1
+    if n + 1 < BEHIND_CONFIRMED and (not ahead or instants < _AHEAD_CONFIRMED):
+        return 0
+    return 1 if ahead else -1
+
+
+@jit
+def _forget(state: State) -> None:
+    """Begin anew after the clock went back; what waits is believed."""
+    state.clock[_RESETS] += 1
+    state.clock[NEWEST] = NEVER
+    state.clock[_NEXT] = NEVER
+    state.newest_ns[:] = NEVER
+    state.held_ns[:] = NEVER
+    state.open_row[:] = NEVER
+
+
+@jit
+def _close_ready(
+    state: State, rules: Rules, rows: Rows, written: int, coming_ns: int, rest: bool
+) -> int:
+    """Close rows while there is room; return the rows written by then.
+
+    With ``coming_ns`` only rows that cannot be touched by that reading, with
+    ``rest`` all up to the newest stamp.
+    """
+    clock = state.clock
+    while clock[_NEXT] != NEVER and written < rows.time_ns.size - rules.spare:
+        tick = clock[_NEXT]
+        if coming_ns != _LATEST_NS:
+            ready = tick < coming_ns and tick + rules.lateness_ns <= coming_ns
+        else:
+            ready = (rest and tick <= clock[NEWEST]) or _can_close(state, rules)
+        if not ready:
+            break
+        if _close(state, rules, rows, written, coming_ns):
+            written += 1
+    return written
+
+
+@inlined
+def _refusal(t: int, v: float, q: int, low: float, high: float) -> int:
+    """Return why a reading is refused at the door, or `_ACCEPTED`."""
+    if not 0 <= t < _LATEST_NS:
+        return _OUTLIER
+    if not math.isfinite(v):
+        return _NOT_FINITE
+    if q >= 2:
+        return _BAD
+    return _ACCEPTED if low <= v <= high else _IMPOSSIBLE
+
+
+@jit
+def _offer_believed(state: State, rules: Rules, rows: Rows, written: int) -> int:
+    """Accept the readings whose leap is confirmed.
+
+    Returns the rows written, or -1 - rows when room ended before all were accepted.
+    """
+    clock = state.clock
+    while 0 <= clock[_BELIEVED] < clock[_WAITING]:
+        k = clock[_BELIEVED]
+        t = state.wait_ns[k]
+        written = _close_ready(state, rules, rows, written, t, False)
+        if written >= rows.time_ns.size - rules.spare:
+            return -1 - written
+        _accept(state, rules, t, state.wait_signal[k], state.wait[k], state.wait_quality[k])
+        clock[_BELIEVED] += 1
+    if clock[_BELIEVED] >= 0:
+        clock[_BELIEVED], clock[_WAITING] = -1, 0
+    return written
+
+
+@jit
+def _go_back(state: State, rules: Rules, rows: Rows, written: int) -> int:
+    """Close what was open before the clock went back, as it stands, and begin anew."""
+    clock = state.clock
+    while clock[_NEXT] <= clock[NEWEST] and written < rows.time_ns.size:
+        if _close(state, rules, rows, written, _LATEST_NS):
+            written += 1
+    _forget(state)
+    return written
+
+
+@jit
+def _far(
+    state: State, rules: Rules, rows: Rows, written: int, t: int, s: int, v: float, q: int
+) -> int:
+    """Deal with a reading far off in time; return the rows written."""
+    leap = _wait(state, rules, t, s, v, q)
+    state.clock[_BELIEVED] = 0 if leap != 0 else -1
+    return _go_back(state, rules, rows, written) if leap < 0 else written
+
+
+@jit
+def align(  # noqa: C901 - one loop over all that can meet a reading
+    time_ns: IntArray,
+    signal: NDArray[np.int8],
+    value: FloatArray,
+    quality: ByteArray,
+    state: State,
+    rules: Rules,
+    rows: Rows,
+    final: bool,
+) -> tuple[int, int, int]:
+    """Run over readings until they or the room for rows end.
+
+    Returns the readings consumed, the rows written and the restarts met.
+    """
+    # Calls hand over many arrays, so the common path asks first whether one is needed.
+    clock = state.clock
+    limit = rows.time_ns.size - rules.spare
+    written = resets = i = 0
+    while True:
+        if clock[_BELIEVED] >= 0:
+            written = _offer_believed(state, rules, rows, written)
+            if written < 0:
+                return i, -1 - written, resets
+        last = i >= time_ns.size
+        if clock[NEWEST] >= clock[_NEXT] and ((final and last) or _can_close(state, rules)):
+            written = _close_ready(state, rules, rows, written, _LATEST_NS, final and last)
+        if written >= limit or last:
+            break
+        t, s, v, q = time_ns[i], int(signal[i]), value[i], quality[i]
+        newest = clock[NEWEST]
+        why = _refusal(t, v, q, rules.limits[s, 0], rules.limits[s, 1])
+        if why != _ACCEPTED:
+            state.counts[s, why] += 1
+        elif newest == NEVER or abs(t - newest) <= rules.jump_ns:
+            if t > clock[_NEXT] and t >= clock[_NEXT] + rules.lateness_ns:
+                written = _close_ready(state, rules, rows, written, t, False)
+                if written >= limit:
+                    break
+            _accept(state, rules, t, s, v, q)
+            if clock[_WAITING] > 0:
+                _drop_waiting(state)
+        else:
+            before = clock[_RESETS]
+            written = _far(state, rules, rows, written, t, s, v, q)
+            if clock[_RESETS] > before:
+                rows.resets[resets] = written
+                resets += 1
+        i += 1
+    if final and i >= time_ns.size:
+        _drop_waiting(state)
+    return i, written, resets
 
 
 @dataclass(frozen=True, slots=True)

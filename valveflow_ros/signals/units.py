@@ -1,12 +1,101 @@
-"""The integrated input u, and the units at the border under their old address."""
+"""Units at the border: what a gateway or a historian may send, and what the engine works in."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from valveflow_ros.jit import jit
-from valveflow_ros.records import FloatArray
-from valveflow_ros.signals.unit_table import UNITS, Unit, convert, unit_of
+from valveflow_ros.errors import InputError
+from valveflow_ros.numerics import jit
+from valveflow_ros.records import SIGNALS, FloatArray, Signal
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """``engine value = scale * value + offset``."""
+
+    scale: float
+    offset: float = 0.0
+
+
+_PSI_PA = 6894.757293168361  # NIST SP 811, table B.8
+_KGF_CM2_PA = 98066.5  # NIST SP 811, table B.8
+# What is added to a gauge pressure: the standard atmosphere (ISO 2533), at the level of the sea.
+AIR_MPA = 0.101325
+
+_OPENING = {'%': Unit(1.0), 'percent': Unit(1.0), 'fraction': Unit(100.0)}
+_PRESSURE = {
+    'MPa': Unit(1.0),
+    'kPa': Unit(1e-3),
+    'Pa': Unit(1e-6),
+    'bar': Unit(0.1),
+    'psi': Unit(_PSI_PA * 1e-6),
+}
+_TEMPERATURE = {
+    'degC': Unit(1.0),
+    'K': Unit(1.0, -273.15),
+    'degF': Unit(5.0 / 9.0, -160.0 / 9.0),
+}
+_POWER = {'MW': Unit(1.0), 'kW': Unit(1e-3), 'W': Unit(1e-6)}
+
+UNITS: dict[Signal, dict[str, Unit]] = {
+    Signal.VALVE_OPENING: _OPENING,
+    Signal.MAIN_STEAM_PRESSURE: _PRESSURE,
+    Signal.MAIN_STEAM_TEMPERATURE: _TEMPERATURE,
+    Signal.GENERATED_POWER: _POWER,
+    Signal.VALVE_COMMAND: _OPENING,
+}
+
+# Understood where a person or a file names them, and never guessed: nothing in the values tells
+# whether a pressure is gauge or absolute.
+FURTHER: dict[Signal, dict[str, Unit]] = {
+    Signal.MAIN_STEAM_PRESSURE: {
+        'barg': Unit(0.1, AIR_MPA),
+        'MPag': Unit(1.0, AIR_MPA),
+        'kPag': Unit(1e-3, AIR_MPA),
+        'psig': Unit(_PSI_PA * 1e-6, AIR_MPA),
+        'kg/cm2': Unit(_KGF_CM2_PA * 1e-6),
+        'mbar': Unit(1e-4),
+    },
+    Signal.GENERATED_POWER: {'GW': Unit(1e3)},
+}
+
+
+def known_units(signal: Signal) -> dict[str, Unit]:
+    """Return every unit that a signal of a log may have."""
+    return {**UNITS[signal], **FURTHER.get(signal, {})}
+
+
+def air_in(signal: Signal, name: str) -> float:
+    """Return what is added to a gauge pressure, in the unit it is in; 0 for any other unit."""
+    unit = unit_of(signal, name)
+    return unit.offset / unit.scale if unit.offset == AIR_MPA else 0.0
+
+
+def unit_of(signal: Signal, name: str) -> Unit:
+    """Look a unit up by its name; capitals do not matter.
+
+    Raises
+    ------
+    InputError
+        The unit is not one this signal can have; the sentence lists those it can.
+    """
+    for spelling, unit in known_units(signal).items():
+        if spelling.lower() == name.strip().lower():
+            return unit
+    known = ', '.join(UNITS[signal])
+    raise InputError(f"Unit '{name}' is unknown for {SIGNALS[signal].topic}: use one of {known}.")
+
+
+def convert(signal: Signal, name: str, values: FloatArray) -> FloatArray:
+    """Convert ``values`` from the unit ``name`` to the engine's unit."""
+    unit = unit_of(signal, name)
+    return np.asarray(values, dtype=np.float64) * unit.scale + unit.offset
+
+
+# The integrated input u, and the units at the border under their old address.
+
 
 __all__ = ['UNITS', 'Unit', 'convert', 'integrated_input', 'unit_of']
 

@@ -2,23 +2,279 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs.mcap.bundled import BUNDLED
 from valveflow_ros.logs.mcap.layout import LayoutError
-from valveflow_ros.logs.mcap.msgdef import (
-    SEPARATOR,
-    Fields,
-    collect,
-    full_name,
-    parse_fields,
-    short_name,
+
+# Definitions of the stock messages that are written and read where no ROS is installed.
+#
+# Fields stand as ROS 2 Jazzy defines them (the type hashes agree); comments are our own.
+
+
+BUNDLED: dict[str, str] = {
+    'builtin_interfaces/msg/Time': """\
+int32 sec       # [s] since the Unix epoch
+uint32 nanosec  # [ns] added to the seconds, below 1e9
+""",
+    'builtin_interfaces/msg/Duration': """\
+int32 sec       # [s]
+uint32 nanosec  # [ns] added to the seconds, below 1e9
+""",
+    'std_msgs/msg/Header': """\
+builtin_interfaces/Time stamp  # time of the data
+string frame_id                # what the data belong to
+""",
+    'std_msgs/msg/Float64': 'float64 data\n',
+    'std_msgs/msg/Bool': 'bool data\n',
+    'std_msgs/msg/String': 'string data\n',
+    'std_msgs/msg/MultiArrayDimension': """\
+string label   # name of the dimension
+uint32 size    # elements along it
+uint32 stride  # elements from here inwards
+""",
+    'std_msgs/msg/MultiArrayLayout': """\
+MultiArrayDimension[] dim  # outermost first
+uint32 data_offset         # elements to skip at the front
+""",
+    'std_msgs/msg/Float64MultiArray': """\
+MultiArrayLayout layout
+float64[] data
+""",
+    'rosgraph_msgs/msg/Clock': 'builtin_interfaces/Time clock\n',
+    'diagnostic_msgs/msg/KeyValue': """\
+string key
+string value
+""",
+    'diagnostic_msgs/msg/DiagnosticStatus': """\
+byte OK=0
+byte WARN=1
+byte ERROR=2
+byte STALE=3
+
+byte level          # one of the above
+string name         # node and component
+string message      # for a person
+string hardware_id  # the device
+KeyValue[] values
+""",
+    'diagnostic_msgs/msg/DiagnosticArray': """\
+std_msgs/Header header
+DiagnosticStatus[] status
+""",
+}
+
+
+# Reads ROS 2 message definitions (`.msg` text) into fields.
+#
+# Only what carries data is kept: constants, defaults and comments are skipped.
+# A text may hold further definitions after lines of ``=``, as recordings do.
+
+
+PRIMITIVES = frozenset(
+    {
+        'bool', 'byte', 'char', 'float32', 'float64', 'int8', 'uint8', 'int16', 'uint16',
+        'int32', 'uint32', 'int64', 'uint64', 'string', 'wstring',
+    }
+)  # fmt: skip
+SEPARATOR = '=' * 80
+MAX_TYPES = 256
+MAX_FIELDS = 4096
+
+_TYPE_NAME = re.compile(r'([A-Za-z][A-Za-z0-9_]*)/(?:msg/)?([A-Za-z][A-Za-z0-9_]*)\Z')
+_LINE = re.compile(
+    r'(?P<base>[A-Za-z][A-Za-z0-9_/]*)(?:<=(?P<bound>[0-9]{1,9}))?'
+    r'(?P<array>\[(?P<upto><=)?(?P<length>[0-9]{0,9})\])?'
+    r'\s+(?P<name>[A-Za-z][A-Za-z0-9_]*)\s*(?P<rest>.*)\Z'
 )
-from valveflow_ros.logs.mcap.type_hash import type_hash
+_BREAK = re.compile(r'^={20,}[ \t]*$', re.MULTILINE)
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A field of a message.
+
+    Attributes
+    ----------
+    name : str
+        Its name.
+    type : str
+        One of `PRIMITIVES`, or a full name ``package/msg/Type``.
+    array : str
+        ``''`` for one value, ``'fixed'``, ``'bounded'`` or ``'unbounded'``.
+    length : int
+        How many elements (fixed), or at most how many (bounded).
+    text_bound : int
+        Longest string, 0 if not bounded.
+    """
+
+    name: str
+    type: str
+    array: str = ''
+    length: int = 0
+    text_bound: int = 0
+
+
+Fields = tuple[Field, ...]
+
+
+def full_name(name: str) -> str:
+    """Return ``package/msg/Type`` for either way of writing it; raises `LayoutError`."""
+    match = _TYPE_NAME.match(name)
+    if match is None:
+        raise LayoutError(f"'{name[:80]}' is not the name of a message type")
+    return f'{match.group(1)}/msg/{match.group(2)}'
+
+
+def short_name(name: str) -> str:
+    """Return ``package/Type``, the way recordings name what follows a separator."""
+    return full_name(name).replace('/msg/', '/')
+
+
+def parse_fields(text: str, package: str) -> Fields:
+    """Return the fields of one definition; ``package`` completes names without one."""
+    fields: list[Field] = []
+    for line in text.splitlines():
+        stripped = line.split('#', 1)[0].strip()
+        if not stripped:
+            continue
+        match = _LINE.match(stripped)
+        if match is None:
+            raise LayoutError(f"the line '{stripped[:80]}' of a message definition is not clear")
+        if not match['rest'].startswith('='):
+            fields.append(_field(match, package))
+        if len(fields) > MAX_FIELDS:
+            raise LayoutError(f'a message has more than {MAX_FIELDS} fields')
+    return tuple(fields)
+
+
+def parse_all(type_name: str, text: str) -> dict[str, Fields]:
+    """Return the fields of a type and of everything that follows it in the text.
+
+    Raises
+    ------
+    LayoutError
+        If a name or a line cannot be understood.
+    """
+    main, *parts = _BREAK.split(text)
+    if len(parts) > MAX_TYPES:
+        raise LayoutError(f'a message definition holds more than {MAX_TYPES} types')
+    types = {full_name(type_name): main}
+    for part in parts:
+        head, _, body = part.lstrip().partition('\n')
+        if not head.startswith('MSG:'):
+            raise LayoutError('a part of a message definition does not say what it defines')
+        types.setdefault(full_name(head[4:].strip()), body)
+    return {name: parse_fields(body, name.split('/')[0]) for name, body in types.items()}
+
+
+def dependencies(fields: Fields) -> list[str]:
+    """Return the message types that fields mention, each once, in order."""
+    return list(dict.fromkeys(f.type for f in fields if f.type not in PRIMITIVES))
+
+
+def collect(type_name: str, types: Mapping[str, Fields]) -> list[str]:
+    """Return the types that a type needs, itself first; raises `LayoutError` if one is missing."""
+    needed, waiting = [], [full_name(type_name)]
+    while waiting:
+        name = waiting.pop(0)
+        if name in needed:
+            continue
+        if name not in types:
+            raise LayoutError(f"the definition of '{name}' is missing")
+        needed.append(name)
+        waiting += dependencies(types[name])
+    return needed
+
+
+def _field(match: re.Match[str], package: str) -> Field:
+    base = match['base']
+    if base == 'Header':
+        base = 'std_msgs/Header'
+    if base not in PRIMITIVES:
+        base = full_name(base if '/' in base else f'{package}/{base}')
+    bound = int(match['bound'] or 0)
+    if match['array'] is None:
+        return Field(match['name'], base, '', 0, bound)
+    if not match['length']:
+        return Field(match['name'], base, 'unbounded', 0, bound)
+    kind = 'bounded' if match['upto'] else 'fixed'
+    return Field(match['name'], base, kind, int(match['length']), bound)
+
+
+# Type hashes RIHS01: the SHA-256 of a type's description (ROS Enhancement Proposal 2011).
+
+
+_NESTED = 1
+_IDS = {
+    'int8': 2,
+    'uint8': 3,
+    'int16': 4,
+    'uint16': 5,
+    'int32': 6,
+    'uint32': 7,
+    'int64': 8,
+    'uint64': 9,
+    'float32': 10,
+    'float64': 11,
+    # A char of a .msg file is an unsigned byte, unlike the description's own char.
+    'char': 3,
+    'bool': 15,
+    'byte': 16,
+    'string': 17,
+    'wstring': 18,
+}
+_BOUNDED_TEXT = 4
+_ARRAY_STEP = {'': 0, 'fixed': 48, 'bounded': 96, 'unbounded': 144}
+# A message without fields gets one, as C knows no empty structures.
+_FILLER: Fields = (Field('structure_needs_at_least_one_member', 'uint8'),)
+
+
+def type_hash(type_name: str, types: Mapping[str, Fields]) -> str:
+    """Return ``RIHS01_`` and 64 hexadecimal digits.
+
+    Raises
+    ------
+    LayoutError
+        If the definition of a type it needs is missing.
+    """
+    main, *others = collect(type_name, types)
+    description = {
+        'type_description': _describe(main, types),
+        'referenced_type_descriptions': [_describe(name, types) for name in sorted(others)],
+    }
+    text = json.dumps(description, separators=(', ', ': '), ensure_ascii=True)
+    return f'RIHS01_{hashlib.sha256(text.encode()).hexdigest()}'
+
+
+def _describe(name: str, types: Mapping[str, Fields]) -> dict[str, Any]:
+    fields = types[full_name(name)] or _FILLER
+    return {'type_name': name, 'fields': [_described_field(field) for field in fields]}
+
+
+def _described_field(field: Field) -> dict[str, Any]:
+    primitive = field.type in PRIMITIVES
+    number = _IDS[field.type] if primitive else _NESTED
+    if field.text_bound:
+        number += _BOUNDED_TEXT
+    return {
+        'name': field.name,
+        'type': {
+            'type_id': number + _ARRAY_STEP[field.array],
+            'capacity': field.length,
+            'string_capacity': field.text_bound,
+            'nested_type_name': '' if primitive else field.type,
+        },
+    }
+
 
 OWN_PACKAGE = 'valveflow_msgs'
 MAX_FILE_BYTES = 1 << 20
@@ -99,6 +355,6 @@ class Definitions:
         if package == OWN_PACKAGE:
             # The node's package carries a copy, for where the messages are not built.
             folders += [prefix / 'share/valveflow_ros/msg' for prefix in self._prefixes]
-            folders += [Path(__file__).parents[2] / 'msg']
+            folders += [Path(__file__).parents[3] / 'msg']
             folders += [Path(sys.prefix) / 'share/valveflow_ros/msg']
         return [folder / f'{stem}.msg' for folder in folders]

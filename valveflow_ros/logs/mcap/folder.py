@@ -12,8 +12,7 @@ from pathlib import Path
 from valveflow_ros import __version__
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.mcap.chunk_file import ChunkFile
-from valveflow_ros.logs.mcap.summary import read_summary
-from valveflow_ros.logs.mcap.topic_table import TopicTable
+from valveflow_ros.logs.mcap.summary import TopicTable, read_summary
 from valveflow_ros.logs.part_file import write_whole
 from valveflow_ros.logs.source import Source
 

@@ -11,11 +11,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs.limits import DEFAULT_LIMITS, OverBudgetError
-from valveflow_ros.logs.mcap.folder import in_order
-from valveflow_ros.logs.mcap.follow_files import files_in, final_of, first_in, part_of
+from valveflow_ros.logs.mcap.cdr import Decoder, PlantSampleReader
+from valveflow_ros.logs.mcap.folder import Split, in_order
+from valveflow_ros.logs.mcap.gather import Rows, float_rows, sample_rows
 from valveflow_ros.logs.mcap.layout import (
     CHUNK_HEAD,
     FOOTER_RECORD_SIZE,
@@ -25,12 +28,59 @@ from valveflow_ros.logs.mcap.layout import (
     LayoutError,
     Op,
 )
-from valveflow_ros.logs.mcap.scan import Scanner
-from valveflow_ros.logs.mcap.seek import candidates, ends_well
-from valveflow_ros.logs.mcap.topic_table import TopicTable
+from valveflow_ros.logs.mcap.scan import Scanner, candidates, ends_well
+from valveflow_ros.logs.mcap.summary import TopicTable
 from valveflow_ros.logs.mcap.walk import MessageTable, walk
-from valveflow_ros.logs.part_file import is_held
-from valveflow_ros.logs.source import Source
+from valveflow_ros.logs.names import FLOAT64, PLANT_SAMPLE, last_part, signal_of
+from valveflow_ros.logs.part_file import PART_SUFFIX, is_held
+from valveflow_ros.logs.source import DEFAULT_LIMITS, OverBudgetError, Source
+from valveflow_ros.records import NS_PER_S, SIGNALS, Signal
+
+# The files of a recording that is followed: their names, and with which to begin.
+
+
+# What stands is announced again within a day, so nothing older is needed to know it.
+LOOK_BACK_NS = 25 * 3600 * NS_PER_S
+
+
+def part_of(path: Path) -> Path:
+    """Return the name of a file while it is written."""
+    return path.with_name(path.name + PART_SUFFIX)
+
+
+def final_of(path: Path) -> Path:
+    """Return the name of a file once it is whole."""
+    return path.with_suffix('') if path.suffix == PART_SUFFIX else path
+
+
+def files_in(folder: Path) -> set[Path]:
+    """Return the files of a folder by their final names; raises `RecordingError`."""
+    try:
+        names = [entry.name for entry in folder.iterdir()]
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(folder, f'cannot be read ({reason})') from None
+    return {
+        folder / name.removesuffix(PART_SUFFIX)
+        for name in names
+        if name.endswith(('.mcap', f'.mcap{PART_SUFFIX}'))
+    }
+
+
+def first_in(folder: Path) -> Path | None:
+    """Return the file to begin with: the first that holds something of the last day."""
+    files = in_order(files_in(folder))
+    begin: Path | None = None
+    newest = 0
+    for path in reversed(files):
+        split = Split.read(path) if path.exists() else None
+        if split is not None and split.messages:
+            newest = newest or split.end_ns
+            if begin is not None and split.end_ns < newest - LOOK_BACK_NS:
+                break
+        begin = path
+    return begin
+
 
 _MOST_ATTACHED = 1 << 20
 _GROUP_BYTES = 1 << 20
@@ -280,3 +330,109 @@ class Follower:
         begun = self._order.index(self._started) if self._started in self._order else 0
         done = self._order.index(self._current) - begun
         return min(1.0, (done + inside) / max(1, len(self._order) - begun))
+
+
+# Takes out of followed batches what a view needs: the last messages, and the readings.
+
+
+_INPUTS = {info.topic for info in SIGNALS}
+
+
+class Raw(NamedTuple):
+    """A message before it is decoded; most are never looked at."""
+
+    decoder: Decoder
+    data: bytes
+
+    @property
+    def type(self) -> str:
+        """Return the name of its type."""
+        return self.decoder.type_name
+
+
+class Picker:
+    """Decodes messages by the definitions that stand in the recording.
+
+    Attributes
+    ----------
+    misfits : int
+        Messages that did not fit their own definition.
+    """
+
+    def __init__(self) -> None:
+        self.misfits = 0
+        self._decoders: dict[tuple[str, str], Decoder | None] = {}
+        self._readers: dict[str, PlantSampleReader | None] = {}
+
+    def last(self, batch: Batch, wanted: dict[str, int]) -> Iterator[Raw]:
+        """Yield messages, not decoded yet, in the order of the file.
+
+        Parameters
+        ----------
+        batch : Batch
+        wanted : dict of str to int
+            The types, and how many messages of each topic are enough.
+        """
+        picked: list[tuple[int, Decoder]] = []
+        for channel, type_name, definition in _channels(batch):
+            if type_name not in wanted:
+                continue
+            decoder = self._decoder(type_name, definition)
+            mine = np.flatnonzero(batch.messages.channel == channel)[-wanted[type_name] :]
+            if decoder is not None:
+                picked += [(row, decoder) for row in mine.tolist()]
+        for row, decoder in sorted(picked, key=lambda item: item[0]):
+            yield Raw(decoder, batch.messages.payload(batch.content, row))
+
+    def fields(self, raw: Raw) -> dict[str, Any] | None:
+        """Decode a message; None, and counted, where it does not fit its definition."""
+        try:
+            return raw.decoder.decode(raw.data)
+        except RecordingError:
+            self.misfits += 1
+            return None
+
+    def readings(self, batch: Batch) -> Iterator[tuple[Signal, str, Rows]]:
+        """Yield the readings of the inputs: the signal, its topic, its rows in their order."""
+        messages = batch.messages
+        for channel, type_name, definition in _channels(batch):
+            topic = batch.topics.channels[channel].topic
+            mine = np.flatnonzero(messages.channel == channel)
+            if type_name == FLOAT64 and last_part(topic) in _INPUTS:
+                (_, found), wrong = float_rows(batch.content, messages, mine)
+                self.misfits += len(wrong)
+                yield signal_of(last_part(topic)), topic, found
+            elif type_name == PLANT_SAMPLE and (reader := self._reader(definition)) is not None:
+                samples = reader.read(batch.content, messages, mine)
+                self.misfits += int((~samples.good).sum())
+                _, found = sample_rows(messages, mine, samples)
+                for number in np.unique(found.signal).tolist():
+                    keep = found.signal == number
+                    columns = (getattr(found, name)[keep] for name in Rows.__dataclass_fields__)
+                    yield Signal(number), topic, Rows(*columns)
+
+    def _decoder(self, type_name: str, definition: str) -> Decoder | None:
+        key = type_name, definition
+        if key not in self._decoders:
+            try:
+                self._decoders[key] = Decoder(type_name, definition)
+            except RecordingError:
+                self._decoders[key] = None
+        return self._decoders[key]
+
+    def _reader(self, definition: str) -> PlantSampleReader | None:
+        if definition not in self._readers:
+            try:
+                self._readers[definition] = PlantSampleReader(definition)
+            except LayoutError:
+                self._readers[definition] = None
+        return self._readers[definition]
+
+
+def _channels(batch: Batch) -> Iterator[tuple[int, str, str]]:
+    """Yield the channels that occur and are known: id, type, definition."""
+    for number in np.unique(batch.messages.channel).tolist():
+        channel = batch.topics.channels.get(number)
+        if channel is not None and channel.encoding == 'cdr':
+            definition = batch.topics.definition_of(channel)
+            yield number, batch.topics.type_of(channel), definition

@@ -16,9 +16,7 @@ import yaml
 from numpy.typing import NDArray
 
 from valveflow_ros.errors import DataError, RecordingError
-from valveflow_ros.logs.mcap.chunk_builder import CHUNK_BYTES, pack_content
-from valveflow_ros.logs.mcap.chunk_file import ChunkFile
-from valveflow_ros.logs.mcap.compression import Packer
+from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES, ChunkFile, pack_content
 from valveflow_ros.logs.mcap.definitions import Definitions
 from valveflow_ros.logs.mcap.folder import (
     LIBRARY,
@@ -27,9 +25,8 @@ from valveflow_ros.logs.mcap.folder import (
     information_text,
     write_metadata,
 )
-from valveflow_ros.logs.mcap.layout import RECORD_HEAD, Attachment, Op, media_type
-from valveflow_ros.logs.mcap.topic_book import TableSchedule, TopicBook
-from valveflow_ros.logs.mcap.writer import Metadata
+from valveflow_ros.logs.mcap.layout import RECORD_HEAD, Attachment, Op, Packer, media_type
+from valveflow_ros.logs.mcap.writer import Metadata, TableSchedule, TopicBook
 from valveflow_ros.logs.names import FLOAT64
 from valveflow_ros.logs.part_file import PartFile, make_folder
 from valveflow_ros.records import (

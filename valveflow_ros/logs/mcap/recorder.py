@@ -7,15 +7,18 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from valveflow_ros.errors import InputError, RecordingError
-from valveflow_ros.logs.mcap.definitions import Definitions
+from valveflow_ros.logs.mcap.definitions import Definitions, full_name, parse_all
+from valveflow_ros.logs.mcap.definitions import type_hash as hash_of
 from valveflow_ros.logs.mcap.layout import LayoutError
-from valveflow_ros.logs.mcap.ledger import Ledger
-from valveflow_ros.logs.mcap.msgdef import full_name, parse_all
-from valveflow_ros.logs.mcap.qos import Qos
-from valveflow_ros.logs.mcap.recorder_loop import HeadMessages, NewTopic, RecorderLoop
-from valveflow_ros.logs.mcap.recorder_status import RecorderSettings, RecorderStatus
-from valveflow_ros.logs.mcap.type_hash import type_hash as hash_of
-from valveflow_ros.logs.mcap.writer import Message, Metadata, OpenFile, RecordingWriter
+from valveflow_ros.logs.mcap.recorder_loop import (
+    HeadMessages,
+    Ledger,
+    NewTopic,
+    RecorderLoop,
+    RecorderSettings,
+    RecorderStatus,
+)
+from valveflow_ros.logs.mcap.writer import Message, Metadata, OpenFile, Qos, RecordingWriter
 from valveflow_ros.logs.part_file import PartFile, make_folder
 
 

@@ -2,20 +2,226 @@
 
 from __future__ import annotations
 
+import enum
+import math
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.mcap.folder import is_split_of
-from valveflow_ros.logs.mcap.ledger import Ledger
-from valveflow_ros.logs.mcap.qos import Qos
-from valveflow_ros.logs.mcap.recorder_status import MIB, RecorderSettings
-from valveflow_ros.logs.mcap.recover import recover_leftovers
-from valveflow_ros.logs.mcap.writer import Message, RecordingWriter
+from valveflow_ros.logs.mcap.recover import RecoveryReport, recover_leftovers
+from valveflow_ros.logs.mcap.writer import Message, Qos, RecordingWriter
+
+# What a recorder is told and what it tells.
+
+
+MIB = 1 << 20
+
+
+class RecorderState(enum.Enum):
+    """How a recorder is doing."""
+
+    RECORDING = 'recording'
+    DEGRADED = 'degraded'
+    STOPPED = 'stopped'
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderSettings:
+    """How a recorder works; every time is in seconds.
+
+    Attributes
+    ----------
+    queue_limit : int
+        Messages held at most while they are not on disk; newer ones are dropped, and counted.
+    flush_period_s : float
+        A killed process loses at most what came in this time.
+    sync_period_s : float
+        A power cut loses at most what came in this time; 0: left to the system.
+    rotate_s, rotate_bytes : float, int
+        A new split is begun after this time or size.
+    free_floor_bytes : int
+        Below so much free space on the disk nothing is written.
+    keep_files : int or None
+        Finished splits that stay in the folder; the oldest go. None: all stay.
+    retry_s, retry_max_s : float
+        First and longest wait after a failure; it doubles.
+    """
+
+    queue_limit: int = 200_000
+    flush_period_s: float = 0.5
+    sync_period_s: float = 5.0
+    rotate_s: float = 3600.0
+    rotate_bytes: int = 256 * MIB
+    free_floor_bytes: int = 500 * MIB
+    keep_files: int | None = None
+    retry_s: float = 1.0
+    retry_max_s: float = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderStatus:
+    """A recorder's account: ``received == written + queued + lost + sum of dropped``, always.
+
+    Attributes
+    ----------
+    state : RecorderState
+        How it is doing.
+    reason : str
+        Why it is not recording; empty if it is.
+    file : str
+        The split at hand, empty if none.
+    received : int
+        Messages handed in.
+    written : int
+        Of these, in whole chunks on disk.
+    queued : int
+        Of these, waiting.
+    lost : int
+        Of these, waiting when the recorder had to stop.
+    dropped : dict[str, int]
+        Of these, refused because too many were waiting, by topic.
+    files_finished : int
+        Splits finished since the start.
+    bytes_written : int
+        Bytes written since the start.
+    recovered : tuple of RecoveryReport
+        Leftovers of an earlier recorder that were finished at the start.
+    stalled_s : float
+        How long the thread has been at one and the same step; 0 while it waits for work. A disk
+        that refuses keeps it small, one that does not answer lets it grow.
+    """
+
+    state: RecorderState
+    reason: str = ''
+    file: str = ''
+    received: int = 0
+    written: int = 0
+    queued: int = 0
+    lost: int = 0
+    dropped: dict[str, int] = field(default_factory=dict)
+    files_finished: int = 0
+    bytes_written: int = 0
+    recovered: tuple[RecoveryReport, ...] = ()
+    stalled_s: float = 0.0
+
+
+# The account of a recorder, kept so that every message is in exactly one column.
+
+
+# So long after the last drop the state says so, for those who look once a second.
+DROPS_SHOWN_S = 2.0
+
+
+class Ledger:
+    """Shared by the recorder's thread and everyone who asks; nobody holds it for long."""
+
+    def __init__(self, limit: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._dropped_at = -math.inf
+        self._lock = threading.Lock()
+        self._limit = limit
+        self._open = True
+        self._received = self._written = self._queued = self._lost = 0
+        self._dropped: dict[str, int] = {}
+        self._drops = 0
+        self._state, self._reason = RecorderState.RECORDING, ''
+        self._file, self._files, self._bytes = '', 0, 0
+        self._recovered: tuple[RecoveryReport, ...] = ()
+        self._at_work_since_s: float | None = None
+
+    def at_work(self) -> None:
+        """Note that the thread has come to its next step; called for every message."""
+        # One assignment, which needs no lock: a stuck thread must not be able to hold one either.
+        self._at_work_since_s = self._clock()
+
+    def at_rest(self) -> None:
+        """Note that the thread waits, or does what takes as long as it takes."""
+        self._at_work_since_s = None
+
+    def admit(self, topic: str) -> bool:
+        """Count a message in; False if it must be dropped."""
+        with self._lock:
+            self._received += 1
+            if self._open and self._queued < self._limit:
+                self._queued += 1
+                return True
+            self._dropped[topic] = self._dropped.get(topic, 0) + 1
+            self._drops += 1
+            self._dropped_at = self._clock()
+            return False
+
+    def refuse(self) -> None:
+        """Drop whatever comes from now on."""
+        with self._lock:
+            self._open = False
+
+    def settle(self, written: int, file: str, files: int, size: int) -> None:
+        """Take note of how many messages are on disk in all, and where."""
+        with self._lock:
+            self._queued -= written - self._written
+            self._written = written
+            self._file, self._files, self._bytes = file, files, size
+
+    def well(self) -> None:
+        """All that waited could be written."""
+        with self._lock:
+            if self._clock() - self._dropped_at < DROPS_SHOWN_S:
+                self._state = RecorderState.DEGRADED
+                self._reason = f'{self._drops} messages were dropped, too many were waiting'
+            else:
+                self._state, self._reason = RecorderState.RECORDING, ''
+
+    def ill(self, reason: str) -> None:
+        """Say that nothing can be written for now."""
+        with self._lock:
+            self._state, self._reason = RecorderState.DEGRADED, reason
+
+    def recovered(self, reports: tuple[RecoveryReport, ...]) -> None:
+        """Take note of leftovers that were finished."""
+        with self._lock:
+            self._recovered = reports
+
+    def stopped(self, reason: str = '') -> None:
+        """Close the account: what waits now is lost."""
+        self.at_rest()
+        with self._lock:
+            self._open = False
+            self._lost += self._queued
+            self._queued = 0
+            self._state, self._reason, self._file = RecorderState.STOPPED, reason, ''
+
+    def counters(self) -> dict[str, str]:
+        """Return the account as it is written into the recording."""
+        status = self.status()
+        items = {f'dropped {topic}': str(count) for topic, count in status.dropped.items()}
+        return {'received': str(status.received), **items}
+
+    def status(self) -> RecorderStatus:
+        """Return the account."""
+        since_s = self._at_work_since_s
+        stalled_s = 0.0 if since_s is None else max(0.0, self._clock() - since_s)
+        with self._lock:
+            return RecorderStatus(
+                self._state,
+                self._reason,
+                self._file,
+                self._received,
+                self._written,
+                self._queued,
+                self._lost,
+                dict(self._dropped),
+                self._files,
+                self._bytes,
+                self._recovered,
+                stalled_s,
+            )
+
 
 # More waiting messages than this wake the thread before its time.
 _WAKE_AT = 4000

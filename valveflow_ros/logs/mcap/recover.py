@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs.mcap.chunk_builder import PackedChunk
-from valveflow_ros.logs.mcap.chunk_file import ChunkFile
+from valveflow_ros.logs.mcap.chunk_file import ChunkFile, PackedChunk
 from valveflow_ros.logs.mcap.folder import (
     LIBRARY,
     Split,
@@ -21,12 +20,9 @@ from valveflow_ros.logs.mcap.folder import (
     write_metadata,
 )
 from valveflow_ros.logs.mcap.layout import CHUNK_HEAD, RECORD_HEAD, Cursor, LayoutError
-from valveflow_ros.logs.mcap.scan import Chunk, Scanner
-from valveflow_ros.logs.mcap.seek import SHAPE_SIZE, candidates
-from valveflow_ros.logs.mcap.summary import read_summary
-from valveflow_ros.logs.mcap.topic_table import TopicTable
+from valveflow_ros.logs.mcap.scan import SHAPE_SIZE, Chunk, Scanner, candidates, scan_warnings
+from valveflow_ros.logs.mcap.summary import TopicTable, read_summary
 from valveflow_ros.logs.mcap.walk import walk
-from valveflow_ros.logs.mcap.warnings import scan_warnings
 from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, make_folder, taken
 from valveflow_ros.logs.source import Source
 

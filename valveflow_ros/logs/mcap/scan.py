@@ -9,24 +9,71 @@ because an unfinished file has none.
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from valveflow_ros.logs.limits import DEFAULT_LIMITS, Budget, Limits, OverBudgetError
-from valveflow_ros.logs.mcap.compression import Unpacker
+from valveflow_ros.errors import counted
 from valveflow_ros.logs.mcap.layout import (
     CHUNK_HEAD,
+    FOOTER_RECORD_SIZE,
     MAGIC,
     RECORD_HEAD,
     Attachment,
     Cursor,
     LayoutError,
     Op,
+    Unpacker,
 )
-from valveflow_ros.logs.mcap.seek import SHAPE_SIZE, candidates, ends_well
-from valveflow_ros.logs.source import Source
+from valveflow_ros.logs.source import DEFAULT_LIMITS, Budget, Limits, OverBudgetError, Source
+
+# Finds places in a file that look like the head of a chunk, and the end of a finished one.
+
+
+# A chunk's record: kind 6, a length below 64 GiB, four fixed fields, then the
+# compression by name. The length is checked against the fields afterwards.
+_SHAPE = re.compile(
+    rb'\x06.{4}[\x00-\x0f]\x00{3}.{28}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd)', re.DOTALL
+)
+# More than the head of a chunk takes.
+SHAPE_SIZE = 64
+_WINDOW = 1 << 22
+
+
+def candidates(source: Source, start: int, end: int) -> Iterator[int]:
+    """Yield places in ``[start, end)`` where the fields of a chunk's head agree."""
+    while start < end:
+        limit = min(_WINDOW, end - start)
+        window = source.read(start, limit + SHAPE_SIZE)
+        match = _SHAPE.search(window)
+        while match is not None and match.start() < limit:
+            if _fields_agree(window, match.start(), match.end()):
+                yield start + match.start()
+            # One byte on: a false head must not hide a true one that overlaps it.
+            match = _SHAPE.search(window, match.start() + 1)
+        start += _WINDOW
+
+
+def _fields_agree(window: bytes, position: int, names_end: int) -> bool:
+    length = RECORD_HEAD.unpack_from(window, position)[1]
+    packed_at = names_end + 8
+    if packed_at > len(window):
+        return False
+    packed = int.from_bytes(window[names_end:packed_at], 'little')
+    return bool(packed_at - position - RECORD_HEAD.size + packed == length)
+
+
+def ends_well(source: Source) -> bool:
+    """Tell whether a file was finished: it ends in a footer and the magic."""
+    start = source.size - len(MAGIC) - FOOTER_RECORD_SIZE
+    if start < len(MAGIC):
+        return False
+    raw = source.read(start, FOOTER_RECORD_SIZE + len(MAGIC))
+    op, length = RECORD_HEAD.unpack_from(raw)
+    return op == Op.FOOTER and length == 20 and raw.endswith(MAGIC)
+
 
 _INDEX_HEAD = struct.Struct('<BQHI')
 _INDEX_BLOCK = 4096
@@ -294,3 +341,35 @@ class Scanner:
             return op in _KINDS
         # The last chunk of an unfinished file may be cut off, with a head that agrees.
         return next(candidates(self._source, position, position + 1), None) is not None
+
+
+# Says in sentences what a scan met.
+
+
+def scan_warnings(findings: Findings, what: str) -> tuple[str, ...]:
+    """Return one sentence for each thing a reader of the file should know; none if all is well."""
+    sentences = []
+    if findings.cut_off_at is not None:
+        sentences.append(
+            f'The {what} was not finished and ends at byte {findings.cut_off_at}; '
+            'everything before it was read.'
+        )
+    elif not findings.finished:
+        sentences.append(f'The {what} was not finished; all of its chunks were read.')
+    if findings.damaged:
+        places = 'place' if findings.damaged == 1 else 'places'
+        sentences.append(
+            f'The {what} is damaged in {findings.damaged} {places}, what stood there was left out '
+            f'({"; ".join(findings.reasons)}).'
+        )
+    if findings.over_budget:
+        sentences.append(
+            f'The {what} unpacks to far more than its size justifies; the rest of it was not read.'
+        )
+    if findings.unchecked:
+        sentences.append(
+            f'{counted(findings.unchecked, "chunk")} of the {what} '
+            f'{"was" if findings.unchecked == 1 else "were"} written without a checksum, '
+            'so damage in it cannot be seen.'
+        )
+    return tuple(sentences)

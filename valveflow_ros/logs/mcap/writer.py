@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
-from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs.mcap.chunk_builder import CHUNK_BYTES, ChunkBuilder
-from valveflow_ros.logs.mcap.chunk_file import ChunkFile
-from valveflow_ros.logs.mcap.definitions import Definitions
+from valveflow_ros.errors import InputError, RecordingError
+from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES, ChunkBuilder, ChunkFile
+from valveflow_ros.logs.mcap.definitions import Definitions, parse_all, type_hash
 from valveflow_ros.logs.mcap.folder import (
     LIBRARY,
     Listing,
@@ -19,10 +19,140 @@ from valveflow_ros.logs.mcap.folder import (
     information_text,
     split_number,
 )
-from valveflow_ros.logs.mcap.layout import Attachment, media_type
-from valveflow_ros.logs.mcap.qos import Qos
-from valveflow_ros.logs.mcap.topic_book import TableSchedule, TopicBook
+from valveflow_ros.logs.mcap.layout import Attachment, Channel, LayoutError, Schema, media_type
+from valveflow_ros.logs.mcap.summary import TopicTable
 from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, Writable, make_folder
+
+# Quality of service as rosbag2 writes it down (metadata version 9).
+
+
+# The longest duration that ROS 2 can express stands for "no limit".
+_NO_LIMIT = ('sec: 9223372036', 'nsec: 854775807')
+
+
+@dataclass(frozen=True, slots=True)
+class Qos:
+    """What the publisher of a topic offers, in rosbag2's words."""
+
+    reliability: str = 'reliable'
+    durability: str = 'volatile'
+    history: str = 'keep_last'
+    depth: int = 10
+
+    def text(self) -> str:
+        """Return the YAML list of one profile that stands in a channel's metadata."""
+        lines = [
+            f'- history: {self.history}',
+            f'  depth: {self.depth}',
+            f'  reliability: {self.reliability}',
+            f'  durability: {self.durability}',
+        ]
+        for name in ('deadline', 'lifespan'):
+            lines += [f'  {name}:', *(f'    {part}' for part in _NO_LIMIT)]
+        lines += ['  liveliness: automatic', '  liveliness_lease_duration:']
+        lines += [f'    {part}' for part in _NO_LIMIT]
+        lines += ['  avoid_ros_namespace_conventions: false']
+        return '\n'.join(lines)
+
+
+LATCHED = Qos(durability='transient_local', depth=1)
+
+
+# The topics a writer knows: fixed channel ids, complete definitions, repeated where it helps.
+
+
+# A chunk may be lost, and with it the only mention of a topic; so the table stands in the
+# first two chunks that could hold it and then in every so-manieth.
+REPEAT_CHUNKS = 256
+
+
+@dataclass(slots=True)
+class TopicBook:
+    """Assigns ids to topics and types in the order in which they are added."""
+
+    definitions: Definitions
+    table: TopicTable = field(default_factory=TopicTable)
+    ids: dict[str, int] = field(default_factory=dict)
+    _schema_ids: dict[str, int] = field(default_factory=dict)
+    _packed: bytes = b''
+
+    def add(
+        self,
+        topic: str,
+        type_name: str,
+        qos: Qos | None = None,
+        hash_text: str | None = None,
+        definition: str | None = None,
+    ) -> int:
+        """Add a topic and return its channel id; adding it again changes nothing.
+
+        Raises
+        ------
+        InputError
+            If the topic was added before with another type.
+        RecordingError
+            If the definition of the type is not found.
+        """
+        if topic in self.ids:
+            channel = self.table.channels[self.ids[topic]]
+            if self.table.type_of(channel) != type_name:
+                have = self.table.type_of(channel)
+                raise InputError(f"Topic '{topic}' is recorded as {have}, not as {type_name}.")
+            return self.ids[topic]
+        if type_name not in self._schema_ids:
+            text = self.definitions.text(type_name) if definition is None else definition
+            schema = Schema(len(self._schema_ids) + 1, type_name, 'ros2msg', text.encode())
+            self._schema_ids[type_name] = schema.id
+            self.table.schemas[schema.id] = schema
+        if hash_text is None:
+            hash_text = self._hash(type_name, definition)
+        metadata = {'offered_qos_profiles': (qos or Qos()).text(), 'topic_type_hash': hash_text}
+        number = len(self.ids) + 1
+        channel = Channel(number, self._schema_ids[type_name], topic, 'cdr', metadata)
+        self.table.channels[number] = channel
+        self.ids[topic] = number
+        self._packed = b''
+        return number
+
+    def _hash(self, type_name: str, definition: str | None) -> str:
+        if definition is None:
+            return self.definitions.type_hash(type_name)
+        try:
+            return type_hash(type_name, parse_all(type_name, definition))
+        except LayoutError:
+            # Without a hash a recording is as readable as with one.
+            return ''
+
+    def packed(self) -> bytes:
+        """Return the records of all topics."""
+        if not self._packed:
+            schemas = [schema.pack() for schema in self.table.schemas.values()]
+            channels = [channel.pack() for channel in self.table.channels.values()]
+            self._packed = b''.join(schemas + channels)
+        return self._packed
+
+
+class TableSchedule:
+    """Says for each chunk of a file whether the table of topics stands in it."""
+
+    def __init__(self) -> None:
+        self._known = 0
+        self._since = 0
+
+    def due(self, topics: int) -> bool:
+        """Tell whether the next chunk needs the table of so many topics."""
+        return topics > self._known or self._since in (0, REPEAT_CHUNKS)
+
+    def done(self, topics: int, with_table: bool) -> None:
+        """Take note of a chunk that was written."""
+        if topics > self._known:
+            # The next chunk repeats what is new.
+            self._known, self._since = topics, 0
+        elif with_table:
+            self._since = 1
+        else:
+            self._since += 1
+
 
 _SPLITS_APART, _NUMBERS_APART = 64, 1 << 26
 

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import Characteristic
-from valveflow_ros.monitoring.corrector import Corrector
-from valveflow_ros.monitoring.diagnosis_task import DiagnosisContent
-from valveflow_ros.monitoring.events import DiagnosisRequested, Event, FitRequested
+from valveflow_ros.monitoring.events import (
+    DiagnosisContent,
+    DiagnosisRequested,
+    Event,
+    FitRequested,
+)
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import CLOCK_BACK
+from valveflow_ros.monitoring.rows import Corrector
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import Readings, SampleTable
 from valveflow_ros.ros.inputs import Row
-from valveflow_ros.ros.worker.outcome import Outcome
+from valveflow_ros.ros.worker.worker import Outcome
 from valveflow_ros.signals.align import Aligner
 from valveflow_ros.state import State
 

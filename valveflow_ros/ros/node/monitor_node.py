@@ -13,15 +13,15 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from valveflow_ros.config import Settings
 from valveflow_ros.errors import ParameterError, ValveflowError, counted
+from valveflow_ros.parameters import Settings
 from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.ros import declare
+from valveflow_ros.ros.conversions import encode
 from valveflow_ros.ros.diagnostics import Changes, Item, Level, array
-from valveflow_ros.ros.encoding import encode
 from valveflow_ros.ros.node.session import DIAGNOSTICS, Session
+from valveflow_ros.ros.process import with_place
 from valveflow_ros.ros.record_place import check_record_place
-from valveflow_ros.ros.sentences import with_place
 from valveflow_ros.ros.services import SERVICES
 
 _SUCCESS = TransitionCallbackReturn.SUCCESS

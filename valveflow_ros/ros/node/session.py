@@ -11,23 +11,21 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from valveflow_ros.config import Settings
 from valveflow_ros.logs import RecorderStatus
 from valveflow_ros.monitoring.events import Event
-from valveflow_ros.ros.chronicle import line_of
-from valveflow_ros.ros.diagnostics import Item, Level
+from valveflow_ros.parameters import Settings
+from valveflow_ros.ros.diagnostics import Item, Level, line_of
 from valveflow_ros.ros.inputs import INPUTS, Decoder
-from valveflow_ros.ros.node import diagnosis_health, graph, model_file, work_health
-from valveflow_ros.ros.node.continuity import Continuity
+from valveflow_ros.ros.node import given_files, health, input_health
+from valveflow_ros.ros.node.given_files import reference_of
 from valveflow_ros.ros.node.input_health import InputHealth
-from valveflow_ros.ros.node.intake import Clock, Intake
+from valveflow_ros.ros.node.intake import Clock, Intake, LogClock
 from valveflow_ros.ros.node.live import LiveEngine
 from valveflow_ros.ros.node.recording import Recording
-from valveflow_ros.ros.node.reference_file import reference_of
-from valveflow_ros.ros.node.stamps import LogClock
+from valveflow_ros.ros.node.restart import Continuity
 from valveflow_ros.ros.node.warmup import warm_up
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs, OutputTopic
-from valveflow_ros.ros.taking import Taker
+from valveflow_ros.ros.polled_subscription import Taker
 from valveflow_ros.ros.worker.worker import DiagnosisWorker, FitWorker
 
 DIAGNOSTICS = '/diagnostics'
@@ -60,7 +58,7 @@ class Session:
         self._log = log
         self._settings = settings
         self._reference = reference_of(settings)
-        self._extended = model_file.extended_of(settings)
+        self._extended = given_files.extended_of(settings)
         self.inputs = {topic.name: node.resolve_topic_name(topic.name) for topic in INPUTS}
         self.outputs = {name: node.resolve_topic_name(f'~/{name}') for name in OUTPUTS}
         self._continuity = Continuity(settings, self.inputs, self.outputs, log)
@@ -89,7 +87,7 @@ class Session:
         self._intake: Intake | None = None
         by_host = not node.get_parameter('use_sim_time').value
         self._health = InputHealth(settings, self.inputs, by_host=by_host)
-        self._seen: dict[str, graph.Publishers] = {}
+        self._seen: dict[str, input_health.Publishers] = {}
         self._looked_s = self._listening_since_s = 0.0
         self._begun = False
 
@@ -97,7 +95,7 @@ class Session:
         """Return the engine; where it goes on from an earlier run its curve is there at once."""
 
         def make(settings: Settings) -> LiveEngine:
-            corrector = model_file.ready(self._extended, settings)
+            corrector = given_files.ready(self._extended, settings)
             return LiveEngine(settings, self.worker, self.diagnosis_worker, corrector)
 
         engine = self._continuity.engine(make)
@@ -200,23 +198,21 @@ class Session:
                 self._looked_s = now_s
                 types = {topic.name: topic.type_name for topic in INPUTS}
                 wanted = {name: (topic, types[name]) for name, topic in self.inputs.items()}
-                self._seen = graph.publishers(self._node, wanted)
+                self._seen = input_health.publishers(self._node, wanted)
                 for name, seen in self._seen.items():
                     self._intake.tallies[name].note_publishers(seen.right)
             items += self._health.items(
                 self._intake.tallies, self.engine.aligner.counts(), self._seen,
                 now_s, now_s - self._listening_since_s, self.engine.aligner.newest_ns,
             )  # fmt: skip
-        items.append(work_health.fit_item(monitor, self.worker, self.engine.last_fit_s))
-        items.append(work_health.alarm_item(monitor))
-        items.append(work_health.reference_item(monitor))
-        items.append(diagnosis_health.model_item(monitor))
+        items.append(health.fit_item(monitor, self.worker, self.engine.last_fit_s))
+        items.append(health.alarm_item(monitor))
+        items.append(health.reference_item(monitor))
+        items.append(health.model_item(monitor))
         items.append(
-            diagnosis_health.diagnosis_item(
-                monitor, self.diagnosis_worker, self.engine.last_diagnosis_s
-            )
+            health.diagnosis_item(monitor, self.diagnosis_worker, self.engine.last_diagnosis_s)
         )
-        items.append(work_health.recorder_item(self.recording))
+        items.append(health.recorder_item(self.recording))
         items.append(self._continuity.item())
         return items
 
@@ -251,7 +247,7 @@ class Session:
 
     def _open_recording(self) -> Recording:
         topics: dict[str, Any] = {'inputs': self.inputs, 'outputs': self.outputs}
-        model = model_file.attached(self._extended)
+        model = given_files.attached(self._extended)
         recording = Recording(
             self._settings, topics, time.time(), model, self._continuity.folder,
             self._continuity.began,

@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from valveflow_ros.config import Settings
 from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
@@ -16,12 +15,13 @@ from valveflow_ros.curve.characteristic import (
     ResidualStatistics,
     Source,
 )
-from valveflow_ros.fit.chart import ChartDesign
-from valveflow_ros.fit.fit_task import FitTask
+from valveflow_ros.fit.residual_chart import ChartDesign
+from valveflow_ros.fit.task import FitTask
 from valveflow_ros.monitoring.alarms import ResidualAlarm
 from valveflow_ros.monitoring.mismatch import Mismatch
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.prediction import Predictor
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SampleTable, SegmentKind, Signal, table_to_readings
 from valveflow_ros.report.first_run import must_compile_to_fit
 from valveflow_ros.ros.worker.worker import FitWorker

@@ -9,6 +9,10 @@ that doubles while failures follow each other.
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import itertools
+import json
+import math
 import os
 import signal
 import subprocess
@@ -16,17 +20,139 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from valveflow_ros.errors import DataError
-from valveflow_ros.fit.fit_task import FitTask
-from valveflow_ros.monitoring.diagnosis_task import DiagnosisTask
-from valveflow_ros.ros.worker.frames import FrameReader, send
-from valveflow_ros.ros.worker.letters import result_of, task_letter
-from valveflow_ros.ros.worker.memory import give_back
-from valveflow_ros.ros.worker.outcome import Outcome
-from valveflow_ros.ros.worker.trades import DIAGNOSIS, DIAGNOSIS_JOB, FIT, FIT_JOB, Trade
+import numpy as np
+
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.errors import DataError, counted
+from valveflow_ros.fit.task import FitTask
+from valveflow_ros.monitoring.events import DiagnosisContent, DiagnosisTask
+from valveflow_ros.ros.conversions import VERDICTS, diagnosis, encode
+from valveflow_ros.ros.worker.protocol import FrameReader, result_of, send, task_letter
+
+# What comes back from a worker, and whether it may be believed.
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """A curve or what a diagnosis gave, or the sentence why there is none.
+
+    Attributes
+    ----------
+    request_ns : int
+        Which request it answers.
+    result : Characteristic, DiagnosisContent or str
+    seconds : float
+        How long it took, with the way there and back.
+    """
+
+    request_ns: int
+    result: Characteristic | DiagnosisContent | str
+    seconds: float
+
+
+def objection(task: FitTask, result: object) -> str:
+    """Return why a result is not to be adopted, empty if nothing speaks against it.
+
+    The worker is another process and may have been hurt in any way; the curve
+    that predicts and raises alarms is only replaced by a whole one.
+    """
+    if not isinstance(result, Characteristic):
+        return 'The fit gave no curve.'
+    pieces = result.pieces
+    most = task.settings.whole('max_pieces')
+    if not 1 <= len(pieces) <= most:
+        return f'The fit gave {counted(len(pieces), "piece")} where 1 to {most} are possible.'
+    numbers = [x for p in pieces for x in (p.u_from, p.u_to, p.slope, p.intercept)]
+    numbers += [x for d in result.dynamics for x in (d.time_constant_s, d.delay_s)]
+    numbers += [result.residuals.rmse_mw, result.residuals.average_sd_mw]
+    if not all(map(math.isfinite, numbers)):
+        return 'The fit gave numbers that are not finite.'
+    knots = result.breakpoints
+    joined = all(a.u_to == b.u_from for a, b in itertools.pairwise(pieces))
+    if not joined or np.any(np.diff(knots) <= 0.0):
+        return 'The fit gave breakpoints that do not increase.'
+    if any(d.time_constant_s <= 0.0 or d.delay_s < 0.0 for d in result.dynamics):
+        return 'The fit gave a time constant or delay that cannot be.'
+    chart = result.residuals.chart
+    if result.residuals.average_sd_mw <= 0.0 or chart is None or not chart.innovation_mw > 0.0:
+        return 'The fit gave residuals without spread.'
+    finite = all(map(math.isfinite, chart.limit + chart.slack))
+    # Innovations are clipped at four: with more slack than this hardly a shift raises an alarm.
+    if not (finite and min(chart.limit) > 0.0 and max(chart.slack) <= 3.0):
+        return 'The fit gave no limits for the alarm.'
+    if result.source.window_end_ns != int(task.contents.time_ns[-1]):
+        return 'The fit answered for other data.'
+    if replace(result, model_id='').with_id().model_id != result.model_id:
+        return 'The fit gave a curve that does not fit its own name.'
+    return ''
+
+
+def content_objection(task: DiagnosisTask, result: object) -> str:
+    """Return why the result of a diagnosis is not to be published, empty if nothing says so."""
+    if not isinstance(result, DiagnosisContent):
+        return 'The diagnosis gave no result.'
+    if result.window_end_ns != task.window_end_ns:
+        return 'The diagnosis answered for other data.'
+    content = json.loads(result.text)
+    if content['verdict'] not in VERDICTS or not content['sentence']:
+        return 'The diagnosis gave no verdict.'
+    # What cannot be told as a message is no result.
+    encode(diagnosis(content, task, ''))
+    return ''
+
+
+# What the processes beside the monitor do: fits and diagnoses.
+
+
+FIT_JOB = 'valveflow_ros.fit.fit:fit'
+DIAGNOSIS_JOB = 'valveflow_ros.diagnosis.from_window:diagnose_window'
+
+
+@dataclass(frozen=True, slots=True)
+class Trade:
+    """What a worker does.
+
+    Attributes
+    ----------
+    word : str
+        What one piece of work is called.
+    parameter : str
+        Which parameter limits its time.
+    objection : callable
+        Says why a result is not to be believed, or nothing.
+    nice : int
+        How far the process stands back.
+    stays : bool
+        The process waits for the next task; otherwise it is started for each.
+    """
+
+    word: str
+    parameter: str
+    objection: Callable[[Any, object], str]
+    nice: int
+    stays: bool
+
+
+FIT = Trade('fit', 'refit_timeout', objection, 10, True)
+DIAGNOSIS = Trade('diagnosis', 'diagnosis_timeout', content_objection, 19, False)
+
+
+# Give memory that is free back to the system.
+
+
+def give_back() -> None:
+    """Return what the C library keeps of freed memory, where it can (glibc); takes milliseconds.
+
+    A snapshot of a window of days for a fit is 40 MB, and what it leaves in the heap when it is
+    freed is otherwise held for good.
+    """
+    trim = getattr(ctypes.CDLL(None), 'malloc_trim', None)
+    if trim is not None:
+        trim(0)
+
 
 _FIRST_PAUSE_S = 0.5
 _LONGEST_PAUSE_S = 60.0

@@ -11,9 +11,8 @@ from collections.abc import Callable
 from typing import Any
 
 from valveflow_ros.errors import DataError
-from valveflow_ros.ros.sentences import one_line, with_place
-from valveflow_ros.ros.worker.frames import FrameReader, send
-from valveflow_ros.ros.worker.letters import result_letter, task_of
+from valveflow_ros.ros.process import one_line, with_place
+from valveflow_ros.ros.worker.protocol import FrameReader, result_letter, send, task_of
 
 _PR_SET_PDEATHSIG = 1
 

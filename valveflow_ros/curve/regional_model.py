@@ -1,0 +1,240 @@
+"""The model that is fitted: a piecewise-linear curve and dynamics by region."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from valveflow_ros.numerics import jit
+from valveflow_ros.records import ByteArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class RegionalModel:
+    """Curve F of eq. (2) and G_i of eq. (3).
+
+    Attributes
+    ----------
+    knots : float64 (J + 1,)
+        Boundaries of the pieces in % MPa^m; beyond the outer ones the outer pieces go on.
+    left, right : float64 (J,)
+        Flow in MW at the left and right end of each piece.
+    levels : float64 (I - 1,)
+        Flow in MW at which one region gives way to the next.
+    time_constants, delays : float64 (I,)
+        Seconds. ``I = 0`` (empty) means the dynamics are not known.
+    """
+
+    knots: FloatArray
+    left: FloatArray
+    right: FloatArray
+    levels: FloatArray
+    time_constants: FloatArray
+    delays: FloatArray
+
+    @property
+    def pieces(self) -> int:
+        """Return J."""
+        return len(self.left)
+
+    @property
+    def regions(self) -> int:
+        """Return I."""
+        return len(self.time_constants)
+
+    def slopes(self) -> FloatArray:
+        """Return K_f, MW per unit of u, shape (J,)."""
+        return np.asarray((self.right - self.left) / np.diff(self.knots))
+
+    def intercepts(self) -> FloatArray:
+        """Return C, MW at u = 0, shape (J,)."""
+        return np.asarray(self.left - self.slopes() * self.knots[:-1])
+
+    def static(self, u: FloatArray) -> FloatArray:
+        """Evaluate F; NaN in gives NaN out."""
+        piece = np.clip(np.searchsorted(self.knots, u, side='right') - 1, 0, self.pieces - 1)
+        width = np.diff(self.knots)[piece]
+        w = (u - self.knots[piece]) / width
+        return np.asarray(self.left[piece] + (self.right - self.left)[piece] * w)
+
+    def taps(self, step_s: float) -> FloatArray:
+        """Return the filter of each region as the kernels want it, shape (I, 7)."""
+        # A model that is only looked at can do without compiled code.
+
+        return make_taps(self.time_constants, self.delays, step_s)
+
+    def respond(
+        self, u: FloatArray, usable: ByteArray, step_s: float, settle_s: float
+    ) -> tuple[FloatArray, ByteArray]:
+        """Return the dynamic prediction in MW and where it has settled, shapes (n,)."""
+        answer = np.empty(len(u))
+        settled = np.empty(len(u), dtype=np.uint8)
+
+        respond(
+            self.static(u), usable, self.levels, self.taps(step_s),
+            round(settle_s / step_s), answer, settled,
+        )  # fmt: skip
+        return answer, settled
+
+    def with_levels(self, levels: FloatArray) -> RegionalModel:
+        """Return a copy that switches elsewhere."""
+        return replace(self, levels=np.asarray(levels, dtype=np.float64))
+
+    def pack(self) -> FloatArray:
+        """Return the parameters in the order of the kernel's columns."""
+        values = np.append(self.left[0], self.right)
+        jumps = self.left[1:] - self.right[:-1]
+        return np.concatenate(
+            [values, self.knots[1:-1], jumps, np.log(self.time_constants), self.delays]
+        )
+
+    def unpack(self, parameters: FloatArray) -> RegionalModel:
+        """Return the model with other parameters; the inverse of `pack`."""
+        j, i = self.pieces, self.regions
+        values, rest = parameters[: j + 1], parameters[j + 1 :]
+        inner, jumps, rest = rest[: j - 1], rest[j - 1 : 2 * j - 2], rest[2 * j - 2 :]
+        knots = self.knots.copy()
+        knots[1:-1] = inner
+        left = values[:-1].copy()
+        left[1:] += jumps
+        return replace(
+            self, knots=knots, left=left, right=values[1:].copy(),
+            time_constants=np.exp(rest[:i]), delays=rest[i:].copy(),
+        )  # fmt: skip
+
+
+# Curve and regional dynamics over measured inputs, row by row.
+#
+# The model is eqs. (2)-(5) of the paper with K_g = 1: x = F(u), and G_i of eq. (3)
+# in the region i that x(t) lies in, discretised exactly for a flow that is
+# straight between two rows: ``y[t] = a y[t-1] + b x(t-h-tau) + c x(t-tau)`` with
+# ``a = exp(-h/T)``, ``b = (1-a) T/h - a`` and ``c = 1 - (1-a) T/h``. Delays need not be
+# whole steps; with the two rows around each delayed instant that makes three
+# taps.
+
+
+@jit
+def piece_of(u: float, knots: FloatArray) -> int:
+    """Return the piece ``u`` lies in; the outer pieces go on for ever."""
+    k = 0
+    while k < knots.size - 2 and u >= knots[k + 1]:
+        k += 1
+    return k
+
+
+@jit
+def curve(u: float, knots: FloatArray, left: FloatArray, right: FloatArray) -> float:
+    """Evaluate F: piece k runs from ``left[k]`` to ``right[k]`` in MW."""
+    k = piece_of(u, knots)
+    w = (u - knots[k]) / (knots[k + 1] - knots[k])
+    return float(left[k] + (right[k] - left[k]) * w)
+
+
+@jit
+def region_of(x: float, levels: FloatArray) -> int:
+    """Return the region of flow x; ``levels`` are the inner boundaries in MW."""
+    r = 0
+    while r < levels.size and x >= levels[r]:
+        r += 1
+    return r
+
+
+# Columns of a table of taps, one row a region: decay, weights of the flows at `TAP_WHOLE`
+# steps back and one and two before, b and c as above.
+TAP_A, TAP_0, TAP_1, TAP_2, TAP_WHOLE, TAP_B, TAP_C = range(7)
+TAPS = 7
+
+
+@jit
+def make_taps(time_constants: FloatArray, delays: FloatArray, step_s: float) -> FloatArray:
+    """Return the taps of each region, shape (I, 7)."""
+    taps = np.empty((time_constants.size, TAPS))
+    for r in range(time_constants.size):
+        a = np.exp(-step_s / time_constants[r])
+        mean = (1.0 - a) * time_constants[r] / step_s
+        b, c = mean - a, 1.0 - mean
+        whole = np.floor(delays[r] / step_s)
+        part = delays[r] / step_s - whole
+        taps[r, TAP_A] = a
+        taps[r, TAP_0] = c * (1.0 - part)
+        taps[r, TAP_1] = c * part + b * (1.0 - part)
+        taps[r, TAP_2] = b * part
+        taps[r, TAP_WHOLE] = whole
+        taps[r, TAP_B], taps[r, TAP_C] = b, c
+    return taps
+
+
+@jit
+def respond(
+    x: FloatArray,
+    usable: ByteArray,
+    levels: FloatArray,
+    taps: FloatArray,
+    settle: int,
+    answer: FloatArray,
+    settled: ByteArray,
+) -> None:
+    """Filter the flow ``x`` (n,) into the power ``answer`` (n,).
+
+    After a gap the filter starts in equilibrium, and
+    ``settled`` is 0 for ``settle`` rows.
+    """
+    state = 0.0
+    age = 0
+    for t in range(x.size):
+        if not usable[t]:
+            age = 0
+            answer[t] = np.nan
+            settled[t] = 0
+            continue
+        if age == 0:
+            state = x[t]
+        tap = taps[region_of(x[t], levels)]
+        whole = int(tap[TAP_WHOLE])
+        state = (
+            tap[TAP_A] * state
+            + tap[TAP_0] * x[t - min(whole, age)]
+            + tap[TAP_1] * x[t - min(whole + 1, age)]
+            + tap[TAP_2] * x[t - min(whole + 2, age)]
+        )
+        answer[t] = state
+        age += 1
+        settled[t] = 1 if age > settle else 0
+
+
+@jit
+def whiten(series: FloatArray, weight: ByteArray, ar: FloatArray, out: FloatArray) -> int:
+    """Write the innovations of ``series`` (m,) under AR coefficients ``ar``.
+
+    Rows whose history is not complete are left out; returns the rows written.
+    """
+    order = ar.size
+    written = 0
+    run = 0
+    for t in range(series.size):
+        run = run + 1 if weight[t] else 0
+        if run > order:
+            value = series[t]
+            for k in range(order):
+                value -= ar[k] * series[t - 1 - k]
+            out[written] = value
+            written += 1
+    return written
+
+
+@jit
+def lagged_products(series: FloatArray, weight: ByteArray, order: int) -> FloatArray:
+    """Return mean products at lags 0..order over pairs of weighted rows."""
+    out = np.zeros(order + 1)
+    count: IntArray = np.zeros(order + 1, dtype=np.int64)
+    for t in range(series.size):
+        if not weight[t]:
+            continue
+        for k in range(min(order, t) + 1):
+            if weight[t - k]:
+                out[k] += series[t] * series[t - k]
+                count[k] += 1
+    for k in range(order + 1):
+        out[k] /= max(count[k], 1)
+    return out

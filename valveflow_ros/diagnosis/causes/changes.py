@@ -1,0 +1,397 @@
+"""Causes that are a change in time: drifts, steps, intervals and the daily swing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from valveflow_ros.curve.regional_model import RegionalModel
+from valveflow_ros.diagnosis import kernels
+from valveflow_ros.diagnosis.cause import Active, Cause, Kind, Stage, Start, Told, Unknown, Values
+from valveflow_ros.diagnosis.scene import DAY_S, Scene
+from valveflow_ros.diagnosis.screening import GAIN, INPUT, OFFSET, Bench
+from valveflow_ros.errors import counted
+from valveflow_ros.records import BoolArray, ByteArray, FloatArray
+
+# What causes that live in time share.
+
+
+TEN_DAYS_S = 10.0 * DAY_S
+
+ONSET = Unknown('t0_days', 'd', 2.0 / 24.0, 0.0, 400.0, Kind.LINE, dated=True)
+
+
+def ramp(scene: Scene, time_s: FloatArray) -> FloatArray:
+    """Return a ramp that rises by 1 in ten days and is 0 in the middle of the record.
+
+    What changes with time is counted from the record's mean throughout: the curve is then the
+    mean curve, and the levels between regions stay where they are while a change is fitted.
+    """
+    return np.asarray((time_s - 0.5 * scene.reference.span_s) / TEN_DAYS_S)
+
+
+def since(scene: Scene, t0_days: float) -> FloatArray:
+    """Return a step of height 1 at an onset, its mean over the record taken off."""
+    onset, span = t0_days * DAY_S, scene.reference.span_s
+    after = min(max(1.0 - onset / span, 0.0), 1.0)
+    return np.where(scene.time_s >= onset, 1.0, 0.0) - after
+
+
+def a_day(scene: Scene) -> str:
+    """Say that a record is too short for what changes with time."""
+    return _at_least(scene, 1.0)
+
+
+def three_days(scene: Scene) -> str:
+    """Say that a record is too short for what repeats daily."""
+    return _at_least(scene, 3.0)
+
+
+def _at_least(scene: Scene, days: float) -> str:
+    if scene.days >= 0.98 * days:
+        return ''
+    return (
+        f'it changes with time, and the record lasts '
+        f'{counted(float(f"{scene.days:.2g}"), "day")}; at least {days:g} are needed'
+    )
+
+
+def change(share: float) -> str:
+    """Return a relative change in words."""
+    return f'{abs(100.0 * share):.2g} % {"more" if share > 0.0 else "less"}'
+
+
+# The power per flow drifts.
+#
+# Erosion and deposits behind the valve, a cycle that loses efficiency, or the scale of the
+# power transducer; from the four signals these are one thing.
+#
+#     x = F(u) (1 + g (t - middle) / 10 d)
+
+
+def apply_gain_drift(values: Values, scene: Scene, extra: Values) -> FloatArray:
+    """Return the factor on x."""
+    return np.asarray(1.0 + values[0] * ramp(scene, scene.time_s))
+
+
+def gain_drift_starts(bench: Bench) -> Sequence[Start]:
+    """Regress on the power times a ramp in time."""
+    _, found = bench.modulated([GAIN], ramp(bench.scene, bench.scene.sub_middle_s)[None, :])
+    return bench.best(GAIN_DRIFT, [(float(found[0]),)])
+
+
+def gain_drift_sentence(values: dict[str, float]) -> str:
+    """Say it."""
+    return (
+        f'The power per flow drifts: {change(values["g"])} in ten days, at every load alike '
+        '(wear, efficiency, or the scale of the power meter).'
+    )
+
+
+GAIN_DRIFT = Cause(
+    'gain_drift', 'drift', Stage.GAIN,
+    (Unknown('g', '1/(10 d)', 5e-4, -0.5, 0.5),),
+    apply_gain_drift, gain_drift_starts, gain_drift_sentence,
+    ('input_drift', 'output_offset_drift', 'gain_step'),
+    'An hour on the flat end of the curve and an hour at low load: a drift of the input '
+    'vanishes on the flat end, one of the offset is the same at both.',
+    a_day, slow=True,
+)  # fmt: skip
+
+
+# The power per flow changes at one moment and stays changed.
+#
+# Maintenance, another power meter, a heater or an extraction taken in or out for good.
+#
+#     x = F(u) (1 + g),  t >= t0
+
+
+def apply_gain_step(values: Values, scene: Scene, extra: Values) -> FloatArray:
+    """Return the factor on x."""
+    return np.asarray(1.0 + values[0] * since(scene, values[1]))
+
+
+def gain_step_starts(bench: Bench) -> Sequence[Start]:
+    """Try a step at every half hour."""
+    return bench.best_onset(GAIN_STEP, bench.only(GAIN))
+
+
+def gain_step_sentence(values: Told) -> str:
+    """Say it."""
+    return (
+        f'From {values.onset} the same flow gives {change(values["g"])} power, at every '
+        'load alike (maintenance, power meter, a heater or extraction).'
+    )
+
+
+GAIN_STEP = Cause(
+    'gain_step', 'step', Stage.GAIN,
+    (Unknown('g', '', 5e-4, -0.5, 0.5), ONSET),
+    apply_gain_step, gain_step_starts, gain_step_sentence,
+    ('input_step', 'curve_step', 'intervals', 'gain_drift'),
+    'An hour on the flat end of the curve and an hour at low load: a step of the input '
+    'vanishes on the flat end.',
+    a_day, slow=True,
+)  # fmt: skip
+
+
+# The flow area that belongs to a reading of u drifts.
+#
+# The scale of the pressure transmitter, that of the position sensor, or wear of the seat;
+# from the four signals these are one thing.
+#
+#     u_true = u (1 + g (t - middle) / 10 d)
+
+
+def apply_input_drift(
+    u: FloatArray, values: Values, scene: Scene, model: RegionalModel
+) -> FloatArray:
+    """Return the factor on u."""
+    return np.asarray(1.0 + values[0] * ramp(scene, scene.time_s))
+
+
+def input_drift_starts(bench: Bench) -> Sequence[Start]:
+    """Regress on the input's effect times a ramp in time."""
+    _, found = bench.modulated([INPUT], ramp(bench.scene, bench.scene.sub_middle_s)[None, :])
+    g = float(found[0])
+    return bench.best(INPUT_DRIFT, [(g,), (0.6 * g,)])
+
+
+def input_drift_sentence(values: dict[str, float]) -> str:
+    """Say it."""
+    return (
+        f'The same reading of opening and pressure passes {change(values["g"])} steam after ten '
+        'days (scale of the pressure or position transmitter, or wear of the seat).'
+    )
+
+
+INPUT_DRIFT = Cause(
+    'input_drift', 'drift', Stage.INPUT,
+    (Unknown('g', '1/(10 d)', 5e-4, -0.5, 0.5),),
+    apply_input_drift, input_drift_starts, input_drift_sentence,
+    ('gain_drift', 'output_offset_drift', 'input_step'),
+    'An hour on the flat end of the curve and an hour at low load: a drift of the input '
+    'vanishes on the flat end.',
+    a_day, slow=True,
+)  # fmt: skip
+
+
+# The pressure or position transmitter is recalibrated.
+#
+# From then on the same reading of u stands for another flow area.
+#
+#     u_true = u (1 + g),  t >= t0
+
+
+def apply_input_step(
+    u: FloatArray, values: Values, scene: Scene, model: RegionalModel
+) -> FloatArray:
+    """Return the factor on u."""
+    return np.asarray(1.0 + values[0] * since(scene, values[1]))
+
+
+def input_step_starts(bench: Bench) -> Sequence[Start]:
+    """Try a step at every half hour."""
+    return bench.best_onset(INPUT_STEP, bench.only(INPUT))
+
+
+def input_step_sentence(values: Told) -> str:
+    """Say it."""
+    return (
+        f'From {values.onset} the same reading of opening and pressure passes '
+        f'{change(values["g"])} steam (a transmitter was recalibrated or failed partly).'
+    )
+
+
+INPUT_STEP = Cause(
+    'input_step', 'step', Stage.INPUT,
+    (Unknown('g', '', 5e-4, -0.5, 0.5), ONSET),
+    apply_input_step, input_step_starts, input_step_sentence,
+    ('gain_step', 'curve_step', 'input_drift'),
+    'An hour on the flat end of the curve and an hour at low load: a step of the input '
+    'vanishes on the flat end.',
+    a_day, slow=True,
+)  # fmt: skip
+
+
+# The zero of the power drifts.
+#
+# The zero of the power transducer, or auxiliary load that comes and stays, adds the same
+# at any load.
+#
+#     y = G x + b (t - middle) / 10 d
+
+
+def apply_output_offset_drift(y: FloatArray, values: Values, scene: Scene) -> FloatArray:
+    """Return the power shown."""
+    return np.asarray(y + values[0] * ramp(scene, scene.time_s))
+
+
+def output_offset_drift_starts(bench: Bench) -> Sequence[Start]:
+    """Regress on a ramp in time."""
+    _, found = bench.modulated([OFFSET], ramp(bench.scene, bench.scene.sub_middle_s)[None, :])
+    return bench.best(OUTPUT_OFFSET_DRIFT, [(float(found[0]),)])
+
+
+def output_offset_drift_sentence(values: dict[str, float]) -> str:
+    """Say it."""
+    b = values['b_mw']
+    return (
+        f'The power drifts by {b:+.2g} MW in ten days, by the same at every load (zero of the '
+        'power meter, or auxiliary load).'
+    )
+
+
+OUTPUT_OFFSET_DRIFT = Cause(
+    'output_offset_drift', 'drift', Stage.OUTPUT,
+    (Unknown('b_mw', 'MW/(10 d)', 0.1, -200.0, 200.0),),
+    apply_output_offset_drift, output_offset_drift_starts, output_offset_drift_sentence,
+    ('gain_drift', 'input_drift'),
+    'Hours at low and at full load: a drift of the gain grows with the load, one of the '
+    'offset does not.',
+    a_day, slow=True,
+)  # fmt: skip
+
+
+# For hours at a time part of the steam or of the heat goes elsewhere.
+#
+# An extraction or a feed water heater is in or out of service:
+#
+#     x = F(u) (1 + g w(t)),  w = 0 or 1
+#
+# w is not measured. It is taken as a path of two states that rarely switches, and found
+# by the method of Viterbi on sums over half hours.
+
+
+_SWITCH_PENALTY = 9.0
+_FIRST_SIZES = (0.003, 0.008, 0.02)
+_FIRST_SHARE = 0.3
+_ROUNDS = 8
+_LEAST_SWITCHES = 2
+
+
+def apply_intervals(values: Values, scene: Scene, extra: Values) -> FloatArray:
+    """Return the factor on x; ``extra`` holds the times of switches in seconds."""
+    inside = np.searchsorted(np.asarray(extra), scene.time_s, side='right') % 2
+    # Counted from the record's mean, as everything in time.
+    span = scene.reference.span_s
+    edges = np.clip(np.append(np.asarray(extra), span if len(extra) % 2 else []), 0.0, span)
+    share = float(np.sum(edges[1::2] - edges[::2])) / span
+    return np.asarray(1.0 + values[0] * (inside - share))
+
+
+def intervals_starts(bench: Bench) -> Sequence[Start]:
+    """Alternate between the path and the size, from several sizes of both signs."""
+    tried = []
+    for sign in (1.0, -1.0):
+        for size in _FIRST_SIZES:
+            tried.append(_search(bench, sign * size))
+    good = [s for s in tried if s is not None and s.gain > 0.0]
+    return sorted(good, key=lambda s: -(s.gain - 5.0 * len(s.extra)))[:1]
+
+
+def _search(bench: Bench, size: float) -> Start | None:
+    own, toward = bench.gain_by_sub()
+    path = np.zeros(len(own), dtype=np.uint8)
+    share = _FIRST_SHARE
+    for _ in range(_ROUNDS):
+        before = path.copy()
+        _path(bench, own, toward, size, share, path)
+        if not path.any() or path.all() or np.array_equal(path, before):
+            break
+        _, found = bench.modulated([GAIN], path[None, :].astype(np.float64))
+        size, share = float(found[0]), float(path.mean())
+    if path.mean() > 0.5:  # what is rarer is the event
+        path, size = (1 - path).astype(np.uint8), -size
+    times = _switches(bench, path)
+    return bench.displaced(INTERVALS, (size,), times) if len(times) >= _LEAST_SWITCHES else None
+
+
+def _path(
+    bench: Bench, own: FloatArray, toward: FloatArray, size: float, share: float, path: ByteArray
+) -> None:
+    """Write the cheapest path of the state for a size and the share of time it is on."""
+    # The curve has taken up the mean: outside, the level lies as far below as it must.
+    on, off = size * (1.0 - share), -size * share
+    cost = (on * on - off * off) * own - 2.0 * (on - off) * toward
+    kernels.viterbi(cost / (2.0 * bench.variance), _SWITCH_PENALTY, path)
+
+
+def _switches(bench: Bench, path: ByteArray) -> Values:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], path]).astype(int)))
+    return tuple(bench.sub_start_s(int(k)) for k in edges)
+
+
+def infer(bench: Bench, active: Active, allowed: BoolArray) -> Values:
+    """Return the switches that the allowed sub-blocks show, for a size that is known.
+
+    The bench is that of the model without this cause.
+    """
+    own, toward = (np.where(allowed, x, 0.0) for x in bench.gain_by_sub())
+    edges = np.asarray(active.extra)
+    middle = bench.scene.sub_middle_s
+    share = float((np.searchsorted(edges, middle, side='right') % 2).mean())
+    path = np.zeros(len(own), dtype=np.uint8)
+    _path(bench, own, toward, active.values[0], share, path)
+    return _switches(bench, path)
+
+
+def intervals_sentence(values: dict[str, float]) -> str:
+    """Say it."""
+    return (
+        f'For hours at a time the same flow gives {change(values["g"])} power: something is '
+        'switched in and out (an extraction, a feed water heater).'
+    )
+
+
+INTERVALS = Cause(
+    'intervals', 'hidden', Stage.GAIN,
+    (Unknown('g', '', 5e-4, -0.5, 0.5),),
+    apply_intervals, intervals_starts, intervals_sentence, ('gain_step', 'diurnal'),
+    'Log the state of extractions and heaters beside the power.',
+    three_days, slow=True, infer=infer,
+)  # fmt: skip
+
+
+# The power follows the time of day.
+#
+# The pressure in the condenser follows the ambient air or the cooling water; auxiliary load
+# driven by the weather looks the same.
+#
+#     x = F(u) (1 + a cos(2 pi (t - t_peak) / 24 h)),  t the time of day, UTC
+
+
+_HOUR_S = 3600.0
+
+
+def apply_diurnal(values: Values, scene: Scene, extra: Values) -> FloatArray:
+    """Return the factor on x."""
+    a, peak_h = values
+    angle = 2.0 * np.pi * (scene.clock_s(scene.time_s) - peak_h * _HOUR_S) / DAY_S
+    return np.asarray(1.0 + a * np.cos(angle))
+
+
+def diurnal_starts(bench: Bench) -> Sequence[Start]:
+    """Regress on the power times a daily sine and cosine."""
+    angle = 2.0 * np.pi * bench.scene.clock_s(bench.scene.sub_middle_s) / DAY_S
+    _, found = bench.modulated([GAIN, GAIN], np.stack([np.cos(angle), np.sin(angle)]))
+    peak_h = float(np.mod(np.arctan2(found[1], found[0]) / (2.0 * np.pi) * 24.0, 24.0))
+    return bench.best(DIURNAL, [(float(np.hypot(*found)), peak_h)])
+
+
+def diurnal_sentence(values: dict[str, float]) -> str:
+    """Say it."""
+    return (
+        f'The power swings by ±{100.0 * abs(values["a"]):.2g} % every day, highest at '
+        f'{values["peak_h"] % 24.0:.1f} h UTC (condenser and cooling water follow the day).'
+    )
+
+
+DIURNAL = Cause(
+    'diurnal', 'daily', Stage.GAIN,
+    (Unknown('a', '', 5e-4, 0.0, 0.2), Unknown('peak_h', 'h', 0.5, -24.0, 48.0)),
+    apply_diurnal, diurnal_starts, diurnal_sentence, ('intervals', 'temperature'),
+    'Log the pressure in the condenser, or a week at constant load.',
+    three_days, slow=True,
+)  # fmt: skip

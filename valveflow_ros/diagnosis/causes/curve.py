@@ -1,0 +1,141 @@
+"""Causes in the curve itself: a bend, and a valve that no longer takes part."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from valveflow_ros.curve.regional_model import RegionalModel
+from valveflow_ros.diagnosis import kernels
+from valveflow_ros.diagnosis.cause import Cause, Kind, Stage, Start, Told, Unknown, Values
+from valveflow_ros.diagnosis.causes.changes import ONSET, a_day, since
+from valveflow_ros.diagnosis.scene import Scene
+from valveflow_ros.diagnosis.screening import CURVE, HATS, Bench
+from valveflow_ros.records import FloatArray
+
+# The curve has a bend that its straight pieces cannot follow.
+#
+# Where one valve begins to open before the one before it is open, their overlap raises the
+# curve; too little of it leaves a dent. The bump is a raised cosine on top of F:
+#
+#     x = F(u) + h (1 + cos(pi (u - u0) / w)) / 2,  |u - u0| <= w
+
+
+_KEPT = 3
+_WIDTHS = (0.06, 0.1, 0.16, 0.25)  # of the range of u
+
+
+def apply_curve_shape(u: FloatArray, values: Values, scene: Scene) -> FloatArray:
+    """Return MW added to the flow."""
+    h, centre, width = values
+    out = np.empty(len(u))
+    kernels.bump(u, centre, max(width, 1.0), out)
+    return h * out
+
+
+def curve_shape_starts(bench: Bench) -> Sequence[Start]:
+    """Try bumps of some widths everywhere on the curve; keep the best of each width."""
+    low, high = bench.hats[0], bench.hats[-1]
+    found: list[Start] = []
+    for share in _WIDTHS:
+        width = share * (high - low)
+        places = np.arange(low + 0.5 * width, high, 0.8 * width)
+        tried = [
+            bench.scaled_height(CURVE_SHAPE, (float(u), float(width))) for u in places.tolist()
+        ]
+        found.append(max(tried, key=lambda s: s.gain))
+    best = sorted(found, key=lambda s: -s.gain)[:_KEPT]
+    return [replace(s, base=_levels_under(bench.model.base, s.values)) for s in best]
+
+
+def _levels_under(base: RegionalModel, values: Values) -> RegionalModel:
+    """Return the base with its levels lifted by the bump: regions then change at the same u."""
+    if not len(base.levels) or np.any(base.right <= base.left):
+        return base
+    x = np.append(base.left, base.right[-1])
+    lift = np.empty(len(base.levels))
+    kernels.bump(np.interp(base.levels, x, base.knots), values[1], values[2], lift)
+    levels = base.levels + values[0] * lift
+    return base.with_levels(levels) if np.all(np.diff(levels) > 0.0) else base
+
+
+def curve_shape_sentence(values: dict[str, float]) -> str:
+    """Say it."""
+    return (
+        f'The curve has a {"bump" if values["h_mw"] > 0.0 else "dent"} of '
+        f'{abs(values["h_mw"]):.2g} MW around u = {values["u0"]:.0f} that straight pieces do not '
+        'follow (overlap of valves).'
+    )
+
+
+CURVE_SHAPE = Cause(
+    'curve_shape', 'curve', Stage.FLOW,
+    (
+        Unknown('h_mw', 'MW', 0.1, -500.0, 500.0),
+        Unknown('u0', '% MPa^m', 10.0, 0.0, 1e5, Kind.ROUGH),
+        Unknown('width_u', '% MPa^m', 10.0, 5.0, 1e5, Kind.ROUGH),
+    ),
+    apply_curve_shape, curve_shape_starts, curve_shape_sentence,
+    ('saturation', 'exponent', 'choked'),
+    'Run slowly through the whole range of loads and look at the slope of the curve.',
+)  # fmt: skip
+
+
+# From one moment on, one of several valves no longer takes part.
+#
+# The curve is the sum of valves that open one after the other. If one sticks, breaks its
+# stem, or the order is changed, its share is missing from where it should have opened:
+#
+#     x = F(u) + s min(max((u - u1) / (u2 - u1), 0), 1),  t >= t0
+
+
+_NARROWEST = 5.0
+
+
+def apply_curve_step(u: FloatArray, values: Values, scene: Scene) -> FloatArray:
+    """Return MW added to the flow."""
+    s, low, high, t0 = values
+    share = np.clip((u - low) / max(high - low, _NARROWEST), 0.0, 1.0)
+    return np.asarray(s * share * since(scene, t0))
+
+
+def curve_step_starts(bench: Bench) -> Sequence[Start]:
+    """Try shares between all pairs of places on the curve, at every half hour."""
+    pairs = [(i, k) for i, k in itertools.combinations(range(HATS), 2) if i >= 1 and k <= HATS - 1]
+    shapes = np.zeros((len(pairs), 3 + HATS))
+    for row, (i, k) in enumerate(pairs):
+        at = (bench.hats - bench.hats[i]) / (bench.hats[k] - bench.hats[i])
+        shapes[row, CURVE:] = np.clip(at, 0.0, 1.0)
+    gains, found = bench.onsets(shapes)
+    sub, row = divmod(int(np.argmax(gains)), len(pairs))
+    i, k = pairs[row]
+    values = (
+        float(found[sub, row]), float(bench.hats[i]), float(bench.hats[k]), bench.onset_days(sub)
+    )  # fmt: skip
+    return bench.best(CURVE_STEP, [values])
+
+
+def curve_step_sentence(values: Told) -> str:
+    """Say it."""
+    return (
+        f'From {values.onset} the curve lacks part of its course: '
+        f'{values["s_mw"]:+.2g} MW above u = {values["u_to"]:.0f}, nothing below '
+        f'{values["u_from"]:.0f} (a valve that sticks, or another order of opening).'
+    )
+
+
+CURVE_STEP = Cause(
+    'curve_step', 'step', Stage.FLOW,
+    (
+        Unknown('s_mw', 'MW', 0.1, -500.0, 500.0),
+        Unknown('u_from', '% MPa^m', 10.0, 0.0, 1e5, Kind.ROUGH),
+        Unknown('u_to', '% MPa^m', 10.0, 0.0, 1e5, Kind.ROUGH),
+        ONSET,
+    ),
+    apply_curve_step, curve_step_starts, curve_step_sentence, ('gain_step', 'input_step'),
+    'Run slowly through the whole range of loads and compare with the curve from before.',
+    a_day, slow=True,
+)  # fmt: skip

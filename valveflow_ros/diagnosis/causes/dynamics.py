@@ -1,0 +1,183 @@
+"""Causes in the response of the power: another lag at high load, the reheater, another clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from valveflow_ros.curve.regional_model import RegionalModel, make_taps
+from valveflow_ros.diagnosis import kernels
+from valveflow_ros.diagnosis.cause import Active, Cause, Kind, Stage, Start, Unknown, Values
+from valveflow_ros.diagnosis.fitting import improve
+from valveflow_ros.diagnosis.scene import Scene
+from valveflow_ros.diagnosis.screening import Bench
+from valveflow_ros.records import FloatArray
+
+# Above a load the unit stores more steam and answers with other dynamics than the model's.
+#
+# The regional G_i of eq. (3): above ``level`` another time constant and another delay hold.
+
+
+_TRIED_SHARES = (0.1, 0.3, 0.5, 0.7)
+_TRIED_FACTORS = (0.4, 0.7, 1.5, 2.5)
+
+
+def apply_region_lag(model: RegionalModel, values: Values) -> RegionalModel:
+    """Return the model with one region above the level."""
+    time_s, delay_s, level = values
+    keep = model.levels < level
+    inside = int(keep.sum()) + 1
+    return replace(
+        model,
+        levels=np.append(model.levels[keep], level),
+        time_constants=np.append(model.time_constants[:inside], time_s),
+        delays=np.append(model.delays[:inside], delay_s),
+    )
+
+
+def region_lag_starts(bench: Bench) -> Sequence[Start]:
+    """Try other time constants above some loads, the model's own levels among them."""
+    scene, base = bench.scene, bench.model.base
+    x = base.static(scene.u[scene.usable > 0][::10])
+    levels = [*np.quantile(x, _TRIED_SHARES).tolist(), *(base.levels + 0.01).tolist()]
+    grid: list[Values] = []
+    for level in levels:
+        own = int(np.searchsorted(base.levels, level))
+        for factor in _TRIED_FACTORS:
+            grid.append(
+                (float(base.time_constants[own]) * factor, float(base.delays[own]), float(level))
+            )
+    return bench.best(REGION_LAG, grid)
+
+
+def region_lag_sentence(values: dict[str, float]) -> str:
+    """Say it."""
+    return (
+        f'Above {values["level_mw"]:.0f} MW the unit answers with a time constant of '
+        f'{values["time_s"]:.3g} s and a delay of {values["delay_s"]:.2g} s, unlike the model.'
+    )
+
+
+REGION_LAG = Cause(
+    'region_lag', 'lag', Stage.DYNAMICS,
+    (
+        Unknown('time_s', 's', 1.0, 0.2, 3600.0),
+        Unknown('delay_s', 's', 0.5, 0.0, 600.0),
+        Unknown('level_mw', 'MW', 6.0, 0.0, 1e5, Kind.LINE),
+    ),
+    apply_region_lag, region_lag_starts, region_lag_sentence,
+    ('reheater', 'backlash', 'rate_limit'),
+    'Run the same ramp at two speeds: what a lag does grows with the speed.',
+    of_model=True,
+)  # fmt: skip
+
+
+# Part of the power comes behind the reheater, which fills slowly.
+#
+# The turbine models of IEEE (IEEEG1, TGOV1) split the power: a share is made in front
+# of the reheater at once, the rest follows its filling.
+#
+#     y = alpha y1 + (1 - alpha) y1 / (1 + T s),  y1 = G x
+
+
+_SLOW, _SWALLOWED, _SHORTEST, _STEPS = (0.3, 60.0), 0.7, 0.3, 5
+_REHEATER_TRIED = tuple((alpha, t) for alpha in (0.2, 0.4, 0.7) for t in (8.0, 20.0, 60.0, 200.0))
+
+
+def apply_reheater(y: FloatArray, values: Values, scene: Scene) -> FloatArray:
+    """Return the power shown."""
+    alpha, time_s = values
+    taps = make_taps(np.array([time_s]), np.zeros(1), scene.step_s)[0]
+    late = np.empty(len(y))
+    kernels.lag(y, scene.usable, taps, late)
+    return np.asarray(alpha * y + (1.0 - alpha) * late)
+
+
+def reheater_starts(bench: Bench) -> Sequence[Start]:
+    """Try shares and time constants, and fit one with the whole model on a quicker base.
+
+    The plain model took much of the lag for its own; its tangents do not lead out of that.
+    """
+    task, base = bench.task, bench.model.base
+    alpha, time_s = _SLOW
+    less = _SWALLOWED * (1.0 - alpha) * time_s
+    quicker = np.maximum(base.time_constants - less, _SHORTEST * base.time_constants)
+    model = replace(bench.model, base=replace(base, time_constants=quicker))
+    model, cost = improve(task, model.with_cause(Active(REHEATER, _SLOW)), _STEPS)
+    gain = (task.cost(bench.model) - cost) / (2.0 * bench.variance)
+    fitted = Start(model.active[-1].values, gain, base=model.base)
+    return [
+        *bench.best(REHEATER, list(_REHEATER_TRIED), keep=1),
+        *([fitted] if gain > 0.0 else []),
+    ]
+
+
+def reheater_sentence(values: dict[str, float]) -> str:
+    """Say it."""
+    return (
+        f'Only {100.0 * values["alpha"]:.0f} % of the power follow the valve at once; the rest '
+        f'comes {values["time_s"]:.3g} s later, through the reheater.'
+    )
+
+
+REHEATER = Cause(
+    'reheater', 'lag', Stage.OUTPUT,
+    (
+        # The same delayed area (1 - alpha) T looks nearly the same: no ellipse holds them.
+        Unknown('alpha', '', 0.03, 0.0, 1.0, Kind.ROUGH),
+        # One fills within seconds to a minute; a memory of hours is another thing.
+        Unknown('time_s', 's', 1.0, 0.5, 300.0, Kind.ROUGH),
+    ),
+    apply_reheater, reheater_starts, reheater_sentence, ('clock', 'region_lag', 'rate_limit'),
+    'Steps of the opening at constant pressure, power logged every second: two slopes in the '
+    'answer are a reheater.',
+    order=1,
+)  # fmt: skip
+
+
+# The power carries stamps of another clock, so that the answer comes before its cause.
+#
+#     y in the row of time t was measured at t + d,  d > 0
+#
+# A power stamped too late is the same as a longer delay and cannot be told from it; of one
+# stamped too early only the part shows that the shortest delay does not hide: ``d_s`` is that
+# part, and its interval reaches higher by the longest delay a unit may have.
+
+
+# Between valve and generator little more than the filling of a chest: 3 to 10 s in the paper.
+_LONGEST_DELAY_S = 15.0
+_TRIED_S = (3.0, 6.0, 10.0, 16.0, 25.0, 40.0)
+
+
+def apply_clock(y: FloatArray, values: Values, scene: Scene) -> FloatArray:
+    """Return what is shown under the early stamps."""
+    late = values[0] / scene.step_s
+    whole = int(np.floor(late))
+    part = late - whole
+    at = np.minimum(np.arange(len(y)) + whole, len(y) - 1)
+    after = np.minimum(at + 1, len(y) - 1)
+    return np.asarray(y[at] * (1.0 - part) + y[after] * part)
+
+
+def clock_starts(bench: Bench) -> Sequence[Start]:
+    """Try some offsets."""
+    return bench.best(CLOCK, [(d,) for d in _TRIED_S], keep=2)
+
+
+def clock_sentence(values: dict[str, float]) -> str:
+    """Say it."""
+    return (
+        f'The power answers before the valve moves: its time stamps are at least '
+        f'{values["d_s"]:.2g} s early against those of the opening.'
+    )
+
+
+CLOCK = Cause(
+    'clock', 'lag', Stage.OUTPUT,
+    (Unknown('d_s', 's', 0.5, 0.0, 60.0, concealed=_LONGEST_DELAY_S),),
+    apply_clock, clock_starts, clock_sentence, ('reheater', 'region_lag'),
+    'Compare the clocks of both loggers, or record both signals with one of them.',
+    order=2,
+)  # fmt: skip

@@ -1,0 +1,228 @@
+"""Causes between the measured and the true position of the valve: slack, friction, servo, stop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from valveflow_ros.diagnosis import kernels
+from valveflow_ros.diagnosis.cause import Cause, Kind, Stage, Start, Unknown, Values
+from valveflow_ros.diagnosis.scene import Scene
+from valveflow_ros.diagnosis.screening import Bench
+from valveflow_ros.records import FloatArray
+
+# A loose linkage between the position sensor and the plug.
+#
+# The plug follows only when one flank of the slack pushes it (the play operator); the loop
+# this draws is as wide at any speed, unlike that of a lag.
+#
+#     plug = min(max(plug before, V - w / 2), V + w / 2)
+
+
+_BACKLASH_TRIED = (0.1, 0.2, 0.35, 0.6, 1.0, 1.6, 2.7, 4.5)
+
+
+def apply_backlash(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
+    """Return the position of the plug; V is taken as it is, filtering would narrow the loop."""
+    out = np.empty(len(v))
+    kernels.play(v, 0.5 * values[0], out)
+    return out
+
+
+def backlash_starts(bench: Bench) -> Sequence[Start]:
+    """Try some widths."""
+    return bench.best(BACKLASH, [(w,) for w in _BACKLASH_TRIED])
+
+
+def backlash_sentence(values: dict[str, float]) -> str:
+    """Say it."""
+    return (
+        f'The plug hangs loosely behind the position sensor: it moves only after a slack of '
+        f'{values["w_percent"]:.2g} % of opening is taken up.'
+    )
+
+
+BACKLASH = Cause(
+    'backlash', 'slack', Stage.OPENING,
+    (Unknown('w_percent', '%', 0.03, 0.0, 20.0, Kind.ROUGH),),
+    apply_backlash, backlash_starts, backlash_sentence, ('stiction', 'region_lag', 'reheater'),
+    'Run the same ramp at two speeds: the loop of a slack keeps its width, that of a lag grows.',
+    order=3,
+)  # fmt: skip
+
+
+# Friction holds the valve until it slips.
+#
+# The two-parameter picture of Choudhury in the form of He: the valve stays until the pull
+# exceeds (S + J) / 2, then slips and stays (S - J) / 2 behind. The moment it slips hangs on
+# every hundredth of a per cent of the measured opening, so several paths are run, each
+# with a draw of the sensor's noise (see `draws`).
+
+
+_DRAWS, _ROUGH_DRAWS = 10, 5
+_SEED = 20_240
+_BANDS = (0.3, 0.5, 0.7, 0.95, 1.25, 1.6, 2.1, 2.8, 3.7, 4.9, 6.5, 8.6, 11.4, 15.0)
+_FACTORS = (0.88, 0.94, 1.0, 1.07, 1.15)
+_OVER_SLACK, _SHARES = (0.97, 1.04, 1.1), (0.15, 0.4, 0.6, 0.75, 0.9)
+_LIKE_SLACK = 3.0
+_SLACKS = (0.8, 0.86, 0.91, 0.95, 0.98, 1.0, 1.03, 1.07)
+_STEPS = (0.04, 0.02, 0.01, 0.005)
+_SHIFT = 7_919
+
+
+def _noise(v: FloatArray, scene: Scene) -> FloatArray:
+    """Return noise like that of the position sensor, the same for every call."""
+    if 'noise of v' not in scene.cache:
+        normal = np.random.default_rng(_SEED).standard_normal(len(v))
+        scene.cache['noise of v'] = scene.reference.opening_noise * normal
+    return scene.cache['noise of v']
+
+
+def draw(number: int) -> Callable[[FloatArray, Values, Scene], FloatArray]:
+    """Return what acts in one draw of the noise."""
+
+    def path(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
+        out = np.empty(len(v))
+        moved = v + np.roll(_noise(v, scene), number * _SHIFT)
+        kernels.stick_slip(moved, values[0], min(values[1], values[0]), out)
+        return out
+
+    return path
+
+
+def apply_stiction(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
+    """Return the mean position of the plug over the draws."""
+    total = np.zeros(len(v))
+    for k in range(_DRAWS):
+        total += draw(k)(v, values, scene)
+    return np.asarray(total / _DRAWS)
+
+
+def stiction_starts(bench: Bench) -> Sequence[Start]:
+    """Begin at the slack it looks like, then walk downhill: the path forgives little."""
+    slack = bench.best(BACKLASH, [(s,) for s in _BANDS])
+    if not slack or slack[0].gain < _LIKE_SLACK:
+        return []  # a valve that sticks looks loose first of all
+    (near,) = bench.best(BACKLASH, [(slack[0].values[0] * f,) for f in _FACTORS])
+    rough = replace(STICTION, draws=_ROUGH_DRAWS)
+    width = near.values[0]
+    tried = bench.best(rough, [(width * f, width * f * j) for f in _OVER_SLACK for j in _SHARES])
+    return [_downhill(bench, rough, tried[0], width)] if tried else []
+
+
+def _downhill(bench: Bench, cause: Cause, best: Start, width: float) -> Start:
+    """Move where the valve breaks loose, (S + J)/2, and where it stops, (S - J)/2, in turn."""
+    for step in _STEPS:
+        for by_band, by_jump in ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0)):
+            while True:
+                band, jump = best.values[0] + step * width * by_band, best.values[1]
+                jump += step * width * by_jump
+                if not 0.0 <= jump <= band:
+                    break
+                trial = bench.displaced(cause, (band, jump))
+                if not trial.gain > best.gain:
+                    break
+                best = trial
+    return best
+
+
+def simpler(values: Values) -> list[Values]:
+    """Return values without a jump, which are a slack of about the same width."""
+    return [(values[0] * f, 0.0) for f in _SLACKS]
+
+
+def stiction_sentence(values: dict[str, float]) -> str:
+    """Say it."""
+    return (
+        f'The valve sticks and slips: it stays until pulled by {values["s_percent"]:.2g} % of '
+        f'opening and then jumps by {values["j_percent"]:.2g} %.'
+    )
+
+
+STICTION = Cause(
+    'stiction', 'slack', Stage.OPENING,
+    (
+        Unknown('s_percent', '%', 0.04, 0.02, 20.0, Kind.LINE),
+        Unknown('j_percent', '%', 0.04, 0.0, 20.0, Kind.LINE),
+    ),
+    apply_stiction, stiction_starts, stiction_sentence, ('backlash',),
+    'A slow ramp below 0.05 %/s, with the position logged to 0.01 %: slipping shows as stairs.',
+    order=1, draws=_DRAWS, draw=draw, contains='backlash', simpler=simpler,
+    # The path of the plug is known roughly; where it is wrong the power lags and leads.
+    conceals=('slack', 'lag'),
+)  # fmt: skip
+
+
+# The servo is slow.
+#
+# Oil flow and pump bound the speed of the stem; a fast move takes the longer the larger it
+# is, a slow one is not affected.
+
+
+_RATE_LIMIT_TRIED = (0.05, 0.08, 0.12, 0.18, 0.27, 0.4)
+
+
+def apply_rate_limit(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
+    """Return the position of the plug."""
+    out = np.empty(len(v))
+    kernels.rate_limit(v, values[0] * scene.fine_s, out)
+    return out
+
+
+def rate_limit_starts(bench: Bench) -> Sequence[Start]:
+    """Try some speeds."""
+    return bench.best(RATE_LIMIT, [(r,) for r in _RATE_LIMIT_TRIED])
+
+
+def rate_limit_sentence(values: dict[str, float]) -> str:
+    """Say it."""
+    return (
+        f'The plug cannot move faster than {values["r_percent_per_s"]:.2g} % of opening a second.'
+    )
+
+
+RATE_LIMIT = Cause(
+    'rate_limit', 'lag', Stage.OPENING,
+    (Unknown('r_percent_per_s', '%/s', 0.005, 0.005, 100.0, Kind.ROUGH),),
+    apply_rate_limit, rate_limit_starts, rate_limit_sentence, ('reheater', 'region_lag'),
+    'Steps of 1 % and of 4 %: with a bounded speed the large one takes four times as long.',
+    order=0,
+)  # fmt: skip
+
+
+# A stop keeps the valve from opening fully.
+#
+# A mechanical or a configured limit behind the position sensor:
+#
+#     V_true = min(V, V_max)
+
+
+_TRIED_SHARES = (0.6, 0.7, 0.78, 0.85, 0.9, 0.94, 0.97, 0.99)
+
+
+def apply_saturation(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
+    """Return the position of the plug."""
+    return np.minimum(v, values[0])
+
+
+def saturation_starts(bench: Bench) -> Sequence[Start]:
+    """Try some places among the highest openings."""
+    places = np.quantile(bench.scene.v[np.isfinite(bench.scene.v)], _TRIED_SHARES)
+    return bench.best(SATURATION, [(float(p),) for p in places])
+
+
+def saturation_sentence(values: dict[str, float]) -> str:
+    """Say it."""
+    return f'The plug does not open beyond {values["max_percent"]:.4g} %, whatever is measured.'
+
+
+SATURATION = Cause(
+    'saturation', 'stop', Stage.OPENING,
+    (Unknown('max_percent', '%', 0.1, 1.0, 150.0, Kind.ROUGH),),
+    apply_saturation, saturation_starts, saturation_sentence,
+    ('curve_shape', 'exponent', 'choked'),
+    'Hold the opening high and change the pressure: a stop shows in the opening, not in u.',
+    order=2,
+)  # fmt: skip

@@ -1,0 +1,252 @@
+"""The workbench of the screening: what is unexplained, and cheap ways to try a cause on it.
+
+All tries are regressions of the whitened residual on whitened columns, freed of what curve,
+dynamics and the causes found so far could take up themselves. Products of columns are summed
+once over sub-blocks of half an hour; a change at any moment, a drift or a daily wave is then a
+weighting of these sums, and needs no further pass over the data.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+
+from valveflow_ros.diagnosis.cause import Active, Cause, Start, Values
+from valveflow_ros.diagnosis.extended import Drive, Extended, answer, drive, flow_of, region_path
+from valveflow_ros.diagnosis.fitting import (
+    Task,
+    base_mask,
+    base_tangents,
+    cause_tangents,
+    level_tangents,
+)
+from valveflow_ros.diagnosis.scene import DAY_S, Scene
+from valveflow_ros.records import FloatArray
+
+# What the model could explain itself, to be taken away before a cause is judged.
+
+
+def nuisance(task: Task, model: Extended) -> FloatArray:
+    """Return whitened tangents of everything the model could move itself, columns scaled to 1.
+
+    A delay at its bound 0 cannot move down and is left out: it would swallow a clock offset.
+    """
+    free = np.flatnonzero(base_mask(task, model))
+    base = base_tangents(task, model)
+    first_delay = len(model.base.pack()) - model.base.regions
+    at_bound = [
+        k for k, p in enumerate(free)
+        if p >= first_delay and model.base.delays[p - first_delay] <= 0.0
+    ]  # fmt: skip
+    base = np.delete(base, at_bound, axis=1)
+    table = task.innovations(
+        np.column_stack([base, cause_tangents(task, model), level_tangents(task, model)])
+    )
+    norm = np.sqrt((table**2).sum(axis=0))
+    return np.asarray(table[:, norm > 1e-9 * norm.max()] / norm[norm > 1e-9 * norm.max()])
+
+
+HATS = 13
+_SECANT = 0.004
+_EDGE_SHARE = 0.04
+GAIN, INPUT, OFFSET, CURVE = 0, 1, 2, 3  # carriers; the hats of the curve begin at CURVE
+
+
+class Bench:
+    """Screening of one model.
+
+    Parameters
+    ----------
+    task : Task
+    model : Extended
+        At its optimum.
+    rough : Scene, optional
+        The record with longer model rows; what a cause would change is computed on them, the
+        residual it has to explain is that of the task.
+    """
+
+    def __init__(self, task: Task, model: Extended, rough: Scene | None = None) -> None:
+        self.e = task.innovations(task.residual(model))
+        task = replace(task, scene=rough) if rough is not None else task
+        self.task, self.model, self.scene = task, model, task.scene
+        self.here = answer(self.scene, model)
+        self.variance = float(self.e @ self.e) / len(self.e)
+        self.n = nuisance(task, model)
+        self._inverse = np.linalg.pinv(self.n.T @ self.n, hermitian=True)
+        self.rest = self.e - self.n @ (self._inverse @ (self.n.T @ self.e))
+        self.floor = float(self.rest @ self.rest)
+        self.hats = self._hat_knots()
+        self._sums: FloatArray | None = None
+
+    def _hat_knots(self) -> FloatArray:
+        u = self.scene.u[self.scene.usable > 0]
+        low, high = np.quantile(u, (0.005, 0.995))
+        even = np.linspace(low, high, HATS)
+        spread = np.quantile(u, np.linspace(0.005, 0.995, HATS))
+        return np.asarray(0.5 * (even + spread))
+
+    def carriers(self) -> FloatArray:
+        """Return d power / d (gain, u, offset, curve at the hats), shape (m, 3 + HATS)."""
+        scene, model = self.scene, self.model
+        driven = drive(scene, model)
+        x = flow_of(model, driven)
+        path = region_path(model, x)
+
+        def scaled(factor: float) -> FloatArray:
+            return answer(scene, model, Drive(driven.u * factor, driven.added, driven.gain))
+
+        gain = np.ones(len(x)) if driven.gain is None else driven.gain
+        columns = [
+            self._linear(driven, x, path, x),
+            (scaled(1.0 + _SECANT) - scaled(1.0 - _SECANT)) / (2.0 * _SECANT),
+            np.ones(len(self.here)),
+        ]
+        for k in range(HATS):
+            hat = np.interp(driven.u, self.hats, np.eye(HATS)[k])
+            columns.append(self._linear(driven, x, path, hat * gain))
+        return np.column_stack(columns)
+
+    def _linear(
+        self, driven: Drive, x: FloatArray, path: np.ndarray, change: FloatArray
+    ) -> FloatArray:
+        """Return the answer to a small change of the flow, regions held."""
+        gain = 1.0 if driven.gain is None else driven.gain
+        added = change / gain if driven.added is None else driven.added + change / gain
+        moved = answer(self.scene, self.model, Drive(driven.u, added, driven.gain), path)
+        held = answer(self.scene, self.model, driven, path)
+        return moved - held
+
+    @property
+    def sums(self) -> FloatArray:
+        """Return products summed over sub-blocks of (carriers freed of the rest, residual).
+
+        Shape (subs, 4 + HATS, 4 + HATS); sealed sub-blocks are zero. Carriers are *not* freed
+        of nuisance here, since a weighting in time would undo that; see `modulated`.
+        """
+        if self._sums is None:
+            carriers = self.task.innovations(self.carriers())
+            table = np.column_stack([self.n, carriers, self.rest])
+            sub = self.scene.sub[self.task.rows]
+            edges = np.searchsorted(sub, np.arange(self.scene.subs + 1))
+            self._sums = np.stack(
+                [table[a:b].T @ table[a:b] for a, b in itertools.pairwise(edges)]
+            )
+        return self._sums
+
+    def modulated(self, which: list[int], weights: FloatArray) -> tuple[float, FloatArray]:
+        """Return the log-likelihood gained by carriers times functions of time, and coefficients.
+
+        Parameters
+        ----------
+        which : list of int, length k
+            Carriers.
+        weights : float64 (k, subs)
+            What each is multiplied by in each sub-block.
+        """
+        p = self.n.shape[1]
+        at = [p + c for c in which]
+        cross = np.einsum('ks,spk->pk', weights, self.sums[:, :p][:, :, at])
+        own = np.einsum('is,js,sij->ij', weights, weights, self.sums[:, at][:, :, at])
+        toward = np.einsum('ks,sk->k', weights, self.sums[:, at, -1])
+        own = own - cross.T @ self._inverse @ cross
+        found = np.linalg.pinv(own, hermitian=True) @ toward
+        return float(toward @ found) / (2.0 * self.variance), found
+
+    def onsets(self, shapes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return gains and coefficients of steps at each sub-block, shapes (subs, k).
+
+        Parameters
+        ----------
+        shapes : float64 (k, 3 + HATS)
+            Each a combination of carriers that sets in.
+        """
+        p, c = self.n.shape[1], 3 + HATS
+        after = np.cumsum(self.sums[::-1], axis=0)[::-1]
+        cross = np.einsum('spc,kc->skp', after[:, :p, p : p + c], shapes)
+        own = np.einsum('kc,scd,kd->sk', shapes, after[:, p : p + c, p : p + c], shapes)
+        whole = np.maximum(own, 1e-12)
+        own = own - np.einsum('skp,pq,skq->sk', cross, self._inverse, cross)
+        toward = np.einsum('kc,sc->sk', shapes, after[:, p : p + c, -1])
+        good = own > 1e-6 * whole
+        found = np.where(good, toward / np.where(good, own, 1.0), 0.0)
+        gains = found * toward / (2.0 * self.variance)
+        margin = max(1, round(_EDGE_SHARE * self.scene.subs))
+        gains[:margin] = gains[-margin:] = 0.0
+        return gains, found
+
+    def displaced(self, cause: Cause, values: Values, extra: Values = ()) -> Start:
+        """Run the model with a cause of given size and return what that is worth."""
+        model = self.model.with_cause(Active(cause, cause.clipped(values), extra))
+        change = self.task.innovations(self._explained(model))
+        left = self.rest - change
+        toward = self.n.T @ left
+        cost = float(left @ left) - float(toward @ self._inverse @ toward)
+        return Start(cause.clipped(values), (self.floor - cost) / (2.0 * self.variance), extra)
+
+    def _explained(self, model: Extended) -> FloatArray:
+        """Return by how much a cause more moves the prediction in MW, shape (m,)."""
+        if not model.active[-1].cause.draws:
+            return answer(self.scene, model) - self.here
+        return self.scene.power - self.here - self.task.residual(model)
+
+    def best(self, cause: Cause, grid: list[Values], keep: int = 1) -> list[Start]:
+        """Return the best of some values."""
+        tried = sorted((self.displaced(cause, v) for v in grid), key=lambda s: -s.gain)
+        return [s for s in tried[:keep] if s.gain > 0.0]
+
+    def scaled(self, cause: Cause, unit: Values) -> list[Start]:
+        """Return the start of a cause of one parameter, from its secant at two small values.
+
+        The size is found by regression on the displacement, then tried as it is.
+        """
+        (size,) = unit
+        tried = []
+        for sign in (1.0, -1.0):
+            model = self.model.with_cause(Active(cause, (sign * size,)))
+            change = self.task.innovations(answer(self.scene, model) - self.here)
+            rest = change - self.n @ (self._inverse @ (self.n.T @ change))
+            slope = float(rest @ self.rest) / max(float(rest @ rest), 1e-300)
+            tried += [self.displaced(cause, (sign * size * f,)) for f in (slope, 0.5 * slope, 1.0)]
+        good = [s for s in tried if s.gain > 0.0]
+        return sorted(good, key=lambda s: -s.gain)[:1]
+
+    def only(self, carrier: int) -> FloatArray:
+        """Return the shape that is one carrier alone, (1, 3 + HATS)."""
+        return np.eye(3 + HATS)[[carrier]]
+
+    def best_onset(self, cause: Cause, shape: FloatArray) -> list[Start]:
+        """Return the best start of a cause (size, onset) that sets in at some half hour."""
+        gains, found = self.onsets(shape)
+        sub = int(np.argmax(gains[:, 0]))
+        size = float(found[sub, 0])
+        at = self.onset_days(sub)
+        return self.best(cause, [(size, at), (0.6 * size, at)])
+
+    def onset_days(self, sub: int) -> float:
+        """Return the beginning of a sub-block in days after the first row."""
+        return self.sub_start_s(int(sub)) / DAY_S
+
+    def sub_start_s(self, sub: int) -> float:
+        """Return the beginning of a sub-block in seconds after the first row."""
+        return float(np.searchsorted(self.scene.sub, sub)) * self.scene.mean_s
+
+    def gain_by_sub(self) -> tuple[FloatArray, FloatArray]:
+        """Return, by sub-block, the square of the gain's column and its product with the rest.
+
+        The column is not freed of what the model can do: over the whole record the curve is
+        the gain, and nothing would be left.
+        """
+        p = self.n.shape[1]
+        return self.sums[:, p + GAIN, p + GAIN], self.sums[:, p + GAIN, -1]
+
+    def scaled_height(self, cause: Cause, shape: Values) -> Start:
+        """Return the start of a cause that is linear in its first parameter."""
+        model = self.model.with_cause(Active(cause, (1.0, *shape)))
+        change = self.task.innovations(answer(self.scene, model) - self.here)
+        change = change - self.n @ (self._inverse @ (self.n.T @ change))
+        own, toward = float(change @ change), float(change @ self.rest)
+        if not own > 0.0:
+            return Start((0.0, *shape), 0.0)
+        return Start((toward / own, *shape), toward * toward / own / (2.0 * self.variance))

@@ -1,0 +1,283 @@
+"""Bring a refined model into the form of the result, with its uncertainties."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from valveflow_ros.curve.characteristic import (
+    Characteristic,
+    Piece,
+    RegionDynamics,
+    ResidualStatistics,
+    Support,
+)
+from valveflow_ros.curve.regional_model import RegionalModel
+from valveflow_ros.errors import counted
+from valveflow_ros.fit.knots import evidence_words
+from valveflow_ros.fit.problem import Samples
+from valveflow_ros.fit.refine import Refined
+from valveflow_ros.fit.residual_chart import design_chart
+from valveflow_ros.fit.task import FitTask
+from valveflow_ros.numerics import running_average
+from valveflow_ros.records import ByteArray, FloatArray, SegmentKind
+from valveflow_ros.segments.window import WindowContents
+
+_Z95 = 1.959963984540054
+_MAD_TO_SD = 1.4826022185056018
+
+
+def residual_statistics(
+    task: FitTask,
+    residual: FloatArray,
+    weight: ByteArray,
+    step_s: float,
+    row_sd_mw: float,
+    curve_error_mw: float,
+) -> ResidualStatistics:
+    """Return what clean residuals look like, and the chart that watches for others.
+
+    Parameters
+    ----------
+    residual, weight : (m,)
+        Of rows, or of means over some, ``step_s`` apart.
+    row_sd_mw : float
+        sd of single rows.
+    curve_error_mw : float
+        Standard error of the prediction.
+    """
+    settings = task.settings
+    average_s = settings.real('alarm_average')
+    rest = residual[weight > 0]
+    forget = math.exp(-step_s / average_s)
+    run = running_average(rest, forget)
+    settled = run[min(len(run) // 4, int(3.0 * average_s / step_s)) :]
+    sd = _MAD_TO_SD * float(np.median(np.abs(settled - np.median(settled))))
+    return ResidualStatistics(
+        rmse_mw=float(np.sqrt(np.mean(rest**2))),
+        average_sd_mw=max(sd, 1e-9),
+        average_s=average_s,
+        input_noise=task.input_noise,
+        power_noise_mw=task.power_noise_mw,
+        width_mw=_Z95 * math.hypot(row_sd_mw, curve_error_mw),
+        chart=design_chart(
+            residual, weight, step_s,
+            block_s=settings.real('alarm_block'),
+            run_length_days=settings.real('alarm_run_length'),
+            floor_mw=settings.real('alarm_floor'),
+            curve_error_mw=curve_error_mw,
+        ),
+    )  # fmt: skip
+
+
+def from_refined(
+    task: FitTask, static: Characteristic, result: Refined, samples: Samples, u: FloatArray
+) -> Characteristic:
+    """Put a refined model into the form of the result, with its uncertainties."""
+    m = result.model
+    slopes, intercepts = m.slopes(), m.intercepts()
+    slope_se, intercept_se = _line_errors(m, result.covariance)
+    knots = m.knots.copy()
+    counts = np.histogram(u, bins=np.concatenate([[-np.inf], knots[1:-1], [np.inf]]))[0]
+    pieces = tuple(
+        Piece(float(knots[k]), float(knots[k + 1]), float(slopes[k]), float(intercepts[k]),
+              float(slope_se[k]), float(intercept_se[k]), int(counts[k]))
+        for k in range(m.pieces)
+    )  # fmt: skip
+    j = m.pieces
+    error = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))
+    knot_se = error[j + 1 : 2 * j]
+    intervals = tuple(
+        (float(b - _Z95 * s), float(b + _Z95 * s))
+        for b, s in zip(knots[1:-1], knot_se, strict=True)
+    )
+    ends = np.concatenate([m.left, m.right, m.levels])
+    edges = [float(ends.min()), *m.levels.tolist(), float(ends.max())]
+    error = error[3 * j - 1 :]
+    level_errors = np.append(result.level_stderr, math.nan)
+    dynamics = tuple(
+        RegionDynamics(
+            edges[i], edges[i + 1], float(m.time_constants[i]), float(m.delays[i]),
+            float(m.time_constants[i] * error[i]), float(error[m.regions + i]),
+            float(level_errors[i]),
+        )
+        for i in range(m.regions)
+        if edges[i] < edges[i + 1]  # a level beyond the curve's ends leaves a region empty
+    )  # fmt: skip
+    choice = static.choice
+    if task.settings.text('selection_rule') == 'prediction_error':
+        note = evidence_words(result.model.pieces, result.confidence)
+        note += f" The paper's rule (24) takes J = {len(static.pieces)}."
+        choice = replace(
+            choice, rule='prediction_error', note=f'{note} {choice.note}'.strip(),
+            confidence=dict(result.confidence),
+        )  # fmt: skip
+    elif m.pieces != len(static.pieces):
+        note = (
+            f'The rule took {counted(len(static.pieces), "piece")}; the refined curve has '
+            f'{m.pieces}, since pieces too narrow to be moved were joined with others.'
+        )
+        choice = replace(choice, note=f'{note} {choice.note}'.strip(), confidence={})
+    return replace(
+        static,
+        choice=choice,
+        pieces=pieces,
+        breakpoint_intervals=intervals,
+        dynamics=dynamics,
+        residuals=residual_statistics(
+            task,
+            result.residual_mw,
+            result.weight,
+            samples.step_s * samples.group,
+            result.row_sd_mw,
+            result.prediction_mw,
+        ),
+    )
+
+
+def _line_errors(m: RegionalModel, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return standard errors of slopes and intercepts by the delta method."""
+    packed = m.pack()
+    size = len(packed)
+    slope_of, intercept_of = np.empty((m.pieces, size)), np.empty((m.pieces, size))
+    for p in range(size):
+        h = 1e-6 * max(1.0, abs(packed[p]))
+        up, down = packed.copy(), packed.copy()
+        up[p] += h
+        down[p] -= h
+        high, low = m.unpack(up), m.unpack(down)
+        slope_of[:, p] = (high.slopes() - low.slopes()) / (2.0 * h)
+        intercept_of[:, p] = (high.intercepts() - low.intercepts()) / (2.0 * h)
+
+    # A region without rows has no known dynamics, which no line leans on.
+    dead = np.isnan(np.diag(covariance))
+    known = np.nan_to_num(covariance)
+
+    def errors(gradient: FloatArray) -> FloatArray:
+        variance = np.einsum('ip,pq,iq->i', gradient, known, gradient)
+        touched = np.any(gradient[:, dead] != 0.0, axis=1)
+        return np.where(touched, np.nan, np.sqrt(np.maximum(variance, 0.0)))
+
+    return errors(slope_of), errors(intercept_of)
+
+
+# Whether each piece rests on data of its own: the condition after Proposition 2 of the paper.
+#
+# Slope and intercept of a piece are determined by the special segments inside it when these
+# are linearly independent: two steady states at different levels, or a slope response that
+# crosses different levels. Where that does not hold, the piece's numbers come from its
+# neighbours through the joins, or from moves between segments, and a person should know.
+
+
+NOT_REFINED = 'The curve is not refined: '  # how a note on that begins
+_LEAST_ROWS = 30  # of a segment on a piece, for it to count there
+_APART = 10.0  # noise sd of u between two levels that are called different
+
+
+def with_support(
+    c: Characteristic, contents: WindowContents, input_noise: float
+) -> Characteristic:
+    """Return the characteristic with the support of its pieces, and a note on each without.
+
+    Parameters
+    ----------
+    c : Characteristic
+    contents : WindowContents
+        The rows and special segments it was fitted to.
+    input_noise : float
+        Noise sd of block means of u.
+    """
+    support = tuple(
+        support_of(piece, contents, input_noise, last=k == len(c.pieces) - 1)
+        for k, piece in enumerate(c.pieces)
+    )
+    notes = [
+        _sentence(k + 1, piece, found)
+        for k, (piece, found) in enumerate(zip(c.pieces, support, strict=True))
+        if not found.identifiable
+    ]
+    return replace(c, support=support, notes=(*c.notes, *notes))
+
+
+def weaknesses(c: Characteristic) -> tuple[str, ...]:
+    """Return the notes that report a weakness; others only tell how a curve was made."""
+    without = sum(1 for found in c.support if not found.identifiable)
+    unrefined = [n for n in c.notes[: len(c.notes) - without] if n.startswith(NOT_REFINED)]
+    return (*unrefined, *c.notes[len(c.notes) - without :])
+
+
+def support_of(
+    piece: Piece, contents: WindowContents, input_noise: float, last: bool = True
+) -> Support:
+    """Count the special segments inside a piece, and judge them.
+
+    A segment counts where half a minute of rows or half of it lies inside. The upper end
+    belongs to the piece only where it is the ``last``.
+    """
+    steady = slope = samples = 0
+    levels: list[float] = []
+    crossing = False
+    apart = _APART * input_noise
+    for first, end, kind in contents.spans.tolist():
+        u = contents.u[first:end]
+        below = u <= piece.u_to if last else u < piece.u_to
+        inside = u[(u >= piece.u_from) & below]
+        samples += len(inside)
+        if len(inside) < min(_LEAST_ROWS, (end - first + 1) // 2):
+            continue
+        if kind == SegmentKind.STEADY:
+            steady += 1
+            levels.append(float(np.median(inside)))
+        else:
+            slope += 1
+            low, high = np.quantile(inside, (0.1, 0.9))
+            crossing = crossing or bool(high - low > apart)
+    distinct = _distinct(levels, apart)
+    return Support(
+        steady=steady,
+        slope_response=slope,
+        samples=samples,
+        levels=tuple(distinct),
+        identifiable=crossing or len(distinct) >= 2,
+    )
+
+
+def _distinct(levels: list[float], apart: float) -> list[float]:
+    """Return levels of which each lies more than ``apart`` above the one before."""
+    found: list[float] = []
+    for level in sorted(levels):
+        if not found or level - found[-1] > apart:
+            found.append(level)
+    return found
+
+
+def _sentence(number: int, piece: Piece, found: Support) -> str:
+    """Say what a piece rests on, and what would settle it."""
+    name = f'Piece {number} (u {piece.u_from:.0f} to {piece.u_to:.0f})'
+    if not found.samples:
+        rests = 'rests on no special sample'
+    elif not found.levels and not found.slope_response:
+        few = counted(found.samples, 'sample')
+        rests = f'rests on no special segment, only on {few} at their ends'
+    elif not found.levels:
+        rests = 'rests on slope responses that hardly move in it'
+    else:
+        rests = f'rests on one steady level, u {found.levels[0]:.0f}'
+    places = _missing(piece, np.array(found.levels))
+    loads = ' and '.join(f'u {u:.0f} ({piece.slope * u + piece.intercept:.0f} MW)' for u in places)
+    each = ' each' if len(places) > 1 else ''
+    return (
+        f'{name} {rests}: its slope comes from the neighbours and from fast moves; '
+        f'an hour{each} at {loads} would settle it.'
+    )
+
+
+def _missing(piece: Piece, levels: FloatArray) -> list[float]:
+    """Return where steady states are missing: two places, or the one farther from a level."""
+    width = piece.u_to - piece.u_from
+    places = [piece.u_from + share * width for share in (0.2, 0.8)]
+    if not len(levels):
+        return places
+    return [max(places, key=lambda u: abs(u - float(levels[0])))]

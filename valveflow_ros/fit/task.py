@@ -1,0 +1,127 @@
+"""What a fit is asked to do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from valveflow_ros.curve.characteristic import HeldCause, Piece
+from valveflow_ros.errors import DataError, TooFewSamplesError
+from valveflow_ros.parameters import Settings
+from valveflow_ros.records import FloatArray, IntArray
+from valveflow_ros.segments.window import WindowContents
+
+
+@dataclass(frozen=True, slots=True)
+class FitTask:
+    """Everything a fit depends on.
+
+    Attributes
+    ----------
+    request_ns : int
+        Time of the row after which the fit was asked for; its name.
+    contents : WindowContents
+    settings : Settings
+    input_noise, power_noise_mw : float
+        The segmenter's noise levels at that moment.
+    held : tuple of HeldCause
+        Causes that were taken out of the rows.
+    """
+
+    request_ns: int
+    contents: WindowContents
+    settings: Settings
+    input_noise: float
+    power_noise_mw: float
+    held: tuple[HeldCause, ...] = ()
+
+
+# Windows that cannot carry a curve, and what would help.
+
+
+_EXPLAINED_LEAST = 0.5  # share of the power's variance a curve must explain to be one
+_ONE_LEVEL_PERCENT = 2.0  # of opening: less than this is one load with its jitter
+_LEAST_SPREAD = 10.0  # noise sd that the openings must spread over
+
+
+def evaluate(pieces: tuple[Piece, ...], u: FloatArray) -> FloatArray:
+    """Return the power in MW of a curve at ``u``; at a knot that of the piece to its right."""
+    inner = np.array([p.u_to for p in pieces[:-1]])
+    k = np.searchsorted(inner, u, side='right')
+    slopes = np.array([p.slope for p in pieces])
+    return np.asarray(slopes[k] * u + np.array([p.intercept for p in pieces])[k])
+
+
+def enough_samples(task: FitTask, samples: int) -> None:
+    """Refuse a window that cannot carry a fit, and say what would help."""
+    c = task.contents
+    usable = np.isfinite(c.u) & np.isfinite(c.power_mw)
+    if not usable.any():
+        raise DataError('There is no row with opening, pressure and power together.')
+    if np.ptp(c.u[usable]) == 0.0:
+        raise DataError(
+            'The integrated input never changes: a curve needs the valve at several openings.'
+        )
+    need = task.settings.whole('min_fit_samples')
+    if samples < need:
+        raise TooFewSamplesError(
+            'Samples in steady-state and slope-response segments', samples, need,
+            'Longer data, or calmer operation at several loads, would help.',
+        )  # fmt: skip
+
+
+def input_moved(task: FitTask, u: FloatArray) -> None:
+    """Refuse samples that lie at one opening: their scatter has no slope to tell."""
+    low, high = np.quantile(u, (0.01, 0.99))
+    if high - low < _LEAST_SPREAD * task.input_noise:
+        raise DataError(
+            f'The unit stood at one opening: in the special segments u lies between {low:.4g} and '
+            f'{high:.4g}, hardly more than its noise of {task.input_noise:.2g}. A curve needs '
+            'several loads.'
+        )
+
+
+def valve_moved(task: FitTask, rows: IntArray) -> None:
+    """Refuse samples whose u was moved by the pressure alone.
+
+    They may follow a curve well, since power follows the pressure; but it is no
+    characteristic of the valve, and a dead transmitter gives the same.
+    """
+    if not len(task.contents.opening_percent):
+        return
+    opening, u = task.contents.opening_percent[rows], task.contents.u[rows]
+    known = np.isfinite(opening)
+    if not known.any() or not np.median(opening[known]) > 0.0:
+        return
+    low, high = np.quantile(opening[known], (0.01, 0.99))
+    moved_u = (high - low) * float(np.median(u[known]) / np.median(opening[known]))
+    if moved_u < _LEAST_SPREAD * task.input_noise:
+        raise DataError(
+            f'The valve did not move: in the special segments its opening lies between {low:.4g} '
+            f'and {high:.4g} %, and u follows the pressure alone. Hours at several openings are '
+            'needed; if the valve did move, the transmitter of its opening is dead.'
+        )
+
+
+def carries_a_curve(task: FitTask, rows: IntArray, pieces: tuple[Piece, ...]) -> None:
+    """Refuse a relation so loose that a curve through it would mislead."""
+    u, power = task.contents.u[rows], task.contents.power_mw[rows]
+    rest = power - evaluate(pieces, u)
+    total = float(np.var(power))
+    explained = 1.0 - float(np.mean(rest**2)) / total if total > 0.0 else 0.0
+    if explained >= _EXPLAINED_LEAST:
+        return
+    opening = task.contents.opening_percent[rows] if len(task.contents.opening_percent) else u[:0]
+    known = opening[np.isfinite(opening)]
+    if len(known) and np.ptp(np.quantile(known, (0.01, 0.99))) < _ONE_LEVEL_PERCENT:
+        raise DataError(
+            f'The unit stood at one opening, {np.median(known):.4g} %, in all special segments. '
+            'A curve needs several loads: hours at other openings would help.'
+        )
+    raise DataError(
+        f'The power hardly follows the valve: the best curve of {len(pieces)} '
+        f'piece{"s" if len(pieces) > 1 else ""} explains {100.0 * explained:.0f} % of its '
+        f'variance (at least {100.0 * _EXPLAINED_LEAST:.0f} % needed). An input that is not '
+        'measured moves it, or a signal is mapped wrongly.'
+    )

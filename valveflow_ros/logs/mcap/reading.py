@@ -1,0 +1,472 @@
+"""Reads a recording of one or several MCAP files into `LogContents`."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from valveflow_ros.errors import RecordingError, counted
+from valveflow_ros.logs.contents import LogContents, LoggedMessage, TopicInfo
+from valveflow_ros.logs.mcap.folder import Split, in_order
+from valveflow_ros.logs.mcap.gather import FileContents, Group, Rows, gather
+from valveflow_ros.logs.mcap.layout import LayoutError
+from valveflow_ros.logs.mcap.scan import Findings, Scanner, scan_warnings
+from valveflow_ros.logs.mcap.walk import HEAD_SIZE, MessageTable, walk
+from valveflow_ros.logs.names import PLANT_SAMPLE_TOPIC, TopicChoice, misfits
+from valveflow_ros.logs.part_file import PART_SUFFIX
+from valveflow_ros.logs.source import DEFAULT_LIMITS, Limits, OverBudgetError, Source
+from valveflow_ros.records import IntArray, Readings, Signal
+
+# Goes through the raw messages of a recording again, in the order of their log times.
+
+
+_END = np.iinfo(np.int64).max
+_BLOCK = 1 << 14
+# Chunks of a recorder overlap by a moment; only a file made to hurt has more than this waiting.
+MAX_WAITING_BYTES = 96 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class _Batch:
+    """Messages of one group that wait for their turn."""
+
+    file: int
+    place: int
+    content: bytes
+    table: MessageTable
+    rows: IntArray
+
+
+def _columns(batch: _Batch) -> tuple[NDArray[np.generic], ...]:
+    table, rows = batch.table, batch.rows
+    starts = table.offset[rows] + HEAD_SIZE
+    return (
+        table.log_time[rows],
+        table.publish_time[rows],
+        table.channel[rows],
+        table.sequence[rows],
+        starts,
+        starts + table.size[rows],
+    )
+
+
+class Journal:
+    """The raw messages of one or several files; holds only what overlaps in time.
+
+    Parameters
+    ----------
+    files : list of FileContents
+        What `gather` found, in the order of the splits.
+    unchecked : bool
+        As when they were found.
+    """
+
+    def __init__(self, files: list[FileContents], unchecked: bool = False) -> None:
+        self._files = files
+        self._unchecked = unchecked
+
+    def messages(self, topics: Collection[str] | None) -> Iterator[LoggedMessage]:
+        """Yield messages; see `LogContents.iter_messages`."""
+        repeats = _Repeats()
+        plan = sorted(
+            (group.first_ns, number, place)
+            for number, file in enumerate(self._files)
+            for place, group in enumerate(file.groups)
+            if group.channels & _channels(file, topics).keys()
+        )
+        waiting: list[_Batch] = []
+        for index, (_, number, place) in enumerate(plan):
+            waiting.append(self._load(number, place, topics))
+            # Nothing that is still to be read can come before this.
+            until = plan[index + 1][0] if index + 1 < len(plan) else _END
+            yield from self._release(waiting, until, repeats)
+
+    def _load(self, number: int, place: int, topics: Collection[str] | None) -> _Batch:
+        file = self._files[number]
+        content = self._content(file, file.groups[place])
+        table, _ = walk(content)
+        wanted = np.isin(table.channel, list(_channels(file, topics)))
+        return _Batch(number, place, content, table, np.flatnonzero(wanted))
+
+    def _release(
+        self, waiting: list[_Batch], until: int, repeats: _Repeats
+    ) -> Iterator[LoggedMessage]:
+        """Yield what comes before ``until`` and keep the rest waiting."""
+        waiting.sort(key=lambda batch: (batch.file, batch.place))
+        due = [batch.table.log_time[batch.rows] < until for batch in waiting]
+        out = [replace(b, rows=b.rows[part]) for b, part in zip(waiting, due, strict=True)]
+        waiting[:] = [
+            replace(batch, rows=batch.rows[~part])
+            for batch, part in zip(waiting, due, strict=True)
+            if not part.all()
+        ]
+        if sum(len(batch.content) for batch in waiting) > MAX_WAITING_BYTES:
+            problem = 'holds too much of the same time side by side to be put in order'
+            raise RecordingError(self._files[out[0].file].path, problem)
+        single = len(self._files) == 1
+        for file, sequence, message in self._in_order(out):
+            if single or not repeats.seen(file, sequence, message):
+                yield message
+
+    def _in_order(self, out: list[_Batch]) -> Iterator[tuple[int, int, LoggedMessage]]:
+        """Yield file, sequence number and message; payloads are cut out one at a time."""
+        names = [_channels(self._files[batch.file], None) for batch in out]
+        columns = [np.concatenate(parts) for parts in zip(*map(_columns, out), strict=True)]
+        sizes = [len(batch.rows) for batch in out]
+        columns.append(np.repeat(np.arange(len(out)), sizes))
+        # A stable sort keeps messages of one time in the order of files and places.
+        order = np.argsort(columns[0], kind='stable')
+        for begin in range(0, len(order), _BLOCK):
+            picked = order[begin : begin + _BLOCK]
+            lists = [column[picked].tolist() for column in columns]
+            for log_ns, publish_ns, channel, sequence, start, end, k in zip(*lists, strict=True):
+                topic, kind = names[k][channel]
+                data = out[k].content[start:end]
+                message = LoggedMessage(topic, kind, log_ns, publish_ns, data)
+                yield out[k].file, sequence, message
+
+    def _content(self, file: FileContents, group: Group) -> bytes:
+        try:
+            with Source.open(file.path) as source:
+                scanner = Scanner(source, unchecked=self._unchecked)
+                return b''.join(scanner.chunk_at(offset).content for offset in group.chunks)
+        except (LayoutError, OverBudgetError):
+            raise RecordingError(file.path, 'has changed while it was read') from None
+
+
+class _Repeats:
+    """Knows the latched messages that a recorder wrote again at the head of a split."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, tuple[int, LoggedMessage]] = {}
+        self._met: set[tuple[int, str]] = set()
+
+    def seen(self, file: int, sequence: int, message: LoggedMessage) -> bool:
+        """Tell whether the first message of a topic in a split is the last of those before.
+
+        The number that the writer gave it tells a repetition from a message
+        that happens to be equal.
+        """
+        last = self._last.get(message.topic)
+        self._last[message.topic] = (sequence, message)
+        if last is None or (file, message.topic) in self._met:
+            self._met.add((file, message.topic))
+            return False
+        self._met.add((file, message.topic))
+        before = last[1]
+        return (
+            sequence == last[0]
+            and message.publish_time_ns == before.publish_time_ns
+            and message.data == before.data
+        )
+
+
+def _channels(file: FileContents, topics: Collection[str] | None) -> dict[int, tuple[str, str]]:
+    """Return topic and type by channel, of some or all topics that the file names."""
+    return {
+        number: (channel.topic, file.table.type_of(channel))
+        for number, channel in file.table.channels.items()
+        if topics is None or channel.topic in topics
+    }
+
+
+def read_recording(
+    paths: list[Path],
+    name: str,
+    columns: Mapping[str, str],
+    unchecked: bool = False,
+    limits: Limits = DEFAULT_LIMITS,
+) -> LogContents:
+    """Return what the files, in this order, hold together.
+
+    Raises
+    ------
+    RecordingError
+        If no message can be read.
+    InputError
+        If the choice of topics is not clear.
+    """
+    choice = TopicChoice(columns)
+    files: list[FileContents] = []
+    warnings: list[str] = []
+    for path in paths:
+        try:
+            files.append(_read_file(path, choice, unchecked, limits))
+        except RecordingError as error:
+            if len(paths) == 1:
+                raise
+            warnings.append(str(error))
+    if not files:
+        raise RecordingError(name, f'none of its files can be read ({warnings[0]})')
+    types = _types(files, name)
+    chosen = choice.signals(types, name)
+    stamped = choice.plant_sample(types, name)
+    for file in files:
+        what = 'file' if len(paths) == 1 else f'file {Path(file.path).name}'
+        warnings += [*scan_warnings(file.findings, what), *_file_warnings(file, what)]
+    warnings += _choice_warnings(types, chosen, stamped, name)
+    found, told = _timed(_readings(files, chosen))
+    return _contents(name, files, types, chosen, stamped, found, warnings + told, unchecked)
+
+
+def _contents(
+    name: str,
+    files: list[FileContents],
+    types: dict[str, str],
+    chosen: dict[str, Signal],
+    stamped: str | None,
+    found: tuple[Readings, IntArray],
+    warnings: list[str],
+    unchecked: bool,
+) -> LogContents:
+    groups = [group for file in files for group in file.groups]
+    signals = {signal: topic for topic, signal in chosen.items()}
+    if stamped is not None:
+        for number in np.unique(found[0].signal).tolist():
+            signals.setdefault(Signal(number), stamped)
+    attachments: dict[str, bytes] = {}
+    metadata: dict[str, dict[str, str]] = {}
+    for file in files:
+        attachments |= {key: item.data for key, item in file.findings.attachments.items()}
+        metadata |= file.findings.metadata
+    return LogContents(
+        name,
+        *found,
+        _topics(files, types, chosen),
+        signals,
+        tuple(warnings),
+        attachments,
+        metadata,
+        min(group.first_ns for group in groups),
+        max(group.last_ns for group in groups),
+        sum(file.findings.damaged for file in files),
+        Journal(files, unchecked),
+    )
+
+
+def _read_file(path: Path, choice: TopicChoice, unchecked: bool, limits: Limits) -> FileContents:
+    with Source.open(path) as source:
+        contents = gather(source, choice, limits, unchecked)
+        if not contents.messages:
+            raise RecordingError(path, _why_empty(contents.findings))
+    return contents
+
+
+def _why_empty(findings: Findings) -> str:
+    if findings.unchecked:
+        return (
+            'was written without checksums, so damage in it could not be seen; '
+            'record with checksums, or ask for it to be read unchecked'
+        )
+    if findings.over_budget:
+        return 'unpacks to far more than its size justifies and was not read'
+    if findings.bare_messages:
+        return (
+            'was written without chunks, so damage in it could not be seen; '
+            "rewrite it with 'ros2 bag convert' to the preset zstd_small"
+        )
+    if not findings.begins_well and not findings.damaged:
+        return 'is not an MCAP file'
+    if findings.damaged:
+        return f'holds no intact chunk of messages ({findings.reasons[0]})'
+    if findings.cut_off_at is not None:
+        return 'is cut off before its first message'
+    return 'holds no messages'
+
+
+def _types(files: list[FileContents], name: str) -> dict[str, str]:
+    types: dict[str, str] = {}
+    for file in files:
+        for channel in file.table.channels.values():
+            kind = file.table.type_of(channel)
+            if types.setdefault(channel.topic, kind) != kind:
+                both = f'{types[channel.topic]} and {kind}'
+                raise RecordingError(name, f"its topic '{channel.topic}' has two types, {both}")
+    return types
+
+
+def _topics(
+    files: list[FileContents], types: dict[str, str], chosen: dict[str, Signal]
+) -> dict[str, TopicInfo]:
+    counts = dict.fromkeys(types, 0)
+    definitions = dict.fromkeys(types, '')
+    hashes = dict.fromkeys(types, '')
+    for file in files:
+        for number, channel in file.table.channels.items():
+            counts[channel.topic] += file.counts.get(number, 0)
+            definitions[channel.topic] = file.table.definition_of(channel)
+            hashes[channel.topic] = channel.metadata.get('topic_type_hash', '')
+    return {
+        topic: TopicInfo(
+            topic, kind, counts[topic], chosen.get(topic), definitions[topic], hashes[topic]
+        )
+        for topic, kind in types.items()
+    }
+
+
+def _file_warnings(file: FileContents, what: str) -> list[str]:
+    sentences = []
+    if file.announced is not None and file.announced > file.messages:
+        missing = file.announced - file.messages
+        sentences.append(
+            f'The {what} was written with {counted(file.announced, "message")}, '
+            f'{missing} of them {"is" if missing == 1 else "are"} lost.'
+        )
+    if file.orphans:
+        many = 'is on a topic' if file.orphans == 1 else 'are on topics'
+        sentences.append(
+            f'{counted(file.orphans, "message")} of the {what} {many} that it does not name any '
+            'more.'
+        )
+    for channel, count in file.misfits.items():
+        topic = file.table.channels[channel].topic
+        fit = 'does not fit its type and was' if count == 1 else 'do not fit their type and were'
+        sentences.append(f"{counted(count, 'message')} on '{topic}' {fit} left out.")
+    return sentences
+
+
+def _choice_warnings(
+    types: dict[str, str], chosen: dict[str, Signal], stamped: str | None, name: str
+) -> list[str]:
+    wrong = misfits(types)
+    if not chosen and stamped is None:
+        if wrong:
+            raise RecordingError(name, wrong[0])
+        return [
+            'None of its topics is an input of the monitor; '
+            'name one with --column valve_opening=TOPIC.'
+        ]
+    sentences = [f'{clause[0].upper()}{clause[1:]}; it was left out.' for clause in wrong]
+    if chosen and stamped is not None:
+        both = ', '.join(f"'{topic}'" for topic in chosen)
+        sentences.append(
+            f"Values stand both in '{stamped}' ({PLANT_SAMPLE_TOPIC}) and in {both}; "
+            'all of them were read.'
+        )
+    return sentences
+
+
+def _timed(found: tuple[Readings, IntArray]) -> tuple[tuple[Readings, IntArray], list[str]]:
+    """Leave out values that never got a time, which a monitor records and does not use either.
+
+    Where none has one, whoever wrote the file gives none, and that is another matter.
+    """
+    readings, log_time = found
+    if not len(readings) or readings.time_ns.min() > 0 or readings.time_ns.max() <= 0:
+        return found, []
+    timed = readings.time_ns > 0
+    kept = Readings(
+        readings.time_ns[timed], readings.signal[timed], readings.value[timed],
+        readings.quality[timed],
+    )  # fmt: skip
+    lost = counted(len(readings) - len(kept), 'value')
+    told = f'{lost} recorded without a time, as before the first /clock, left out.'
+    return (kept, log_time[timed]), [told]
+
+
+def _readings(files: list[FileContents], chosen: dict[str, Signal]) -> tuple[Readings, IntArray]:
+    parts: list[tuple[Rows, np.ndarray[tuple[int], np.dtype[np.int8]]]] = []
+    for file in files:
+        lookup = np.full(1 << 16, -1, dtype=np.int8)
+        for number, channel in file.table.channels.items():
+            if channel.topic in chosen:
+                lookup[number] = chosen[channel.topic]
+        for rows in file.rows:
+            signal = np.where(rows.signal >= 0, rows.signal, lookup[rows.channel])
+            parts.append((rows, signal))
+    if not parts:
+        return Readings.of([]), np.empty(0, dtype=np.int64)
+    signal = np.concatenate([signal for _, signal in parts])
+    log_time = np.concatenate([rows.log_time for rows, _ in parts])
+    keep = signal >= 0
+    whole = bool(keep.all())
+    # Almost always the order of the file is the order of the log times already.
+    sorted_already = bool((log_time[1:] >= log_time[:-1]).all())
+    order = (
+        None
+        if sorted_already
+        else np.argsort(log_time if whole else log_time[keep], kind='stable')
+    )
+    columns = [
+        np.concatenate([getattr(rows, field) for rows, _ in parts])
+        for field in ('time_ns', 'value', 'quality')
+    ]
+    everything = (columns[0], signal, columns[1], columns[2], log_time)
+    # Picking all of some million values takes as long as reading them.
+    picked = [column if whole else column[keep] for column in everything]
+    if order is not None:
+        picked = [column[order] for column in picked]
+    return Readings(*picked[:4]), picked[4]
+
+
+# The end of a recording: what was logged after a moment, without reading all before it.
+
+
+_TRIES = 3
+
+
+def messages_since(folder: str | Path, after_ns: int) -> Iterator[LoggedMessage]:
+    """Yield the messages of a recording's folder logged after ``after_ns``, in order.
+
+    Parameters
+    ----------
+    folder : str or Path
+    after_ns : int
+        Log time.
+
+    Raises
+    ------
+    RecordingError
+        The files cannot be read; a folder without any gives nothing.
+    """
+    for message in _read(Path(folder), after_ns).iter_messages():
+        if message.log_time_ns > after_ns:
+            yield message
+
+
+def _read(home: Path, after_ns: int) -> LogContents:
+    """Return what the last files hold; one that is made whole meanwhile has another name then."""
+    for left in reversed(range(_TRIES)):
+        wanted = _wanted(home, after_ns)
+        if not wanted:
+            break
+        try:
+            found = read_recording(wanted, str(home), {})
+        except RecordingError:
+            if not left or all(path.exists() for path in wanted):
+                raise
+            continue
+        # Of several files one that is gone is passed over, with a warning only.
+        if not left or all(path.exists() for path in wanted):
+            return found
+    return LogContents(str(home), Readings.of([]), np.empty(0, dtype=np.int64))
+
+
+def _wanted(home: Path, after_ns: int) -> list[Path]:
+    wanted: list[Path] = []
+    for path in reversed(in_order(_files(home))):
+        wanted.insert(0, path)
+        split = Split.read(path) if path.suffix == '.mcap' else None
+        # Splits follow each other in time; one that begins before the moment is the first needed.
+        if split is not None and split.messages and split.start_ns <= after_ns:
+            break
+    return wanted
+
+
+def _files(home: Path) -> list[Path]:
+    try:
+        names = {entry.name for entry in home.iterdir() if entry.is_file()}
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(home, f'cannot be read ({reason})') from None
+    whole = {name for name in names if name.endswith('.mcap')}
+    parts = {
+        name
+        for name in names
+        if name.endswith(f'.mcap{PART_SUFFIX}') and name[: -len(PART_SUFFIX)] not in whole
+    }
+    return [home / name for name in whole | parts]

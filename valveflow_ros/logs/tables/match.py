@@ -1,0 +1,300 @@
+"""Decides which column of a table is which signal, and refuses what it cannot decide."""
+
+from __future__ import annotations
+
+import re
+import zoneinfo
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+from valveflow_ros.errors import InputError
+from valveflow_ros.logs.tables.layout import Heading
+from valveflow_ros.logs.tables.refusal import THEIRS, RefusedError, Remedy
+from valveflow_ros.logs.tables.words import (
+    CLEAR,
+    EXACT,
+    LIKELY,
+    TAG,
+    Spelling,
+    folded,
+    is_foreign,
+    marks,
+    of_gauge,
+    spelling,
+    split_unit,
+)
+from valveflow_ros.records import SIGNALS, Signal
+
+TIME, DATE = 'time', 'date'
+_TIME_WORDS = re.compile(
+    r'time ?stamp|zeit ?stempel|date ?time|datum ?(?:und ?)?(?:uhr)?zeit|^(?:\w+ )?time$|'
+    r'^(?:local |utc |lokale |abtast)?(?:time|zeit)\b|^uhrzeit$|^ts$|^t$|^sample time$|^clock$'
+)
+_DATE_WORDS = re.compile(r'^(?:date|datum|day|tag)$')
+_CLOCK_WORDS = re.compile(r'^(?:time|zeit|uhrzeit|clock|time of day)$')
+_LOCAL = {
+    **dict.fromkeys(('CET', 'MEZ', 'CEST', 'MESZ'), 'Europe/Berlin'),
+    'EET': 'Europe/Helsinki', 'WET': 'Europe/Lisbon', 'BST': 'Europe/London',
+    **dict.fromkeys(('EST', 'EDT'), 'America/New_York'),
+    **dict.fromkeys(('CST', 'CDT'), 'America/Chicago'),
+    **dict.fromkeys(('PST', 'PDT'), 'America/Los_Angeles'),
+}  # fmt: skip
+_GROUNDS = {EXACT: '', CLEAR: 'by its name', LIKELY: 'by its name', TAG: 'by its tag'}
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """A column that stands for a signal.
+
+    Attributes
+    ----------
+    place : int
+        Which column, from 0.
+    theirs : str
+        What it is called in the file.
+    unit : Spelling or None
+        The unit the file names.
+    ground : str
+        Why it was chosen; empty where nothing had to be guessed.
+    """
+
+    place: int
+    theirs: str
+    unit: Spelling | None = None
+    ground: str = ''
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """What the columns of a table stand for, and what is open.
+
+    Attributes
+    ----------
+    signals : dict
+        What was found.
+    absent : dict
+        Columns that the person named and that are not there.
+    several : tuple of str
+        A sentence for each signal that several columns could be.
+    missing : tuple of str
+        Contract names of the signals that no column could be.
+    remedies : tuple of Remedy
+        An option for each of `several`.
+    """
+
+    signals: dict[Signal, Chosen]
+    absent: dict[Signal, str]
+    several: tuple[str, ...]
+    missing: tuple[str, ...]
+    remedies: tuple[Remedy, ...]
+
+    @property
+    def open(self) -> bool:
+        """Tell whether something is left to be said."""
+        return bool(self.absent or self.several or self.missing)
+
+
+class Matcher:
+    """Chooses among columns (or, in a long table, among tags).
+
+    Parameters
+    ----------
+    path : str
+        The file, for sentences.
+    heading : Heading
+        Names, units and descriptions.
+    what : str
+        ``column`` or ``tag``.
+    taken : collection of int
+        Columns that stand for something else already: the time.
+    """
+
+    def __init__(
+        self, path: str, heading: Heading, what: str = 'column', taken: Collection[int] = ()
+    ) -> None:
+        self.path = path
+        self.names = heading.names
+        self.what = what
+        self._units = heading.units
+        self._about = heading.about
+        self._taken = set(taken)
+
+    def find(self, theirs: str) -> int | None:
+        """Return the column of this name, with or without the unit in it.
+
+        Raises
+        ------
+        InputError
+            If several have it.
+        """
+        wanted = theirs.strip()
+        same = [k for k, name in enumerate(self.names) if name == wanted]
+        if not same:
+            same = [k for k, name in enumerate(self.names) if split_unit(name)[0] == wanted]
+        if len(same) > 1:
+            raise InputError(f"{self.path}: there are several {self.what}s called '{wanted}'.")
+        return same[0] if same else None
+
+    def match(self, wanted: Mapping[Signal, str], spared: Collection[Signal]) -> Match:
+        """Return what was found for each signal, and what is open about the others.
+
+        Raises
+        ------
+        InputError
+            If several columns have the same name.
+        """
+        chosen, absent = self._named(wanted)
+        marked = self._marked({c.place for c in chosen.values()})
+        several, missing, remedies = [], [], []
+        for info in SIGNALS:
+            if info.signal in chosen or info.signal in absent:
+                continue
+            best, mark = self._best(info.signal, marked)
+            # A constant is to take the place of the signal, whatever the names suggest.
+            if info.signal in spared and mark < EXACT:
+                continue
+            if len(best) == 1:
+                ground = _GROUNDS.get(mark, 'by its unit alone')
+                place = best[0]
+                chosen[info.signal] = Chosen(place, self.names[place], self.unit_of(place), ground)
+            elif best and mark == EXACT:
+                raise InputError(
+                    f"{self.path}: there are several {self.what}s called '{self.names[best[0]]}'."
+                )
+            elif best and info.required:
+                several.append(self._several(info.topic, best))
+                remedies.append(Remedy('column', f'{info.topic}={self.names[best[0]]}'))
+            elif info.required and info.signal not in spared:
+                missing.append(info.column)
+        return Match(chosen, absent, tuple(several), tuple(missing), tuple(remedies))
+
+    def _named(
+        self, wanted: Mapping[Signal, str]
+    ) -> tuple[dict[Signal, Chosen], dict[Signal, str]]:
+        """Return the columns that the person named, and those of them that are not there."""
+        chosen: dict[Signal, Chosen] = {}
+        absent: dict[Signal, str] = {}
+        for signal, theirs in wanted.items():
+            place = self.find(theirs)
+            if place is None:
+                absent[signal] = theirs
+            else:
+                chosen[signal] = Chosen(place, self.names[place], self.unit_of(place))
+        return chosen, absent
+
+    def refusal(self, found: Match, no_time: bool) -> RefusedError:
+        """Return one error for everything that could not be decided."""
+        topics = {info.column: info.topic for info in SIGNALS}
+        named = [f"'{theirs}'" for theirs in found.absent.values()]
+        missing = [*found.missing, *([TIME] if no_time else [])]
+        parts = list(found.several)
+        remedies = list(found.remedies)
+        absent = [SIGNALS[s].topic for s in found.absent] + [topics.get(n, n) for n in missing]
+        if absent:
+            told = ', '.join([*named, *(f"'{name}'" for name in missing)])
+            unit = '' if absent == [TIME] else '[:unit]'
+            options = ' '.join(f'--column {name}={THEIRS}{unit}' for name in absent)
+            constant = ', or give --constant NAME=VALUE for what hardly changes'
+            parts.append(
+                f'there is no {self.what} {told}; the {self.what}s are: {self._have()}. Name '
+                f'yours with {options}{constant if found.missing else ""}'
+            )
+            remedies += [Remedy('column', f'{name}={THEIRS}') for name in absent]
+        return RefusedError(self.path, '; '.join(parts), remedies)
+
+    def missing(self, theirs: str, name: str) -> RefusedError:
+        """Return the error for a column of times that the person named and that is not there."""
+        return RefusedError(
+            self.path,
+            f"there is no {self.what} '{theirs}'; the {self.what}s are: {self._have()}. "
+            f'Name yours with --column {name}={THEIRS}',
+            [Remedy('column', f'{name}={THEIRS}')],
+        )
+
+    def _have(self) -> str:
+        return ', '.join(name for name in self.names[:40])
+
+    def unit_of(self, place: int) -> Spelling | None:
+        """Return the unit that the file names for a column."""
+        if not self._units[place]:
+            return None
+        return of_gauge(spelling(self._units[place]), f'{self.names[place]} {self._about[place]}')
+
+    def _marked(self, used: Collection[int]) -> list[dict[Signal, float]]:
+        found: list[dict[Signal, float]] = []
+        for place, name in enumerate(self.names):
+            foreign = is_foreign(self._units[place])
+            if place in self._taken or place in used or not name or foreign:
+                found.append({})
+                continue
+            bare = split_unit(name)[0]
+            everything = marks(bare, self._about[place], self.unit_of(place))
+            # A column is one thing: what it is less likely to be, it is not.
+            most = max(everything.values(), default=0.0)
+            found.append({s: m for s, m in everything.items() if m == most})
+        return found
+
+    def _best(self, signal: Signal, marked: list[dict[Signal, float]]) -> tuple[list[int], float]:
+        most = max((m[signal] for m in marked if signal in m), default=0.0)
+        return [k for k, m in enumerate(marked) if m.get(signal) == most], most
+
+    def _several(self, topic: str, places: list[int]) -> str:
+        names = [self.names[k] for k in places]
+        options = ' or '.join(option(topic, name) for name in names[:4])
+        listed = ' and '.join(f"'{name}'" for name in names[:8])
+        return f'{listed} could each be {topic}: add {options}'
+
+
+def option(topic: str, theirs: str, unit: str = '') -> str:
+    """Return the option that chooses a column, as it can be pasted into a shell."""
+    return str(choosing(topic, theirs, unit))
+
+
+def choosing(topic: str, theirs: str, unit: str = '') -> Remedy:
+    """Return the option that chooses a column."""
+    return Remedy('column', f'{topic}={theirs}' + (f':{unit}' if unit else ''))
+
+
+def time_columns(heading: Heading) -> tuple[int | None, int | None]:
+    """Return the places of the time and, where it stands apart, of the date."""
+    names = heading.names
+    if TIME in names:
+        return names.index(TIME), (names.index(DATE) if DATE in names else None)
+    if DATE in names and not any(_is_time(name) for name in names if name != DATE):
+        return None, names.index(DATE)
+    bare = [folded(split_unit(name)[0]) for name in names]
+    date = next((k for k, name in enumerate(bare) if _DATE_WORDS.search(name)), None)
+    clock = next((k for k, name in enumerate(bare) if _CLOCK_WORDS.search(name)), None)
+    if date is not None and clock is not None:
+        return clock, date
+    found = next((k for k, name in enumerate(names) if _is_time(name)), None)
+    return (found, None) if found is not None else (None, date)
+
+
+def _is_time(name: str) -> bool:
+    return bool(_TIME_WORDS.search(folded(split_unit(_without_zone(name))[0])))
+
+
+def zone_in(name: str) -> str:
+    """Return the zone that a time column's name tells, empty if it tells none."""
+    found = re.search(r'[\[({ ](UTC|GMT|[A-Z][A-Za-z]+/[\w/+-]+|(?:UTC)?[+-]\d{1,2}(?::?\d{2})?)'
+                      r'[\])} ]*$', name)  # fmt: skip
+    if not found:
+        return ''
+    # 'PI Date/Time' reads like one, and is none.
+    named = '/' not in found[1] or found[1] in zoneinfo.available_timezones()
+    return found[1] if named else ''
+
+
+def local_zone_in(name: str) -> tuple[str, str]:
+    """Return a zone's abbreviation in a name, and a place where it is used.
+
+    It does not say whether summer time is kept.
+    """
+    found = re.search(rf'\b({"|".join(_LOCAL)})\b', name)
+    return (found[1], _LOCAL[found[1]]) if found else ('', '')
+
+
+def _without_zone(name: str) -> str:
+    return re.sub(r'[\[({ ]+(?:UTC|GMT|CES?T|MES?Z|local|lokal)[\])} ]*$', '', name,
+                  flags=re.IGNORECASE)  # fmt: skip

@@ -1,0 +1,188 @@
+"""Reads a historian's table, CSV, Excel or Parquet, into columns of numbers over time."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from valveflow_ros.logs.contents import LogContents
+from valveflow_ros.logs.names import signal_of
+from valveflow_ros.logs.tables.reader import TableReader
+from valveflow_ros.logs.tables.refusal import AS_SEEN, TableOptions
+from valveflow_ros.records import (
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    IntArray,
+    Readings,
+    SampleTable,
+    table_to_readings,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class RawTable:
+    """A table as it stands in its file, but for the order of time.
+
+    Attributes
+    ----------
+    path : str
+        Where it was read.
+    time_ns : int64 (n,)
+        Not decreasing; equal times keep the order of the file.
+    columns : dict[str, float64 (n,)]
+        By contract column name, in the units of the file; NaN where no number stands.
+    names : dict[str, str]
+        What each column is called in the file.
+    quality : dict[str, uint8 (n,)]
+        A `Quality` per value, for columns beside which the file has one.
+    notes : tuple of str
+        Sentences about what had to be understood or left out.
+    bad_cells : dict[str, int]
+        Cells that are not empty and hold no number, by contract column name.
+    bad_times : int
+        Rows left out because their time cannot be read.
+    units : dict[str, str]
+        The unit the file names, by contract column name.
+    grounds : dict[str, str]
+        Why a column was taken for what it is, where that had to be found out.
+    ignored : tuple of str
+        Columns (of a long table: tags) that were not used.
+    present : dict[str, bool (n,)]
+        Of a long table: which rows have a value of this signal at all.
+    """
+
+    path: str
+    time_ns: IntArray
+    columns: dict[str, FloatArray]
+    names: dict[str, str]
+    quality: dict[str, ByteArray]
+    notes: tuple[str, ...]
+    bad_cells: dict[str, int]
+    bad_times: int = 0
+    units: dict[str, str] = field(default_factory=dict)
+    grounds: dict[str, str] = field(default_factory=dict)
+    ignored: tuple[str, ...] = ()
+    present: dict[str, BoolArray] = field(default_factory=dict)
+
+    def readings(self) -> Readings:
+        """Return the values one by one, in the order of time."""
+        by_signal = {signal_of(name): column for name, column in self.columns.items()}
+        quality = {signal_of(name): codes for name, codes in self.quality.items()}
+        table = SampleTable.from_columns(self.time_ns, by_signal, quality)
+        if not self.present:
+            return table_to_readings(table)
+        order = [signal_of(name) for name in self.present]
+        there = np.column_stack([self.present[name] for name in self.present])
+        row, column = np.nonzero(there)
+        signal = np.array(order, dtype=np.int8)[column]
+        return Readings(
+            table.time_ns[row], signal, table.values[row, signal], table.quality[row, signal]
+        )
+
+
+def read_table(
+    path: str | Path,
+    columns: Mapping[str, str] | None = None,
+    absent: Collection[str] = (),
+    options: TableOptions = AS_SEEN,
+) -> RawTable:
+    """Return the table in a file.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``.csv`` and the like (any common separator, encoding and decimal
+        mark), ``.xlsx`` or ``.parquet``; a column a signal, or a row a value.
+    columns : mapping of str to str, optional
+        Contract name, also ``time`` and ``date``, to their column. Signals that
+        are not named are found by the names and units of the columns.
+    absent : collection of str
+        Contract names that need not be there.
+    options : TableOptions
+        What the table does not say itself.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not a table that can be read.
+    InputError
+        If a column is missing or could be several, or a contract name is unknown.
+    """
+    return whole_table(TableReader(Path(path), columns or {}, absent, options))
+
+
+def whole_table(reader: TableReader) -> RawTable:
+    """Return all blocks of a table in the order of time; raises like `read_table`."""
+    blocks = list(reader.blocks())
+    notes = reader.notes()
+    raw = RawTable(
+        str(reader.path),
+        np.concatenate([block.time_ns for block in blocks]),
+        {n: np.concatenate([b.columns[n] for b in blocks]) for n in reader.names},
+        dict(reader.names),
+        {n: np.concatenate([b.quality[n] for b in blocks]) for n in blocks[0].quality},
+        (),
+        reader.bad_cells,
+        reader.bad_times,
+        dict(reader.units),
+        dict(reader.grounds),
+        reader.ignored,
+        {n: np.concatenate([b.present[n] for b in blocks]) for n in blocks[0].present},
+    )
+    return _ordered(raw, notes)
+
+
+def open_table(
+    path: Path,
+    columns: Mapping[str, str],
+    absent: Collection[str] = (),
+    options: TableOptions = AS_SEEN,
+) -> LogContents:
+    """Return a table as a log; raises like `read_table`."""
+    reader = TableReader(path, columns, absent, options)
+    raw = whole_table(reader)
+    readings = raw.readings()
+    return LogContents(
+        raw.path,
+        readings,
+        readings.time_ns,
+        signals={signal_of(name): theirs for name, theirs in raw.names.items()},
+        warnings=raw.notes,
+        start_ns=int(raw.time_ns[0]),
+        end_ns=int(raw.time_ns[-1]),
+        units={signal_of(name): unit for name, unit in raw.units.items()},
+        grounds={signal_of(name): ground for name, ground in raw.grounds.items()},
+        understood=reader.understood(),
+    )
+
+
+def order_note(newest_first: bool) -> str:
+    """Return the sentence for rows that had to be sorted."""
+    kind = 'newest first' if newest_first else 'not in the order of time'
+    return f'The rows stood {kind} and were sorted.'
+
+
+def _ordered(raw: RawTable, notes: list[str]) -> RawTable:
+    """Return the rows in the order of time."""
+    steps = np.diff(raw.time_ns)
+    if not (steps < 0).any():
+        return replace(raw, notes=tuple(notes))
+    newest_first = bool((steps <= 0).all())
+    order = np.arange(len(raw.time_ns))
+    if newest_first:
+        order = order[::-1]
+    order = order[np.argsort(raw.time_ns[order], kind='stable')]
+    if not raw.present:
+        notes = [*notes, order_note(newest_first)]
+    return replace(
+        raw,
+        time_ns=raw.time_ns[order],
+        columns={name: column[order] for name, column in raw.columns.items()},
+        quality={name: codes[order] for name, codes in raw.quality.items()},
+        notes=tuple(notes),
+        present={name: there[order] for name, there in raw.present.items()},
+    )

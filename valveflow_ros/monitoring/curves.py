@@ -1,0 +1,291 @@
+"""The curve that predicts, what it is worth, and why."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Sequence
+
+import numpy as np
+
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.characteristic_json import from_json, to_json
+from valveflow_ros.curve.shift import Shift, ShiftLimits, judge_shift
+from valveflow_ros.errors import DataError
+from valveflow_ros.monitoring.alarms import AlarmChange, ShiftAlarm
+from valveflow_ros.monitoring.prediction import PredictionBlock, Predictor, no_prediction
+from valveflow_ros.monitoring.rows import Rows
+from valveflow_ros.parameters import Settings
+from valveflow_ros.records import NS_PER_S, ByteArray, IntArray, SpecialSegment
+from valveflow_ros.segments.window import RollingWindow
+from valveflow_ros.state import State
+
+# What the running curve is worth.
+
+
+class CurveStatus(enum.IntEnum):
+    """What can be said of the running curve; the same numbers stand in the message.
+
+    `STALE`: there is a curve, but the last fit was refused or the clock went
+    back. `REFUSED`: there is none, and the last fit was refused.
+    """
+
+    UNKNOWN = 0
+    FRESH = 1
+    STALE = 2
+    REFUSED = 3
+
+
+class CurveInForce:
+    """Holds the running curve and its predictor.
+
+    Parameters
+    ----------
+    settings : Settings
+
+    Attributes
+    ----------
+    status : CurveStatus
+    cause : str
+        Why there is no curve, or only a stale one; empty if it is fresh.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._predictor: Predictor | None = None
+        self.status = CurveStatus.UNKNOWN
+        self.cause = 'No curve yet: not enough special segments.'
+
+    @property
+    def characteristic(self) -> Characteristic | None:
+        """Return the running curve."""
+        return None if self._predictor is None else self._predictor.characteristic
+
+    def configure(self, settings: Settings) -> None:
+        """Take settings of which only live ones differ."""
+        self._settings = settings
+        if self._predictor is not None:
+            self._predictor.limit_mw = settings.real('alarm_limit')
+
+    def adopt(self, characteristic: Characteristic, window: RollingWindow) -> None:
+        """Predict from another curve; the evidence that the last one had gathered stays."""
+        before, self._predictor = self._predictor, Predictor.of(characteristic, self._settings)
+        if before is not None:
+            self._predictor.follow(before)
+        self._predictor.warm_up(*window.tail(self._predictor.warm_up_rows))
+        self.status, self.cause = CurveStatus.FRESH, ''
+
+    def refuse(self, reason: str) -> None:
+        """Keep the old curve as stale, if there is one."""
+        self.status = CurveStatus.REFUSED if self._predictor is None else CurveStatus.STALE
+        self.cause = reason
+
+    def restart(self, reason: str) -> None:
+        """Begin anew with the curve there is, after the clock went back."""
+        if self._predictor is not None:
+            self._predictor = Predictor.of(self._predictor.characteristic, self._settings)
+            self.status, self.cause = CurveStatus.STALE, reason
+
+    def predict(self, rows: Rows, kinds: ByteArray) -> PredictionBlock:
+        """Predict rows; ``kinds`` are the segmenter's."""
+        columns = rows.time_ns, rows.u, rows.power_mw, kinds
+        if self._predictor is None:
+            return rows.shown(no_prediction(*columns))
+        return rows.shown(self._predictor.predict(*columns))
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        predictor, curve = self._predictor, self.characteristic
+        return {
+            'curve': None if curve is None else to_json(curve),
+            'predictor': None if predictor is None else predictor.snapshot(),
+            'status': int(self.status),
+            'cause': self.cause,
+        }
+
+    def restore(self, saved: State) -> None:
+        """Go on from a snapshot; raises `DataError` if it does not fit."""
+        if saved['curve'] is not None:
+            self._predictor = Predictor.of(from_json(saved['curve']), self._settings)
+            self._predictor.restore(saved['predictor'])
+        self.status, self.cause = CurveStatus(saved['status']), saved['cause']
+
+
+# The reference of the running monitor: kept, and what later curves are judged against.
+
+
+class ReferenceKeeper:
+    """Keep the reference and the alarm on a shift.
+
+    Parameters
+    ----------
+    settings : Settings
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.curve: Characteristic | None = None
+        self.shift: Shift | None = None
+        self.problem = ''
+        self.alarm = ShiftAlarm(settings)
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`. The last judgement is not."""
+        return {
+            'curve': None if self.curve is None else to_json(self.curve),
+            'problem': self.problem,
+            'alarm': self.alarm.snapshot(),
+        }
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state; raises `DataError` if it does not fit."""
+        self.curve = None if saved['curve'] is None else from_json(saved['curve'])
+        self.problem = saved['problem']
+        self.alarm.restore(saved['alarm'])
+
+    def set(self, curve: Characteristic, time_ns: int, settings: Settings) -> list[AlarmChange]:
+        """Judge against ``curve`` from the next adoption on.
+
+        Raises
+        ------
+        DataError
+            The curve's input u is not the one of this monitor.
+        """
+        exponent = settings.real('pressure_exponent')
+        if curve.pressure_exponent != exponent:
+            raise DataError(
+                f'The reference has the pressure exponent {curve.pressure_exponent:g}, the '
+                f'monitor {exponent:g}: their inputs u are not the same thing.'
+            )
+        self.curve = curve
+        self.shift, self.problem = None, ''
+        return self.alarm.end('There is a new reference.', time_ns, curve.model_id, settings)
+
+    def judge(
+        self,
+        current: Characteristic,
+        segments: Sequence[SpecialSegment],
+        time_ns: int,
+        settings: Settings,
+    ) -> tuple[Shift | None, list[AlarmChange]]:
+        """Judge a curve that was adopted; None without a reference it can be compared with.
+
+        Parameters
+        ----------
+        current : Characteristic
+        segments : sequence of SpecialSegment
+            Those of the window, in order of time.
+        time_ns : int
+        settings : Settings
+        """
+        self.shift, self.problem = None, ''
+        if self.curve is None:
+            return None, []
+        limits = ShiftLimits(settings.real('shift_confidence'), settings.real('shift_least'))
+        try:
+            self.shift = judge_shift(self.curve, current, segments, limits)
+        except DataError as error:
+            self.problem = str(error)
+            return None, self.alarm.unjudged(
+                self.problem, time_ns, current.model_id, settings
+            )  # fmt: skip
+        return self.shift, self.alarm.judge(self.shift, time_ns, settings)
+
+
+# When a fit is to be asked for, and which outcome is awaited.
+
+
+class Refits:
+    """Counts segments and time towards the next request, and names requests.
+
+    A request's name is the time of the row after which it was made.
+    """
+
+    def __init__(self) -> None:
+        self.pending_ns: int | None = None
+        self._last_ns: int | None = None
+        self._later_ns: int | None = None
+        self._last_name_ns = 0
+        self._segments_at_request = 0
+        self.segments_seen = 0
+
+    def rows_until_due(self, time_ns: IntArray, settings: Settings) -> tuple[int, bool]:
+        """Return how many rows to take before the period is over, and whether it is among them."""
+        if self._last_ns is None:
+            self._last_ns = int(time_ns[0])
+        elif time_ns[0] < self._last_ns:
+            # The clock went back, and the period is not to last the longer for it; but should it
+            # come again, the period is not over at once.
+            self._later_ns, self._last_ns = self._last_ns, int(time_ns[0])
+        over = len(time_ns)
+        if self._later_ns is not None:
+            over = int(np.searchsorted(time_ns, self._later_ns, side='right'))
+            if over == 0:
+                self._last_ns, self._later_ns, over = self._later_ns, None, len(time_ns)
+        period_ns = round(settings.real('refit_period') * NS_PER_S)
+        if period_ns == 0:
+            return over, False
+        due = int(np.searchsorted(time_ns, self._last_ns + period_ns, side='left'))
+        return (due + 1, True) if due < over else (over, False)
+
+    def due(self, last_ns: int, closed: bool, by_time: bool, settings: Settings) -> bool:
+        """Tell whether the time or the segments since the last request ask for one.
+
+        Parameters
+        ----------
+        last_ns : int
+            Time of the newest row.
+        closed : bool
+            A segment closed at it.
+        by_time : bool
+            The period ended at it.
+        """
+        if by_time:
+            self._last_ns = last_ns
+        if self.pending_ns is not None or settings.real('refit_period') <= 0.0:
+            return False
+        new = self.segments_seen - self._segments_at_request
+        wanted = settings.whole('refit_segments')
+        return (by_time and new > 0) or (closed and wanted > 0 and new >= wanted)
+
+    def ask(self, last_ns: int) -> int:
+        """Note a request made now; return its name."""
+        # After the clock went back names must not come again.
+        self.pending_ns = max(last_ns, self._last_name_ns + 1)
+        self._last_name_ns = self.pending_ns
+        self._last_ns, self._later_ns = last_ns, None
+        self._segments_at_request = self.segments_seen
+        return self.pending_ns
+
+    def settle(self, request_ns: int) -> bool:
+        """Take an outcome; tell whether it was awaited."""
+        if request_ns != self.pending_ns:
+            return False
+        self.pending_ns = None
+        return True
+
+    def ask_again(self) -> None:
+        """Wait no longer for the outcome that was asked for; its segments count as new."""
+        if self.pending_ns is not None:
+            self.pending_ns = None
+            self.owe()
+
+    def owe(self) -> None:
+        """Let the segments of the last request count as new."""
+        self._segments_at_request = min(self._segments_at_request, self.segments_seen - 1)
+
+    def snapshot(self) -> State:
+        """Return what is remembered; see `core.state`."""
+        return {
+            'pending_ns': self.pending_ns,
+            'last_ns': self._last_ns,
+            'later_ns': self._later_ns,
+            'last_name_ns': self._last_name_ns,
+            'segments_at_request': self._segments_at_request,
+            'segments_seen': self.segments_seen,
+        }
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state."""
+        self.pending_ns, self._last_ns = saved['pending_ns'], saved['last_ns']
+        self._later_ns, self._last_name_ns = saved['later_ns'], saved['last_name_ns']
+        self._segments_at_request = saved['segments_at_request']
+        self.segments_seen = saved['segments_seen']

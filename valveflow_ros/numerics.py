@@ -1,0 +1,207 @@
+"""The one place where numba's flags are chosen."""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+from collections.abc import Callable, Generator, Iterable, Iterator
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+
+from valveflow_ros.records import FloatArray
+
+# No fastmath: it lets NaN disappear and reorders the sums that tests compare.
+JIT: dict[str, Any] = {'cache': True, 'nogil': True}
+
+_Function = TypeVar('_Function', bound=Callable[..., Any])
+
+
+def jit(function: _Function) -> _Function:
+    """Compile a loop over arrays, keeping its type for the checker."""
+    return cast(_Function, numba.njit(**JIT)(function))
+
+
+# A division by zero gives inf or NaN here instead of an exception, whose test
+# would keep a loop from being turned into SIMD instructions.
+_KERNEL_JIT: dict[str, Any] = {**JIT, 'error_model': 'numpy'}
+
+
+def kernel(function: _Function) -> _Function:
+    """Compile a loop made for SIMD: like `jit`, with IEEE division."""
+    return cast(_Function, numba.njit(**_KERNEL_JIT)(function))
+
+
+# Not callable from Python, which saves compiling a wrapper for each.
+_INLINED_JIT: dict[str, Any] = {
+    **_KERNEL_JIT,
+    'forceinline': True,
+    'no_cpython_wrapper': True,
+    'no_cfunc_wrapper': True,
+}
+
+
+def inlined(function: _Function) -> _Function:
+    """Compile a part of a `kernel` into its caller.
+
+    A call that hands over records of arrays costs more than a short loop does:
+    every array is passed as seven numbers and its reference count goes up and down.
+    """
+    return cast(_Function, numba.njit(**_INLINED_JIT)(function))
+
+
+# Plain threads for kernels that release the interpreter lock.
+
+
+T = TypeVar('T')
+_END = object()
+# How often a thread that waits for room looks whether it is still wanted.
+_LOOK_S = 0.2
+
+
+def cores() -> int:
+    """Return how many cores this process may use.
+
+    ``NUMBA_NUM_THREADS`` sets a limit, as it does to the compiler's own threads: a monitor's
+    worker leaves all cores but one to others.
+    """
+    have = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()
+    told = os.environ.get('NUMBA_NUM_THREADS', '')
+    return max(1, min(have or 1, int(told) if told.isdecimal() else have or 1))
+
+
+def runs(count: int, length: int) -> list[tuple[int, int]]:
+    """Cut ``range(count)`` into runs of at most ``length``, the last one first."""
+    return [(first, min(first + length, count)) for first in range(0, count, length)][::-1]
+
+
+def share(work: Callable[..., Any], tasks: Iterable[tuple[int, ...]], threads: int) -> None:
+    """Call ``work(*task)`` for every task, on ``threads`` threads; 1 starts none.
+
+    Unlike the compiler's own parallel loops this may happen in several places
+    of a process at the same time, costs microseconds to start, and leaves no
+    pool behind that a fork would break. A task's error is raised here once all
+    threads have stopped.
+    """
+    waiting = list(tasks)
+    todo = iter(waiting)
+    lock = threading.Lock()
+    errors: list[BaseException] = []
+
+    def loop() -> None:
+        while not errors:
+            with lock:
+                task = next(todo, None)
+            if task is None:
+                return
+            try:
+                work(*task)
+            except BaseException as error:  # noqa: BLE001 - raised again below
+                errors.append(error)
+
+    helpers = [
+        threading.Thread(target=loop, daemon=True) for _ in range(min(threads, len(waiting)) - 1)
+    ]
+    for helper in helpers:
+        helper.start()
+    loop()
+    for helper in helpers:
+        helper.join()
+    if errors:
+        raise errors[0]
+
+
+def ahead(items: Iterator[T], depth: int = 2) -> Iterator[T]:
+    """Return the same items, made in a thread while the last ones are worked on.
+
+    At most ``depth`` of them wait. Where there is one core, they are made when asked for. An
+    error comes where it would have come; who stops early stops the thread.
+    """
+    return items if cores() < 2 else _made_ahead(items, depth)
+
+
+def _made_ahead(items: Iterator[T], depth: int) -> Generator[T, None, None]:
+    made: queue.Queue[Any] = queue.Queue(depth)
+    unwanted = threading.Event()
+
+    def hand_over(item: object, error: BaseException | None = None) -> bool:
+        while not unwanted.is_set():
+            try:
+                made.put((item, error), timeout=_LOOK_S)
+            except queue.Full:
+                continue
+            return True
+        return False
+
+    def make() -> None:
+        try:
+            for item in items:
+                if not hand_over(item):
+                    return
+        except BaseException as error:  # noqa: BLE001 - raised again where it is waited for
+            hand_over(_END, error)
+        else:
+            hand_over(_END)
+
+    threading.Thread(target=make, daemon=True).start()
+    try:
+        while True:
+            item, error = made.get()
+            if error is not None:
+                raise error
+            if item is _END:
+                return
+            yield item
+    finally:
+        unwanted.set()
+
+
+# Long sums that come out alike whatever the number of threads.
+#
+# The linear algebra library splits long dot products over threads, so its last
+# bits depend on how many there are. A fit must give the same bits in the
+# worker of a live run and in a replay, so what runs over samples runs here.
+
+
+@jit
+def gram(table: FloatArray) -> FloatArray:
+    """Return ``table.T @ table``; table (m, P), result (P, P)."""
+    columns = table.shape[1]
+    out = np.zeros((columns, columns))
+    for t in range(table.shape[0]):
+        for p in range(columns):
+            value = table[t, p]
+            for q in range(p + 1):
+                out[p, q] += value * table[t, q]
+    for p in range(columns):
+        for q in range(p):
+            out[q, p] = out[p, q]
+    return out
+
+
+@jit
+def product(table: FloatArray, matrix: FloatArray) -> FloatArray:
+    """Return ``table @ matrix``; table (m, P), matrix (P, Q), result (m, Q)."""
+    out = np.zeros((table.shape[0], matrix.shape[1]))
+    for t in range(table.shape[0]):
+        for p in range(table.shape[1]):
+            value = table[t, p]
+            for q in range(matrix.shape[1]):
+                out[t, q] += value * matrix[p, q]
+    return out
+
+
+@jit
+def running_average(values: FloatArray, forget: float) -> FloatArray:
+    """Return the exponential average of ``values`` (n,) after each, begun at zero, shape (n,).
+
+    Each step keeps ``forget`` (0 to 1) of the average before.
+    """
+    out = np.empty(values.size)
+    average = 0.0
+    for t in range(values.size):
+        average = forget * average + (1.0 - forget) * values[t]
+        out[t] = average
+    return out

@@ -1,0 +1,442 @@
+"""One layer of the exact search: the best last break for every end.
+
+Ends are taken a group at a time, from left to right within a run of groups. A
+group first tries the breaks that were best for the group before it, which
+nearly always are best again, and then goes through all candidate breaks from
+right to left, a node of the tree at a time. A node whose lower bound
+(`partition_bounds`) is no better than what is known for any end of the group
+is passed over; otherwise its children are looked at, and of a leaf every
+single candidate, first by the same kind of bound and only then end by end.
+
+The moments of the core, from the end of the current node to the beginning of
+the group, are carried along and only ever added to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from valveflow_ros.numerics import inlined, kernel, runs, share
+from valveflow_ros.partition.bounds import SLOTS, fill_leaf_bounds, fill_node_bounds, make_priors
+from valveflow_ros.partition.group import (
+    Group,
+    Near,
+    fill_near,
+    make_near,
+    new_group,
+    open_group,
+    refer,
+    refer_nowhere,
+    refresh,
+    search_near,
+    tail_part,
+    try_break,
+)
+from valveflow_ros.partition.moments import (
+    BRANCH,
+    LEAF,
+    Moments,
+    Tree,
+    build_tree,
+    fit,
+    joined,
+    leaf_moments,
+    node_moments,
+    stretch_moments,
+)
+from valveflow_ros.records import FloatArray, IntArray
+
+# Breaks that the first group of a run begins with, for lack of a group before it.
+_FIRST_SEEDS = 48
+# How many times longer the core must be before the tail's reference line is renewed.
+_RENEW = 4.0
+
+
+class Layer(NamedTuple):
+    """What the search of one layer reads, besides the tree.
+
+    Attributes
+    ----------
+    pieces : int
+        Number of pieces of this layer.
+    shortest : int
+        Smallest number of samples in a piece.
+    slack : float
+        A bound counts as reached when it comes within ``slack`` >= 0.
+    limit : float
+        Reference lines do not leave ``[-limit, limit]``.
+    near : Near
+    prior : float64 (nodes, SLOTS, 5)
+    before : float64 (ends,)
+        Costs of the layer before, indexed by end.
+    bound : float64 (nodes, SLOTS, 5)
+    """
+
+    pieces: int
+    shortest: int
+    slack: float
+    limit: float
+    near: Near
+    prior: FloatArray
+    before: FloatArray
+    bound: FloatArray
+
+
+@inlined
+def _mark_candidates(
+    tree: Tree, layer: Layer, block: int, core: Moments, shift: float, group: Group
+) -> int:
+    """Flag a leaf's candidates whose bound leaves room for improvement; return how many."""
+    t = tree.leaf[block]
+    a, b, lo1, hi1, lo2, hi2, least, width = (
+        group.line[0], group.line[1], group.line[2], group.line[3],
+        group.line[4], group.line[5], group.line[6], group.line[7],
+    )  # fmt: skip
+    room = -layer.slack - least
+    before = layer.before[LEAF * block : LEAF * block + LEAF]
+    keep = group.keep
+    kept = 0
+    for i in range(t.shape[1]):
+        n = core[0] + t[0, i]
+        x1 = core[1] + (t[1, i] + shift * t[0, i])
+        x2 = core[2] + (t[2, i] + shift * (2.0 * t[1, i] + shift * t[0, i]))
+        y = core[3] + t[3, i]
+        xy = core[4] + (t[4, i] + shift * t[3, i])
+        yy = core[5] + t[5, i]
+        each = 1.0 / n
+        sxx = x2 - x1 * x1 * each
+        sxy = xy - x1 * y * each
+        firm = sxx > 1e-10 * x2
+        slope = sxy / sxx if firm else 0.0
+        cost = (yy - y * y * each) - slope * sxy
+        cost = cost if firm and cost > 0.0 else 0.0
+        da = (y - slope * x1) * each - a
+        db = da + width * (slope - b)
+        box = min(lo1 * da, hi1 * da) + min(lo2 * db, hi2 * db)
+        possible = (before[i] + cost + box < room) | (not firm)
+        keep[i] = possible
+        kept += possible
+    return kept
+
+
+@inlined
+def _search_leaf(
+    tree: Tree, layer: Layer, block: int, leaf: int, core: Moments, group: Group
+) -> None:
+    """Try the breaks of one leaf on the ends of the group that begins at ``block``."""
+    shift = tree.x[LEAF * block - 1] - tree.x[LEAF * leaf + LEAF - 1]
+    kept = _mark_candidates(tree, layer, leaf, core, shift, group)
+    if kept > 2 and leaf < block - 1:
+        # A reference line of these very candidates leaves less to the box of slopes.
+        _, value, slope, firm = fit(joined(leaf_moments(tree, leaf, LEAF // 2), shift, core))
+        if firm:
+            refer(group, core, value, slope, layer.limit)
+            kept = _mark_candidates(tree, layer, leaf, core, shift, group)
+    if kept == 0:
+        return
+    better = False
+    for i in range(LEAF):
+        break_ = LEAF * leaf + i
+        first = break_ + layer.shortest - 1 - LEAF * block
+        if group.keep[i] and first < LEAF:
+            m = joined(leaf_moments(tree, leaf, i), shift, core)
+            better |= try_break(group, m, layer.before[break_], break_, first)
+    if better:
+        refresh(group)
+
+
+@inlined
+def _node_part(
+    tree: Tree, layer: Layer, level: int, end: int, size: int, wide: int, right: float,
+    slope: float,
+) -> float:  # fmt: skip
+    """Lower bound of a node's part about the core's line, whose value at its end is ``right``."""
+    number = tree.start[level] + end // size - 1
+    slot = min(wide - level, SLOTS - 1) if wide > level else 0
+    b = layer.bound[number, slot]
+    if slot == 0 or b[0] == np.inf:
+        return float(b[0])
+    width = tree.x[LEAF * end - 1] - tree.x[LEAF * (end - size)]
+    dr = right - layer.prior[number, slot, 3]
+    dl = dr + width * (slope - layer.prior[number, slot, 4])
+    return float(b[0] + (min(b[1] * dr, b[2] * dr) + min(b[3] * dl, b[4] * dl)))
+
+
+@kernel
+def _descend(tree: Tree, layer: Layer, block: int, group: Group) -> int:
+    """Go through all breaks left of a group, near ones first; return the leaves opened."""
+    origin = tree.x[LEAF * block - 1]
+    core = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    end = block
+    wide = 0  # windows of BRANCH ** (wide - 1) blocks fit between the node and the group
+    next_wide = 1
+    renewed = 0.0
+    leaves = 0
+    refer_nowhere(group)
+    while end > 0:
+        cost = value = slope = 0.0
+        firm = True
+        if end < block:
+            cost, value, slope, firm = fit(core)
+            if block - end >= _RENEW * renewed and firm:
+                refer(group, core, value, slope, layer.limit)
+                renewed = float(block - end)
+            while block - end >= next_wide:
+                wide += 1
+                next_wide *= BRANCH
+        level = 0
+        size = 1
+        while level < tree.levels - 1 and end % (BRANCH * size) == 0:
+            level += 1
+            size *= BRANCH
+        right = value + slope * (origin - tree.x[LEAF * end - 1])
+        rest = cost + layer.slack + tail_part(group, value, slope)
+        while True:
+            part = _node_part(tree, layer, level, end, size, wide, right, slope)
+            # Without a line of the core there is nothing to bound about.
+            drop = firm and part + rest >= 0.0
+            if drop or level == 0:
+                break
+            level -= 1
+            size //= BRANCH
+        if not drop:
+            leaves += 1
+            _search_leaf(tree, layer, block, end - 1, core, group)
+        number = tree.start[level] + end // size - 1
+        core = joined(node_moments(tree, number), origin - tree.node[number, 6], core)
+        end -= size
+    return leaves
+
+
+@kernel
+def _sow(tree: Tree, layer: Layer, block: int, seeds: IntArray, count: int, group: Group) -> None:
+    """Try the breaks that were best for the group before this one."""
+    for q in range(count):
+        break_ = seeds[q]
+        m = stretch_moments(tree, break_, block)
+        first = break_ + layer.shortest - 1 - LEAF * block
+        try_break(group, m, layer.before[break_], break_, first)
+
+
+@inlined
+def _harvest(group: Group, seeds: IntArray) -> int:
+    """Collect the different breaks of a group; return how many."""
+    count = 0
+    last = -1
+    for k in range(LEAF):
+        if group.breaks[k] != last and group.breaks[k] >= 0:
+            last = group.breaks[k]
+            seeds[count] = last
+            count += 1
+    return count
+
+
+@kernel
+def search_groups(
+    tree: Tree,
+    layer: Layer,
+    first: int,
+    last: int,
+    after: FloatArray,
+    breaks: NDArray[np.int32],
+) -> int:
+    """Fill ``after`` and ``breaks`` for the ends of the groups ``[first, last)``.
+
+    Parameters
+    ----------
+    after : float64 (ends,)
+        Cost of the best ``layer.pieces`` pieces up to each end; inf where impossible.
+    breaks : int32 (ends,)
+        Where the last of them begins; -1 where impossible.
+
+    Returns
+    -------
+    int
+        How many leaves were opened: what the bounds could not decide.
+    """
+    group = new_group()
+    seeds = np.empty(_FIRST_SEEDS + LEAF, np.int64)
+    count = 0
+    step = max(LEAF * first // _FIRST_SEEDS, 1)
+    for break_ in range(step // 2, LEAF * first, step):
+        if layer.before[break_] < np.inf and count < len(seeds):
+            seeds[count] = break_
+            count += 1
+    leaves = 0
+    for block in range(first, last):
+        open_group(tree, block, layer.pieces * layer.shortest, group)
+        if block > 0:
+            _sow(tree, layer, block, seeds, count, group)
+        search_near(
+            tree, layer.near, layer.before, block, layer.shortest, layer.slack,
+            group.best, group.breaks,
+        )  # fmt: skip
+        if block > 0:
+            leaves += _descend(tree, layer, block, group)
+        count = _harvest(group, seeds)
+        for k in range(LEAF):
+            end = LEAF * block + 1 + k
+            after[end] = group.best[k] if group.breaks[k] >= 0 else np.inf
+            breaks[end] = group.breaks[k]
+    return leaves
+
+
+# All layers of the exact dynamic programme, and the way back through them.
+
+
+# Groups that one thread searches before it asks for more. Fixed, so that the
+# result does not depend on the number of threads.
+_RUN = 64
+
+
+class Problem(NamedTuple):
+    """A prepared search: the tree and all else that does not depend on the layer."""
+
+    tree: Tree
+    near: Near
+    prior: FloatArray
+    shortest: int
+    slack: float
+    limit: float
+    threads: int
+
+
+def prepare(
+    x: FloatArray, y: FloatArray, w: FloatArray, shortest: int, slack: float, threads: int
+) -> Problem:
+    """Build the tables for `layers`.
+
+    Parameters
+    ----------
+    x, y, w : float64 (n,)
+        Strictly increasing positions, values, weights > 0.
+    shortest : int
+        Smallest number of samples in a piece, >= 2.
+    slack : float
+        Each layer's cost may exceed the optimum by this much, >= 0.
+    threads : int
+        Threads to use; 1 starts none.
+    """
+    tree = build_tree(x, y, w)
+    near = make_near(len(tree.leaf))
+
+    def fill(first: int, last: int) -> None:
+        fill_near(tree, first, last, near)
+
+    share(fill, runs(len(tree.leaf), _RUN), threads)
+    limit = 2.0 * float(np.abs(y).max())
+    return Problem(tree, near, make_priors(tree, limit), shortest, slack, limit, threads)
+
+
+@kernel
+def _fill_first(tree: Tree, shortest: int, first: int, last: int, after: FloatArray) -> None:
+    """Fill the costs of one piece that begins at the first sample, for a run of groups."""
+    for block in range(first, last):
+        n = x1 = x2 = y1 = xy = yy = 0.0
+        origin = tree.x[0]
+        if block > 0:
+            n, x1, x2, y1, xy, yy = stretch_moments(tree, 0, block)
+            origin = tree.x[LEAF * block - 1]
+        for k in range(LEAF):
+            p = LEAF * block + k
+            d = origin - tree.x[p]
+            w = tree.w[p]
+            y = tree.y[p]
+            n += w
+            x1 += w * d
+            x2 += w * d * d
+            y1 += w * y
+            xy += w * d * y
+            yy += w * y * y
+            cost = 0.0
+            if p >= 2:
+                sxy = xy - x1 * y1 / n
+                sxx = x2 - x1 * x1 / n
+                cost = max(yy - y1 * y1 / n - sxy * sxy / sxx, 0.0)
+            after[p + 1] = cost if shortest <= p + 1 <= tree.n else np.inf
+
+
+def layers(problem: Problem, pieces: int) -> Iterator[tuple[FloatArray, NDArray[np.int32]]]:
+    """Yield for 1, 2, ... ``pieces`` pieces the best cost up to each end, and the last break.
+
+    Of the last layer only the end ``n`` is worked out; the array of costs is
+    used again two layers later. Costs are inf where an end cannot be reached.
+    """
+    tree, threads = problem.tree, problem.threads
+    blocks = len(tree.leaf)
+    before = np.full(LEAF * blocks + 1, np.inf)
+    after = np.full(LEAF * blocks + 1, np.inf)
+    share(_first(problem, after), runs(blocks, _RUN), threads)
+    yield after, np.zeros(len(after), dtype=np.int32)
+    bound = np.empty_like(problem.prior)
+    groups = runs(blocks, _RUN)
+    for j in range(2, pieces + 1):
+        before, after = after, before
+        after[0] = np.inf
+        share(_leaf_bounds(problem, before, bound), runs(blocks, _RUN), threads)
+        for level in range(1, tree.levels):
+            count = int(tree.start[level + 1] - tree.start[level])
+            fill_node_bounds(tree, problem.prior, level, 0, count, bound)
+        layer = Layer(
+            j, problem.shortest, problem.slack, problem.limit, problem.near, problem.prior,
+            before, bound,
+        )  # fmt: skip
+        breaks: NDArray[np.int32] = np.full(len(after), -1, dtype=np.int32)
+        if j == pieces:
+            groups = [((tree.n - 1) // LEAF, (tree.n - 1) // LEAF + 1)]
+        share(_groups(tree, layer, after, breaks), groups, threads)
+        yield after, breaks
+
+
+def _first(problem: Problem, after: FloatArray) -> Callable[[int, int], None]:
+    return lambda a, b: _fill_first(problem.tree, problem.shortest, a, b, after)
+
+
+def _leaf_bounds(
+    problem: Problem, before: FloatArray, bound: FloatArray
+) -> Callable[[int, int], None]:
+    return lambda a, b: fill_leaf_bounds(problem.tree, problem.prior, before, a, b, bound)
+
+
+def _groups(
+    tree: Tree, layer: Layer, after: FloatArray, breaks: NDArray[np.int32]
+) -> Callable[[int, int], int]:
+    return lambda a, b: search_groups(tree, layer, a, b, after, breaks)
+
+
+def best_partitions(problem: Problem, pieces: int) -> tuple[FloatArray, list[IntArray]]:
+    """Solve eqs. (21)-(23) of the paper for 1..``pieces`` pieces.
+
+    Parameters
+    ----------
+    pieces : int
+        With ``pieces * shortest <= n``.
+
+    Returns
+    -------
+    cost : float64 (pieces,)
+    starts : list of int64 arrays
+        ``starts[j - 1]`` holds 0, the first samples of the other pieces, and n.
+    """
+    n = problem.tree.n
+    cost = np.empty(pieces)
+    all_breaks: list[NDArray[np.int32]] = []
+    starts: list[IntArray] = []
+    for j, (after, breaks) in enumerate(layers(problem, pieces), start=1):
+        cost[j - 1] = after[n]
+        all_breaks.append(breaks)
+        starts.append(_way_back(all_breaks, n))
+    return cost, starts
+
+
+def _way_back(breaks: list[NDArray[np.int32]], n: int) -> IntArray:
+    """Follow the recorded breaks from the end to the beginning."""
+    starts = np.empty(len(breaks) + 1, dtype=np.int64)
+    starts[-1] = n
+    for j in range(len(breaks) - 1, -1, -1):
+        starts[j] = breaks[j][starts[j + 1]]
+    return starts

@@ -1,0 +1,253 @@
+"""Effects that are a change in time: drifts, steps, intervals and the daily swing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from valveflow_ros.parameters import Parameter
+from valveflow_ros.plant.effect import (
+    DAY_S,
+    ONSET,
+    Effect,
+    Forcing,
+    Hooks,
+    Values,
+    at_onset,
+    ramp,
+    step,
+)
+from valveflow_ros.records import FloatArray
+
+# The power per flow drifts.
+#
+# Erosion and deposits behind the valve, falling efficiency of the cycle, and a
+# drifting scale of the power transducer are the same to the four signals:
+#
+#     x = F(u) (1 + g t / 10 d),  t from the first row on
+
+
+def install_gain_drift(values: Values, hooks: Hooks) -> None:
+    """Multiply x by a ramp in time."""
+    g = values['g']
+
+    def change(rows: Forcing) -> None:
+        rows.gain[:] *= 1.0 + g * ramp(rows.time_s)
+
+    hooks.forcing.append(change)
+
+
+GAIN_DRIFT = Effect(
+    'gain_drift',
+    'The power belonging to a flow rises or falls steadily.',
+    (Parameter('g', 0.01, '1/(10 d)', 'Relative change in ten days.', -0.2, 0.2),),
+    install_gain_drift,
+)
+
+
+# The power per flow changes at once and stays changed.
+#
+# Maintenance, another power meter, a heater or an extraction taken in or out
+# for good:
+#
+#     x = F(u) (1 + g),  t >= t0
+
+
+def install_gain_step(values: Values, hooks: Hooks) -> None:
+    """Multiply x from the onset on."""
+
+    def change(rows: Forcing) -> None:
+        rows.gain[:] *= 1.0 + values['g'] * step(rows.time_s, values)
+
+    hooks.forcing.append(change)
+
+
+GAIN_STEP = Effect(
+    'gain_step',
+    'The power belonging to a flow changes at one moment.',
+    (Parameter('g', 0.006, '', 'Relative change.', -0.2, 0.2), ONSET),
+    install_gain_step,
+    starts_days=at_onset,
+)
+
+
+# The opening or the pressure is read ever more wrongly, or the seat wears.
+#
+# A drifting scale of the pressure transmitter, a drifting scale of the position
+# sensor and a wearing seat all change u against its reading:
+#
+#     u_true = u (1 + g t / 10 d),  t from the first row on
+
+
+def install_input_drift(values: Values, hooks: Hooks) -> None:
+    """Multiply u by a ramp in time."""
+    g = values['g']
+
+    def change(rows: Forcing) -> None:
+        rows.input_gain[:] *= 1.0 + g * ramp(rows.time_s)
+
+    hooks.forcing.append(change)
+
+
+INPUT_DRIFT = Effect(
+    'input_drift',
+    'The flow area belonging to a reading of u rises or falls steadily.',
+    (Parameter('g', 0.01, '1/(10 d)', 'Relative change in ten days.', -0.2, 0.2),),
+    install_input_drift,
+)
+
+
+# The pressure or position transmitter is recalibrated.
+#
+# From then on the same reading of u stands for another flow area:
+#
+#     u_true = u (1 + g),  t >= t0
+
+
+def install_input_step(values: Values, hooks: Hooks) -> None:
+    """Multiply u from the onset on."""
+
+    def change(rows: Forcing) -> None:
+        rows.input_gain[:] *= 1.0 + values['g'] * step(rows.time_s, values)
+
+    hooks.forcing.append(change)
+
+
+INPUT_STEP = Effect(
+    'input_step',
+    'The flow area belonging to a reading of u changes at one moment.',
+    (Parameter('g', 0.006, '', 'Relative change.', -0.2, 0.2), ONSET),
+    install_input_step,
+    starts_days=at_onset,
+)
+
+
+# The zero of the power drifts.
+#
+# A drifting zero of the power transducer, or auxiliary load that comes and
+# stays, adds the same at any load:
+#
+#     y = G x + b t / 10 d,  t from the first row on
+
+
+def install_output_offset_drift(values: Values, hooks: Hooks) -> None:
+    """Add a ramp in time to the power."""
+    b_mw = values['b_mw']
+
+    def change(rows: Forcing) -> None:
+        rows.offset_mw[:] += b_mw * ramp(rows.time_s)
+
+    hooks.forcing.append(change)
+
+
+OUTPUT_OFFSET_DRIFT = Effect(
+    'output_offset_drift',
+    'The power drifts by the same amount at any load.',
+    (Parameter('b_mw', 2.0, 'MW/(10 d)', 'Change in ten days.', -50.0, 50.0),),
+    install_output_offset_drift,
+)
+
+
+# Now and then part of the steam or of the heat goes elsewhere.
+#
+# An extraction or a feed water heater is in or out of service for hours:
+#
+#     x = F(u) (1 + g w(t)),  w = 0 or 1
+#
+# w begins with 0; how long it stays is drawn uniformly between two bounds, from
+# a generator of its own, so that ``pattern`` names one fixed sequence of times.
+
+
+_HOUR_S = 3600.0
+
+
+def _draw(values: Values) -> Iterator[tuple[float, float]]:
+    """Yield start and end of one interval after the other, in seconds."""
+    rng = np.random.default_rng([int(values['pattern']), 1])
+    end = 0.0
+    while True:
+        start = end + _HOUR_S * rng.uniform(values['off_low_h'], values['off_high_h'])
+        end = start + _HOUR_S * rng.uniform(values['on_low_h'], values['on_high_h'])
+        yield start, end
+
+
+def intervals_s(values: Values, length_s: float) -> FloatArray:
+    """Return start and end of every interval that begins in a run, (k, 2), in seconds."""
+    rows = []
+    for start, end in _draw(values):
+        if start >= length_s:
+            break
+        rows.append((start, end))
+    return np.array(rows).reshape(-1, 2)
+
+
+def install_intervals(values: Values, hooks: Hooks) -> None:
+    """Multiply x inside the intervals."""
+    edges = intervals_s(values, hooks.length_s).ravel()
+
+    def change(rows: Forcing) -> None:
+        inside = np.searchsorted(edges, rows.time_s, side='right') % 2
+        rows.gain[:] *= 1.0 + values['g'] * inside
+
+    hooks.forcing.append(change)
+
+
+def starts_days(values: Values) -> float:
+    """Return when the first interval begins."""
+    return next(_draw(values))[0] / DAY_S
+
+
+def problem(values: Values) -> str:
+    """Say which bounds are the wrong way round."""
+    for state in ('on', 'off'):
+        if values[f'{state}_low_h'] > values[f'{state}_high_h']:
+            return f'{state}_low_h must not exceed {state}_high_h'
+    return ''
+
+
+INTERVALS = Effect(
+    'intervals',
+    'For hours at a time the power belonging to a flow is another one.',
+    (
+        Parameter('g', -0.01, '', 'Relative change inside an interval.', -0.2, 0.2),
+        Parameter('on_low_h', 5.0, 'h', 'Shortest interval.', 0.1, 1000.0),
+        Parameter('on_high_h', 22.0, 'h', 'Longest interval.', 0.1, 1000.0),
+        Parameter('off_low_h', 24.0, 'h', 'Shortest pause.', 0.1, 1000.0),
+        Parameter('off_high_h', 60.0, 'h', 'Longest pause.', 0.1, 1000.0),
+        Parameter('pattern', 1, '', 'Which sequence of times.', 0, 2**31 - 1),
+    ),
+    install_intervals,
+    starts_days=starts_days,
+    problem=problem,
+)
+
+
+# The power follows the time of day.
+#
+# The pressure in the condenser follows the ambient air or the cooling water, and
+# the enthalpy drop follows it. Auxiliary load driven by the weather looks the same.
+#
+#     x = F(u) (1 + a cos(2 pi (t - t_peak) / 24 h)),  t the time of day, UTC
+
+
+def install_diurnal(values: Values, hooks: Hooks) -> None:
+    """Multiply x by a daily wave."""
+    peak_s = values['peak_h'] * 3600.0
+
+    def change(rows: Forcing) -> None:
+        wave = np.cos(2.0 * np.pi * (rows.clock_s - peak_s) / DAY_S)
+        rows.gain[:] *= 1.0 + values['a'] * wave
+
+    hooks.forcing.append(change)
+
+
+DIURNAL = Effect(
+    'diurnal',
+    'The power belonging to a flow rises and falls once a day.',
+    (
+        Parameter('a', 0.005, '', 'Relative amplitude.', -0.2, 0.2),
+        Parameter('peak_h', 5.0, 'h', 'Time of day of the highest power, UTC.', 0.0, 24.0),
+    ),
+    install_diurnal,
+)

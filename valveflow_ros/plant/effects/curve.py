@@ -1,0 +1,77 @@
+"""Effects in the curve itself: a bend, and a valve that no longer takes part."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from valveflow_ros.parameters import Parameter
+from valveflow_ros.plant.effect import DAY_S, ONSET, AddedCurve, Effect, Hooks, Values, at_onset
+
+# The curve has a bend that few straight pieces cannot follow.
+#
+# Where one valve begins to open before the one before it is open, their overlap
+# raises the curve; too little overlap leaves a dent. The bump is a raised cosine:
+#
+#     x = F(u) + h (1 + cos(pi (u - u0) / w)) / 2,  |u - u0| <= w
+
+
+_POINTS = 65
+
+
+def install_curve_shape(values: Values, hooks: Hooks) -> None:
+    """Add the bump to the curve."""
+    place = np.linspace(-1.0, 1.0, _POINTS)
+    bump = 0.5 + 0.5 * np.cos(np.pi * place)
+    bump[[0, -1]] = 0.0
+    u = values['u0'] + values['width_u'] * place
+    hooks.added_curves.append(AddedCurve(u, values['h_mw'] * bump))
+
+
+CURVE_SHAPE = Effect(
+    'curve_shape',
+    'The curve has a bump between its knots.',
+    (
+        Parameter('h_mw', 1.5, 'MW', 'Height of the bump.', -50.0, 50.0),
+        Parameter('u0', 1425.0, '% MPa^(9/8)', 'Its centre.', 0.0, 1e5),
+        Parameter('width_u', 150.0, '% MPa^(9/8)', 'From its centre to its foot.', 1.0, 1e4),
+    ),
+    install_curve_shape,
+)
+
+
+# One of several valves no longer takes part.
+#
+# The curve is the sum of valves that open one after the other. If one of them
+# sticks, breaks its stem, or the order of opening is changed, its share is
+# missing from the openings on where it should have opened:
+#
+#     x = F(u) + s min(max((u - u1) / (u2 - u1), 0), 1),  t >= t0
+
+
+def install_curve_step(values: Values, hooks: Hooks) -> None:
+    """Add the missing share to the curve from the onset on."""
+    u = np.array([values['u_from'], values['u_to']])
+    share = np.array([0.0, values['s_mw']])
+    hooks.added_curves.append(AddedCurve(u, share, values['t0_days'] * DAY_S))
+
+
+def problem(values: Values) -> str:
+    """Say what is wrong with the range of u."""
+    return '' if values['u_from'] < values['u_to'] else 'u_from must be less than u_to'
+
+
+CURVE_STEP = Effect(
+    'curve_step',
+    'At one moment the share of one valve is lost from the curve.',
+    (
+        Parameter('s_mw', -2.5, 'MW', 'Power added where the valve is open.', -50.0, 50.0),
+        Parameter(
+            'u_from', 1450.0, '% MPa^(9/8)', 'Where the valve should begin to open.', 0.0, 1e5
+        ),
+        Parameter('u_to', 1750.0, '% MPa^(9/8)', 'Where it should be open.', 0.0, 1e5),
+        ONSET,
+    ),
+    install_curve_step,
+    starts_days=at_onset,
+    problem=problem,
+)

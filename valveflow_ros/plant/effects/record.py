@@ -1,0 +1,165 @@
+"""Effects of the record alone: another clock, values that stand still, coarse steps, spikes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from valveflow_ros.parameters import Parameter
+from valveflow_ros.plant.effect import (
+    DAY_S,
+    ONSET,
+    SIGNAL,
+    Effect,
+    Hooks,
+    Values,
+    Written,
+    at_onset,
+)
+from valveflow_ros.records import FloatArray
+
+# The power carries stamps of another clock.
+#
+#     y in the row of time t was measured at t + d
+#
+# With d > 0 the answer seems to come before its cause. Power and its noise move
+# together; the control of the unit, which reads no stamps, does not notice.
+
+
+def install_clock(values: Values, hooks: Hooks) -> None:
+    """Shift the stamps of the power."""
+    hooks.claim('clock')
+    hooks.lead_s = values['d_s']
+
+
+CLOCK = Effect(
+    'clock',
+    'The power is stamped earlier (or later) than it was measured.',
+    (Parameter('d_s', 12.0, 's', 'How much too early; negative: too late.', -600.0, 600.0),),
+    install_clock,
+)
+
+
+# A record that stands still: a stuck transmitter or a gateway that repeats itself.
+#
+# From the onset the last value is written again and again; the plant goes on.
+
+
+def install_flatline(values: Values, hooks: Hooks) -> None:
+    """Hold the recorded value for a while."""
+    signal, start = values.signal(), values['t0_days'] * DAY_S
+    end = start + values['minutes'] * 60.0
+    held = np.nan
+
+    def change(rows: Written) -> None:
+        nonlocal held
+        first, last = np.searchsorted(rows.time_s, (start, end))
+        if first < last:
+            column = rows.columns[signal]
+            held = column[first] if np.isnan(held) else held
+            column[first:last] = held
+
+    hooks.writing.append(change)
+
+
+FLATLINE = Effect(
+    'flatline',
+    'A recorded signal stands still for a while.',
+    (
+        SIGNAL,
+        Parameter('minutes', 120.0, 'min', 'How long.', 0.0, 1e6),
+        ONSET,
+    ),
+    install_flatline,
+    starts_days=at_onset,
+)
+
+
+# A record with a coarse step: few bits, or a historian's dead band.
+#
+# Every value is rounded to the nearest multiple of ``step``.
+
+
+def install_quantisation(values: Values, hooks: Hooks) -> None:
+    """Round the recorded values coarsely."""
+    signal, step = values.signal(), values['step']
+    if step == 0.0:
+        return
+
+    def change(rows: Written) -> None:
+        rows.columns[signal] = step * np.round(rows.columns[signal] / step)
+
+    hooks.writing.append(change)
+
+
+QUANTISATION = Effect(
+    'quantisation',
+    'A recorded signal has a coarse step.',
+    (
+        SIGNAL,
+        Parameter('step', 5.0, "the signal's", 'Step of the record; 0: none.', 0.0, 100.0),
+    ),
+    install_quantisation,
+)
+
+
+# Single wild values in a record: disturbed transmission.
+#
+# Their times are a Poisson process and their signs random, drawn from a
+# generator of their own, so that ``pattern`` names one fixed set of them.
+
+
+def _draw(values: Values) -> Iterator[tuple[float, float]]:
+    """Yield time in seconds and sign of one spike after the other."""
+    rng = np.random.default_rng([int(values['pattern']), 2])
+    now = 0.0
+    while True:
+        now += DAY_S * rng.exponential(1.0 / values['per_day'])
+        yield now, 1.0 if rng.random() < 0.5 else -1.0
+
+
+def spikes(values: Values, length_s: float) -> FloatArray:
+    """Return time in seconds and sign of every spike of a run, (k, 2)."""
+    rows = []
+    for now, sign in _draw(values):
+        if now >= length_s:
+            break
+        rows.append((now, sign))
+    return np.array(rows).reshape(-1, 2)
+
+
+def install_spikes(values: Values, hooks: Hooks) -> None:
+    """Add the spikes to the recorded signal."""
+    signal = values.signal()
+    h = hooks.unit.sample_period_s
+    drawn = spikes(values, hooks.length_s)
+    row_of_spike, sign = np.floor(drawn[:, 0] / h), drawn[:, 1]
+
+    def change(rows: Written) -> None:
+        if rows.time_s.size == 0:
+            return
+        place = row_of_spike - round(rows.time_s[0] / h)
+        here = (place >= 0) & (place < rows.time_s.size)
+        np.add.at(rows.columns[signal], place[here].astype(int), values['height'] * sign[here])
+
+    hooks.writing.append(change)
+
+
+def starts_days(values: Values) -> float:
+    """Return when the first spike comes."""
+    return next(_draw(values))[0] / DAY_S
+
+
+SPIKES = Effect(
+    'spikes',
+    'A recorded signal has single wild values.',
+    (
+        SIGNAL,
+        Parameter('height', 20.0, "the signal's", 'Height, up or down.', 0.0, 1e4),
+        Parameter('per_day', 10.0, '1/d', 'How many a day on average.', 0.01, 10_000.0),
+        Parameter('pattern', 1, '', 'Which set of times and signs.', 0, 2**31 - 1),
+    ),
+    install_spikes,
+    starts_days=starts_days,
+)

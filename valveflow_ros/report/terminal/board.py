@@ -1,0 +1,182 @@
+"""Keeps what a terminal view needs of a monitor's messages, and no more than that."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from valveflow_ros.records import NS_PER_S
+from valveflow_ros.report.terminal.frame import (
+    AlarmView,
+    CurveView,
+    DiagnosisView,
+    Frame,
+    HealthView,
+    SampleView,
+)
+
+CURVE = 'valveflow_msgs/msg/FlowCharacteristic'
+PREDICTION = 'valveflow_msgs/msg/Prediction'
+ALARM = 'valveflow_msgs/msg/Alarm'
+DIAGNOSIS = 'valveflow_msgs/msg/Diagnosis'
+HEALTH = 'diagnostic_msgs/msg/DiagnosticArray'
+AGE = 'Age of the curve (s)'
+# A quarter of an hour at one sample a second: more than fits on any terminal.
+KEPT = 900
+
+Fields = Mapping[str, Any]
+
+
+class Board:
+    """The state of a monitor as its messages tell it, in bounded memory.
+
+    Messages are taken as mappings from field to value, whatever brought them.
+
+    Attributes
+    ----------
+    inputs : tuple of HealthView
+        Set by whoever knows better than `/diagnostics`.
+    recorder : HealthView or None
+        The same.
+    """
+
+    def __init__(self) -> None:
+        self.inputs: tuple[HealthView, ...] = ()
+        self.recorder: HealthView | None = None
+        self._unit = ''
+        # The tag of what the monitor publishes, and of the health that was taken; None: no word.
+        self._tag: str | None = None
+        self._health_tag: str | None = None
+        self._now_ns = 0
+        self._curve: CurveView | None = None
+        self._diagnosis: DiagnosisView | None = None
+        self._samples: deque[SampleView] = deque(maxlen=KEPT)
+        self._alarms: dict[str, AlarmView] = {}
+
+    def take(self, type_name: str, fields: Fields) -> None:
+        """Take a message; one of another type changes nothing."""
+        if type_name == PREDICTION:
+            self._sample(fields)
+        elif type_name == CURVE:
+            self._head(fields)
+            self._curve = _curve(fields)
+            self.at(self._curve.window[1])
+        elif type_name == ALARM:
+            self._alarm(fields)
+        elif type_name == DIAGNOSIS:
+            self._head(fields)
+            self._diagnosis = DiagnosisView(
+                int(fields['verdict']), str(fields['sentence']).strip(),
+                tuple(str(cause['name']) for cause in fields['causes']),
+                stamp_ns(fields['header']['stamp']),
+            )  # fmt: skip
+        elif type_name == HEALTH:
+            self._health(fields)
+
+    def frame(self, source: str, note: str = '') -> Frame:
+        """Return what is known now."""
+        return Frame(
+            self._unit, source, self._now_ns, note, self._curve,
+            self._samples[-1] if self._samples else None, tuple(self._samples),
+            tuple(self._alarms[name] for name in sorted(self._alarms)), self.inputs,
+            self.recorder, self._diagnosis,
+        )  # fmt: skip
+
+    def at(self, time_ns: int) -> None:
+        """Take note of the plant's time where no prediction tells it."""
+        self._now_ns = max(self._now_ns, time_ns)
+
+    def _head(self, fields: Fields) -> int:
+        self._tag = str(fields['header']['frame_id'])
+        if self._health_tag not in (None, self._tag):
+            # It came before it was known which monitor of several this is.
+            self.inputs, self.recorder, self._health_tag = (), None, None
+        self._unit = self._tag or self._unit
+        return stamp_ns(fields['header']['stamp'])
+
+    def _sample(self, fields: Fields) -> None:
+        time_ns = self._head(fields)
+        if time_ns < self._now_ns and self._samples:
+            # The clock went back: what was drawn before does not belong beside it.
+            self._samples.clear()
+        # An alarm is never later than the sample that brought it.
+        self._now_ns = time_ns
+        measured, residual = float(fields['measured_mw']), float(fields['residual_mw'])
+        expected = measured - residual
+        self._samples.append(
+            SampleView(
+                time_ns, int(fields['state']), float(fields['integrated_input']), measured,
+                residual, float(fields['average_mw']), float(fields['limit_low_mw']) - expected,
+                float(fields['limit_high_mw']) - expected,
+                float(fields.get('alarm_evidence', math.nan)),
+            )
+        )  # fmt: skip
+
+    def _alarm(self, fields: Fields) -> None:
+        self.at(self._head(fields))
+        name = str(fields['name'])
+        self._alarms[name] = AlarmView(
+            name, int(fields['state']), str(fields['sentence']).strip(), stamp_ns(fields['raised'])
+        )
+
+    def _health(self, fields: Fields) -> None:
+        ours = [s for s in fields['status'] if str(s['name']).startswith('valveflow: ')]
+        if self._tag is not None:
+            # `/diagnostics` is one topic for every monitor there is.
+            ours = [s for s in ours if str(s['hardware_id']) == self._tag]
+        if ours:
+            self._health_tag = str(ours[0]['hardware_id'])
+        items = [_item(status) for status in ours]
+        inputs = [item for item in items if item.name.startswith('input ')]
+        if inputs:
+            self.inputs = tuple(
+                HealthView(i.name.removeprefix('input '), i.level, i.sentence) for i in inputs
+            )
+        self.recorder = next((i for i in items if i.name == 'recorder'), self.recorder)
+        fit = next((status for status in ours if str(status['name']).endswith(' fit')), None)
+        if fit is not None and self._curve is not None and not self._samples:
+            # Without a sample the age of the curve is what tells the plant's time.
+            self.at(self._curve.window[1] + _age_ns(fit))
+
+
+def stamp_ns(stamp: Fields) -> int:
+    """Return a message's stamp in ns since the epoch."""
+    return int(stamp['sec']) * NS_PER_S + int(stamp['nanosec'])
+
+
+def _curve(fields: Fields) -> CurveView:
+    return CurveView(
+        _floats(fields['breakpoints']), _floats(fields['values']), int(fields['status']),
+        str(fields['cause']).strip(), str(fields['model_id']),
+        (stamp_ns(fields['window_start']), stamp_ns(fields['window_end'])),
+        int(fields['samples']), float(fields['rmse_mw']),
+        str(fields.get('shift_sentence', '')).strip(),
+        float(fields.get('pressure_exponent', math.nan)),
+    )  # fmt: skip
+
+
+def _floats(values: Iterable[Any]) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)
+
+
+def _age_ns(fit: Fields) -> int:
+    """Return the age of the curve that the health tells, 0 where it tells none."""
+    told = {str(pair['key']): str(pair['value']) for pair in fit.get('values', ())}
+    try:
+        return round(float(told[AGE]) * NS_PER_S)
+    except (KeyError, ValueError, OverflowError):
+        return 0
+
+
+def _item(status: Fields) -> HealthView:
+    """Return a line of the health without the monitor's name and the unit's tag before it."""
+    tag = f'valveflow: {status["hardware_id"]} '
+    level = status['level']
+    number = level[0] if isinstance(level, bytes) else int(level)
+    name = str(status['name'])
+    return HealthView(
+        name.removeprefix(tag) if name.startswith(tag) else name.removeprefix('valveflow: '),
+        number, str(status['message']),
+    )  # fmt: skip

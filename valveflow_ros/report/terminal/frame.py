@@ -1,0 +1,289 @@
+"""What the terminal view shows at one moment, as plain records."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from valveflow_ros.records import NS_PER_S
+from valveflow_ros.report.words import counted, decimals, duration, moment
+
+# The words of the messages' numbers, as a person says them.
+CURVE_STATES = ('no curve yet', 'fresh', 'stale', 'refused')
+SAMPLE_STATES = (
+    'no curve to judge by',
+    'plant in motion',
+    'steady state',
+    'on a long ramp',
+    'outside the curve',
+    'bad or missing data',
+)
+ALARM_STATES = (
+    'normal',
+    'ALARM, not acknowledged',
+    'ALARM, acknowledged',
+    'gone by itself, not acknowledged',
+    'put aside for a time',
+    'cannot be judged now',
+    'out of service',
+)
+VERDICTS = ('not diagnosed yet', 'nothing is wrong', 'cause named', 'unexplained')
+NORMAL, UNACKNOWLEDGED, ACKNOWLEDGED = 0, 1, 2
+OUTSIDE, BAD_DATA = 4, 5
+OK, WARN, ERROR, STALE = 0, 1, 2, 3
+
+
+@dataclass(frozen=True, slots=True)
+class CurveView:
+    """The flow characteristic.
+
+    Attributes
+    ----------
+    breakpoints, values : tuple of float
+        u in % MPa^m and power in MW at the ends of the pieces; empty without a curve.
+    state : int
+        Place in `CURVE_STATES`.
+    cause : str
+        Why it is not fresh.
+    model_id : str
+    window : tuple of int
+        First and last time of its data in ns; 0: none.
+    samples : int
+    rmse_mw : float
+    shift : str
+        The judgement against the reference; empty: none.
+    exponent : float
+        The m of u = V p^m; NaN: not told.
+    """
+
+    breakpoints: tuple[float, ...]
+    values: tuple[float, ...]
+    state: int
+    cause: str
+    model_id: str
+    window: tuple[int, int]
+    samples: int
+    rmse_mw: float
+    shift: str
+    exponent: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class SampleView:
+    """One sample beside what the curve says of it; NaN: not known.
+
+    Attributes
+    ----------
+    time_ns : int
+    state : int
+        Place in `SAMPLE_STATES`.
+    u, measured_mw, residual_mw, average_mw : float
+    low_mw, high_mw : float
+        Where the residual should lie, 95 times in a hundred.
+    evidence : float
+        Beyond 1 or -1 there is an alarm.
+    """
+
+    time_ns: int
+    state: int
+    u: float
+    measured_mw: float
+    residual_mw: float
+    average_mw: float
+    low_mw: float
+    high_mw: float
+    evidence: float
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmView:
+    """One alarm: its name, its place in `ALARM_STATES`, what it says, since when (0: never)."""
+
+    name: str
+    state: int
+    sentence: str
+    raised_ns: int
+
+    @property
+    def standing(self) -> bool:
+        """Tell whether somebody has to know of it."""
+        return self.state != NORMAL
+
+
+@dataclass(frozen=True, slots=True)
+class HealthView:
+    """How an input, the recorder or anything else is: OK, WARN, ERROR or STALE, and why."""
+
+    name: str
+    level: int
+    sentence: str
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosisView:
+    """The last diagnosis: its place in `VERDICTS`, its sentence, names of causes, its end."""
+
+    verdict: int
+    sentence: str
+    causes: tuple[str, ...]
+    until_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """Everything the view shows at one moment.
+
+    Attributes
+    ----------
+    unit : str
+        The unit's tag; empty: not known.
+    source : str
+        Where it comes from, for a person.
+    now_ns : int
+        The plant's time; 0: nothing has come yet.
+    note : str
+        A sentence that stands above all, such as what is waited for.
+    """
+
+    unit: str = ''
+    source: str = ''
+    now_ns: int = 0
+    note: str = ''
+    curve: CurveView | None = None
+    last: SampleView | None = None
+    samples: tuple[SampleView, ...] = ()
+    alarms: tuple[AlarmView, ...] = ()
+    inputs: tuple[HealthView, ...] = ()
+    recorder: HealthView | None = None
+    diagnosis: DiagnosisView | None = None
+
+
+def word(words: tuple[str, ...], number: int) -> str:
+    """Return the word for a number of a message; one of a later version is said as it is."""
+    return words[number] if 0 <= number < len(words) else f'state {number}'
+
+
+# The sentences of a terminal view.
+
+
+# A word and its tone, see `terminal_text`.
+Said = tuple[str, str]
+NONE_YET = 'None yet.'
+_SHORT = {
+    'valve_opening': 'opening',
+    'main_steam_pressure': 'pressure',
+    'main_steam_temperature': 'temperature',
+    'generated_power': 'power',
+    'valve_command': 'command',
+}
+_TONES = {OK: '', WARN: 'warn', STALE: 'bad'}
+
+
+def curve_words(curve: CurveView | None, now_ns: int) -> Said:
+    """Say how old the curve is and what it rests on."""
+    if curve is None:
+        return NONE_YET, 'warn'
+    if not curve.breakpoints:
+        return curve.cause or NONE_YET, 'warn'
+    first, last = curve.window
+    told = [
+        f'{word(CURVE_STATES, curve.state)}, {counted(len(curve.breakpoints) - 1, "piece")}',
+        f'{counted(curve.samples, "sample")} of {duration((last - first) / NS_PER_S)} '
+        f'until {moment(last).removesuffix(" UTC")[:-3]}',
+    ]
+    if now_ns >= last:
+        told.append(f'{duration((now_ns - last) / NS_PER_S)} old')
+    if math.isfinite(curve.rmse_mw):
+        told.append(f'scatter {decimals(curve.rmse_mw, 2)} MW')
+    text = ', '.join(told) + '.'
+    if curve.cause:
+        return f'{text} {curve.cause}', 'warn'
+    return f'{text} {curve.shift}'.rstrip(), ''
+
+
+def sample_words(sample: SampleView | None) -> Said:
+    """Say how the last sample lies to the curve."""
+    if sample is None:
+        return NONE_YET, 'dim'
+    state = word(SAMPLE_STATES, sample.state)
+    if not math.isfinite(sample.residual_mw):
+        return f'{state}.', 'bad' if sample.state == BAD_DATA else 'dim'
+    text = f'{signed(sample.residual_mw)} MW ({state})'
+    inside = sample.low_mw <= sample.residual_mw <= sample.high_mw
+    if math.isfinite(sample.low_mw) and math.isfinite(sample.high_mw):
+        text += f', limits {signed(sample.low_mw)} to {signed(sample.high_mw)}'
+    if math.isfinite(sample.average_mw):
+        text += f', mean {signed(sample.average_mw)}'
+    if math.isfinite(sample.evidence):
+        text += f', {decimals(100.0 * abs(sample.evidence), 0)} % of the way to an alarm'
+    return f'{text}.', '' if inside or sample.state == OUTSIDE else 'warn'
+
+
+def alarm_words(alarm: AlarmView) -> Said:
+    """Say how an alarm stands."""
+    raised = f', raised {moment(alarm.raised_ns)[11:16]}'
+    if not (alarm.standing and alarm.raised_ns):
+        raised = ''
+    tone = {UNACKNOWLEDGED: 'bad', ACKNOWLEDGED: 'bad'}.get(alarm.state, 'warn')
+    text = f'{alarm.name}: {word(ALARM_STATES, alarm.state)}{raised}. {alarm.sentence}'
+    return text, tone
+
+
+def alarms_words(frame: Frame) -> list[Said]:
+    """Say which alarms stand, the most urgent first."""
+    standing = [alarm for alarm in frame.alarms if alarm.standing]
+    if not standing:
+        return [('None.', 'good')]
+    return [alarm_words(a) for a in sorted(standing, key=lambda a: (a.state, a.raised_ns))]
+
+
+def inputs_words(frame: Frame) -> list[Said]:
+    """Say what is wrong with inputs, a line each, and the rest in one line."""
+    if not frame.inputs:
+        return [('Nothing has come from any of them yet.', 'dim')]
+    # What is wrong with several at once is one line, such as a gateway that has stopped.
+    groups: dict[tuple[int, str], list[str]] = {}
+    for item in frame.inputs:
+        if item.level != OK:
+            groups.setdefault((item.level, item.sentence), []).append(item.name)
+    wrong = [
+        (f'{", ".join(map(short, names))}: {sentence}', _TONES.get(level, 'bad'))
+        for (level, sentence), names in groups.items()
+    ]
+    fine = [f'{short(i.name)} {i.sentence.rstrip(".")}' for i in frame.inputs if i.level == OK]
+    return [*wrong, *([(', '.join(fine), '')] if fine else [])]
+
+
+def health_words(item: HealthView) -> Said:
+    """Say how one thing is."""
+    return f'{short(item.name)}: {item.sentence}', _TONES.get(item.level, 'bad')
+
+
+def recorder_words(frame: Frame) -> Said:
+    """Say how the recorder is."""
+    if frame.recorder is None:
+        return 'Nothing is known of it yet.', 'dim'
+    return frame.recorder.sentence, _TONES.get(frame.recorder.level, 'bad')
+
+
+def diagnosis_words(diagnosis: DiagnosisView | None) -> Said:
+    """Say what the last diagnosis found."""
+    if diagnosis is None:
+        return 'None yet.', 'dim'
+    if not diagnosis.verdict and diagnosis.sentence:
+        return diagnosis.sentence, 'dim'
+    names = f' ({", ".join(diagnosis.causes)})' if diagnosis.causes else ''
+    until = f' in the data until {moment(diagnosis.until_ns)[:16]}' if diagnosis.until_ns else ''
+    text = f'{word(VERDICTS, diagnosis.verdict)}{names}{until}. {diagnosis.sentence}'
+    return text, 'warn' if diagnosis.verdict in (2, 3) else ''
+
+
+def short(name: str) -> str:
+    """Return a signal's name as it is said in a narrow place."""
+    return _SHORT.get(name, name)
+
+
+def signed(value: float, places: int = 1) -> str:
+    """Write a number with its sign."""
+    text = decimals(value, places)
+    return f'+{text}' if value > 0.0 and float(f'{value:.{places}f}') else text

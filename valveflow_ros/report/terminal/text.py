@@ -1,0 +1,153 @@
+"""Lines of a terminal view: pieces of text with a tone, and what a terminal is sent for them."""
+
+from __future__ import annotations
+
+import math
+import re
+import unicodedata
+from argparse import ArgumentTypeError
+from collections.abc import Callable, Iterator
+
+# A piece of a line: the text, and one of the tones below or '' for plain.
+Span = tuple[str, str]
+Line = tuple[Span, ...]
+
+# Colour-blind safe: bad differs from good in weight and brightness too, and in the words.
+_SGR = {'strong': '1', 'dim': '2', 'curve': '36', 'good': '32', 'warn': '33', 'bad': '1;31'}
+# One letter for one, so that a line stays as long as it was.
+_PLAIN = str.maketrans('…·●┄─−\u202f±│°', '~|@--- ~| ')
+# More than any terminal shows of a sentence: what comes from others may be of any length.
+_LONGEST = 4096
+_BLANKS = re.compile(r'[^\S\u202f]+')
+
+
+def clean(text: str) -> str:
+    """Return a text of others as it may stand on a terminal: no control characters, one line."""
+    if len(text) > _LONGEST:
+        text = f'{text[: _LONGEST - 1]}…'
+    text = _BLANKS.sub(' ', text).strip()
+    return ''.join(c if c.isprintable() or c == '\u202f' else '?' for c in text)
+
+
+def cells(text: str) -> int:
+    """Return how many places of a terminal a text takes."""
+    wide = sum(unicodedata.east_asian_width(c) in 'WF' for c in text)
+    return len(text) + wide - sum(bool(unicodedata.combining(c)) for c in text)
+
+
+def cut(text: str, width: int) -> str:
+    """Return a text, shortened to a width."""
+    taken, kept = 0, 0
+    for place, letter in enumerate(text):
+        taken += cells(letter)
+        if taken > width:
+            return f'{text[:kept].rstrip()}…' if width > 0 else ''
+        if taken <= width - 1:
+            kept = place + 1
+    return text
+
+
+def wrapped(text: str, width: int, most: int) -> list[str]:
+    """Return a text in at most so many lines of a width; what is left out ends in an ellipsis."""
+    lines = ['']
+    for word in text.split(' '):
+        longer = f'{lines[-1]} {word}'.lstrip()
+        if cells(longer) <= width:
+            lines[-1] = longer
+        elif len(lines) == most:
+            lines[-1] = cut(f'{lines[-1]} {word}', width)
+            break
+        else:
+            lines.append(word)
+    return [cut(line, width) for line in lines]
+
+
+def labelled(label: str, text: str, tone: str, width: int, most: int) -> Iterator[Line]:
+    """Yield the lines of a text that hangs beside a label."""
+    space = len(label) + 2
+    for k, line in enumerate(wrapped(clean(text), max(1, width - space), most)):
+        head = f'{label}  ' if k == 0 else ' ' * space
+        yield ((head, 'strong'), (line, tone))
+
+
+def painted(line: Line, width: int, colour: bool, unicode: bool = True) -> str:
+    """Return what a terminal is sent for a line, never longer than ``width`` places."""
+    parts, left = [], width
+    for text, tone in line:
+        shown = cut(text, left)
+        left -= cells(shown)
+        if not unicode:
+            shown = _ascii(shown)
+        parts.append(f'\x1b[{_SGR[tone]}m{shown}\x1b[0m' if colour and tone else shown)
+        if left <= 0:
+            break
+    return ''.join(parts).rstrip(' ')
+
+
+def _ascii(text: str) -> str:
+    """Return a text for a terminal that knows no other letters, no longer than it was."""
+    bare = ''.join(c for c in text.translate(_PLAIN) if not unicodedata.combining(c))
+    return bare.encode('ascii', 'replace').decode()
+
+
+# Numbers that a person types behind an option: read, or refused in words.
+
+
+def number(
+    wanted: str, low: float, high: float, example: str, *, above: bool = False
+) -> Callable[[str], float]:
+    """Return a reader of numbers for ``type=`` of an option.
+
+    Parameters
+    ----------
+    wanted : str
+        What is meant, with its unit: 'a number of days'.
+    low, high : float
+        The range; if it has no ends, any number that is finite.
+    example : str
+        How it would be written right: '--days 10'.
+    above : bool
+        ``low`` itself is too small.
+
+    Returns
+    -------
+    callable
+        It raises `ArgumentTypeError` that goes on after the option's name: 'must be a number
+        of days above 0 and at most 400, such as --days 10; 'ten' is no number'.
+    """
+    # No powers of ten: a person reads 1000000 rather than 1e+06.
+    first, last = f'{low:.15g}', f'{high:.15g}'
+    between = f' above {first} and at most {last}' if above else f' from {first} to {last}'
+    if math.isinf(low) and math.isinf(high):
+        between = ''
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            raise _refusal(wanted, between, example, f"'{text}' is no number") from None
+        if not (math.isfinite(value) and low <= value <= high) or (above and value == low):
+            raise _refusal(wanted, between, example, f"'{text}' is not")
+        return value
+
+    return read
+
+
+def whole(wanted: str, low: int, high: int | None, example: str) -> Callable[[str], int]:
+    """Return a reader of whole numbers; parameters and errors as of `number`."""
+    between = f' of {low} or more' if high is None else f' from {low} to {high}'
+
+    def read(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            raise _refusal(wanted, between, example, f"'{text}' is no whole number") from None
+        if value < low or (high is not None and value > high):
+            raise _refusal(wanted, between, example, f"'{text}' is not")
+        return value
+
+    return read
+
+
+def _refusal(wanted: str, between: str, example: str, why: str) -> ArgumentTypeError:
+    return ArgumentTypeError(f'must be {wanted}{between}, such as {example}; {why}')

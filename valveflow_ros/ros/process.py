@@ -1,0 +1,143 @@
+"""Signals become a flag: what runs is finished, then the process ends in order."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import signal
+import sys
+import traceback
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn
+
+from valveflow_ros.parameters import Parameter
+
+_ASKED_TO_STOP = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class Stopped(BaseException):
+    """A signal came where it may cut what runs."""
+
+
+class StopFlag:
+    """Set by SIGINT, SIGTERM or SIGHUP; asking twice changes nothing."""
+
+    def __init__(self) -> None:
+        self._by: int | None = None
+        self._cuts = False
+
+    def install(self) -> StopFlag:
+        """Take over the signals of this process."""
+        for number in _ASKED_TO_STOP:
+            signal.signal(number, self._note)
+        return self
+
+    @contextmanager
+    def cutting(self) -> Iterator[None]:
+        """Let signals raise `Stopped` inside: for work that leaves nothing to be finished.
+
+        Raises
+        ------
+        Stopped
+            One came, or had come before.
+        """
+        if self:
+            raise Stopped
+        self._cuts = True
+        try:
+            yield
+        finally:
+            self._cuts = False
+
+    def last(self) -> None:
+        """Hear nothing more: the process ends already, and its last steps are not to be cut."""
+        for number in _ASKED_TO_STOP:
+            signal.signal(number, signal.SIG_IGN)
+
+    def __bool__(self) -> bool:
+        """Tell whether to stop."""
+        return self._by is not None
+
+    @property
+    def name(self) -> str:
+        """Return the name of the signal, empty before one came."""
+        return '' if self._by is None else signal.Signals(self._by).name
+
+    def set(self) -> None:
+        """Ask to stop from inside."""
+        self._by = self._by or signal.SIGTERM
+
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        self._by = number
+        if self._cuts:
+            self._cuts = False
+            raise Stopped
+
+
+# Foreign errors in one line: a person is owed a sentence, not a trace.
+
+
+_IN_C = re.compile(r',? at /\S+\.c(?:pp)?:\d+')
+
+
+def one_line(error: BaseException) -> str:
+    """Return the first line of an error's text, or its name if it has none.
+
+    Where in C code it happened, as rcl writes it, tells nobody anything.
+    """
+    text = _IN_C.sub('', str(error)).strip().splitlines()
+    return text[0] if text else type(error).__name__
+
+
+def with_place(error: BaseException) -> str:
+    """Return an unexpected error with where it happened, for the report of the fault."""
+    found = traceback.extract_tb(error.__traceback__)
+    place = f', {os.path.basename(found[-1].filename)}, line {found[-1].lineno}' if found else ''
+    return f'{one_line(error)} ({type(error).__name__}{place})'
+
+
+# What the executables answer to ``--help``.
+
+
+_WIDTH = 28
+
+
+def wants_help(args: Sequence[str] | None) -> bool:
+    """Tell whether somebody asked what there is to give."""
+    given = sys.argv[1:] if args is None else args
+    return any(word in ('-h', '--help') for word in given)
+
+
+def show(text: str) -> None:
+    """Print, also where whoever reads has had enough: ``monitor --help | head``."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        # What is left over is flushed again at the end of the process.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose help may be cut short by whoever reads it."""
+
+    def print_help(self, file: object = None) -> None:
+        """Print the help on stdout."""
+        show(self.format_help().rstrip('\n'))
+
+    def error(self, message: str) -> NoReturn:
+        """Refuse what was typed, in words."""
+        super().error(re.sub(r'^argument (\S+): must ', r'\1 must ', message))
+
+
+def usage(about: str, example: str, rows: Iterable[Parameter]) -> str:
+    """Return a page: what it does, an example, and every parameter with unit and default."""
+    lines = [about, '', 'Parameters are given as for any ROS 2 node:', f'  {example}', '']
+    for row in rows:
+        default = repr(row.default) if isinstance(row.default, str) else str(row.default).lower()
+        unit = f' {row.unit}' if row.unit else ''
+        lines.append(f'  {row.name:{_WIDTH}} {default}{unit}')
+        lines.append(f'  {"":{_WIDTH}} {row.sentence}')
+    return '\n'.join(lines)

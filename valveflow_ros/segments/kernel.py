@@ -1,0 +1,537 @@
+"""The streaming piecewise linear representation of u and power, row by row.
+
+Rows are averaged over short blocks. A straight line of u grows from the last
+break; the block that leaves it, twice in a row or by a mean over a minute, is
+the next break. After a break the first 5 T + tau are transient, eq. (13) of
+the paper, and do not count; from then on a line of the power grows as well,
+and leaving that one is a break too. What lies between the end of the transient
+and the next break is judged by `judge`.
+
+All state lives in three arrays, so that it can be copied, saved and compared.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from valveflow_ros.numerics import jit
+from valveflow_ros.records import ByteArray, FloatArray, IntArray
+
+# A straight line through points that arrive one by one, in constant time.
+
+
+# A line is five running sums over (k, v), k = 0, 1, 2, ... and v taken
+# relative to the first point, so that a large offset costs no digits.
+N, ORIGIN, SV, SKV, SVV = range(5)
+LINE_SIZE = 5
+
+
+@jit
+def line_reset(line: FloatArray) -> None:
+    """Forget all points."""
+    line[:] = 0.0
+
+
+@jit
+def line_add(line: FloatArray, value: float) -> None:
+    """Append the next point."""
+    if line[N] == 0.0:
+        line[ORIGIN] = value
+    v = value - line[ORIGIN]
+    k = line[N]
+    line[N] += 1.0
+    line[SV] += v
+    line[SKV] += k * v
+    line[SVV] += v * v
+
+
+@jit
+def line_fit(line: FloatArray) -> tuple[float, float, float]:
+    """Return mean, slope per point, and rms residual (n - 2 degrees of freedom).
+
+    Two points or fewer have no residual (0); one point has no slope (0).
+    """
+    n = line[N]
+    if n < 1.0:
+        return math.nan, 0.0, 0.0
+    mean = line[SV] / n
+    if n < 2.0:
+        return mean + line[ORIGIN], 0.0, 0.0
+    middle = (n - 1.0) / 2.0
+    sxx = n * (n * n - 1.0) / 12.0
+    sxy = line[SKV] - middle * line[SV]
+    slope = sxy / sxx
+    if n < 3.0:
+        return mean + line[ORIGIN], slope, 0.0
+    rest = line[SVV] - line[SV] * mean - slope * sxy
+    return mean + line[ORIGIN], slope, math.sqrt(max(rest, 0.0) / (n - 2.0))
+
+
+@jit
+def line_ahead(line: FloatArray, steps: float) -> tuple[float, float]:
+    """Extrapolate to ``steps`` points after the last one.
+
+    Returns the value and the factor on the noise sd that the error of a new
+    point there has, ``sqrt(1 + leverage)``.
+    """
+    mean, slope, _ = line_fit(line)
+    n = line[N]
+    x = n - 1.0 + steps - (n - 1.0) / 2.0
+    spread = n * (n * n - 1.0) / 12.0
+    leverage = 1.0 / n + (x * x / spread if spread > 0.0 else 0.0)
+    return mean + slope * x, math.sqrt(1.0 + leverage)
+
+
+# The signals' own noise, learnt while they stream by.
+#
+# Each stretch of `WINDOW` block means gives one rms about its own straight line.
+# Those numbers go into a histogram on a log scale, and the noise is a low
+# quantile of it: stretches with moves in them only fill its upper end. A
+# stretch of seven minutes is long enough to hold the wander of a valve under
+# load control, which shorter ones mistake for a trend.
+
+
+WINDOW = 42  # block means a stretch
+BINS = 480
+_PER_DECADE = 40.0
+_LOWEST = -6.0  # log10 of the histogram's lower end
+QUANTILE = 0.4
+WARM_UP = 4  # stretches before the noise is believed
+FORGET_AT = 4000.0  # stretches after which old ones count half (about three weeks)
+
+
+@jit
+def noise_add(histogram: FloatArray, rms: float) -> None:
+    """Add one stretch's rms; halve everything when there is much of it.
+
+    A signal that stood still to the last digit teaches nothing of its noise.
+    """
+    if not 10.0**_LOWEST < rms < 10.0 ** (_LOWEST + BINS / _PER_DECADE):
+        return
+    place = min(max(int((math.log10(rms) - _LOWEST) * _PER_DECADE), 0), BINS - 1)
+    histogram[place] += 1.0
+    if histogram.sum() >= FORGET_AT:
+        histogram *= 0.5
+
+
+@jit
+def noise_level(histogram: FloatArray) -> float:
+    """Return the noise sd: the quantile, interpolated inside its bin."""
+    wanted = QUANTILE * histogram.sum()
+    below = 0.0
+    for k in range(histogram.size):
+        count = histogram[k]
+        if count > 0.0 and below + count >= wanted:
+            inside = (wanted - below) / count
+            return float(10.0 ** (_LOWEST + (k + inside) / _PER_DECADE))
+        below += count
+    return 0.0
+
+
+# Integer state.
+(
+    ROW,
+    ROWS_IN_BLOCK,
+    BLOCKS,
+    FIRST_ROW,
+    SKIP,
+    RUN_U,
+    RUN_Y,
+    STRETCHES,
+    IN_STRETCH,
+    LAST_NS,
+    END_NS,
+) = range(11)
+INT_STATE = 11
+
+# The block that is filling: sums of u, power, temperature, and the count of temperatures.
+BLOCK_T_COUNT = 3
+SUMS = 4
+
+# Rows of `lines`: of u up to now, of u up to a minute ago, of the power, of a stretch of each.
+LINE_U, LINE_U_BEHIND, LINE_Y, STRETCH_U, STRETCH_Y = range(5)
+LINES = 5
+
+# Rows of `blocks`: means of u, power and temperature of the segment that is open.
+BLOCK_U, BLOCK_Y, BLOCK_T = range(3)
+
+# Settings as the kernel wants them.
+(
+    BLOCK_ROWS,
+    SETTLE,
+    LONGEST,
+    STEADY_MIN,
+    SLOPE_MIN,
+    TRIM,
+    BREAK,
+    STEADY,
+    SLOPE,
+    NOISE_U,
+    NOISE_Y,
+    PERIOD_NS,
+) = range(12)
+SETTINGS_SIZE = 12
+
+_BEHIND = 6  # blocks whose mean is held against the line before them
+_BEHIND_LIMIT = 2.5  # in sd of that mean, were the blocks half as many and independent
+_LEAST = 6  # blocks before a line is believed
+_ROUGH = 2.0  # a segment rougher than this many noise sd is no straight line
+
+# What a finished segment is described by.
+(
+    SEG_FIRST,
+    SEG_END,
+    SEG_KIND,
+    SEG_U_MEAN,
+    SEG_U_SLOPE,
+    SEG_U_RMS,
+    SEG_Y_MEAN,
+    SEG_Y_SLOPE,
+    SEG_Y_RMS,
+    SEG_T,
+) = range(10)
+SEG_SIZE = 10
+
+# What a row is, as far as can be told when it arrives.
+TRANSIENT, SETTLED_STEADY, SETTLED_SLOPE, NO_DATA = range(4)
+
+
+@jit
+def noise_now(histograms: FloatArray, setting: FloatArray) -> tuple[float, float]:
+    """Return the noise sd of u and of the power, the given one before the learnt one."""
+    u = setting[NOISE_U] if setting[NOISE_U] > 0.0 else noise_level(histograms[0])
+    y = setting[NOISE_Y] if setting[NOISE_Y] > 0.0 else noise_level(histograms[1])
+    # Exact straight lines have no noise; rounding must not look like a break.
+    return max(u, 1e-6), max(y, 1e-6)
+
+
+@jit
+def _learn(state: IntArray, lines: FloatArray, histograms: FloatArray, u: float, y: float) -> None:
+    """Put one block into the running stretch and close it when it is long enough."""
+    line_add(lines[STRETCH_U], u)
+    line_add(lines[STRETCH_Y], y)
+    state[IN_STRETCH] += 1
+    if state[IN_STRETCH] == WINDOW:
+        noise_add(histograms[0], line_fit(lines[STRETCH_U])[2])
+        noise_add(histograms[1], line_fit(lines[STRETCH_Y])[2])
+        state[STRETCHES] += 1
+        state[IN_STRETCH] = 0
+        line_reset(lines[STRETCH_U])
+        line_reset(lines[STRETCH_Y])
+
+
+@jit
+def _begin(state: IntArray, lines: FloatArray, blocks: FloatArray, drop: int, skip: int) -> None:
+    """Begin a segment ``drop`` blocks after the old one's first, keeping the blocks behind.
+
+    The first ``skip`` blocks do not count: they are transient, or counted before.
+    """
+    keep = state[BLOCKS] - drop
+    for k in range(keep):
+        for row in range(3):
+            blocks[row, k] = blocks[row, drop + k]
+    state[BLOCKS] = 0
+    state[SKIP] = skip
+    state[RUN_U] = 0
+    state[RUN_Y] = 0
+    for row in range(3):
+        line_reset(lines[row])
+    for _ in range(keep):
+        _grow(state, lines, blocks)
+
+
+@jit
+def _grow(state: IntArray, lines: FloatArray, blocks: FloatArray) -> None:
+    """Let the lines take the block that stands at the end of ``blocks``."""
+    k = state[BLOCKS]
+    line_add(lines[LINE_U], blocks[BLOCK_U, k])
+    if k >= _BEHIND:
+        line_add(lines[LINE_U_BEHIND], blocks[BLOCK_U, k - _BEHIND])
+    if k >= state[SKIP]:
+        line_add(lines[LINE_Y], blocks[BLOCK_Y, k])
+    state[BLOCKS] = k + 1
+
+
+@jit
+def _leaves(line: FloatArray, value: float, noise: float, limit: float, run: int) -> int:
+    """Return the signed count of blocks in a row that left the line (0: it stays)."""
+    if line[N] < _LEAST:
+        return 0
+    ahead, factor = line_ahead(line, 1.0)
+    off = (value - ahead) / (noise * factor)
+    if abs(off) <= limit:
+        return 0
+    step = 1 if off > 0.0 else -1
+    if abs(off) > 2.0 * limit:
+        step *= 2
+    return run + step if run * step >= 0 else step
+
+
+@jit
+def _drifts(lines: FloatArray, blocks: FloatArray, k: int, noise: float) -> bool:
+    """Tell whether the last minute's mean left the line through what came before."""
+    behind = lines[LINE_U_BEHIND]
+    if behind[N] < 2 * _BEHIND:
+        return False
+    off = 0.0
+    for step in range(_BEHIND):
+        ahead, _ = line_ahead(behind, step + 1.0)
+        off += blocks[BLOCK_U, k - _BEHIND + step] - ahead
+    _, factor = line_ahead(behind, (_BEHIND + 1) / 2.0)
+    leverage = factor * factor - 1.0
+    # Neighbouring blocks are correlated: six of them are taken for two.
+    sd = noise * math.sqrt(0.5 + _BEHIND * leverage / 2.0)
+    return abs(off / _BEHIND) > _BEHIND_LIMIT * sd
+
+
+@jit
+def judge(
+    blocks: FloatArray,
+    first: int,
+    end: int,
+    noise_u: float,
+    noise_y: float,
+    setting: FloatArray,
+    found: FloatArray,
+) -> int:
+    """Judge the blocks ``[first, end)``: 0 none, 1 steady state, 2 slope response."""
+    line = np.zeros((2, LINE_SIZE))
+    temperature, known = 0.0, 0
+    for k in range(first, end):
+        line_add(line[BLOCK_U], blocks[BLOCK_U, k])
+        line_add(line[BLOCK_Y], blocks[BLOCK_Y, k])
+        if math.isfinite(blocks[BLOCK_T, k]):
+            temperature += blocks[BLOCK_T, k]
+            known += 1
+    mean_u, slope_u, rms_u = line_fit(line[BLOCK_U])
+    mean_y, slope_y, rms_y = line_fit(line[BLOCK_Y])
+    n = end - first
+    move_u = abs(slope_u) * n / noise_u
+    move_y = abs(slope_y) * n / noise_y
+    found[SEG_U_MEAN], found[SEG_U_SLOPE], found[SEG_U_RMS] = mean_u, slope_u, rms_u
+    found[SEG_Y_MEAN], found[SEG_Y_SLOPE], found[SEG_Y_RMS] = mean_y, slope_y, rms_y
+    found[SEG_T] = temperature / known if known > 0 else math.nan
+    if rms_u > _ROUGH * noise_u or rms_y > _ROUGH * noise_y:
+        return 0
+    if move_u <= setting[STEADY] and move_y <= setting[STEADY] + 0.5:
+        return 1 if n >= setting[STEADY_MIN] else 0
+    if move_u >= setting[SLOPE]:
+        return 2 if n >= setting[SLOPE_MIN] else 0
+    return 0
+
+
+@jit
+def _close(
+    state: IntArray,
+    blocks: FloatArray,
+    end: int,
+    noise_u: float,
+    noise_y: float,
+    setting: FloatArray,
+    found: FloatArray,
+) -> bool:
+    """Judge what is open, up to block ``end``; True when it is a special segment."""
+    first = state[SKIP]
+    least = min(setting[STEADY_MIN], setting[SLOPE_MIN])
+    if end - first < max(least, 3):
+        return False
+    kind = judge(blocks, first, end, noise_u, noise_y, setting, found)
+    if kind == 0:
+        return False
+    rows = int(setting[BLOCK_ROWS])
+    found[SEG_FIRST] = state[FIRST_ROW] + first * rows
+    found[SEG_END] = state[FIRST_ROW] + end * rows
+    found[SEG_KIND] = kind
+    # The rows of a segment follow each other without a gap.
+    behind = state[ROW] - state[FIRST_ROW] - end * rows
+    state[END_NS] = state[LAST_NS] - behind * int(setting[PERIOD_NS])
+    return True
+
+
+@jit
+def _take_block(
+    state: IntArray,
+    lines: FloatArray,
+    blocks: FloatArray,
+    histograms: FloatArray,
+    setting: FloatArray,
+    found: FloatArray,
+) -> bool:
+    """Take the block at the end of ``blocks``; True when that closed a special segment."""
+    settle = int(setting[SETTLE])
+    rows = int(setting[BLOCK_ROWS])
+    k = state[BLOCKS]
+    u, y = blocks[BLOCK_U, k], blocks[BLOCK_Y, k]
+    _learn(state, lines, histograms, u, y)
+    if state[STRETCHES] < WARM_UP and (setting[NOISE_U] <= 0.0 or setting[NOISE_Y] <= 0.0):
+        # Without a noise level nothing can be judged: let the line start later.
+        state[FIRST_ROW] += rows
+        return False
+    noise_u, noise_y = noise_now(histograms, setting)
+    state[RUN_U] = _leaves(lines[LINE_U], u, noise_u, setting[BREAK], state[RUN_U])
+    state[RUN_Y] = _leaves(lines[LINE_Y], y, noise_y, setting[BREAK], state[RUN_Y])
+    back = 0
+    if abs(state[RUN_U]) >= 2 or abs(state[RUN_Y]) >= 2:
+        back = 1
+    elif _drifts(lines, blocks, k, noise_u):
+        back = _BEHIND
+    if back == 0:
+        _grow(state, lines, blocks)
+        return _cut_if_long(state, lines, blocks, noise_u, noise_y, setting, found)
+    end = k - back - int(setting[TRIM])
+    closed = _close(state, blocks, end, noise_u, noise_y, setting, found)
+    # What moved moved by now: the transient counts from the block before this one.
+    at = max(k - 1, 0)
+    state[FIRST_ROW] += at * rows
+    state[BLOCKS] = k + 1
+    _begin(state, lines, blocks, at, settle)
+    return closed
+
+
+@jit
+def _cut_if_long(
+    state: IntArray,
+    lines: FloatArray,
+    blocks: FloatArray,
+    noise_u: float,
+    noise_y: float,
+    setting: FloatArray,
+    found: FloatArray,
+) -> bool:
+    """Close a segment that has become too long; True when that made a special segment.
+
+    The next one goes on without a transient. Its line keeps some blocks from
+    before the cut, and the last minute is left to it, so that a move that began
+    there is still seen as a break.
+    """
+    trim = int(setting[TRIM])
+    if state[BLOCKS] < int(setting[LONGEST]) + state[SKIP] + trim:
+        return False
+    closed = _close(state, blocks, state[BLOCKS] - trim, noise_u, noise_y, setting, found)
+    keep = min(3 * _BEHIND, state[BLOCKS])
+    drop = state[BLOCKS] - keep
+    state[FIRST_ROW] += drop * int(setting[BLOCK_ROWS])
+    _begin(state, lines, blocks, drop, max(keep - trim, 0))
+    return closed
+
+
+@jit
+def _kind_now(
+    state: IntArray, lines: FloatArray, histograms: FloatArray, setting: FloatArray
+) -> int:
+    """Say what the newest row is, from what is known by now."""
+    if state[BLOCKS] < max(state[SKIP], _LEAST):
+        return TRANSIENT
+    if state[RUN_U] != 0 or state[RUN_Y] != 0:
+        return TRANSIENT
+    noise_u, _ = noise_now(histograms, setting)
+    slope = line_fit(lines[LINE_U])[1]
+    moved = abs(slope) * state[BLOCKS] / noise_u
+    return SETTLED_SLOPE if moved >= setting[SLOPE] else SETTLED_STEADY
+
+
+@jit
+def _break_off(
+    state: IntArray,
+    sums: FloatArray,
+    lines: FloatArray,
+    blocks: FloatArray,
+    histograms: FloatArray,
+    setting: FloatArray,
+    found: FloatArray,
+) -> bool:
+    """End what is open at a gap; nothing is known of what happened in it.
+
+    True when that closed a special segment; the row that shows the gap is not
+    taken yet.
+    """
+    closed = False
+    if state[BLOCKS] > 0:
+        noise_u, noise_y = noise_now(histograms, setting)
+        closed = _close(state, blocks, state[BLOCKS], noise_u, noise_y, setting, found)
+    _begin(state, lines, blocks, state[BLOCKS], int(setting[SETTLE]))
+    state[FIRST_ROW] = state[ROW]
+    state[ROWS_IN_BLOCK] = 0
+    sums[:] = 0.0
+    # The stretch the noise is learnt from must not span a gap either.
+    state[IN_STRETCH] = 0
+    line_reset(lines[STRETCH_U])
+    line_reset(lines[STRETCH_Y])
+    return closed
+
+
+@jit
+def _take_row(
+    u: float,
+    y: float,
+    temperature: float,
+    state: IntArray,
+    sums: FloatArray,
+    lines: FloatArray,
+    blocks: FloatArray,
+    histograms: FloatArray,
+    setting: FloatArray,
+    found: FloatArray,
+) -> bool:
+    """Add a row to the block that is filling; True when that closed a special segment."""
+    sums[BLOCK_U] += u
+    sums[BLOCK_Y] += y
+    if math.isfinite(temperature):
+        sums[BLOCK_T] += temperature
+        sums[BLOCK_T_COUNT] += 1.0
+    state[ROWS_IN_BLOCK] += 1
+    if state[ROWS_IN_BLOCK] < int(setting[BLOCK_ROWS]):
+        return False
+    k = state[BLOCKS]
+    blocks[BLOCK_U, k] = sums[BLOCK_U] / state[ROWS_IN_BLOCK]
+    blocks[BLOCK_Y, k] = sums[BLOCK_Y] / state[ROWS_IN_BLOCK]
+    count = sums[BLOCK_T_COUNT]
+    blocks[BLOCK_T, k] = sums[BLOCK_T] / count if count > 0.0 else math.nan
+    sums[:] = 0.0
+    state[ROWS_IN_BLOCK] = 0
+    return _take_block(state, lines, blocks, histograms, setting, found)
+
+
+@jit
+def run(
+    time_ns: IntArray,
+    u: FloatArray,
+    y: FloatArray,
+    temperature: FloatArray,
+    state: IntArray,
+    sums: FloatArray,
+    lines: FloatArray,
+    blocks: FloatArray,
+    histograms: FloatArray,
+    setting: FloatArray,
+    kinds: ByteArray,
+    found: FloatArray,
+) -> tuple[int, bool]:
+    """Run over rows until they end or a special segment closes.
+
+    Returns the rows consumed and whether ``found`` holds a segment, closed at
+    the last of them; ``kinds`` gets one code a row.
+    """
+    gap_ns = int(1.5 * setting[PERIOD_NS])
+    for i in range(u.size):
+        usable = math.isfinite(u[i]) and math.isfinite(y[i])
+        jumped = time_ns[i] - state[LAST_NS] > gap_ns or time_ns[i] <= state[LAST_NS]
+        closed = False
+        if jumped or not usable:
+            closed = _break_off(state, sums, lines, blocks, histograms, setting, found)
+        state[LAST_NS] = time_ns[i]
+        state[ROW] += 1
+        if usable:
+            if _take_row(
+                u[i], y[i], temperature[i], state, sums, lines, blocks, histograms, setting, found
+            ):
+                closed = True
+            kinds[i] = _kind_now(state, lines, histograms, setting)
+        else:
+            state[FIRST_ROW] = state[ROW]
+            kinds[i] = NO_DATA
+        if closed:
+            return i + 1, True
+    return u.size, False
