@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from valveflow_ros.logs import open_log, write_samples, write_table
-from valveflow_ros.logs.mcap import recover
+from valveflow_ros.logs.mcap.recover import recover
 from valveflow_ros.records import SampleTable, Signal
 
 SECONDS_A_DAY = 86_400

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import inspect
 import json
-from pathlib import Path
 from typing import Any
 
 from docs.page_tables import table
@@ -43,14 +42,12 @@ def part(name: str, which: str) -> str:
 
 
 def _docstring(name: str) -> str:
-    package = 'plant.effects' if name in FAULTS else 'diagnosis.causes'
-    path = Path(inspect.getfile(effects)).parents[2] / package.replace('.', '/') / f'{name}.py'
-    source = path.read_text()
-    return inspect.cleandoc(source.split('"""')[1])
+    does = effects.catalogue()[name].install if name in FAULTS else causes.catalogue()[name].act
+    return inspect.getdoc(does) or ''
 
 
 def _physics(name: str) -> str:
-    """Return the docstring of the module, its formulas as blocks."""
+    """Return the docstring of what it does, its formulas as blocks."""
     parts = []
     for paragraph in _docstring(name).split('\n\n'):
         if paragraph.startswith('    '):

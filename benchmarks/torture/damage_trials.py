@@ -15,7 +15,7 @@ from benchmarks.torture.stock import stock_count
 from benchmarks.torture.trial import Options, Outcome
 from valveflow_ros.errors import RecordingError, ValveflowError
 from valveflow_ros.logs import RecordingWriter, open_log
-from valveflow_ros.logs.mcap import recover
+from valveflow_ros.logs.mcap.recover import recover
 
 PER_CHUNK = 20
 FLIPS = 20_000

@@ -14,7 +14,7 @@ from benchmarks.torture.stock import stock_count
 from benchmarks.torture.trial import Options, Outcome
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import open_log
-from valveflow_ros.logs.mcap import recover
+from valveflow_ros.logs.mcap.recover import recover
 
 STEPS = 500
 INPUTS = ('/valve_opening', '/main_steam_pressure', '/main_steam_temperature', '/generated_power')

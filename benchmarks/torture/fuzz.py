@@ -21,7 +21,7 @@ from benchmarks.torture.trial import Options, Outcome
 from valveflow_ros.cli.main import main as valveflow
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.logs import Message, open_log, write_samples, write_table
-from valveflow_ros.logs.mcap import recover
+from valveflow_ros.logs.mcap.recover import recover
 
 BATCH = 200
 # The node reads no tables; a library of theirs may want more for one.

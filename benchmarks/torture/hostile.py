@@ -16,7 +16,7 @@ from benchmarks.torture.trial import Options, Outcome
 from valveflow_ros.cli.main import main as valveflow
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.logs import open_log
-from valveflow_ros.logs.mcap import recover
+from valveflow_ros.logs.mcap.recover import recover
 
 # A file of up to a mebibyte may cost so much CPU time, a larger one more in proportion.
 MOST_S = 2.0

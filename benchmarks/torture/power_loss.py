@@ -12,7 +12,7 @@ from benchmarks.torture.stock import stock_count
 from benchmarks.torture.trial import Options, Outcome
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import RecordingWriter, open_log
-from valveflow_ros.logs.mcap import recover
+from valveflow_ros.logs.mcap.recover import recover
 from valveflow_ros.logs.part_file import PartFile
 
 SECONDS = 120

@@ -11,7 +11,7 @@ from benchmarks.torture.kill_child import TOPICS
 from benchmarks.torture.memory import MIB, peak
 from benchmarks.torture.trial import Options, Outcome
 from valveflow_ros.logs import RecordingWriter
-from valveflow_ros.logs.mcap import recover
+from valveflow_ros.logs.mcap.recover import recover
 
 SECONDS = 3600
 RATE = 4000

@@ -9,8 +9,8 @@ from log_files import START_NS, Reading, read_back, write_chunks
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import open_log
-from valveflow_ros.logs.mcap import recover
 from valveflow_ros.logs.mcap.layout import RECORD_HEAD, Op
+from valveflow_ros.logs.mcap.recover import recover
 from valveflow_ros.logs.mcap.scan import Scanner
 from valveflow_ros.logs.source import Source
 

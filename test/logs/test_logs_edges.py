@@ -16,7 +16,6 @@ from log_files import (
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import Decoder, RecordingWriter, open_log
-from valveflow_ros.logs.mcap import recover
 from valveflow_ros.logs.mcap.chunk_file import ChunkBuilder
 from valveflow_ros.logs.mcap.layout import (
     MAGIC,
@@ -27,6 +26,7 @@ from valveflow_ros.logs.mcap.layout import (
     Unpacker,
     pack_header,
 )
+from valveflow_ros.logs.mcap.recover import recover
 from valveflow_ros.logs.mcap.summary import TopicTable
 from valveflow_ros.logs.mcap.writer import REPEAT_CHUNKS, TableSchedule
 from valveflow_ros.logs.part_file import PartFile

@@ -28,9 +28,9 @@ from valveflow_ros.logs import (
     part_file,
     recover_leftovers,
 )
-from valveflow_ros.logs.mcap import recover
 from valveflow_ros.logs.mcap.layout import Op
 from valveflow_ros.logs.mcap.recorder_loop import Ledger, RecorderLoop
+from valveflow_ros.logs.mcap.recover import recover
 from valveflow_ros.logs.mcap.writer import Message
 from valveflow_ros.logs.part_file import PartFile, taken
 

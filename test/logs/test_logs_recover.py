@@ -12,8 +12,8 @@ from rosbags.highlevel import AnyReader
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import RecordingWriter, open_log, recover_leftovers
-from valveflow_ros.logs.mcap import recover
 from valveflow_ros.logs.mcap.layout import Op
+from valveflow_ros.logs.mcap.recover import recover
 from valveflow_ros.logs.part_file import is_held
 
 DIE_WRITING = """

@@ -20,9 +20,9 @@ from log_files import FLOAT64, START_NS, STOCK, float64, read_back, write_chunks
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import RecordingWriter, open_log, part_file, recover_leftovers
-from valveflow_ros.logs.mcap import recover
 from valveflow_ros.logs.mcap.chunk_file import ChunkBuilder, ChunkFile, PackedChunk
 from valveflow_ros.logs.mcap.layout import RECORD_HEAD, Channel, Op, Schema
+from valveflow_ros.logs.mcap.recover import recover
 from valveflow_ros.logs.mcap.summary import TopicTable
 from valveflow_ros.logs.part_file import (
     PartFile,

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.logs import open_log, read_table
+from valveflow_ros.logs.tables import file
 from valveflow_ros.logs.tables.refusal import TableOptions
-from valveflow_ros.logs.tables.table import table_file
 from valveflow_ros.records import SIGNALS, Signal
 
 START = dt.datetime(2026, 11, 22, 14, 5, 0)
@@ -113,7 +113,7 @@ def test_the_size_of_the_blocks_changes_nothing(tmp_path, monkeypatch, block):
     path = write(tmp_path / 'x.csv', names='german', separator=';', decimal=',', date='dots')
     path.write_text(path.read_text().replace('538,', 'Bad', 3))
     whole = read_table(path)
-    monkeypatch.setattr(table_file, 'BLOCK_ROWS', block)
+    monkeypatch.setattr(file, 'BLOCK_ROWS', block)
     parts = read_table(path)
     assert parts.notes == whole.notes
     assert parts.bad_cells == whole.bad_cells
@@ -220,7 +220,7 @@ def test_the_hour_that_comes_twice(tmp_path, monkeypatch, zone, block, newest_fi
     path = tmp_path / 'x.csv'
     ordered = reversed(lines) if newest_first else lines
     path.write_text('\n'.join(['time,valve position,ms pressure,ms temperature,MW', *ordered]))
-    monkeypatch.setattr(table_file, 'BLOCK_ROWS', block)
+    monkeypatch.setattr(file, 'BLOCK_ROWS', block)
     raw = read_table(path, options=TableOptions(time_zone=zone))
     assert raw.time_ns.tolist() == [int(t.timestamp()) * 10**9 for t in truth]
     assert any('120 rows stand in the hour that comes twice' in note for note in raw.notes)

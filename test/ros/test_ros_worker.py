@@ -34,7 +34,7 @@ from valveflow_ros.ros.worker.protocol import (
     task_letter,
     task_of,
 )
-from valveflow_ros.ros.worker.worker import FIT_JOB, FitWorker, Outcome, memory
+from valveflow_ros.ros.worker.worker import FIT_JOB, FitWorker, Outcome
 from valveflow_ros.ros.worker.worker import worker as worker_module
 from valveflow_ros.segments.window import NO_ROWS
 from valveflow_ros.state import State
@@ -314,12 +314,12 @@ def test_memory_is_given_back_once_after_each_outcome_when_the_task_was_let_go(
 def test_memory_is_given_back_by_what_the_c_library_has_or_not_at_all(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    memory.give_back()
+    worker_module.give_back()
     asked: list[int] = []
     with_it = SimpleNamespace(malloc_trim=asked.append)
-    monkeypatch.setattr(memory.ctypes, 'CDLL', lambda _name: with_it)
-    memory.give_back()
+    monkeypatch.setattr(worker_module.ctypes, 'CDLL', lambda _name: with_it)
+    worker_module.give_back()
     assert asked == [0]
-    monkeypatch.setattr(memory.ctypes, 'CDLL', lambda _name: SimpleNamespace())
-    memory.give_back()
+    monkeypatch.setattr(worker_module.ctypes, 'CDLL', lambda _name: SimpleNamespace())
+    worker_module.give_back()
     assert asked == [0]

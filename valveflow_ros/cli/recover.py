@@ -29,7 +29,7 @@ def arguments(parser: ArgumentParser) -> None:
 def run(options: Namespace, console: Console) -> Outcome:
     """Recover and say what was kept."""
     from valveflow_ros.cli.files import check_output
-    from valveflow_ros.logs.mcap import recover
+    from valveflow_ros.logs.mcap.recover import recover
     from valveflow_ros.report.words import count, counted
 
     check_output(options.output, ('.mcap',), source=options.broken)

@@ -62,16 +62,14 @@ def change(share: float) -> str:
     return f'{abs(100.0 * share):.2g} % {"more" if share > 0.0 else "less"}'
 
 
-# The power per flow drifts.
-#
-# Erosion and deposits behind the valve, a cycle that loses efficiency, or the scale of the
-# power transducer; from the four signals these are one thing.
-#
-#     x = F(u) (1 + g (t - middle) / 10 d)
-
-
 def apply_gain_drift(values: Values, scene: Scene, extra: Values) -> FloatArray:
-    """Return the factor on x."""
+    """The power per flow drifts.
+
+    Erosion and deposits behind the valve, a cycle that loses efficiency, or the scale of the
+    power transducer; from the four signals these are one thing.
+
+        x = F(u) (1 + g (t - middle) / 10 d)
+    """
     return np.asarray(1.0 + values[0] * ramp(scene, scene.time_s))
 
 
@@ -100,15 +98,13 @@ GAIN_DRIFT = Cause(
 )  # fmt: skip
 
 
-# The power per flow changes at one moment and stays changed.
-#
-# Maintenance, another power meter, a heater or an extraction taken in or out for good.
-#
-#     x = F(u) (1 + g),  t >= t0
-
-
 def apply_gain_step(values: Values, scene: Scene, extra: Values) -> FloatArray:
-    """Return the factor on x."""
+    """The power per flow changes at one moment and stays changed.
+
+    Maintenance, another power meter, a heater or an extraction taken in or out for good.
+
+        x = F(u) (1 + g),  t >= t0
+    """
     return np.asarray(1.0 + values[0] * since(scene, values[1]))
 
 
@@ -136,18 +132,16 @@ GAIN_STEP = Cause(
 )  # fmt: skip
 
 
-# The flow area that belongs to a reading of u drifts.
-#
-# The scale of the pressure transmitter, that of the position sensor, or wear of the seat;
-# from the four signals these are one thing.
-#
-#     u_true = u (1 + g (t - middle) / 10 d)
-
-
 def apply_input_drift(
     u: FloatArray, values: Values, scene: Scene, model: RegionalModel
 ) -> FloatArray:
-    """Return the factor on u."""
+    """The flow area that belongs to a reading of u drifts.
+
+    The scale of the pressure transmitter, that of the position sensor, or wear of the seat;
+    from the four signals these are one thing.
+
+        u_true = u (1 + g (t - middle) / 10 d)
+    """
     return np.asarray(1.0 + values[0] * ramp(scene, scene.time_s))
 
 
@@ -177,17 +171,15 @@ INPUT_DRIFT = Cause(
 )  # fmt: skip
 
 
-# The pressure or position transmitter is recalibrated.
-#
-# From then on the same reading of u stands for another flow area.
-#
-#     u_true = u (1 + g),  t >= t0
-
-
 def apply_input_step(
     u: FloatArray, values: Values, scene: Scene, model: RegionalModel
 ) -> FloatArray:
-    """Return the factor on u."""
+    """The pressure or position transmitter is recalibrated.
+
+    From then on the same reading of u stands for another flow area.
+
+        u_true = u (1 + g),  t >= t0
+    """
     return np.asarray(1.0 + values[0] * since(scene, values[1]))
 
 
@@ -215,16 +207,14 @@ INPUT_STEP = Cause(
 )  # fmt: skip
 
 
-# The zero of the power drifts.
-#
-# The zero of the power transducer, or auxiliary load that comes and stays, adds the same
-# at any load.
-#
-#     y = G x + b (t - middle) / 10 d
-
-
 def apply_output_offset_drift(y: FloatArray, values: Values, scene: Scene) -> FloatArray:
-    """Return the power shown."""
+    """The zero of the power drifts.
+
+    The zero of the power transducer, or auxiliary load that comes and stays, adds the same
+    at any load.
+
+        y = G x + b (t - middle) / 10 d
+    """
     return np.asarray(y + values[0] * ramp(scene, scene.time_s))
 
 
@@ -254,16 +244,6 @@ OUTPUT_OFFSET_DRIFT = Cause(
 )  # fmt: skip
 
 
-# For hours at a time part of the steam or of the heat goes elsewhere.
-#
-# An extraction or a feed water heater is in or out of service:
-#
-#     x = F(u) (1 + g w(t)),  w = 0 or 1
-#
-# w is not measured. It is taken as a path of two states that rarely switches, and found
-# by the method of Viterbi on sums over half hours.
-
-
 _SWITCH_PENALTY = 9.0
 _FIRST_SIZES = (0.003, 0.008, 0.02)
 _FIRST_SHARE = 0.3
@@ -272,7 +252,16 @@ _LEAST_SWITCHES = 2
 
 
 def apply_intervals(values: Values, scene: Scene, extra: Values) -> FloatArray:
-    """Return the factor on x; ``extra`` holds the times of switches in seconds."""
+    """For hours at a time part of the steam or of the heat goes elsewhere.
+
+    An extraction or a feed water heater is in or out of service:
+
+        x = F(u) (1 + g w(t)),  w = 0 or 1
+
+    w is not measured. It is taken as a path of two states that rarely switches, and found
+    by the method of Viterbi on sums over half hours.
+    """
+    # Return the factor on x; ``extra`` holds the times of switches in seconds.
     inside = np.searchsorted(np.asarray(extra), scene.time_s, side='right') % 2
     # Counted from the record's mean, as everything in time.
     span = scene.reference.span_s
@@ -354,19 +343,17 @@ INTERVALS = Cause(
 )  # fmt: skip
 
 
-# The power follows the time of day.
-#
-# The pressure in the condenser follows the ambient air or the cooling water; auxiliary load
-# driven by the weather looks the same.
-#
-#     x = F(u) (1 + a cos(2 pi (t - t_peak) / 24 h)),  t the time of day, UTC
-
-
 _HOUR_S = 3600.0
 
 
 def apply_diurnal(values: Values, scene: Scene, extra: Values) -> FloatArray:
-    """Return the factor on x."""
+    """The power follows the time of day.
+
+    The pressure in the condenser follows the ambient air or the cooling water; auxiliary load
+    driven by the weather looks the same.
+
+        x = F(u) (1 + a cos(2 pi (t - t_peak) / 24 h)),  t the time of day, UTC
+    """
     a, peak_h = values
     angle = 2.0 * np.pi * (scene.clock_s(scene.time_s) - peak_h * _HOUR_S) / DAY_S
     return np.asarray(1.0 + a * np.cos(angle))

@@ -16,20 +16,18 @@ from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.diagnosis.screening import CURVE, HATS, Bench
 from valveflow_ros.records import FloatArray
 
-# The curve has a bend that its straight pieces cannot follow.
-#
-# Where one valve begins to open before the one before it is open, their overlap raises the
-# curve; too little of it leaves a dent. The bump is a raised cosine on top of F:
-#
-#     x = F(u) + h (1 + cos(pi (u - u0) / w)) / 2,  |u - u0| <= w
-
-
 _KEPT = 3
 _WIDTHS = (0.06, 0.1, 0.16, 0.25)  # of the range of u
 
 
 def apply_curve_shape(u: FloatArray, values: Values, scene: Scene) -> FloatArray:
-    """Return MW added to the flow."""
+    """The curve has a bend that its straight pieces cannot follow.
+
+    Where one valve begins to open before the one before it is open, their overlap raises the
+    curve; too little of it leaves a dent. The bump is a raised cosine on top of F:
+
+        x = F(u) + h (1 + cos(pi (u - u0) / w)) / 2,  |u - u0| <= w
+    """
     h, centre, width = values
     out = np.empty(len(u))
     kernels.bump(u, centre, max(width, 1.0), out)
@@ -84,19 +82,17 @@ CURVE_SHAPE = Cause(
 )  # fmt: skip
 
 
-# From one moment on, one of several valves no longer takes part.
-#
-# The curve is the sum of valves that open one after the other. If one sticks, breaks its
-# stem, or the order is changed, its share is missing from where it should have opened:
-#
-#     x = F(u) + s min(max((u - u1) / (u2 - u1), 0), 1),  t >= t0
-
-
 _NARROWEST = 5.0
 
 
 def apply_curve_step(u: FloatArray, values: Values, scene: Scene) -> FloatArray:
-    """Return MW added to the flow."""
+    """From one moment on, one of several valves no longer takes part.
+
+    The curve is the sum of valves that open one after the other. If one sticks, breaks its
+    stem, or the order is changed, its share is missing from where it should have opened:
+
+        x = F(u) + s min(max((u - u1) / (u2 - u1), 0), 1),  t >= t0
+    """
     s, low, high, t0 = values
     share = np.clip((u - low) / max(high - low, _NARROWEST), 0.0, 1.0)
     return np.asarray(s * share * since(scene, t0))

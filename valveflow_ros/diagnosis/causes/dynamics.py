@@ -15,17 +15,15 @@ from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.diagnosis.screening import Bench
 from valveflow_ros.records import FloatArray
 
-# Above a load the unit stores more steam and answers with other dynamics than the model's.
-#
-# The regional G_i of eq. (3): above ``level`` another time constant and another delay hold.
-
-
 _TRIED_SHARES = (0.1, 0.3, 0.5, 0.7)
 _TRIED_FACTORS = (0.4, 0.7, 1.5, 2.5)
 
 
 def apply_region_lag(model: RegionalModel, values: Values) -> RegionalModel:
-    """Return the model with one region above the level."""
+    """Above a load the unit stores more steam and answers with other dynamics than the model's.
+
+    The regional G_i of eq. (3): above ``level`` another time constant and another delay hold.
+    """
     time_s, delay_s, level = values
     keep = model.levels < level
     inside = int(keep.sum()) + 1
@@ -74,20 +72,18 @@ REGION_LAG = Cause(
 )  # fmt: skip
 
 
-# Part of the power comes behind the reheater, which fills slowly.
-#
-# The turbine models of IEEE (IEEEG1, TGOV1) split the power: a share is made in front
-# of the reheater at once, the rest follows its filling.
-#
-#     y = alpha y1 + (1 - alpha) y1 / (1 + T s),  y1 = G x
-
-
 _SLOW, _SWALLOWED, _SHORTEST, _STEPS = (0.3, 60.0), 0.7, 0.3, 5
 _REHEATER_TRIED = tuple((alpha, t) for alpha in (0.2, 0.4, 0.7) for t in (8.0, 20.0, 60.0, 200.0))
 
 
 def apply_reheater(y: FloatArray, values: Values, scene: Scene) -> FloatArray:
-    """Return the power shown."""
+    """Part of the power comes behind the reheater, which fills slowly.
+
+    The turbine models of IEEE (IEEEG1, TGOV1) split the power: a share is made in front
+    of the reheater at once, the rest follows its filling.
+
+        y = alpha y1 + (1 - alpha) y1 / (1 + T s),  y1 = G x
+    """
     alpha, time_s = values
     taps = make_taps(np.array([time_s]), np.zeros(1), scene.step_s)[0]
     late = np.empty(len(y))
@@ -137,22 +133,20 @@ REHEATER = Cause(
 )  # fmt: skip
 
 
-# The power carries stamps of another clock, so that the answer comes before its cause.
-#
-#     y in the row of time t was measured at t + d,  d > 0
-#
-# A power stamped too late is the same as a longer delay and cannot be told from it; of one
-# stamped too early only the part shows that the shortest delay does not hide: ``d_s`` is that
-# part, and its interval reaches higher by the longest delay a unit may have.
-
-
 # Between valve and generator little more than the filling of a chest: 3 to 10 s in the paper.
 _LONGEST_DELAY_S = 15.0
 _TRIED_S = (3.0, 6.0, 10.0, 16.0, 25.0, 40.0)
 
 
 def apply_clock(y: FloatArray, values: Values, scene: Scene) -> FloatArray:
-    """Return what is shown under the early stamps."""
+    """The power carries stamps of another clock, so that the answer comes before its cause.
+
+        y in the row of time t was measured at t + d,  d > 0
+
+    A power stamped too late is the same as a longer delay and cannot be told from it; of one
+    stamped too early only the part shows that the shortest delay does not hide: ``d_s`` is that
+    part, and its interval reaches higher by the longest delay a unit may have.
+    """
     late = values[0] / scene.step_s
     whole = int(np.floor(late))
     part = late - whole

@@ -13,21 +13,20 @@ from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.diagnosis.screening import Bench
 from valveflow_ros.records import FloatArray
 
-# The exponent of the pressure differs from the one in eq. (1).
-#
-# 9/8 comes from the drum boiler of Bell and Astrom, fitted to one unit; ideal choked flow
-# has 1. With a true exponent m + dm the flow follows
-#
-#     u_true = u (p / mean p)^dm
-#
-# Under sliding pressure the curve takes up most of it: only the pressure's departure
-# from its line over the load tells.
-
 
 def apply_exponent(
     u: FloatArray, values: Values, scene: Scene, model: RegionalModel
 ) -> FloatArray:
-    """Return the factor on u."""
+    """The exponent of the pressure differs from the one in eq. (1).
+
+    9/8 comes from the drum boiler of Bell and Astrom, fitted to one unit; ideal choked flow
+    has 1. With a true exponent m + dm the flow follows
+
+        u_true = u (p / mean p)^dm
+
+    Under sliding pressure the curve takes up most of it: only the pressure's departure
+    from its line over the load tells.
+    """
     log = np.log(np.maximum(scene.pressure, 1e-6))
     return np.asarray(np.exp(values[0] * (log - scene.reference.log_pressure)))
 
@@ -61,18 +60,6 @@ EXPONENT = Cause(
 )  # fmt: skip
 
 
-# Flow that is not choked: the pressure behind the valve throttles it.
-#
-# Above the critical ratio r_c of pressures (0.546 for superheated steam) the flow follows an
-# ellipse, psi(r) = sqrt(1 - ((r - r_c) / (1 - r_c))^2); the pressure behind the valve is
-# proportional to the flow (Stodola), r = kappa x / p. The curve holds the usual psi on the
-# line p_s(x) of sliding pressure already, so what shows is
-#
-#     u_true = u psi(kappa F(u) / p) / psi(kappa F(u) / p_s(F(u)))
-#
-# IEC 60534 says the same of control valves with an expansion factor.
-
-
 _CRITICAL, _LARGEST = 0.546, 0.98
 _TRIED_RATIOS = (0.57, 0.61, 0.66, 0.72, 0.79, 0.87)
 
@@ -89,7 +76,17 @@ def _flow(u: FloatArray, model: RegionalModel) -> FloatArray:
 
 
 def apply_choked(u: FloatArray, values: Values, scene: Scene, model: RegionalModel) -> FloatArray:
-    """Return the factor on u."""
+    """Flow that is not choked: the pressure behind the valve throttles it.
+
+    Above the critical ratio r_c of pressures (0.546 for superheated steam) the flow follows an
+    ellipse, psi(r) = sqrt(1 - ((r - r_c) / (1 - r_c))^2); the pressure behind the valve is
+    proportional to the flow (Stodola), r = kappa x / p. The curve holds the usual psi on the
+    line p_s(x) of sliding pressure already, so what shows is
+
+        u_true = u psi(kappa F(u) / p) / psi(kappa F(u) / p_s(F(u)))
+
+    IEC 60534 says the same of control valves with an expansion factor.
+    """
     x = _flow(u, model)
     p = np.maximum(scene.pressure, 1e-6)
     line = np.maximum(scene.reference.pressure_level + scene.reference.pressure_slope * x, 0.1 * p)
@@ -125,20 +122,18 @@ CHOKED = Cause(
 )  # fmt: skip
 
 
-# Main steam temperature, which the paper holds constant.
-#
-# A turbine swallows m ~ p / sqrt(T_K) (the cone law of Stodola and Fluegel): the hotter
-# the steam the less mass passes, about -0.062 %/K near 539 degC, while the enthalpy drop
-# grows. What remains is a few hundredths of a per cent of the power per kelvin.
-#
-#     x = F(u) (1 + k (T - mean T))
-
-
 _LEAST_SPREAD_K = 0.1
 
 
 def apply_temperature(values: Values, scene: Scene, extra: Values) -> FloatArray:
-    """Return the factor on x."""
+    """Main steam temperature, which the paper holds constant.
+
+    A turbine swallows m ~ p / sqrt(T_K) (the cone law of Stodola and Fluegel): the hotter
+    the steam the less mass passes, about -0.062 %/K near 539 degC, while the enthalpy drop
+    grows. What remains is a few hundredths of a per cent of the power per kelvin.
+
+        x = F(u) (1 + k (T - mean T))
+    """
     return np.asarray(1.0 + values[0] * (scene.temperature - scene.reference.temperature_degc))
 
 

@@ -13,19 +13,18 @@ from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.diagnosis.screening import Bench
 from valveflow_ros.records import FloatArray
 
-# A loose linkage between the position sensor and the plug.
-#
-# The plug follows only when one flank of the slack pushes it (the play operator); the loop
-# this draws is as wide at any speed, unlike that of a lag.
-#
-#     plug = min(max(plug before, V - w / 2), V + w / 2)
-
-
 _BACKLASH_TRIED = (0.1, 0.2, 0.35, 0.6, 1.0, 1.6, 2.7, 4.5)
 
 
 def apply_backlash(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
-    """Return the position of the plug; V is taken as it is, filtering would narrow the loop."""
+    """A loose linkage between the position sensor and the plug.
+
+    The plug follows only when one flank of the slack pushes it (the play operator); the loop
+    this draws is as wide at any speed, unlike that of a lag.
+
+        plug = min(max(plug before, V - w / 2), V + w / 2)
+    """
+    # Return the position of the plug; V is taken as it is, filtering would narrow the loop.
     out = np.empty(len(v))
     kernels.play(v, 0.5 * values[0], out)
     return out
@@ -51,14 +50,6 @@ BACKLASH = Cause(
     'Run the same ramp at two speeds: the loop of a slack keeps its width, that of a lag grows.',
     order=3,
 )  # fmt: skip
-
-
-# Friction holds the valve until it slips.
-#
-# The two-parameter picture of Choudhury in the form of He: the valve stays until the pull
-# exceeds (S + J) / 2, then slips and stays (S - J) / 2 behind. The moment it slips hangs on
-# every hundredth of a per cent of the measured opening, so several paths are run, each
-# with a draw of the sensor's noise (see `draws`).
 
 
 _DRAWS, _ROUGH_DRAWS = 10, 5
@@ -93,7 +84,13 @@ def draw(number: int) -> Callable[[FloatArray, Values, Scene], FloatArray]:
 
 
 def apply_stiction(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
-    """Return the mean position of the plug over the draws."""
+    """Friction holds the valve until it slips.
+
+    The two-parameter picture of Choudhury in the form of He: the valve stays until the pull
+    exceeds (S + J) / 2, then slips and stays (S - J) / 2 behind. The moment it slips hangs on
+    every hundredth of a per cent of the measured opening, so several paths are run, each
+    with a draw of the sensor's noise (see `draws`).
+    """
     total = np.zeros(len(v))
     for k in range(_DRAWS):
         total += draw(k)(v, values, scene)
@@ -155,17 +152,15 @@ STICTION = Cause(
 )  # fmt: skip
 
 
-# The servo is slow.
-#
-# Oil flow and pump bound the speed of the stem; a fast move takes the longer the larger it
-# is, a slow one is not affected.
-
-
 _RATE_LIMIT_TRIED = (0.05, 0.08, 0.12, 0.18, 0.27, 0.4)
 
 
 def apply_rate_limit(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
-    """Return the position of the plug."""
+    """The servo is slow.
+
+    Oil flow and pump bound the speed of the stem; a fast move takes the longer the larger it
+    is, a slow one is not affected.
+    """
     out = np.empty(len(v))
     kernels.rate_limit(v, values[0] * scene.fine_s, out)
     return out
@@ -192,18 +187,16 @@ RATE_LIMIT = Cause(
 )  # fmt: skip
 
 
-# A stop keeps the valve from opening fully.
-#
-# A mechanical or a configured limit behind the position sensor:
-#
-#     V_true = min(V, V_max)
-
-
 _TRIED_SHARES = (0.6, 0.7, 0.78, 0.85, 0.9, 0.94, 0.97, 0.99)
 
 
 def apply_saturation(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
-    """Return the position of the plug."""
+    """A stop keeps the valve from opening fully.
+
+    A mechanical or a configured limit behind the position sensor:
+
+        V_true = min(V, V_max)
+    """
     return np.minimum(v, values[0])
 
 

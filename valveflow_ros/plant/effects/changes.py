@@ -20,16 +20,15 @@ from valveflow_ros.plant.effect import (
 )
 from valveflow_ros.records import FloatArray
 
-# The power per flow drifts.
-#
-# Erosion and deposits behind the valve, falling efficiency of the cycle, and a
-# drifting scale of the power transducer are the same to the four signals:
-#
-#     x = F(u) (1 + g t / 10 d),  t from the first row on
-
 
 def install_gain_drift(values: Values, hooks: Hooks) -> None:
-    """Multiply x by a ramp in time."""
+    """The power per flow drifts.
+
+    Erosion and deposits behind the valve, falling efficiency of the cycle, and a
+    drifting scale of the power transducer are the same to the four signals:
+
+        x = F(u) (1 + g t / 10 d),  t from the first row on
+    """
     g = values['g']
 
     def change(rows: Forcing) -> None:
@@ -46,16 +45,14 @@ GAIN_DRIFT = Effect(
 )
 
 
-# The power per flow changes at once and stays changed.
-#
-# Maintenance, another power meter, a heater or an extraction taken in or out
-# for good:
-#
-#     x = F(u) (1 + g),  t >= t0
-
-
 def install_gain_step(values: Values, hooks: Hooks) -> None:
-    """Multiply x from the onset on."""
+    """The power per flow changes at once and stays changed.
+
+    Maintenance, another power meter, a heater or an extraction taken in or out
+    for good:
+
+        x = F(u) (1 + g),  t >= t0
+    """
 
     def change(rows: Forcing) -> None:
         rows.gain[:] *= 1.0 + values['g'] * step(rows.time_s, values)
@@ -72,16 +69,14 @@ GAIN_STEP = Effect(
 )
 
 
-# The opening or the pressure is read ever more wrongly, or the seat wears.
-#
-# A drifting scale of the pressure transmitter, a drifting scale of the position
-# sensor and a wearing seat all change u against its reading:
-#
-#     u_true = u (1 + g t / 10 d),  t from the first row on
-
-
 def install_input_drift(values: Values, hooks: Hooks) -> None:
-    """Multiply u by a ramp in time."""
+    """The opening or the pressure is read ever more wrongly, or the seat wears.
+
+    A drifting scale of the pressure transmitter, a drifting scale of the position
+    sensor and a wearing seat all change u against its reading:
+
+        u_true = u (1 + g t / 10 d),  t from the first row on
+    """
     g = values['g']
 
     def change(rows: Forcing) -> None:
@@ -98,15 +93,13 @@ INPUT_DRIFT = Effect(
 )
 
 
-# The pressure or position transmitter is recalibrated.
-#
-# From then on the same reading of u stands for another flow area:
-#
-#     u_true = u (1 + g),  t >= t0
-
-
 def install_input_step(values: Values, hooks: Hooks) -> None:
-    """Multiply u from the onset on."""
+    """The pressure or position transmitter is recalibrated.
+
+    From then on the same reading of u stands for another flow area:
+
+        u_true = u (1 + g),  t >= t0
+    """
 
     def change(rows: Forcing) -> None:
         rows.input_gain[:] *= 1.0 + values['g'] * step(rows.time_s, values)
@@ -123,16 +116,14 @@ INPUT_STEP = Effect(
 )
 
 
-# The zero of the power drifts.
-#
-# A drifting zero of the power transducer, or auxiliary load that comes and
-# stays, adds the same at any load:
-#
-#     y = G x + b t / 10 d,  t from the first row on
-
-
 def install_output_offset_drift(values: Values, hooks: Hooks) -> None:
-    """Add a ramp in time to the power."""
+    """The zero of the power drifts.
+
+    A drifting zero of the power transducer, or auxiliary load that comes and
+    stays, adds the same at any load:
+
+        y = G x + b t / 10 d,  t from the first row on
+    """
     b_mw = values['b_mw']
 
     def change(rows: Forcing) -> None:
@@ -147,16 +138,6 @@ OUTPUT_OFFSET_DRIFT = Effect(
     (Parameter('b_mw', 2.0, 'MW/(10 d)', 'Change in ten days.', -50.0, 50.0),),
     install_output_offset_drift,
 )
-
-
-# Now and then part of the steam or of the heat goes elsewhere.
-#
-# An extraction or a feed water heater is in or out of service for hours:
-#
-#     x = F(u) (1 + g w(t)),  w = 0 or 1
-#
-# w begins with 0; how long it stays is drawn uniformly between two bounds, from
-# a generator of its own, so that ``pattern`` names one fixed sequence of times.
 
 
 _HOUR_S = 3600.0
@@ -183,7 +164,15 @@ def intervals_s(values: Values, length_s: float) -> FloatArray:
 
 
 def install_intervals(values: Values, hooks: Hooks) -> None:
-    """Multiply x inside the intervals."""
+    """Now and then part of the steam or of the heat goes elsewhere.
+
+    An extraction or a feed water heater is in or out of service for hours:
+
+        x = F(u) (1 + g w(t)),  w = 0 or 1
+
+    w begins with 0; how long it stays is drawn uniformly between two bounds, from
+    a generator of its own, so that ``pattern`` names one fixed sequence of times.
+    """
     edges = intervals_s(values, hooks.length_s).ravel()
 
     def change(rows: Forcing) -> None:
@@ -223,16 +212,14 @@ INTERVALS = Effect(
 )
 
 
-# The power follows the time of day.
-#
-# The pressure in the condenser follows the ambient air or the cooling water, and
-# the enthalpy drop follows it. Auxiliary load driven by the weather looks the same.
-#
-#     x = F(u) (1 + a cos(2 pi (t - t_peak) / 24 h)),  t the time of day, UTC
-
-
 def install_diurnal(values: Values, hooks: Hooks) -> None:
-    """Multiply x by a daily wave."""
+    """The power follows the time of day.
+
+    The pressure in the condenser follows the ambient air or the cooling water, and
+    the enthalpy drop follows it. Auxiliary load driven by the weather looks the same.
+
+        x = F(u) (1 + a cos(2 pi (t - t_peak) / 24 h)),  t the time of day, UTC
+    """
     peak_s = values['peak_h'] * 3600.0
 
     def change(rows: Forcing) -> None:

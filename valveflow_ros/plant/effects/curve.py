@@ -7,19 +7,17 @@ import numpy as np
 from valveflow_ros.parameters import Parameter
 from valveflow_ros.plant.effect import DAY_S, ONSET, AddedCurve, Effect, Hooks, Values, at_onset
 
-# The curve has a bend that few straight pieces cannot follow.
-#
-# Where one valve begins to open before the one before it is open, their overlap
-# raises the curve; too little overlap leaves a dent. The bump is a raised cosine:
-#
-#     x = F(u) + h (1 + cos(pi (u - u0) / w)) / 2,  |u - u0| <= w
-
-
 _POINTS = 65
 
 
 def install_curve_shape(values: Values, hooks: Hooks) -> None:
-    """Add the bump to the curve."""
+    """The curve has a bend that few straight pieces cannot follow.
+
+    Where one valve begins to open before the one before it is open, their overlap
+    raises the curve; too little overlap leaves a dent. The bump is a raised cosine:
+
+        x = F(u) + h (1 + cos(pi (u - u0) / w)) / 2,  |u - u0| <= w
+    """
     place = np.linspace(-1.0, 1.0, _POINTS)
     bump = 0.5 + 0.5 * np.cos(np.pi * place)
     bump[[0, -1]] = 0.0
@@ -39,17 +37,15 @@ CURVE_SHAPE = Effect(
 )
 
 
-# One of several valves no longer takes part.
-#
-# The curve is the sum of valves that open one after the other. If one of them
-# sticks, breaks its stem, or the order of opening is changed, its share is
-# missing from the openings on where it should have opened:
-#
-#     x = F(u) + s min(max((u - u1) / (u2 - u1), 0), 1),  t >= t0
-
-
 def install_curve_step(values: Values, hooks: Hooks) -> None:
-    """Add the missing share to the curve from the onset on."""
+    """One of several valves no longer takes part.
+
+    The curve is the sum of valves that open one after the other. If one of them
+    sticks, breaks its stem, or the order of opening is changed, its share is
+    missing from the openings on where it should have opened:
+
+        x = F(u) + s min(max((u - u1) / (u2 - u1), 0), 1),  t >= t0
+    """
     u = np.array([values['u_from'], values['u_to']])
     share = np.array([0.0, values['s_mw']])
     hooks.added_curves.append(AddedCurve(u, share, values['t0_days'] * DAY_S))

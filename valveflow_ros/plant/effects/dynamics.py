@@ -10,14 +10,13 @@ from valveflow_ros.parameters import Parameter
 from valveflow_ros.plant.effect import Effect, Hooks, Values
 from valveflow_ros.plant.unit import Region
 
-# Above a load the unit stores more steam and answers later.
-#
-# The regional dynamics G_i of eq. (3): above ``level_mw`` the unit has the given
-# time constant and delay instead of its own.
-
 
 def install_region_lag(values: Values, hooks: Hooks) -> None:
-    """Replace all regions above the level by one."""
+    """Above a load the unit stores more steam and answers later.
+
+    The regional dynamics G_i of eq. (3): above ``level_mw`` the unit has the given
+    time constant and delay instead of its own.
+    """
     hooks.claim('region_lag')
     level = values['level_mw']
     # A region that lay above the level keeps no power at which it would act.
@@ -41,16 +40,14 @@ REGION_LAG = Effect(
 )
 
 
-# Most of the power comes behind the reheater, which fills slowly.
-#
-# The turbine models of IEEE (IEEEG1, TGOV1) split the power: a share is made in
-# front of the reheater at once, the rest follows its filling.
-#
-#     y = alpha y1 + (1 - alpha) y1 / (1 + T s),  y1 = G x
-
-
 def install_reheater(values: Values, hooks: Hooks) -> None:
-    """Split the power."""
+    """Most of the power comes behind the reheater, which fills slowly.
+
+    The turbine models of IEEE (IEEEG1, TGOV1) split the power: a share is made in
+    front of the reheater at once, the rest follows its filling.
+
+        y = alpha y1 + (1 - alpha) y1 / (1 + T s),  y1 = G x
+    """
     hooks.claim('reheater')
     hooks.reheater_share = values['alpha']
     hooks.reheater_s = values['time_s']

@@ -8,17 +8,16 @@ from valveflow_ros.errors import InputError
 from valveflow_ros.parameters import Parameter
 from valveflow_ros.plant.effect import Effect, Forcing, Hooks, Values
 
-# The exponent of the pressure differs from 9/8.
-#
-# The 9/8 of eq. (1) comes from the drum boiler model of Bell and Astrom, fitted
-# to one unit; ideal choked flow has 1.0. A unit whose true exponent is m + dm
-# has, against the u of eq. (1),
-#
-#     u_true = u (p / p_ref)^dm
-
 
 def install_exponent(values: Values, hooks: Hooks) -> None:
-    """Multiply u by a power of the pressure."""
+    """The exponent of the pressure differs from 9/8.
+
+    The 9/8 of eq. (1) comes from the drum boiler model of Bell and Astrom, fitted
+    to one unit; ideal choked flow has 1.0. A unit whose true exponent is m + dm
+    has, against the u of eq. (1),
+
+        u_true = u (p / p_ref)^dm
+    """
     dm, reference = values['dm'], values['reference_mpa']
 
     def change(rows: Forcing) -> None:
@@ -38,34 +37,25 @@ EXPONENT = Effect(
 )
 
 
-# Flow that is not choked: the pressure behind the valve matters.
-#
-# Below the critical ratio of the pressures behind and before a nozzle the flow
-# no longer depends on the pressure behind it; above, it follows an ellipse,
-#
-#     psi(r) = sqrt(1 - ((r - r_c) / (1 - r_c))^2),  r > r_c,
-#
-# r_c being about 0.546 for superheated steam. The pressure behind the valve is
-# proportional to the flow (Stodola), r = kappa x / p. A curve identified under
-# sliding pressure has the usual psi inside, so only the departure from the
-# sliding line p_s shows; x is taken from the curve, F(u):
-#
-#     u_true = u psi(kappa x / p) / psi(kappa x / p_s(x))
-#
-# IEC 60534 describes the same of control valves by an expansion factor.
-
-
 _LARGEST_USUAL_RATIO = 0.9
 
 
 def install_choked(values: Values, hooks: Hooks) -> None:
-    """Give the nozzle its back pressure.
+    """Flow that is not choked: the pressure behind the valve matters.
 
-    Raises
-    ------
-    InputError
-        On this unit's sliding line the pressure behind the valve would come
-        near the one before it, where nothing flows.
+    Below the critical ratio of the pressures behind and before a nozzle the flow
+    no longer depends on the pressure behind it; above, it follows an ellipse,
+
+        psi(r) = sqrt(1 - ((r - r_c) / (1 - r_c))^2),  r > r_c,
+
+    r_c being about 0.546 for superheated steam. The pressure behind the valve is
+    proportional to the flow (Stodola), r = kappa x / p. A curve identified under
+    sliding pressure has the usual psi inside, so only the departure from the
+    sliding line p_s shows; x is taken from the curve, F(u):
+
+        u_true = u psi(kappa x / p) / psi(kappa x / p_s(x))
+
+    IEC 60534 describes the same of control valves by an expansion factor.
     """
     hooks.claim('choked')
     plan = hooks.unit.programme
@@ -93,18 +83,16 @@ CHOKED = Effect(
 )
 
 
-# Main steam temperature: what the paper holds constant.
-#
-# A turbine has a constant swallowing capacity, m ~ p / sqrt(T_K) (the cone law
-# of Stodola and Fluegel): less mass passes when the steam is hotter, about
-# -0.062 %/K at 539 degC. The enthalpy drop rises with the temperature and gives
-# part of it back; -0.03 to -0.06 %/K of power remain for main steam alone.
-#
-#     x = F(u) (1 + k (T - T_ref))
-
-
 def install_temperature(values: Values, hooks: Hooks) -> None:
-    """Multiply x by a straight line in T."""
+    """Main steam temperature: what the paper holds constant.
+
+    A turbine has a constant swallowing capacity, m ~ p / sqrt(T_K) (the cone law
+    of Stodola and Fluegel): less mass passes when the steam is hotter, about
+    -0.062 %/K at 539 degC. The enthalpy drop rises with the temperature and gives
+    part of it back; -0.03 to -0.06 %/K of power remain for main steam alone.
+
+        x = F(u) (1 + k (T - T_ref))
+    """
     k, reference = values['k'], values['reference_degc']
 
     def change(rows: Forcing) -> None:

@@ -19,16 +19,15 @@ from valveflow_ros.plant.effect import (
 )
 from valveflow_ros.records import FloatArray
 
-# The power carries stamps of another clock.
-#
-#     y in the row of time t was measured at t + d
-#
-# With d > 0 the answer seems to come before its cause. Power and its noise move
-# together; the control of the unit, which reads no stamps, does not notice.
-
 
 def install_clock(values: Values, hooks: Hooks) -> None:
-    """Shift the stamps of the power."""
+    """The power carries stamps of another clock.
+
+        y in the row of time t was measured at t + d
+
+    With d > 0 the answer seems to come before its cause. Power and its noise move
+    together; the control of the unit, which reads no stamps, does not notice.
+    """
     hooks.claim('clock')
     hooks.lead_s = values['d_s']
 
@@ -41,13 +40,11 @@ CLOCK = Effect(
 )
 
 
-# A record that stands still: a stuck transmitter or a gateway that repeats itself.
-#
-# From the onset the last value is written again and again; the plant goes on.
-
-
 def install_flatline(values: Values, hooks: Hooks) -> None:
-    """Hold the recorded value for a while."""
+    """A record that stands still: a stuck transmitter or a gateway that repeats itself.
+
+    From the onset the last value is written again and again; the plant goes on.
+    """
     signal, start = values.signal(), values['t0_days'] * DAY_S
     end = start + values['minutes'] * 60.0
     held = np.nan
@@ -76,13 +73,11 @@ FLATLINE = Effect(
 )
 
 
-# A record with a coarse step: few bits, or a historian's dead band.
-#
-# Every value is rounded to the nearest multiple of ``step``.
-
-
 def install_quantisation(values: Values, hooks: Hooks) -> None:
-    """Round the recorded values coarsely."""
+    """A record with a coarse step: few bits, or a historian's dead band.
+
+    Every value is rounded to the nearest multiple of ``step``.
+    """
     signal, step = values.signal(), values['step']
     if step == 0.0:
         return
@@ -102,12 +97,6 @@ QUANTISATION = Effect(
     ),
     install_quantisation,
 )
-
-
-# Single wild values in a record: disturbed transmission.
-#
-# Their times are a Poisson process and their signs random, drawn from a
-# generator of their own, so that ``pattern`` names one fixed set of them.
 
 
 def _draw(values: Values) -> Iterator[tuple[float, float]]:
@@ -130,7 +119,11 @@ def spikes(values: Values, length_s: float) -> FloatArray:
 
 
 def install_spikes(values: Values, hooks: Hooks) -> None:
-    """Add the spikes to the recorded signal."""
+    """Single wild values in a record: disturbed transmission.
+
+    Their times are a Poisson process and their signs random, drawn from a
+    generator of their own, so that ``pattern`` names one fixed set of them.
+    """
     signal = values.signal()
     h = hooks.unit.sample_period_s
     drawn = spikes(values, hooks.length_s)

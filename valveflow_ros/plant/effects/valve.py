@@ -5,16 +5,15 @@ from __future__ import annotations
 from valveflow_ros.parameters import Parameter
 from valveflow_ros.plant.effect import BEFORE_SENSOR, Effect, Hooks, Values
 
-# A loose linkage between the position sensor and the plug.
-#
-# The plug follows only when one of the two flanks of the slack pushes it (the
-# play operator); the loop this draws is as wide at any speed.
-#
-#     plug = min(max(plug before, V - w / 2), V + w / 2)
-
 
 def install_backlash(values: Values, hooks: Hooks) -> None:
-    """Put slack behind the position sensor."""
+    """A loose linkage between the position sensor and the plug.
+
+    The plug follows only when one of the two flanks of the slack pushes it (the
+    play operator); the loop this draws is as wide at any speed.
+
+        plug = min(max(plug before, V - w / 2), V + w / 2)
+    """
     hooks.claim('backlash')
     hooks.after_sensor.slack_percent = values['w_percent']
 
@@ -27,15 +26,13 @@ BACKLASH = Effect(
 )
 
 
-# The valve sticks and then slips.
-#
-# The two-parameter picture of Choudhury in the form of He: the valve stays until
-# the pull has grown beyond (S + J) / 2, then slips by J and stays (S - J) / 2
-# behind. S is the width of the band, J of the jump; J = 0 is plain backlash.
-
-
 def install_stiction(values: Values, hooks: Hooks) -> None:
-    """Put friction on one side of the position sensor."""
+    """The valve sticks and then slips.
+
+    The two-parameter picture of Choudhury in the form of He: the valve stays until
+    the pull has grown beyond (S + J) / 2, then slips by J and stays (S - J) / 2
+    behind. S is the width of the band, J of the jump; J = 0 is plain backlash.
+    """
     before = values['before_sensor']
     hooks.claim('stiction', 'before the sensor' if before else 'behind the sensor')
     bank = hooks.bank(before)
@@ -62,14 +59,12 @@ STICTION = Effect(
 )
 
 
-# The servo is slow.
-#
-# Oil flow and pump bound the speed of the stem; a fast move takes the longer the
-# larger it is, a slow one is not affected.
-
-
 def install_rate_limit(values: Values, hooks: Hooks) -> None:
-    """Bound the speed on one side of the position sensor."""
+    """The servo is slow.
+
+    Oil flow and pump bound the speed of the stem; a fast move takes the longer the
+    larger it is, a slow one is not affected.
+    """
     before = values['before_sensor']
     hooks.claim('rate_limit', 'before the sensor' if before else 'behind the sensor')
     hooks.bank(before).rate_percent_per_s = values['r_percent_per_s']
@@ -86,15 +81,13 @@ RATE_LIMIT = Effect(
 )
 
 
-# A stop keeps the valve from opening fully.
-#
-# A mechanical or a configured limit:
-#
-#     V_true = min(V, V_max)
-
-
 def install_saturation(values: Values, hooks: Hooks) -> None:
-    """Put a stop on one side of the position sensor."""
+    """A stop keeps the valve from opening fully.
+
+    A mechanical or a configured limit:
+
+        V_true = min(V, V_max)
+    """
     before = values['before_sensor']
     hooks.claim('saturation', 'before the sensor' if before else 'behind the sensor')
     hooks.bank(before).top_percent = values['max_percent']
