@@ -49,22 +49,6 @@ def _partition() -> list[tuple[str, str, str]]:
     ]  # fmt: skip
 
 
-def _choice() -> list[tuple[str, str, str]]:
-    study = result('selection_study')
-    rows = {row['kind']: row for row in study['table']}
-    plain, alike = rows['J=1 independent'], rows['J=1 AR .9']
-    return [
-        _row('a straight line in independent noise: eq. (24) as printed finds one piece',
-             f'{plain["paper (24)"]["right_percent"]:.0f} of 100, by evidence '
-             f'{plain["evidence"]["right_percent"]:.0f}', 'selection_study'),
-        _row('a straight line in correlated noise: eq. (24), guarded, finds one piece',
-             f'{alike["paper (24), guarded"]["right_percent"]:.0f} of 100, by evidence '
-             f'{alike["evidence"]["right_percent"]:.0f}', 'selection_study'),
-        _row('random curves: the right number of pieces by evidence',
-             f'{study["random_right_percent"]:.1f} %', 'selection_study'),
-    ]  # fmt: skip
-
-
 def _coverage() -> list[tuple[str, str, str]]:
     name = 'coverage_9000_9199'
     s = result(name)['summary']
@@ -144,6 +128,6 @@ def _speed() -> list[tuple[str, str, str]]:
 
 def measured() -> str:
     """Return what the studies found, with the command of each."""
-    rows = [*_paper(), *_partition(), *_choice(), *_coverage(), *_rivals(), *_alarm(),
+    rows = [*_paper(), *_partition(), *_coverage(), *_rivals(), *_alarm(),
             *_diagnosis(), *_speed()]  # fmt: skip
     return table(('question', 'answer', 'measured by'), rows)

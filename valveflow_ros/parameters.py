@@ -207,10 +207,9 @@ _MODEL = (
 _FIT = (
     Parameter('max_pieces', 10, '', 'Largest number of pieces tried, R_max of the paper.', 1, 20),
     Parameter('selection_rule', 'prediction_error', '',
-              'How the number of pieces is chosen: a knee must pay for itself in the whitened '
-              'prediction error (needs refine), by the evidence of the special samples alone, or '
-              "by the paper's turning angle, eq. (24).",
-              choices=('prediction_error', 'evidence', 'paper')),
+              'How the number of pieces is chosen: a knee must lower the whitened prediction '
+              "error by enough (needs refine), or by the paper's turning angle, eq. (24).",
+              choices=('prediction_error', 'paper')),
     Parameter('min_piece_share', 0.01, '',
               'Smallest share of the special samples in a piece.', 0.0, 0.2),
     Parameter('refine', True, '',
@@ -425,7 +424,7 @@ def _check_together(values: Mapping[str, Value]) -> None:
                 name, f'({float(values[name]):g} s) must not be below sample_period ({period:g} s)'
             )
     if values['selection_rule'] == 'prediction_error' and not values['refine']:
-        raise ParameterError('selection_rule', 'must be evidence or paper when refine is false')
+        raise ParameterError('selection_rule', 'must be paper when refine is false')
     longest, window_s = float(values['longest_segment']), 86400.0 * float(values['window_days'])
     if longest < 6.0 * float(values['block']):
         raise ParameterError('longest_segment', 'must be at least six times block')

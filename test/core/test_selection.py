@@ -1,4 +1,4 @@
-"""The paper's rule (24) and its guard, and what both rules answer where there is no choice."""
+"""The paper's rule (24), its guard, and its answer where there is no choice."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from partition_kinds import samples, valve
 
-from valveflow_ros.errors import DataError, InputError, ParameterError
+from valveflow_ros.errors import DataError, ParameterError
 from valveflow_ros.partition.partition import partition
 from valveflow_ros.partition.selection import paper_rule, select
 
@@ -89,11 +89,9 @@ def test_costs_must_be_numbers(bad):
 def test_the_paper_s_curve_has_four_pieces():
     u, y = samples('noiseless', N)
     found = partition(u, y + np.random.default_rng(6).normal(0, 0.5, N))
-    selection = select(found, rule='paper')
+    selection = select(found)
     assert selection.pieces == 4
-    assert selection.guard_reason == selection.note == ''
-    assert selection.confidence == {}
-    assert selection.rule == 'paper'
+    assert selection.note == ''
     assert list(selection.cost) == list(range(1, 11))
     assert selection.cost[4] == found.cost[3]
     assert list(selection.turning_angle) == list(range(2, 10))
@@ -103,9 +101,9 @@ def test_the_paper_s_curve_has_four_pieces():
 @pytest.mark.parametrize('seed', range(5))
 def test_noise_about_a_line_is_one_piece(kind, seed):
     u, y = samples(kind, N, seed)
-    selection = select(partition(u, y), rule='paper')
+    selection = select(partition(u, y))
     assert selection.pieces == 1
-    assert selection.guard_reason.startswith('No break lowers the cost by more than chance')
+    assert selection.note.startswith('No break lowers the cost by more than chance')
     assert len(selection.turning_angle) == 8  # still reported
 
 
@@ -122,51 +120,40 @@ def test_noise_about_a_line_is_one_piece(kind, seed):
 )
 def test_an_exact_line_is_one_piece(y):
     u, _ = samples('straight', N)
-    for rule in ('evidence', 'paper'):
-        selection = select(partition(u, y(u)), rule=rule)
-        assert selection.pieces == 1
-        assert selection.note == 'One line fits exactly.'
-    assert selection.guard_reason == selection.note
+    selection = select(partition(u, y(u)))
+    assert selection.pieces == 1
+    assert selection.note == 'One line fits exactly.'
 
 
 def test_an_exact_curve_has_its_own_number_of_pieces():
     u, y = samples('noiseless', N)
-    assert select(partition(u, y), rule='paper').pieces == 4
-    selection = select(partition(u, y))
-    assert selection.pieces == 4
-    assert selection.confidence == {4: 1.0}
-    assert selection.note == '4 lines fit exactly.'
+    assert select(partition(u, y)).pieces == 4
 
 
 def test_correlation_makes_chance_larger():
     u = np.linspace(1200.0, 1300.0, N)
     noise = np.random.default_rng(8).normal(0, 1, N)
     found = partition(u, valve(u) + noise, 5)
-    assert select(found, rule='paper').pieces > 1
-    assert select(found, rule='paper', correlation_inflation=1e4).pieces == 1
+    assert select(found).pieces > 1
+    assert select(found, correlation_inflation=1e4).pieces == 1
 
 
 def test_few_distinct_u_leave_few_choices():
     r = np.random.default_rng(4)
     u = np.repeat(np.arange(4.0), 60)
     kinked = np.abs(u - 1.5) + 0.01 * r.normal(size=240)
-    selection = select(partition(u, kinked), rule='paper')
+    selection = select(partition(u, kinked))
     assert selection.pieces == 2
     assert selection.turning_angle == {}
-    assert 'only 2 are possible' in selection.guard_reason
-    assert select(partition(u, kinked)).pieces == 2
-    straight = partition(u, u + 0.01 * r.normal(size=240))
-    for rule in ('evidence', 'paper'):
-        assert select(straight, rule=rule).pieces == 1
-        single = select(partition(u[u < 3.0], kinked[u < 3.0]), rule=rule)
-        assert single.pieces == 1
-        assert '3 distinct u' in single.note
+    assert 'only 2 are possible' in selection.note
+    assert select(partition(u, u + 0.01 * r.normal(size=240))).pieces == 1
+    single = select(partition(u[u < 3.0], kinked[u < 3.0]))
+    assert single.pieces == 1
+    assert '3 distinct u' in single.note
 
 
-def test_unknown_rules_and_impossible_inflations_are_refused():
+def test_impossible_inflations_are_refused():
     found = partition(np.arange(30.0), np.arange(30.0) ** 2)
-    with pytest.raises(InputError, match="rule 'aic' is unknown"):
-        select(found, rule='aic')
     for bad in (0.5, math.nan, math.inf):
         with pytest.raises(ParameterError, match='correlation_inflation'):
             select(found, correlation_inflation=bad)

@@ -31,7 +31,6 @@ from valveflow_ros.fit.task import (
 from valveflow_ros.fit.whitening import inflation
 from valveflow_ros.partition.partition import Partition, partition
 from valveflow_ros.partition.selection import select
-from valveflow_ros.partition.series import Series
 from valveflow_ros.records import ByteArray, FloatArray, SegmentKind
 from valveflow_ros.segments.window import WindowContents
 
@@ -93,20 +92,12 @@ def _begin(task: FitTask, progress: Progress) -> _Begun:
     least = max(2, math.ceil(settings.real('min_piece_share') * len(np.unique(u))))
     part = partition(u, power, settings.whole('max_pieces'), least)
     growth = _inflation(contents, part)
-    selection = select(
-        part,
-        rule='evidence' if settings.text('selection_rule') == 'evidence' else 'paper',
-        correlation_inflation=growth,
-        series=Series.of_spans(contents.u, contents.power_mw, contents.spans),
-    )
+    selection = select(part, growth)
     input_moved(task, u)
     valve_moved(task, rows)
     chosen = _pieces_of(part, selection.pieces, growth)
     carries_a_curve(task, rows, chosen)
-    choice = Choice(
-        selection.rule, dict(selection.cost), dict(selection.turning_angle), selection.note,
-        dict(selection.confidence),
-    )  # fmt: skip
+    choice = Choice('paper', selection.cost, selection.turning_angle, selection.note)
     static = Characteristic(
         pressure_exponent=settings.real('pressure_exponent'),
         pieces=chosen,

@@ -275,8 +275,6 @@ def dynamics_figure(dynamics: tuple[RegionDynamics, ...]) -> Figure:
 _KEPT = {
     'prediction_error': 'the number kept is the one that predicts all samples best once the '
     'dynamics are known',
-    'evidence': 'the number kept is the one that makes the special samples most probable, their '
-    'noise considered',
 }
 _LEAST_SHOWN = 0.005  # probability of a number of pieces worth a row
 # Mantissas of the ticks, the coarsest first.
