@@ -104,7 +104,8 @@ def test_causes_counted_from_the_mean_are_those_of_the_catalogue_that_change_wit
     counted = {
         name
         for name, cause in causes.catalogue().items()
-        if {'change', 'ramp', 'since'} & set(cause.act.__code__.co_names)
+        if {'change', 'ramp', 'since'}
+        & {*cause.act.__code__.co_names, *cause.sentence.__code__.co_names}
     }
     assert counted == _FROM_THE_MEAN
     step = HeldCause('input_step', (('g', 0.03),), 'From then on.')
