@@ -54,7 +54,6 @@ def inlined(function: _Function) -> _Function:
 
 # Plain threads for kernels that release the interpreter lock.
 
-
 T = TypeVar('T')
 _END = object()
 # How often a thread that waits for room looks whether it is still wanted.

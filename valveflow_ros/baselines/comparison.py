@@ -225,7 +225,6 @@ def _errors(
 
 # A comparison as JSON: what ``comparison.json`` holds.
 
-
 FORMAT = 'valveflow/comparison'
 VERSION = 1
 

@@ -23,7 +23,6 @@ from valveflow_ros.records import FloatArray
 
 # Move all parameters of a Hammerstein model together, by the prediction error.
 
-
 OUTPUT_ERROR: FloatArray = np.empty(0)
 _NARROWEST = 0.004  # of the range of u: as narrow as the proposed method lets a piece be
 _DELAY_STEPS_S = (8.0, 4.0, 2.0, 1.0)
@@ -98,7 +97,6 @@ def search_delay(
 
 
 # Where the search for a Hammerstein model begins: least squares on a grid.
-
 
 _GRID_T_S = (3.0, 6.0, 12.0, 25.0, 50.0, 100.0, 200.0)
 _GRID_DELAY_S = (0.0, 5.0, 15.0, 30.0)

@@ -26,7 +26,6 @@ from valveflow_ros.segments.window import WindowContents
 # test sees ten or a hundred times the evidence there is. Beside it stand tests
 # that count what the samples are worth.
 
-
 _LONGEST_S = 300.0
 
 
@@ -419,7 +418,6 @@ def other_data(contents: WindowContents, settings: Settings) -> OtherData:
 
 
 # A part of the identification data held back to choose between candidates.
-
 
 LEARN_SHARE = 0.7
 _LEAST_OF_PART = 0.1  # of the settled rows needed altogether, in each part

@@ -24,7 +24,6 @@ from valveflow_ros.records import BoolArray, ByteArray, FloatArray, IntArray
 
 # A sparse model of the power: an ordinary differential equation, and where it rests.
 
-
 _START_S = 30.0  # power averaged to begin with after a gap
 _PLACES = 400  # inputs at which the rest is searched, at least
 _FINE_U = 0.25  # farthest apart where the rest swings with sin u or cos u: 25 to a period
@@ -124,7 +123,6 @@ def _rest(xi: FloatArray, u: float, y: FloatArray, near: float) -> float:
 # local polynomials (Savitzky and Golay) and the polynomial is differentiated, or
 # both sides are multiplied by a smooth test function that vanishes at the ends of
 # a window and integrated, which moves the derivative from the data to the test function.
-
 
 _ORDER = 2  # of the local polynomials
 _STEEP = 4  # phi = (1 - s^2)^4: smooth enough that its derivative vanishes at the ends too

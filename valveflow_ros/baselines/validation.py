@@ -208,7 +208,6 @@ def _verdict(checks: tuple[PieceCheck, ...], tolerance_mw: float) -> Verdict:
 
 # A validation as JSON: what ``validation.json`` holds.
 
-
 FORMAT = 'valveflow/validation'
 VERSION = 1
 

@@ -14,7 +14,6 @@ from valveflow_ros.records import FloatArray, IntArray, SegmentKind, SpecialSegm
 
 # At which moment a series changed its mean, and how sure that is.
 
-
 LEAST_SIDE = 4  # members on either side of a change
 _LARGEST_RHO = 0.9
 _LEAST_VARIANCE = 1e-200  # without any noise; z^2 stays a number

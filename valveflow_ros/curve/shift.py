@@ -25,7 +25,6 @@ from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SpecialSegment
 
 # The judgement of a shift in words an operator understands.
 
-
 _SURE = 0.9999
 
 
@@ -393,7 +392,6 @@ def _since(
 
 
 # The judgement of a shift as JSON: what ``shift.json`` holds.
-
 
 FORMAT = 'valveflow/shift'
 VERSION = 1

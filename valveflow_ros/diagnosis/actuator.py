@@ -25,7 +25,6 @@ from valveflow_ros.records import BoolArray, FloatArray, IntArray
 # is taken to move, and stands in the prediction as well. Here rows are chosen by readings that
 # have no part in what is averaged over them.
 
-
 Sizes = tuple[tuple[float, float, float], ...]  # value, low, high of each parameter
 _LEAST_SIZED_ROWS = 12  # of one direction
 _CLEAR = 3.0  # standard deviations of the reading that count as surely

@@ -16,7 +16,6 @@ from valveflow_ros.records import NS_PER_S, BoolArray
 
 # A number with its 95 % interval, and how a time is told: as dates in UTC.
 
-
 DAY_S = 86_400.0
 _DAY, _HOUR, _MINUTE = 86_400, 3_600, 60
 _STEPS = (_DAY, _HOUR, 10 * _MINUTE)

@@ -48,7 +48,6 @@ from valveflow_ros.state import ArrayMemory, Continuing, State, copies, put_back
 # Causes that need only the row at hand are asked by their own ``act``. Those here carry a state:
 # the same formulas as in the catalogue, with their own small classes.
 
-
 _DRAWS = 10  # as many as the catalogue's stiction averages over
 _SEED = 20_240
 _LONGEST_DELAY_S = 660.0

@@ -43,7 +43,6 @@ from valveflow_ros.records import BoolArray, FloatArray, IntArray, SampleTable
 # A name that the open blocks suggest stands only if blocks nothing was fitted to confirm it at
 # the 5 % level, the number of causes tried taken into account.
 
-
 LARGEST_P = 0.05
 
 
@@ -79,7 +78,6 @@ def gains_of(found: Found, models: list[Extended]) -> list[Gain]:
 
 
 # Causes that are found without the model of the unit: in the actuator and in the record.
-
 
 _BETWEEN = 'Between the commanded and the measured opening: '
 _SLACK = 'The valve follows only after a slack of {w_percent:.2g} % of opening is taken up.'

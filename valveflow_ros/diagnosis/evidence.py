@@ -204,7 +204,6 @@ def _wald(task: Task, without: Extended, model: Extended, e: FloatArray) -> floa
 
 # What a cause is worth on blocks of time that nothing was fitted to, opened once.
 
-
 _FLIPS = 100_000
 _CHUNK = 5_000
 _SEED = 7

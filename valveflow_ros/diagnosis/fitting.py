@@ -28,7 +28,6 @@ from valveflow_ros.records import BoolArray, FloatArray
 # The rule is that of the fixed-share forecaster (Herbster and Warmuth, Machine Learning 32, 1998,
 # 151): it never looks at the row it predicts, so that it gains nothing where the cause is absent.
 
-
 _EVERY = 7  # rows are enough for a median
 _OF_NORMAL = 0.455  # the median square of a standard normal variable
 _SHARED = 0.005  # of the belief that goes round at every mean: one change in half an hour

@@ -24,7 +24,6 @@ from valveflow_ros.signals.units import integrated_input
 
 # A model to begin with where special segments give none.
 
-
 _PIECES, _MOST = 4, 6
 _LEAST_SPREAD = 0.02
 

@@ -229,7 +229,6 @@ def viterbi(cost_on: FloatArray, penalty: float, out: ByteArray) -> None:
 # States are arrays that the caller owns and the loops write. ``begin`` says of every row how it
 # follows the one before: `GOES_ON`, `ANEW` after a gap, or `NO_DATA`.
 
-
 GOES_ON, ANEW, NO_DATA = 0, 1, 2
 AGE, PLACE = 0, 1
 

@@ -96,7 +96,6 @@ class Diagnosis:
 
 # The extended model as JSON: what ``extended_model.json`` holds, and what is believed of one.
 
-
 MODEL_FORMAT, MODEL_VERSION = 'valveflow/extended_model', 1
 _MOST_MODELS = 10  # on top of one another
 _LONGEST_DELAY_S, _LONGEST_S = 600.0, 3600.0
@@ -213,7 +212,6 @@ def _cause(field: Field) -> Active:
 
 
 # The diagnosis as JSON: ``diagnosis.json``.
-
 
 FORMAT, VERSION = 'valveflow/diagnosis', 1
 

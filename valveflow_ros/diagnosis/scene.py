@@ -154,7 +154,6 @@ class Scene:
 
 # The noise of the position sensor: what it adds to an opening that wanders.
 
-
 _KEPT = 0.8  # share of the increments that are no pulses of the frequency control
 _OF_NORMAL = 0.4377  # their mean square in units of the whole, for a normal law
 _PARTS, _LEAST_ROWS = 12, 50
@@ -197,7 +196,6 @@ def _lift(v: FloatArray) -> float:
 
 
 # From a table of samples to the grids of a `Scene`.
-
 
 _BRIDGE_S = 30.0
 _BEFORE_GAP_S = 60.0

@@ -33,7 +33,6 @@ from valveflow_ros.records import FloatArray
 # A curve found by prediction error has as many knees as pay. A shallow one is no valve point
 # but part of a shape, and would hide `curve_shape` inside the model.
 
-
 SHALLOW = 0.2  # change of slope relative to the larger one
 _JUMP_MW = 0.01
 
@@ -67,7 +66,6 @@ def without_knot(model: RegionalModel, knot: int) -> RegionalModel:
 # A curve found by prediction error puts a knee wherever one pays, in the middle of a bump too,
 # and `curve_shape` would find nothing left. Such a knee bends the other way than both its
 # neighbours. It is given up where a bump in its place does as well.
-
 
 _WIDTHS = (0.5, 0.8, 1.2)  # of the shorter piece beside the knee
 _PLACES = (-0.15, 0.0, 0.15)
@@ -112,7 +110,6 @@ def _as_good(task: Task, plain: Extended, smaller: Extended, u: float, width: fl
 # A cause that moves the power by as much as the noise leads the identification astray: regions
 # are missed, knees are put where none is. Seen through the cause, the record is that of the
 # plant without it, and pieces and regions are searched for again as in an identification.
-
 
 _MORE_PIECES, _MOST = 3, 8
 _EACH = 5.0  # log-likelihood that each number more of curve and regions must bring

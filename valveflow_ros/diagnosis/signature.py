@@ -150,7 +150,6 @@ def after_moves(task: Task, before: Extended, after: Extended) -> tuple[Answer, 
 
 # Maps of the residual over two variables at once: what depends on both shows in neither alone.
 
-
 CELLS = 14
 PAIRS = (('time', 'u'), ('pressure given u', 'u'))
 _MAP_SHIFTS, _MAP_SEED = 60, 13
@@ -233,7 +232,6 @@ def _chance(x: FloatArray, means: Callable[[FloatArray], FloatArray]) -> FloatAr
 
 
 # What the pictures of a diagnosis show, taken from the record and the models.
-
 
 Views = tuple[tuple[Signature, ...], tuple[Answer, ...], tuple[ResidualMap, ...]]
 

@@ -206,7 +206,6 @@ def _tabulated(task: Task, series: FloatArray, values: dict[str, FloatArray]) ->
 
 # A hidden period: one line of the residual's spectrum far above its neighbours.
 
-
 LARGEST_P = 1e-5
 _MEAN_S = 60.0
 _NEIGHBOURS = 101
@@ -262,7 +261,6 @@ def period(task: Task, model: Extended) -> Period:
 
 
 # A slow wander of the power that is no cause: coal, vacuum, ambient.
-
 
 LEAST_WANDER_GAIN = 16.0
 _WIDTHS_H = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)

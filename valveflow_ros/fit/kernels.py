@@ -28,7 +28,6 @@ from valveflow_ros.records import ByteArray, FloatArray
 # first, for the processor to do side by side; what is left row after row is one product and one
 # sum.
 
-
 _BLOCK = 256
 # The region of a row without data.
 NONE = np.uint8(255)
@@ -359,7 +358,6 @@ def tangents(
 #
 # Rows lie one behind the other in memory, so whitening a block of them is, for each coefficient,
 # one long product and sum of two stretches that lie whole rows apart.
-
 
 _NORMAL_BLOCK = 128
 

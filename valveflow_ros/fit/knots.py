@@ -269,9 +269,7 @@ def evidence_words(pieces: int, likely: dict[int, float]) -> str:
 #
 # A continuous curve imitates a jump by a short steep piece. So each short piece is held against a
 # jump in its place, which has one parameter less. Where a jump stands the cost is not smooth in
-# the
-# knot's place, which is therefore searched along a line with both neighbouring lines held.
-
+# the knot's place, which is therefore searched along a line with both neighbouring lines held.
 
 _SHORT = 0.06  # of the range of u
 _STEPS = (0.02, 0.01, 0.005, 0.002, 0.001, 0.0005)  # of the range of u

@@ -33,14 +33,10 @@ from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 # Errors of the measured input, which make a plant look slower than it is, and their correction.
 #
 # Least squares take opening and pressure for exact. Their sensors' noise goes through the model
-# and
-# not through the plant, so a fit prefers a model that lets less of it pass: time constants come
-# out
-# a few per cent too long. Simulation and extrapolation (Cook and Stefanski, J. Am. Stat. Assoc.
-# 89,
-# 1994) takes that back: noise of the same size is added once more, the fit moves by the bias that
-# once more of it causes, and is moved back by as much.
-
+# and not through the plant, so a fit prefers a model that lets less of it pass: time constants
+# come out a few per cent too long. Simulation and extrapolation (Cook and Stefanski, J. Am. Stat.
+# Assoc. 89, 1994) takes that back: noise of the same size is added once more, the fit moves by the
+# bias that once more of it causes, and is moved back by as much.
 
 _SEED = 20240229
 _LEAST_PAIRS = 1000
@@ -96,7 +92,6 @@ def corrected(
 
 
 # Find the regions of different dynamics: how many, where, and roughly which.
-
 
 _GRID_T_S = (3.0, 6.0, 12.0, 25.0, 50.0, 100.0, 200.0)
 _GRID_DELAY_S = (0.0, 4.0, 12.0, 30.0)

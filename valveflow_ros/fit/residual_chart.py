@@ -171,15 +171,11 @@ class ResidualChart(ArrayMemory):
 # Limits of the residual's chart for a wanted time between false alarms.
 #
 # Tables of limits hold for independent normal values. The unit's own clean residual is neither
-# quite
-# independent after whitening nor normal, so its blocks are drawn again and again in runs of an
-# hour
-# (moving-block bootstrap, Kuensch, Ann. Stat. 17, 1989), and the limits are put where the chart
-# then
-# gives one alarm in the wanted time. What a short window cannot show is guarded against: the
-# limits
-# are never below those for independent normal values, and the slack holds the curve's own error.
-
+# quite independent after whitening nor normal, so its blocks are drawn again and again in runs of
+# an hour (moving-block bootstrap, Kuensch, Ann. Stat. 17, 1989), and the limits are put where the
+# chart then gives one alarm in the wanted time. What a short window cannot show is guarded
+# against: the limits are never below those for independent normal values, and the slack holds the
+# curve's own error.
 
 _SEED = 19540301
 _RUN = 60  # blocks drawn together

@@ -170,7 +170,6 @@ def _line_errors(m: RegionalModel, covariance: FloatArray) -> tuple[FloatArray, 
 # crosses different levels. Where that does not hold, the piece's numbers come from its
 # neighbours through the joins, or from moves between segments, and a person should know.
 
-
 NOT_REFINED = 'The curve is not refined: '  # how a note on that begins
 _LEAST_ROWS = 30  # of a segment on a piece, for it to count there
 _APART = 10.0  # noise sd of u between two levels that are called different

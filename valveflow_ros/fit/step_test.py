@@ -34,7 +34,6 @@ from valveflow_ros.signals.units import integrated_input
 
 # A rising broken line through the levels of a step test.
 
-
 ENOUGH = 8  # levels from which on pieces are put through several of them
 _LEAST_LEVELS = 2  # of a piece
 # Of a number, in units of Schwarz' log n. A knee is put where it helps most, so the best of many

@@ -39,7 +39,6 @@ class FitTask:
 
 # Windows that cannot carry a curve, and what would help.
 
-
 _EXPLAINED_LEAST = 0.5  # share of the power's variance a curve must explain to be one
 _ONE_LEVEL_PERCENT = 2.0  # of opening: less than this is one load with its jitter
 _LEAST_SPREAD = 10.0  # noise sd that the openings must spread over

@@ -96,7 +96,6 @@ class Source:
 
 # How much a file may cost before it is given up.
 
-
 MIB = 1 << 20
 
 

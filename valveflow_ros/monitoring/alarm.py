@@ -195,7 +195,6 @@ class AlarmLife:
 
 # How often one alarm may be announced: a chattering one must not bury the others.
 
-
 _WINDOW_NS = 600 * NS_PER_S
 # Three announcements within a minute are chattering.
 _MINUTE_NS = 60 * NS_PER_S

@@ -25,7 +25,6 @@ from valveflow_ros.state import State, copies, put_back
 
 # One pass over rows: means of a minute, what they say, and sums that forget.
 
-
 MINUTE_NS = 60 * NS_PER_S
 BLOCK_NS = 7200 * NS_PER_S
 _DAY_NS = 86400 * NS_PER_S

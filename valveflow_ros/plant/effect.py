@@ -14,7 +14,6 @@ from valveflow_ros.records import NS_PER_S, SIGNALS, FloatArray, Signal
 
 # The places of the plant where an effect may take hold.
 
-
 DAY_S = 86_400.0
 
 

@@ -90,7 +90,6 @@ class LowPass:
 
 # The outside of the unit: load programme, pressure, temperature, fast valve moves.
 
-
 PULSE_EDGE_S = 4.0
 PULSE_HOLD_S = (30.0, 120.0)
 # Spraying follows a change of load: the temperature falls by this much per MW/min.

@@ -17,7 +17,6 @@ from valveflow_ros.records import NS_PER_S, FloatArray, SampleTable, Signal
 
 # What the historian keeps of a plant: stamps, rounding, faults of the record.
 
-
 DECIMALS = {
     Signal.VALVE_OPENING: 2,
     Signal.MAIN_STEAM_PRESSURE: 3,

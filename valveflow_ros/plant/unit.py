@@ -244,7 +244,6 @@ class UnitDescription:
 
 # Other plausible units, so that nothing is fitted to the one unit of the paper.
 
-
 _EXPONENT = 1.125
 # The paper's unit, from which habits in MW and u are scaled.
 _PAPER_RATED_MW = 300.0

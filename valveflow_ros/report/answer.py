@@ -212,7 +212,6 @@ def window_words(c: Characteristic) -> str:
 
 # Time constant and delay by region of power.
 
-
 _COLOURS = ('chosen', 'steady', 'slope')
 _DASHES = ('solid', 'dash', 'dot')
 
@@ -270,7 +269,6 @@ def dynamics_figure(dynamics: tuple[RegionDynamics, ...]) -> Figure:
 
 
 # Why so many pieces: cost and turning angle against their number (the paper's Fig. 6).
-
 
 _KEPT = {
     'prediction_error': 'the number kept is the one that predicts all samples best once the '

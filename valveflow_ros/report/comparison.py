@@ -32,7 +32,6 @@ from valveflow_ros.report.words import counted, duration, moment, plain
 
 # What came out of a comparison, in sentences.
 
-
 _FINDING = {
     Finding.CONFIRMED: 'In this run that comes out.',
     Finding.CONTRADICTED: 'This run contradicts it.',

@@ -124,7 +124,6 @@ def truth_figure(data: Compared) -> Figure:
 
 # Stretches of the data to judge by, measured and simulated: Figs. 9 and 10 of the paper.
 
-
 _LENGTH_S = 7200.0
 _MOVE_S = 900.0
 _POINTS = 600

@@ -266,7 +266,6 @@ def segments_table(data: Compared, segments: Sequence[JudgedSegment]) -> str:
 
 # The tables of a comparison as CSV, unrounded.
 
-
 _PLACES = 500
 
 

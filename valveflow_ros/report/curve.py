@@ -250,7 +250,6 @@ def _description(data: Identified) -> str:
 
 # What the curve leaves of each special segment: over u, and over time.
 
-
 _LEAST = 3  # segments that are worth a picture
 
 

@@ -155,7 +155,6 @@ def quality_words(data: Identified) -> str:
 
 # Where the data are: over u, and over time.
 
-
 _BINS = 60
 _STRETCHES = 240
 _WHOLE = 0.999  # a stretch of time with fewer of its values is drawn as incomplete
@@ -270,7 +269,6 @@ def presence_figure(data: Identified) -> Figure | None:
 
 
 # The signals over time, with the special segments found in them.
-
 
 _DRAWN_STRETCHES = 5000
 _SEGMENT_POINTS = 4000

@@ -18,7 +18,6 @@ from valveflow_ros.report.page import read_text
 
 # One line, cloud, map or set of bars of a picture, drawn by matplotlib.
 
-
 Palette = Mapping[str, str]
 _DASHES = {'dash': '--', 'dot': ':', 'dashdot': '-.'}
 _SIGNS = {

@@ -11,7 +11,6 @@ from valveflow_ros.records import NS_PER_S
 
 # Numbers as people read them: rounded by what they are worth, with their unit.
 
-
 UNKNOWN = 'unknown'
 _MINUS = '−'
 

@@ -92,7 +92,6 @@ def line_ahead(line: FloatArray, steps: float) -> tuple[float, float]:
 # stretch of seven minutes is long enough to hold the wander of a valve under
 # load control, which shorter ones mistake for a trend.
 
-
 WINDOW = 42  # block means a stretch
 BINS = 480
 _PER_DECADE = 40.0

@@ -17,7 +17,6 @@ from valveflow_ros.state import State
 
 # Special segments as plain values, for a saved state.
 
-
 _NAMES = [field.name for field in fields(SpecialSegment)]
 
 

@@ -37,7 +37,6 @@ from valveflow_ros.state import ArrayMemory
 
 # The loop that turns readings into rows; see `valveflow_ros.signals.align` for the rules.
 
-
 REASONS = (
     'accepted',  # taken into the table
     'not_finite',  # NaN or infinite

@@ -96,7 +96,6 @@ def convert(signal: Signal, name: str, values: FloatArray) -> FloatArray:
 
 # The integrated input u, and the units at the border under their old address.
 
-
 __all__ = ['UNITS', 'Unit', 'convert', 'integrated_input', 'unit_of']
 
 

@@ -16,7 +16,6 @@ from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
 # What causes that live in time share.
 
-
 TEN_DAYS_S = 10.0 * DAY_S
 
 ONSET = Unknown('t0_days', 'd', 2.0 / 24.0, 0.0, 400.0, Kind.LINE, dated=True)

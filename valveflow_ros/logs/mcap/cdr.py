@@ -163,7 +163,6 @@ class _Reader:
 
 # Reads many stamped samples at once, by the definition that stands in the file.
 
-
 _NUMPY = {
     'bool': 'u1', 'byte': 'u1', 'char': 'u1', 'uint8': 'u1', 'int8': 'i1',
     'uint16': 'u2', 'int16': 'i2', 'uint32': 'u4', 'int32': 'i4',

@@ -36,7 +36,6 @@ from valveflow_ros.records import IntArray
 
 # Gathers messages until they are worth a chunk.
 
-
 CHUNK_BYTES = 64 * 1024
 _HEAD = struct.Struct('<BQHIQQ')
 

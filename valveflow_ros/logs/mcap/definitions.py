@@ -19,7 +19,6 @@ from valveflow_ros.logs.mcap.layout import LayoutError
 #
 # Fields stand as ROS 2 Jazzy defines them (the type hashes agree); comments are our own.
 
-
 BUNDLED: dict[str, str] = {
     'builtin_interfaces/msg/Time': """\
 int32 sec       # [s] since the Unix epoch
@@ -77,7 +76,6 @@ DiagnosticStatus[] status
 #
 # Only what carries data is kept: constants, defaults and comments are skipped.
 # A text may hold further definitions after lines of ``=``, as recordings do.
-
 
 PRIMITIVES = frozenset(
     {
@@ -211,7 +209,6 @@ def _field(match: re.Match[str], package: str) -> Field:
 
 
 # Type hashes RIHS01: the SHA-256 of a type's description (ROS Enhancement Proposal 2011).
-
 
 _NESTED = 1
 _IDS = {

@@ -334,7 +334,6 @@ class Follower:
 
 # Takes out of followed batches what a view needs: the last messages, and the readings.
 
-
 _INPUTS = {info.topic for info in SIGNALS}
 
 

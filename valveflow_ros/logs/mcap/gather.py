@@ -24,7 +24,6 @@ from valveflow_ros.records import SIGNALS, ByteArray, FloatArray, IntArray
 
 # What is found in a file: rows of values, groups of chunks, counts.
 
-
 _PAYLOAD = np.dtype([('mark', '>u2'), ('options', '<u2'), ('value', '<f8')])
 # A Float64 takes 12 bytes; some middlewares pad to a multiple of 8.
 _SIZES = (12, 16)

@@ -231,7 +231,6 @@ def media_type(name: str) -> str:
 
 # Decompression that believes no claim: bounded by the claim and by the limit.
 
-
 ZSTD = 'zstd'
 LZ4 = 'lz4'
 NONE = ''

@@ -23,7 +23,6 @@ from valveflow_ros.records import IntArray, Readings, Signal
 
 # Goes through the raw messages of a recording again, in the order of their log times.
 
-
 _END = np.iinfo(np.int64).max
 _BLOCK = 1 << 14
 # Chunks of a recorder overlap by a moment; only a file made to hurt has more than this waiting.
@@ -404,7 +403,6 @@ def _readings(files: list[FileContents], chosen: dict[str, Signal]) -> tuple[Rea
 
 
 # The end of a recording: what was logged after a moment, without reading all before it.
-
 
 _TRIES = 3
 

@@ -19,7 +19,6 @@ from valveflow_ros.logs.mcap.writer import Message, Qos, RecordingWriter
 
 # What a recorder is told and what it tells.
 
-
 MIB = 1 << 20
 
 

@@ -156,7 +156,6 @@ _EMPTY = frozenset({'', 'nan', 'na', 'n/a', '#n/a', 'null', 'none', '-', '--'})
 
 # Reads a historian's column of quality, in words or in the codes of OPC.
 
-
 _ENDINGS = ('quality', 'qualitaet', 'status', 'qual', 'q', 'quality code', 'guete', 'st')
 _WORDS = {
     Quality.GOOD: 'good gut ok valid gueltig annotated normal raw interpolated',

@@ -125,7 +125,6 @@ def _last_line(text: str, cells: list[tuple[int, int]]) -> int:
 
 # Gives the text of a table and refuses a line or a cell that would fill the memory.
 
-
 LONGEST_LINE = 1 << 20
 _PIECE = 1 << 18
 

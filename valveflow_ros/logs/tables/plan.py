@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
 # Tables with a row for each value: time, tag, value, as PI and its kin export them.
 
-
 _TAG = re.compile(
     r'^(?:pi )?(?:tag|point|sensor|item|variable|signal|name|kks|channel)(?: ?(?:name|id))?$|'
     r'^(?:messstelle|kennzeichen|messstellenname|messgroesse|tag path)$'

@@ -83,7 +83,6 @@ def quoted(word: str) -> str:
 
 # What a person may have to say about a table that the table does not say itself.
 
-
 DATE_ORDERS = ('dmy', 'mdy', 'ymd')
 DECIMALS = ('point', 'comma')
 

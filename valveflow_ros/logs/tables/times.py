@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 # Makes nanoseconds of the stamps of pandas.
 
-
 _WHOLE_LIMIT = 2.0**63
 # Zones that stand behind a time: German ones tell summer from winter themselves.
 _ABBREVIATED = (

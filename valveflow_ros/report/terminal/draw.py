@@ -24,7 +24,6 @@ from valveflow_ros.report.words import duration, input_unit_plain, moment
 
 # Drawing with characters: a grid of dots, eight to a character in braille.
 
-
 _BRAILLE = 0x2800
 # Which bit of a braille character each of its dots is, by row and column.
 _BITS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
