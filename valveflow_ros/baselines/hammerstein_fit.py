@@ -16,6 +16,7 @@ import numpy as np
 
 from valveflow_ros.baselines.hammerstein import HammersteinModel, tangents
 from valveflow_ros.baselines.judged import cut_samples, run_mse
+from valveflow_ros.fit.descent import gauss_newton
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.fit.whitening import fit_ar, whitened
 from valveflow_ros.numerics import gram
@@ -50,34 +51,19 @@ def move(
     ar : float64 (k,)
         Of the noise of the means; empty is the output error, which calls all noise white.
     """
-    best = cost(samples, model, ar)
-    damping = 1e-4
-    for _ in range(steps):
+
+    def equations(model: HammersteinModel) -> tuple[FloatArray, FloatArray]:
         residual, jacobian, weight = tangents(samples, model)
         sums = gram(whitened(np.column_stack([jacobian, residual]), weight, ar))
-        trial = None
-        for _ in range(6):
-            step = _step(sums, damping)
-            candidate = model.unpack(model.pack() + step)
-            value = cost(samples, candidate, ar) if _possible(candidate) else np.inf
-            if value < best:
-                trial = candidate
-                break
-            damping *= 10.0
-        if trial is None:
-            break
-        gain, best, model = best - value, value, trial
-        damping = max(damping / 10.0, 1e-9)
-        if gain < 1e-6 * best:
-            break
-    return model, best
+        return sums[:-1, :-1], sums[:-1, -1]
 
+    def shifted(model: HammersteinModel, step: FloatArray) -> HammersteinModel | None:
+        moved = model.unpack(model.pack() + step)
+        return moved if _possible(moved) else None
 
-def _step(sums: FloatArray, damping: float) -> FloatArray:
-    normal, slope = sums[:-1, :-1], sums[:-1, -1]
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-12 * np.diag(normal).max()))
-    normal = normal / np.outer(scale, scale) + damping * np.eye(len(scale))
-    return np.asarray(np.linalg.solve(normal, slope / scale) / scale)
+    return gauss_newton(
+        model, lambda m: cost(samples, m, ar), equations, shifted, steps, least_gain=1e-6
+    )
 
 
 def search_delay(

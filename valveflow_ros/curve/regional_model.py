@@ -60,8 +60,6 @@ class RegionalModel:
 
     def taps(self, step_s: float) -> FloatArray:
         """Return the filter of each region as the kernels want it, shape (I, 7)."""
-        # A model that is only looked at can do without compiled code.
-
         return make_taps(self.time_constants, self.delays, step_s)
 
     def respond(
@@ -166,6 +164,23 @@ def make_taps(time_constants: FloatArray, delays: FloatArray, step_s: float) -> 
 
 
 @jit
+def lag_step(flow: FloatArray, at: int, age: int, tap: FloatArray, state: float) -> float:
+    """Return the power of a row from that of the row before, ``state``.
+
+    ``flow`` holds the flow of this row at ``at`` and those before it at lower places, a negative
+    place counting from the end: so a ring of past flows will do. ``age`` rows lie between this
+    row and the last gap; before the gap the flow is taken for that behind it.
+    """
+    whole = int(tap[TAP_WHOLE])
+    return float(
+        tap[TAP_A] * state
+        + tap[TAP_0] * flow[at - min(whole, age)]
+        + tap[TAP_1] * flow[at - min(whole + 1, age)]
+        + tap[TAP_2] * flow[at - min(whole + 2, age)]
+    )
+
+
+@jit
 def respond(
     x: FloatArray,
     usable: ByteArray,
@@ -190,14 +205,7 @@ def respond(
             continue
         if age == 0:
             state = x[t]
-        tap = taps[region_of(x[t], levels)]
-        whole = int(tap[TAP_WHOLE])
-        state = (
-            tap[TAP_A] * state
-            + tap[TAP_0] * x[t - min(whole, age)]
-            + tap[TAP_1] * x[t - min(whole + 1, age)]
-            + tap[TAP_2] * x[t - min(whole + 2, age)]
-        )
+        state = lag_step(x, t, age, taps[region_of(x[t], levels)], state)
         answer[t] = state
         age += 1
         settled[t] = 1 if age > settle else 0

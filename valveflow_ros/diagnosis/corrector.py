@@ -156,10 +156,15 @@ class Sticking:
 class Response(ArrayMemory):
     """Regional dynamics, run on a flow as it comes."""
 
-    def __init__(self, model: RegionalModel, step_s: float) -> None:
-        self._levels, self._taps = model.levels, model.taps(step_s)
+    def __init__(self, levels: FloatArray, taps: FloatArray, rows: int) -> None:
+        self._levels, self._taps = levels, taps
         self._place, self._answer = np.zeros(2, dtype=np.int64), np.zeros(1)
-        self._past = np.zeros(int(_LONGEST_DELAY_S / step_s) + 4)
+        self._past = np.zeros(rows)
+
+    @classmethod
+    def of(cls, model: RegionalModel, step_s: float) -> Response:
+        """Return the dynamics of a model."""
+        return cls(model.levels, model.taps(step_s), int(_LONGEST_DELAY_S / step_s) + 4)
 
     def feed(self, x: FloatArray, begin: ByteArray) -> FloatArray:
         """Return the power in MW, NaN without data."""
@@ -173,22 +178,17 @@ class Response(ArrayMemory):
         return {'place': self._place, 'answer': self._answer, 'past': self._past}
 
 
-class Refill(ArrayMemory):
-    """A reheater behind part of the turbine."""
+class Reheater(Response):
+    """A reheater behind part of the turbine: a share of the power is late by one lag."""
 
     def __init__(self, active: Active, step_s: float) -> None:
-        self._share = active.values[0]
-        self._taps = make_taps(np.array([active.values[1]]), np.zeros(1), step_s)[0]
-        self._state = np.zeros(2)
+        share, time_s = active.values
+        super().__init__(np.empty(0), make_taps(np.array([time_s]), np.zeros(1), step_s), 3)
+        self._share = share
 
-    def feed(self, y: FloatArray, begin: ByteArray) -> FloatArray:
+    def feed(self, x: FloatArray, begin: ByteArray) -> FloatArray:
         """Return the power shown."""
-        late = np.empty(len(y))
-        kernels.lag_block(y, begin, self._taps, self._state, late)
-        return np.asarray(self._share * y + (1.0 - self._share) * late)
-
-    def _memory(self) -> dict[str, NDArray[Any]]:
-        return {'state': self._state}
+        return np.asarray(self._share * x + (1.0 - self._share) * super().feed(x, begin))
 
 
 class LateClock(ArrayMemory):
@@ -216,8 +216,8 @@ _VALVES: dict[str, Callable[[Active, Reference], Valve]] = {
     'rate_limit': SlowServo,
     'saturation': Stop,
 }
-REFILL, CLOCK = 'reheater', 'clock'
-_SHOWN = {REFILL, CLOCK, 'output_offset_drift'}
+REHEATER, CLOCK = 'reheater', 'clock'
+_SHOWN = {REHEATER, CLOCK, 'output_offset_drift'}
 
 
 def valves(chain: tuple[Active, ...], reference: Reference) -> list[Valve]:
@@ -331,9 +331,9 @@ class ModelCorrector:
         """Forget all rows."""
         reference, step = self._given.reference, self._step_s
         self._valves = valves(self._model.at(Stage.OPENING), reference)
-        self._plain = Response(self._model.base, step)
-        self._extended = Response(self._model.regional, step)
-        self._refills = {a.name: Refill(a, step) for a in self._shown if a.name == REFILL}
+        self._plain = Response.of(self._model.base, step)
+        self._extended = Response.of(self._model.regional, step)
+        self._reheaters = {a.name: Reheater(a, step) for a in self._shown if a.name == REHEATER}
         late = [a.values[0] for a in self._model.active if a.name == CLOCK]
         self._clock = LateClock(sum(late), step) if late else None
         self._temperature = np.array([reference.temperature_degc])
@@ -366,7 +366,7 @@ class ModelCorrector:
 
     def _parts(self) -> list[Continuing]:
         clock = [] if self._clock is None else [self._clock]
-        return [*self._valves, self._plain, self._extended, *self._refills.values(), *clock]
+        return [*self._valves, self._plain, self._extended, *self._reheaters.values(), *clock]
 
     def correct(self, table: SampleTable) -> SampleTable:
         """Return the rows without the causes."""
@@ -435,10 +435,10 @@ class ModelCorrector:
         return y
 
     def _show(self, a: Active, y: FloatArray, scene: Scene, begin: ByteArray) -> FloatArray:
-        if a.name not in self._refills:
+        if a.name not in self._reheaters:
             return np.asarray(a.cause.act(y, a.values, scene))
         out = y.copy()
-        out[: len(begin)] = self._refills[a.name].feed(y[: len(begin)], begin)
+        out[: len(begin)] = self._reheaters[a.name].feed(y[: len(begin)], begin)
         return out
 
 

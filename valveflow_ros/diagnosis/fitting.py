@@ -12,7 +12,8 @@ from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import Active, Cause, Kind, Stage, Values
 from valveflow_ros.diagnosis.extended import Extended, answer, drive, flow_of, region_path
 from valveflow_ros.diagnosis.scene import ORDER, Scene
-from valveflow_ros.fit.problem import free_parameters
+from valveflow_ros.fit.descent import descend, gauss_newton
+from valveflow_ros.fit.problem import free_parameters, with_level_moved
 from valveflow_ros.fit.whitening import fit_ar
 from valveflow_ros.numerics import jit
 from valveflow_ros.records import BoolArray, FloatArray
@@ -319,8 +320,8 @@ def _levels_along(before: RegionalModel, after: RegionalModel) -> RegionalModel:
     return after.with_levels(levels) if np.all(np.diff(levels) > 0.0) else after
 
 
-def _stepped(task: Task, model: Extended, step: FloatArray) -> Extended:
-    """Return the model moved by a step, within bounds."""
+def _stepped(task: Task, model: Extended, step: FloatArray) -> Extended | None:
+    """Return the model moved by a step, within bounds; None if knots come too close."""
     free = np.flatnonzero(base_mask(task, model))
     packed = model.base.pack()
     packed[free] += step[: len(free)]
@@ -331,12 +332,8 @@ def _stepped(task: Task, model: Extended, step: FloatArray) -> Extended:
     moved = replace(model, base=_levels_along(model.base, model.base.unpack(packed)))
     for (c, k), by in zip(_slots(model), step[len(free) :], strict=True):
         moved = _shifted(moved, c, k, float(by))
-    return moved
-
-
-def _possible(model: Extended) -> bool:
-    knots = model.base.knots
-    return bool(np.all(np.diff(knots) > 0.004 * (knots[-1] - knots[0])))
+    knots = moved.base.knots
+    return moved if np.all(np.diff(knots) > 0.004 * (knots[-1] - knots[0])) else None
 
 
 def improve(
@@ -350,54 +347,32 @@ def improve(
         Tangents of curve and dynamics to be used throughout; they change little, and
         taking them anew costs most of the time.
     """
-    cost = task.cost(model)
-    damping = 1e-4
-    for _ in range(steps):
+
+    def equations(model: Extended) -> tuple[FloatArray, FloatArray]:
         base = frozen_base if frozen_base is not None else base_tangents(task, model)
         table = task.innovations(np.column_stack([base, cause_tangents(task, model)]))
-        e = task.innovations(task.residual(model))
-        normal, slope = table.T @ table, table.T @ e
-        scale = np.sqrt(np.diag(normal))
-        scale[scale <= 1e-9 * scale.max()] = np.inf
-        normal = normal / np.outer(scale, scale)
-        better = None
-        for _ in range(5):
-            system = normal + damping * np.eye(len(scale))
-            trial = _stepped(task, model, np.linalg.solve(system, slope / scale) / scale)
-            if _possible(trial):
-                value = task.cost(trial)
-                if value < cost:
-                    better = (trial, value)
-                    break
-            damping *= 10.0
-        if better is None:
-            break
-        gain, (model, cost) = cost - better[1], better
-        damping = max(damping / 10.0, 1e-8)
-        if gain < 1e-6 * cost:
-            break
-    return model, cost
+        return table.T @ table, table.T @ task.innovations(task.residual(model))
+
+    return gauss_newton(
+        model, task.cost, equations, lambda m, step: _stepped(task, m, step), steps,
+        trials=5, least_gain=1e-6,
+    )  # fmt: skip
 
 
 def search_levels(
     task: Task, model: Extended, cost: float, steps: tuple[float, ...] = _LEVEL_STEPS_MW
 ) -> tuple[Extended, float]:
     """Move each level between regions along a line while the cost falls."""
-    if task.fixed_dynamics:
-        return model, cost
-    for k in range(len(model.base.levels)):
-        for step in steps:
-            for sign in (1.0, -1.0):
-                while True:
-                    levels = model.base.levels.copy()
-                    levels[k] += sign * step
-                    if np.any(np.diff(levels) <= 1.0):
-                        break
-                    trial = replace(model, base=model.base.with_levels(levels))
-                    value = task.cost(trial)
-                    if not value < cost:
-                        break
-                    model, cost = trial, value
+
+    def moved(model: Extended, level: int, by: float) -> Extended | None:
+        base = with_level_moved(model.base, level, by)
+        return None if base is None else replace(model, base=base)
+
+    for k in range(0 if task.fixed_dynamics else len(model.base.levels)):
+        for step, sign in itertools.product(steps, (1.0, -1.0)):
+            model, cost = descend(
+                model, cost, task.cost, lambda m, k=k, by=sign * step: moved(m, k, by)
+            )
     return model, cost
 
 
@@ -414,21 +389,23 @@ def _directions(cause: Cause) -> list[Values]:
     ]  # fmt: skip
 
 
+def _along(model: Extended, c: int, direction: Values, by: float) -> Extended:
+    for k, size in enumerate(direction):
+        if size:
+            model = _shifted(model, c, k, by * size)
+    return model
+
+
 def search_lines(task: Task, model: Extended, cost: float) -> tuple[Extended, float]:
     """Move every parameter of kind ``LINE`` along a line while the cost falls."""
     for c, a in enumerate(model.active):
         directions = _directions(a.cause)
         for share in _LINE_SHARES if directions else ():
             for direction, sign in itertools.product(directions, (1.0, -1.0)):
-                while True:
-                    trial = model
-                    for k, by in enumerate(direction):
-                        if by:
-                            trial = _shifted(trial, c, k, sign * share * by)
-                    value = task.cost(trial)
-                    if not value < cost:
-                        break
-                    model, cost = trial, value
+                model, cost = descend(
+                    model, cost, task.cost,
+                    lambda m, c=c, d=direction, by=sign * share: _along(m, c, d, by),
+                )  # fmt: skip
     return model, cost
 
 

@@ -4,15 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from valveflow_ros.curve.regional_model import (
-    TAP_0,
-    TAP_1,
-    TAP_2,
-    TAP_A,
-    TAP_WHOLE,
-    curve,
-    region_of,
-)
+from valveflow_ros.curve.regional_model import curve, lag_step, region_of
 from valveflow_ros.numerics import jit
 from valveflow_ros.records import NS_PER_S, ByteArray, FloatArray, IntArray
 
@@ -47,14 +39,7 @@ def respond(
             continue
         if age == 0:
             state = x[t]
-        r = region[t]
-        whole = int(taps[r, TAP_WHOLE])
-        state = (
-            taps[r, TAP_A] * state
-            + taps[r, TAP_0] * x[t - min(whole, age)]
-            + taps[r, TAP_1] * x[t - min(whole + 1, age)]
-            + taps[r, TAP_2] * x[t - min(whole + 2, age)]
-        )
+        state = lag_step(x, t, age, taps[region[t]], state)
         out[t] = state
         age += 1
 
@@ -79,19 +64,7 @@ def respond_means(
                 continue
             if age == 0:
                 state = x[t]
-            r = region[t]
-            whole = int(taps[r, TAP_WHOLE])
-            if age > whole + 2:
-                at = t - whole
-                late = taps[r, TAP_0] * x[at] + taps[r, TAP_1] * x[at - 1]
-                late += taps[r, TAP_2] * x[at - 2]
-            else:
-                late = (
-                    taps[r, TAP_0] * x[t - min(whole, age)]
-                    + taps[r, TAP_1] * x[t - min(whole + 1, age)]
-                    + taps[r, TAP_2] * x[t - min(whole + 2, age)]
-                )
-            state = taps[r, TAP_A] * state + late
+            state = lag_step(x, t, age, taps[region[t]], state)
             total += state
             age += 1
         out[b] = total / group
@@ -113,25 +86,6 @@ def bump(u: FloatArray, centre: float, width: float, out: FloatArray) -> None:
     for t in range(u.size):
         place = (u[t] - centre) / width
         out[t] = 0.5 + 0.5 * np.cos(np.pi * place) if -1.0 < place < 1.0 else 0.0
-
-
-@jit
-def lag(x: FloatArray, usable: ByteArray, taps: FloatArray, out: FloatArray) -> None:
-    """Pass a series through one first-order lag given by its taps (7,)."""
-    state = 0.0
-    last = 0.0
-    age = 0
-    for t in range(x.size):
-        if not usable[t]:
-            age = 0
-            out[t] = 0.0
-            continue
-        if age == 0:
-            state = last = x[t]
-        state = taps[TAP_A] * state + taps[TAP_1] * last + taps[TAP_0] * x[t]
-        last = x[t]
-        out[t] = state
-        age += 1
 
 
 @jit
@@ -279,33 +233,10 @@ def respond_block(
             answer[0] = x[t]
         age, at = place[AGE], place[PLACE]
         past[at] = x[t]
-        tap = taps[region_of(x[t], levels)]
-        whole = int(tap[TAP_WHOLE])
-        answer[0] = (
-            tap[TAP_A] * answer[0]
-            + tap[TAP_0] * past[(at - min(whole, age)) % room]
-            + tap[TAP_1] * past[(at - min(whole + 1, age)) % room]
-            + tap[TAP_2] * past[(at - min(whole + 2, age)) % room]
-        )
+        answer[0] = lag_step(past, at, age, taps[region_of(x[t], levels)], answer[0])
         out[t] = answer[0]
         place[AGE] = age + 1
         place[PLACE] = (at + 1) % room
-
-
-@jit
-def lag_block(
-    x: FloatArray, begin: ByteArray, taps: FloatArray, state: FloatArray, out: FloatArray
-) -> None:
-    """Pass a series through one first-order lag; ``state`` is its answer and the last value."""
-    for t in range(x.size):
-        if begin[t] == NO_DATA:
-            out[t] = np.nan
-            continue
-        if begin[t] == ANEW:
-            state[0] = state[1] = x[t]
-        state[0] = taps[TAP_A] * state[0] + taps[TAP_1] * state[1] + taps[TAP_0] * x[t]
-        state[1] = x[t]
-        out[t] = state[0]
 
 
 @jit

@@ -11,12 +11,14 @@ while the weakest loses too little.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
+from valveflow_ros.fit.descent import descend
 from valveflow_ros.fit.problem import Problem, free_parameters, move
 from valveflow_ros.fit.uncertainty import bend_certainty
 from valveflow_ros.fit.whitening import whitened
@@ -368,16 +370,18 @@ def _search_place(
 ) -> tuple[RegionalModel, float]:
     """Move an inner knot along its lines while the cost falls."""
     span = model.knots[-1] - model.knots[0]
-    for share in _STEPS:
-        for step in (share * span, -share * span):
-            while True:
-                trial = _moved(model, knot, step)
-                if np.any(np.diff(trial.knots) <= 0.004 * span):
-                    break
-                value = problem.cost(trial, ar)
-                if not value < cost:
-                    break
-                model, cost = trial, value
+
+    def moved(model: RegionalModel, by: float) -> RegionalModel | None:
+        trial = _moved(model, knot, by)
+        return None if np.any(np.diff(trial.knots) <= 0.004 * span) else trial
+
+    for share, sign in itertools.product(_STEPS, (1.0, -1.0)):
+        model, cost = descend(
+            model,
+            cost,
+            lambda m: problem.cost(m, ar),
+            lambda m, by=sign * share * span: moved(m, by),
+        )
     return model, cost
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
+from valveflow_ros.fit.descent import descend, gauss_newton
 from valveflow_ros.fit.kernels import answer_residual, normal_sums, square_sum, tangents
 from valveflow_ros.numerics import cores, runs, share
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
@@ -216,38 +218,29 @@ def in_bounds(model: RegionalModel, samples: Samples) -> bool:
 def move(
     problem: Problem, model: RegionalModel, ar: FloatArray, free: BoolArray, steps: int
 ) -> tuple[RegionalModel, float]:
-    """Levenberg-Marquardt in the free parameters, levels held."""
-    damping = 1e-4
-    cost = problem.cost(model, ar)
-    for _ in range(steps):
+    """Lower the cost in the free parameters, levels held."""
+
+    def equations(model: RegionalModel) -> tuple[FloatArray, FloatArray]:
         sums, _ = problem.normal(model, ar)
-        normal, slope = sums[:-1, :-1][np.ix_(free, free)], sums[:-1, -1][free]
-        scale = np.sqrt(np.maximum(np.diag(normal), 1e-12 * np.diag(normal).max()))
-        normal = normal / np.outer(scale, scale)
-        better = None
-        for _ in range(6):
-            step = np.linalg.solve(
-                normal + damping * np.eye(len(scale)), slope / scale
-            ) / scale  # fmt: skip
-            packed = model.pack()
-            packed[free] += step
-            n_delays = model.regions
-            packed[-n_delays:] = np.maximum(packed[-n_delays:], 0.0)
-            trial = model.unpack(packed)
-            if in_bounds(trial, problem.samples):
-                value = problem.cost(trial, ar)
-                if value < cost:
-                    better = (trial, value)
-                    break
-            damping *= 10.0
-        if better is None:
-            break
-        gain = cost - better[1]
-        model, cost = better
-        damping = max(damping / 10.0, 1e-8)
-        if gain < 1e-7 * cost:
-            break
-    return model, cost
+        return sums[:-1, :-1][np.ix_(free, free)], sums[:-1, -1][free]
+
+    def shifted(model: RegionalModel, step: FloatArray) -> RegionalModel | None:
+        packed = model.pack()
+        packed[free] += step
+        packed[-model.regions :] = np.maximum(packed[-model.regions :], 0.0)
+        trial = model.unpack(packed)
+        return trial if in_bounds(trial, problem.samples) else None
+
+    return gauss_newton(model, lambda m: problem.cost(m, ar), equations, shifted, steps)
+
+
+def with_level_moved(
+    model: RegionalModel, level: int, by: float, least: float = 1.0
+) -> RegionalModel | None:
+    """Return the model with one level moved by some MW; None if two come closer than ``least``."""
+    levels = model.levels.copy()
+    levels[level] += by
+    return None if np.any(np.diff(levels) <= least) else model.with_levels(levels)
 
 
 def search_levels(
@@ -255,16 +248,9 @@ def search_levels(
 ) -> tuple[RegionalModel, float]:
     """Move each level along a line, the step shrinking, while the cost falls."""
     for k in range(len(model.levels)):
-        for step in _LEVEL_STEPS_MW:
-            for sign in (1.0, -1.0):
-                while True:
-                    levels = model.levels.copy()
-                    levels[k] += sign * step
-                    if np.any(np.diff(levels) <= 1.0):
-                        break
-                    trial = model.with_levels(levels)
-                    value = problem.cost(trial, ar)
-                    if not value < cost:
-                        break
-                    model, cost = trial, value
+        for step, sign in itertools.product(_LEVEL_STEPS_MW, (1.0, -1.0)):
+            model, cost = descend(
+                model, cost, lambda m: problem.cost(m, ar),
+                lambda m, k=k, by=sign * step: with_level_moved(m, k, by),
+            )  # fmt: skip
     return model, cost

@@ -10,15 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from valveflow_ros.curve.characteristic import Characteristic
-from valveflow_ros.curve.regional_model import (
-    TAP_0,
-    TAP_1,
-    TAP_2,
-    TAP_A,
-    TAP_WHOLE,
-    curve,
-    region_of,
-)
+from valveflow_ros.curve.regional_model import curve, lag_step, region_of
 from valveflow_ros.fit.residual_chart import ResidualChart
 from valveflow_ros.numerics import jit
 from valveflow_ros.parameters import Settings
@@ -115,21 +107,13 @@ class _Columns(NamedTuple):
 def _filter(f: _Filter, x: float) -> None:
     """Put one flow through the dynamics of its region."""
     age = f.place[_AGE]
-    room = f.past.size
     place = f.place[_PLACE]
     f.past[place] = x
     if f.taps.shape[0] > 0:
         tap = f.taps[region_of(x, f.levels)]
-        whole = int(tap[TAP_WHOLE])
-        if age == 0:
-            f.memory[_ANSWER] = x
-        f.memory[_ANSWER] = (
-            tap[TAP_A] * f.memory[_ANSWER]
-            + tap[TAP_0] * f.past[(place - min(whole, age)) % room]
-            + tap[TAP_1] * f.past[(place - min(whole + 1, age)) % room]
-            + tap[TAP_2] * f.past[(place - min(whole + 2, age)) % room]
-        )
-    f.place[_PLACE] = (place + 1) % room
+        before = x if age == 0 else f.memory[_ANSWER]
+        f.memory[_ANSWER] = lag_step(f.past, place, age, tap, before)
+    f.place[_PLACE] = (place + 1) % f.past.size
     f.place[_AGE] = age + 1
 
 

@@ -85,9 +85,9 @@ def apply_reheater(y: FloatArray, values: Values, scene: Scene) -> FloatArray:
         y = alpha y1 + (1 - alpha) y1 / (1 + T s),  y1 = G x
     """
     alpha, time_s = values
-    taps = make_taps(np.array([time_s]), np.zeros(1), scene.step_s)[0]
+    taps = make_taps(np.array([time_s]), np.zeros(1), scene.step_s)
     late = np.empty(len(y))
-    kernels.lag(y, scene.usable, taps, late)
+    kernels.respond(y, scene.usable, np.zeros(len(y), dtype=np.uint8), taps, late)
     return np.asarray(alpha * y + (1.0 - alpha) * late)
 
 
