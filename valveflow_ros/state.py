@@ -7,11 +7,12 @@ first one would have. What does not fit is refused, since a state half believed 
 
 from __future__ import annotations
 
+import enum
 import hashlib
 import io
 import json
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,30 +22,67 @@ from valveflow_ros.errors import DataError
 State = dict[str, Any]
 
 
-class Continuing(Protocol):
-    """Something that can be taken up where it was left."""
+class Memory:
+    """Remembers the attributes that `REMEMBERED` names, under their names without underscores.
+
+    Arrays are copied out and written back in place; what has a memory of its own gives and takes
+    its own state; enumerations and named tuples come back as such; None stays None.
+    """
+
+    REMEMBERED: ClassVar[tuple[str, ...]] = ()
 
     def snapshot(self) -> State:
         """Return what is remembered."""
+        return {name.lstrip('_'): _plain(getattr(self, name)) for name in self.REMEMBERED}
 
     def restore(self, saved: State) -> None:
-        """Go on from a state; raises `DataError` if it does not fit."""
+        """Go on from a state.
+
+        Raises
+        ------
+        DataError
+            It does not fit; the object is not to be used then.
+        """
+        own = {name.lstrip('_'): getattr(self, name) for name in self.REMEMBERED}
+        put_back(
+            {key: value for key, value in own.items() if isinstance(value, np.ndarray)}, saved
+        )
+        for name in self.REMEMBERED:
+            key = name.lstrip('_')
+            if key not in saved:
+                raise DataError(f"The saved state lacks '{key}'.")
+            value = _of_kind(own[key], saved[key], key)
+            if value is not own[key]:
+                setattr(self, name, value)
 
 
-class ArrayMemory:
-    """Remembers in arrays that it changes in place, and in nothing else."""
+def _plain(value: Any) -> Any:
+    """Return a value as a state keeps it."""
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if hasattr(value, 'snapshot'):
+        return value.snapshot()
+    if isinstance(value, enum.IntEnum):
+        return int(value)
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    return value
 
-    def _memory(self) -> Mapping[str, NDArray[Any]]:
-        """Return the arrays by names."""
-        return {}
 
-    def snapshot(self) -> State:
-        """Return what is remembered."""
-        return copies(self._memory())
-
-    def restore(self, saved: State) -> None:
-        """Go on from a state; raises `DataError` if it does not fit."""
-        put_back(self._memory(), saved)
+def _of_kind(own: Any, saved: Any, key: str) -> Any:
+    """Return a saved value as the kind of value that an object has now."""
+    if isinstance(own, np.ndarray):
+        return own  # written in place
+    if hasattr(own, 'restore') != isinstance(saved, dict):
+        raise DataError(f"The saved state has '{key}' of another kind.")
+    if hasattr(own, 'restore'):
+        own.restore(saved)
+        return own
+    if isinstance(own, enum.IntEnum):
+        return type(own)(saved)
+    if isinstance(own, tuple):
+        return type(own)(*saved) if hasattr(own, '_fields') else tuple(saved)
+    return saved
 
 
 def copies(arrays: Mapping[str, NDArray[Any]]) -> State:

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import START_NS, blocks_of, cuts, examples, frozen, grid_ns
 
+from valveflow_ros.monitoring.alarm import AlarmAction
 from valveflow_ros.monitoring.alarms import AlarmState, Judged, ResidualAlarm
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S
@@ -47,7 +48,7 @@ def feed(alarm, time_ns, average):
 def acknowledged(alarm, shift_mw):
     """Acknowledge while this is what the residual speaks of; return the change, if any."""
     alarm.judged = Judged(START_NS, shift_mw / LIMIT, shift_mw)
-    return next(iter(alarm.acknowledge(START_NS, 'm')), None)
+    return next(iter(alarm.operate(AlarmAction.ACKNOWLEDGE, START_NS, 'm')[1]), None)
 
 
 def rows_of(plan):
@@ -62,8 +63,7 @@ def rows_of(plan):
 
 def press(alarm, act, now_ns):
     """Do what an operator does; return whether there was anything to do, and the changes."""
-    given = getattr(alarm, act)(now_ns, 'm')
-    return (bool(given), given) if act == 'acknowledge' else given
+    return alarm.operate(AlarmAction(act), now_ns, 'm')
 
 
 @examples(100)

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from streams import START_NS, blocks_of, cuts, examples, frozen, grid_ns
 
 from valveflow_ros.curve.shift import PieceShift, Shift
-from valveflow_ros.monitoring.alarm import BURIED
+from valveflow_ros.monitoring.alarm import BURIED, AlarmAction
 from valveflow_ros.monitoring.alarms import (
-    AlarmDesk,
+    Alarms,
     AlarmState,
     Judged,
     ResidualAlarm,
@@ -45,7 +45,7 @@ def fed(alarm, values, start_s=0, beside=()):
 def test_what_is_shelved_for_days_is_told_again_once_a_day_however_cut(data):
     alarm = ResidualAlarm(Settings(NERVOUS))
     fed(alarm, [2.0])
-    _, (aside,) = alarm.shelve(START_NS, 'm')
+    _, (aside,) = alarm.operate(AlarmAction.SHELVE, START_NS, 'm')
     count, told = 3 * DAY_S - 1, []
     for start, end in blocks_of(count, data.draw(cuts(count))):
         told += [(start + k, c) for k, c in fed(alarm, [2.0] * (end - start), 1 + start)]
@@ -61,7 +61,7 @@ def test_what_is_suppressed_for_days_is_told_again_if_it_stands(acts):
         alarm = ResidualAlarm(Settings({**NERVOUS, 'alarm_suppress_time': 60.0}))
         fed(alarm, [value])
         for act in acts:
-            getattr(alarm, act)(START_NS, 'm')
+            alarm.operate(AlarmAction(act), START_NS, 'm')
         (dark, *told) = fed(alarm, [math.nan] * (3 * DAY_S), 1)
         assert (dark[0], dark[1].state) == (60, SUPPRESSED)
         assert [row for row, _ in told] == [60 + day * DAY_S for day in days]
@@ -73,7 +73,7 @@ def test_on_the_shelf_what_is_over_is_not_told_again():
     for latch in (True, False):
         alarm = ResidualAlarm(Settings({**NERVOUS, 'alarm_latch': latch}))
         fed(alarm, [2.0])
-        alarm.shelve(START_NS, 'm')
+        alarm.operate(AlarmAction.SHELVE, START_NS, 'm')
         told = fed(alarm, [0.0] * (2 * DAY_S), 1)
         # Latched, it waits below the shelf for who has not acknowledged it.
         assert len(told) == (2 if latch else 0)
@@ -104,11 +104,11 @@ def moved(by_mw):
 
 
 class Two:
-    """Both alarms at one desk, and what they told."""
+    """Both alarms in one list, and what they told."""
 
     def __init__(self):
         self.residual, self.shift = ResidualAlarm(LONG), ShiftAlarm(LONG)
-        self.desk = AlarmDesk(self.residual, self.shift)
+        self.alarms = Alarms(self.residual, self.shift)
         self.told = []
 
     def rows(self, values, start_s):
@@ -118,7 +118,9 @@ class Two:
         self.told += self.shift.judge(moved(by_mw), START_NS + second * NS_PER_S, LONG)
 
     def press(self, act, second=0):
-        self.told += getattr(self.desk, act)(Judged(START_NS + second * NS_PER_S, 0.0, 0.0), 'm')
+        self.told += self.alarms.operate(
+            AlarmAction(act), Judged(START_NS + second * NS_PER_S, 0.0, 0.0), 'm'
+        )
 
     def go_on_elsewhere(self):
         """Be saved, and restored in a new process."""

@@ -27,9 +27,10 @@ from streams import (
 
 from valveflow_ros.curve.shift import PieceShift, Shift
 from valveflow_ros.errors import DataError
+from valveflow_ros.monitoring.alarm import AlarmAction
 from valveflow_ros.monitoring.alarms import (
     AlarmChange,
-    AlarmDesk,
+    Alarms,
     AlarmState,
     ResidualAlarm,
     ShiftAlarm,
@@ -67,7 +68,12 @@ def run(settings, rows, acts, places=()):
         events += feed_rows(monitor, rows.part(start, end))
         if end in acts:
             try:
-                events += getattr(monitor, acts.pop(end))()
+                act = acts.pop(end)
+                events += (
+                    monitor.set_reference()
+                    if act == 'set_reference'
+                    else monitor.operate_alarms(AlarmAction(act))
+                )
             except DataError as error:
                 assert 'shel' in str(error) or 'acknowledge' in str(error)
     return monitor, events
@@ -119,9 +125,9 @@ def test_an_outage_suppresses_and_gives_back_what_was():
 def test_without_an_alarm_there_is_nothing_to_shelve():
     monitor, _ = run(SETTINGS, table().part(0, LEARNT), {})
     with pytest.raises(DataError, match='no alarm to shelve'):
-        monitor.shelve()
+        monitor.operate_alarms(AlarmAction.SHELVE)
     with pytest.raises(DataError, match='no shelved alarm'):
-        monitor.unshelve()
+        monitor.operate_alarms(AlarmAction.UNSHELVE)
 
 
 # --- both at one desk -----------------------------------------------------------------------
@@ -136,7 +142,7 @@ def moved(by_mw):
 @pytest.fixture
 def desk():
     residual, shift = ResidualAlarm(NERVOUS), ShiftAlarm(NERVOUS)
-    return AlarmDesk(residual, shift), residual, shift
+    return Alarms(residual, shift), residual, shift
 
 
 def rows_for(residual, shift, values, start_s):
@@ -153,9 +159,9 @@ def test_first_out_is_the_alarm_that_came_first_of_those_that_stand(desk):
     assert second.first_out == 'curve_shift'
     assert second.sentence.endswith('The alarm curve_shift came first.')
     shift.judge(moved(0.0), START_NS + 20 * NS_PER_S, NERVOUS)
-    (cleared,) = shift.acknowledge(START_NS + 20 * NS_PER_S, 'm')
+    (cleared,) = shift.operate(AlarmAction.ACKNOWLEDGE, START_NS + 20 * NS_PER_S, 'm')[1]
     assert (cleared.state, cleared.first_out) == (AlarmState.NORMAL, 'residual')
-    made.acknowledge(residual.judged, 'm')
+    made.operate(AlarmAction.ACKNOWLEDGE, residual.judged, 'm')
     (last,) = rows_for(residual, shift, [0.0], 30)
     assert (last.state, last.first_out) == (AlarmState.NORMAL, '')
 
@@ -163,11 +169,13 @@ def test_first_out_is_the_alarm_that_came_first_of_those_that_stand(desk):
 def test_a_new_alarm_is_not_hidden_by_one_on_the_shelf(desk):
     made, residual, shift = desk
     rows_for(residual, shift, [2.0], 0)
-    (shelved,) = made.shelve(residual.judged, 'm')
+    (shelved,) = made.operate(AlarmAction.SHELVE, residual.judged, 'm')
     assert (shelved.name, shelved.state) == ('residual', AlarmState.SHELVED)
     (new,) = shift.judge(moved(2.0), START_NS, NERVOUS)
     assert (new.name, new.state) == ('curve_shift', AlarmState.UNACKNOWLEDGED)
-    (too,) = made.shelve(residual.judged._replace(time_ns=START_NS + 10 * NS_PER_S), 'm')
+    (too,) = made.operate(
+        AlarmAction.SHELVE, residual.judged._replace(time_ns=START_NS + 10 * NS_PER_S), 'm'
+    )
     assert too.name == 'curve_shift'
     back = rows_for(residual, shift, [2.0] * 100, 1)
     assert [(c.name, c.time_ns) for c in back] == [
@@ -192,10 +200,10 @@ def test_a_curve_that_cannot_be_judged_suppresses_until_one_can(desk):
 def test_a_shift_alarm_goes_on_where_it_was_saved(desk):
     made, residual, shift = desk
     shift.judge(moved(2.0), START_NS, NERVOUS)
-    made.shelve(residual.judged._replace(time_ns=START_NS), 'm')
+    made.operate(AlarmAction.SHELVE, residual.judged._replace(time_ns=START_NS), 'm')
     other, beside = ShiftAlarm(NERVOUS), ResidualAlarm(NERVOUS)
     other.restore(shift.snapshot())
-    AlarmDesk(beside, other)
+    Alarms(beside, other)
     for k in range(3):
         given = moved([2.0, 0.0, -3.0][k]), START_NS + k, NERVOUS
         assert frozen(shift.judge(*given)) == frozen(other.judge(*given))

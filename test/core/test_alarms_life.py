@@ -11,7 +11,7 @@ from alarm_story import held_in
 from streams import START_NS
 
 from valveflow_ros.errors import DataError
-from valveflow_ros.monitoring.alarm import AlarmLife
+from valveflow_ros.monitoring.alarm import AlarmAction, AlarmLife
 from valveflow_ros.monitoring.alarms import AlarmState, Priority, ResidualAlarm
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S
@@ -85,12 +85,12 @@ def test_a_shelf_ends_in_the_samples_own_time_by_whether_the_cause_is_there():
     for value, wanted in ((2.0, UNACKNOWLEDGED), (0.0, NORMAL)):
         alarm = ResidualAlarm(Settings({**NERVOUS, 'alarm_shelve_time': 60.0}))
         fed(alarm, [2.0] * 10)
-        done, (change,) = alarm.shelve(START_NS + 9 * NS_PER_S, 'm')
+        done, (change,) = alarm.operate(AlarmAction.SHELVE, START_NS + 9 * NS_PER_S, 'm')
         assert done
         assert (change.state, change.previous) == (SHELVED, UNACKNOWLEDGED)
         assert re.match(r'Put aside until 20\d\d-\d\d-\d\d \d\d:\d\d UTC; ', change.sentence)
-        assert alarm.shelve(START_NS + 9 * NS_PER_S, 'm') == (False, [])
-        assert alarm.acknowledge(START_NS + 9 * NS_PER_S, 'm') == []
+        assert alarm.operate(AlarmAction.SHELVE, START_NS + 9 * NS_PER_S, 'm') == (False, [])
+        assert alarm.operate(AlarmAction.ACKNOWLEDGE, START_NS + 9 * NS_PER_S, 'm')[1] == []
         ((row, back),) = fed(alarm, [value] * 100, 10)
         assert (row, back.state, back.previous) == (60, wanted, SHELVED)
         assert back.occurrence == 1
@@ -99,7 +99,7 @@ def test_a_shelf_ends_in_the_samples_own_time_by_whether_the_cause_is_there():
 def test_an_occurrence_on_the_shelf_is_not_lost():
     alarm = ResidualAlarm(Settings({**NERVOUS, 'alarm_shelve_time': 60.0}))
     fed(alarm, [2.0])
-    alarm.shelve(START_NS, 'm')
+    alarm.operate(AlarmAction.SHELVE, START_NS, 'm')
     (_, back), *_ = fed(alarm, [0.0, 2.0] * 50, 1)
     assert (back.state, back.occurrence) == (UNACKNOWLEDGED, 31)
 
@@ -110,7 +110,7 @@ def test_suppression_keeps_what_the_alarm_was_and_counts_nothing():
         alarm = ResidualAlarm(Settings(given))
         fed(alarm, [2.0] * 5)
         for act in done:
-            getattr(alarm, act)(START_NS + 4 * NS_PER_S, 'm')
+            alarm.operate(AlarmAction(act), START_NS + 4 * NS_PER_S, 'm')
         was = alarm.state
         changes = fed(alarm, [*[math.nan] * 100, *[2.0] * 50], 5)
         assert [(row, c.state) for row, c in changes] == [(30, SUPPRESSED), (110, was)]
@@ -123,7 +123,7 @@ def test_what_does_not_show_cannot_be_acknowledged():
     alarm = ResidualAlarm(Settings({**NERVOUS, 'alarm_suppress_time': 30.0}))
     fed(alarm, [2.0, *[math.nan] * 40])
     assert alarm.state == SUPPRESSED
-    assert alarm.acknowledge(START_NS + 40 * NS_PER_S, 'm') == []
+    assert alarm.operate(AlarmAction.ACKNOWLEDGE, START_NS + 40 * NS_PER_S, 'm')[1] == []
     ((_, back),) = fed(alarm, [2.0] * 100, 41)
     assert back.state == UNACKNOWLEDGED
 
@@ -138,7 +138,7 @@ def test_a_new_occurrence_ends_suppression_at_once():
 def test_a_clock_set_back_gives_the_shelf_no_more_time():
     alarm = ResidualAlarm(Settings({**NERVOUS, 'alarm_shelve_time': 60.0}))
     fed(alarm, [2.0], 5000)
-    alarm.shelve(START_NS + 5000 * NS_PER_S, 'm')
+    alarm.operate(AlarmAction.SHELVE, START_NS + 5000 * NS_PER_S, 'm')
     ((row, back),) = fed(alarm, [2.0] * 100)
     assert (row, back.state) == (61, UNACKNOWLEDGED)
 
@@ -219,10 +219,10 @@ def test_a_life_without_events_is_normal():
 def test_shelved_again_before_its_return_was_told_it_is_shelved_all_the_same():
     alarm = ResidualAlarm(Settings({**NERVOUS, 'alarm_flood': 1}))
     fed(alarm, [2.0])
-    alarm.shelve(START_NS, 'm')
-    assert alarm.unshelve(START_NS, 'm') == (True, [])
+    alarm.operate(AlarmAction.SHELVE, START_NS, 'm')
+    assert alarm.operate(AlarmAction.UNSHELVE, START_NS, 'm') == (True, [])
     assert (alarm.state, alarm.held) == (UNACKNOWLEDGED, 1)
-    assert alarm.shelve(START_NS, 'm') == (True, [])
+    assert alarm.operate(AlarmAction.SHELVE, START_NS, 'm') == (True, [])
     assert alarm.state == SHELVED
 
 
@@ -274,7 +274,7 @@ def test_what_stands_for_a_day_is_told_again_once_a_day(acts, state):
     alarm = ResidualAlarm(Settings({'alarm_suppress_time': 600.0}))
     ((_, raised),) = fed(alarm, [2.0])
     for act in acts:
-        getattr(alarm, act)(START_NS, 'm')
+        alarm.operate(AlarmAction(act), START_NS, 'm')
     changes = fed(alarm, [2.0] * (3 * DAY_S - 1), 1)
     assert [row for row, _ in changes] == [DAY_S, 2 * DAY_S]
     for _, change in changes:
@@ -291,7 +291,7 @@ def test_what_returned_and_waits_is_told_again_and_what_is_over_is_not():
     assert [(row, c.state) for row, c in changes] == [
         (1, UNACKNOWLEDGED), (2, RETURNED), (DAY_S + 2, RETURNED),
     ]  # fmt: skip
-    alarm.acknowledge(START_NS, 'm')
+    alarm.operate(AlarmAction.ACKNOWLEDGE, START_NS, 'm')[1]
     assert alarm.due_ns is None
     assert fed(alarm, [0.0] * (2 * DAY_S), DAY_S + 2) == []
 

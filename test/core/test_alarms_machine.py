@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 from streams import INTERPRETED, START_NS, frozen
 
+from valveflow_ros.monitoring.alarm import AlarmAction
 from valveflow_ros.monitoring.alarms import AlarmState, ResidualAlarm
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S
@@ -95,8 +96,7 @@ class Living(RuleBasedStateMachine):
 
     def by_hand(self, act):
         before = self.alarm.state
-        given = self.both(act, self.now_ns, 'm')
-        changes = given if act == 'acknowledge' else given[1]
+        _, changes = self.both('operate', AlarmAction(act), self.now_ns, 'm')
         self.check(before, changes)
         return before
 

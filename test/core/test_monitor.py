@@ -22,6 +22,7 @@ from streams import (
 from valveflow_ros.errors import DataError, ParameterError
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.fit.residual_chart import ResidualChart
+from valveflow_ros.monitoring.alarm import AlarmAction
 from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState
 from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.events import (
@@ -334,11 +335,11 @@ def test_a_fault_raises_one_alarm_which_stays_until_acknowledged_and_holds_fits_
     assert 300 < int(np.searchsorted(rows, changes[1].time_ns)) < 360
     for event in of_type(events, FitRequested):
         assert not changes[0].time_ns <= event.task.request_ns < changes[1].time_ns
-    change, entry = monitor.acknowledge()
+    change, entry = monitor.operate_alarms(AlarmAction.ACKNOWLEDGE)
     assert change.state == AlarmState.NORMAL
     assert entry.kind == JournalKind.ACKNOWLEDGE
     with pytest.raises(DataError, match='no alarm'):
-        monitor.acknowledge()
+        monitor.operate_alarms(AlarmAction.ACKNOWLEDGE)
 
 
 def test_an_outage_without_rows_raises_no_alarm():

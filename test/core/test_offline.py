@@ -22,6 +22,7 @@ from streams import (
 
 from valveflow_ros.errors import DataError, ValveflowError
 from valveflow_ros.fit.fit import fit
+from valveflow_ros.monitoring.alarm import AlarmAction
 from valveflow_ros.monitoring.events import CurveAdopted, FitRequested, JournalEntry, JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import (
@@ -80,7 +81,7 @@ class LiveRun:
         monitor = self.monitor
         try:
             if button == 'acknowledge':
-                self.events += monitor.acknowledge()
+                self.events += monitor.operate_alarms(AlarmAction.ACKNOWLEDGE)
             elif button == 'request':
                 self.take(monitor.request_fit(), late)
             elif button == 'time out' and self.waiting:

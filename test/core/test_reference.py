@@ -22,6 +22,7 @@ from streams import (
 from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.curve.shift import PieceShift, Shift
 from valveflow_ros.errors import DataError
+from valveflow_ros.monitoring.alarm import AlarmAction
 from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState, ShiftAlarm
 from valveflow_ros.monitoring.events import CurveAdopted, JournalEntry, JournalKind, ReferenceSet
 from valveflow_ros.monitoring.monitor import Monitor
@@ -133,12 +134,12 @@ def test_a_plant_that_moved_raises_the_alarm_once_and_it_can_be_acknowledged():
     assert change.value < -SETTINGS.real('shift_least')
     assert change.unit == 'MW'
     assert 'less than the reference of 2023-11-15' in change.sentence
-    acknowledged, entry = monitor.acknowledge()
+    acknowledged, entry = monitor.operate_alarms(AlarmAction.ACKNOWLEDGE)
     assert acknowledged.state == AlarmState.ACKNOWLEDGED
     assert acknowledged.name == 'curve_shift'
     assert entry.kind == JournalKind.ACKNOWLEDGE
     with pytest.raises(DataError, match='no alarm to acknowledge'):
-        monitor.acknowledge()
+        monitor.operate_alarms(AlarmAction.ACKNOWLEDGE)
     # The moved plant is accepted: its curve is the reference now.
     ended = changes_of(monitor.set_reference())
     assert [c.state for c in ended] == [AlarmState.NORMAL]
@@ -175,10 +176,12 @@ def test_its_states_are_those_of_the_standard():
     alarm = ShiftAlarm()
     assert told(alarm, judged(0.0, 1.0), judged(2.0), judged(2.1)) == [AlarmState.UNACKNOWLEDGED]
     assert told(alarm, judged(0.0, 1.0)) == [AlarmState.RETURNED_UNACKNOWLEDGED]
-    assert [c.state for c in alarm.acknowledge(START_NS, 'now')] == [AlarmState.NORMAL]
-    assert alarm.acknowledge(START_NS, 'now') == []
+    assert [c.state for c in alarm.operate(AlarmAction.ACKNOWLEDGE, START_NS, 'now')[1]] == [
+        AlarmState.NORMAL
+    ]
+    assert alarm.operate(AlarmAction.ACKNOWLEDGE, START_NS, 'now')[1] == []
     assert told(alarm, judged(-2.0)) == [AlarmState.UNACKNOWLEDGED]
-    (change,) = alarm.acknowledge(START_NS, 'now')
+    (change,) = alarm.operate(AlarmAction.ACKNOWLEDGE, START_NS, 'now')[1]
     assert change.sentence == 'Acknowledged. By -2.0 MW.'
     assert (change.occurrence, change.value, change.limit) == (2, -2.0, 0.4)
     assert told(alarm, judged(0.1)) == [AlarmState.NORMAL]
@@ -243,7 +246,7 @@ def test_rows_and_journal_repeat_it_bit_for_bit():
     events += monitor.set_reference()
     tables.append(following(monitor, 12, 2000, 4.0))
     events += feed_rows(monitor, tables[-1])
-    events += monitor.acknowledge()
+    events += monitor.operate_alarms(AlarmAction.ACKNOWLEDGE)
     events += monitor.reconfigure(SETTINGS.changed({'shift_least': 0.5}))
     events += monitor.restart(CLOCK_BACK)
     tables.append(plant(13, 900, 4.0))

@@ -10,7 +10,7 @@ from valveflow_msgs.msg import Alarm
 from valveflow_ros.curve.shift import PieceShift, Shift
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit
-from valveflow_ros.monitoring.alarms import AlarmDesk, ResidualAlarm, ShiftAlarm
+from valveflow_ros.monitoring.alarms import Alarms, ResidualAlarm, ShiftAlarm
 from valveflow_ros.monitoring.events import CurveAdopted, Event, JournalEntry, JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import JournalReplayer
@@ -170,7 +170,7 @@ def test_who_comes_late_finds_every_alarm_that_stands_among_what_is_kept() -> No
     """One stands and nothing happens to it; the other comes and goes for an hour."""
     nervous = Settings({'alarm_on_delay': 0.0, 'alarm_off_delay': 0.0, 'alarm_flood': 10})
     residual, shift = ResidualAlarm(nervous), ShiftAlarm(nervous)
-    AlarmDesk(residual, shift)
+    Alarms(residual, shift)
     nan, start_ns = float('nan'), DEFAULT_START_NS
     piece = PieceShift(1e3, 2e3, 2.0, 2.0, 2.0, 0.1, nan, nan, 200.0, 1e-6, True, 0.4)
     moved = Shift('then', 'now', start_ns, start_ns, (piece,), 0, 0, 0, 'It moved.')

@@ -15,6 +15,7 @@ from test_ros_reference import Listener
 from valveflow_msgs.msg import Alarm
 
 from valveflow_ros.curve.characteristic_json import to_json
+from valveflow_ros.monitoring.alarm import AlarmAction
 from valveflow_ros.monitoring.alarms import Judged, ResidualAlarm
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_rows
@@ -36,7 +37,7 @@ def after(values: list[float], shelved: bool = False) -> Item:
     column = np.array(values)
     alarm.feed(time_ns, column, column, 'm')
     if shelved:
-        assert alarm.shelve(int(time_ns[-1]), 'm')[0]
+        assert alarm.operate(AlarmAction.SHELVE, int(time_ns[-1]), 'm')[0]
     monitor: Any = SimpleNamespace(alarm=alarm, judged=Judged(0, values[-1], values[-1]))
     return alarm_item(monitor)
 

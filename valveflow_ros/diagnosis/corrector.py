@@ -20,7 +20,6 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from valveflow_ros.curve.characteristic import HeldCause
 from valveflow_ros.curve.regional_model import RegionalModel, make_taps
@@ -41,7 +40,7 @@ from valveflow_ros.records import (
     Signal,
 )
 from valveflow_ros.signals.units import integrated_input
-from valveflow_ros.state import ArrayMemory, Continuing, State, copies, put_back
+from valveflow_ros.state import Memory, State, put_back
 
 # What a cause with a memory does to rows as they come.
 #
@@ -69,7 +68,7 @@ class Valve(Protocol):
         ...
 
 
-class Stop(ArrayMemory):
+class Stop(Memory):
     """A saturation, or any cause of the opening without a memory."""
 
     def __init__(self, active: Active, reference: Reference) -> None:
@@ -82,8 +81,10 @@ class Stop(ArrayMemory):
         return np.asarray(self._active.cause.act(v, self._active.values, None), dtype=np.float64)
 
 
-class Slack(ArrayMemory):
+class Slack(Memory):
     """A backlash: the plug stays where it is until a flank reaches it."""
+
+    REMEMBERED = ('_state',)
 
     def __init__(self, active: Active, reference: Reference) -> None:
         del reference
@@ -97,12 +98,11 @@ class Slack(ArrayMemory):
         kernels.play_block(v, self._half, self._state, out)
         return out
 
-    def _memory(self) -> dict[str, NDArray[Any]]:
-        return {'place': self._state}
 
-
-class SlowServo(ArrayMemory):
+class SlowServo(Memory):
     """A rate limit, by the time between rows."""
+
+    REMEMBERED = ('_state', '_last_ns')
 
     def __init__(self, active: Active, reference: Reference) -> None:
         del reference
@@ -114,9 +114,6 @@ class SlowServo(ArrayMemory):
         out = np.empty(len(v))
         kernels.rate_limit_block(v, time_ns, self._rate, self._state, self._last_ns, out)
         return out
-
-    def _memory(self) -> dict[str, NDArray[Any]]:
-        return {'place': self._state, 'last_ns': self._last_ns}
 
 
 class Sticking:
@@ -153,8 +150,10 @@ class Sticking:
         self._chance.bit_generator.state = saved['chance']
 
 
-class Response(ArrayMemory):
+class Response(Memory):
     """Regional dynamics, run on a flow as it comes."""
+
+    REMEMBERED = ('_place', '_answer', '_past')
 
     def __init__(self, levels: FloatArray, taps: FloatArray, rows: int) -> None:
         self._levels, self._taps = levels, taps
@@ -174,9 +173,6 @@ class Response(ArrayMemory):
         )
         return out
 
-    def _memory(self) -> dict[str, NDArray[Any]]:
-        return {'place': self._place, 'answer': self._answer, 'past': self._past}
-
 
 class Reheater(Response):
     """A reheater behind part of the turbine: a share of the power is late by one lag."""
@@ -191,8 +187,10 @@ class Reheater(Response):
         return np.asarray(self._share * x + (1.0 - self._share) * super().feed(x, begin))
 
 
-class LateClock(ArrayMemory):
+class LateClock(Memory):
     """A series as it was some time ago."""
+
+    REMEMBERED = ('_place', '_past')
 
     def __init__(self, delay_s: float, step_s: float) -> None:
         late = delay_s / step_s
@@ -205,9 +203,6 @@ class LateClock(ArrayMemory):
         out = np.empty(len(y))
         kernels.delay(y, jumps, self._whole, self._part, self._place, self._past, out)
         return out
-
-    def _memory(self) -> dict[str, NDArray[Any]]:
-        return {'place': self._place, 'past': self._past}
 
 
 _VALVES: dict[str, Callable[[Active, Reference], Valve]] = {
@@ -286,7 +281,7 @@ class ChainCorrector:
         self._second.restore(saved['second'])
 
 
-class ModelCorrector:
+class ModelCorrector(Memory):
     """Take the causes of one extended model out of rows.
 
     Parameters
@@ -309,6 +304,8 @@ class ModelCorrector:
     DataError
         A cause cannot be taken out of rows as they come.
     """
+
+    REMEMBERED = ('_temperature', '_follows')
 
     def __init__(self, given: ExtendedModel, step_s: float) -> None:
         check_streams(given.model.active)
@@ -340,9 +337,9 @@ class ModelCorrector:
         self._follows = np.array([np.iinfo(np.int64).min // 2, kernels.NO_DATA], dtype=np.int64)
 
     def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`."""
+        """Return what is remembered."""
         return {
-            **copies(self._memory()),
+            **super().snapshot(),
             'parts': [part.snapshot() for part in self._parts()],
             'causes': self._causes(),
         }
@@ -351,7 +348,7 @@ class ModelCorrector:
         """Go on from a state; raises `DataError` if it does not fit."""
         if saved['causes'] != self._causes():
             raise DataError('The saved state was made with another model_file.')
-        put_back(self._memory(), saved)
+        super().restore(saved)
         for part, given in zip(self._parts(), saved['parts'], strict=True):
             part.restore(given)
 
@@ -361,10 +358,7 @@ class ModelCorrector:
         curve = [base.knots.tolist(), base.left.tolist(), base.right.tolist()]
         return [curve, *([a.name, list(a.values), list(a.extra)] for a in self._model.active)]
 
-    def _memory(self) -> dict[str, NDArray[Any]]:
-        return {'temperature': self._temperature, 'follows': self._follows}
-
-    def _parts(self) -> list[Continuing]:
+    def _parts(self) -> list[Valve | Memory]:
         clock = [] if self._clock is None else [self._clock]
         return [*self._valves, self._plain, self._extended, *self._reheaters.values(), *clock]
 

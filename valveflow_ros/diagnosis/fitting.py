@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -370,9 +371,7 @@ def search_levels(
 
     for k in range(0 if task.fixed_dynamics else len(model.base.levels)):
         for step, sign in itertools.product(steps, (1.0, -1.0)):
-            model, cost = descend(
-                model, cost, task.cost, lambda m, k=k, by=sign * step: moved(m, k, by)
-            )
+            model, cost = descend(model, cost, task.cost, partial(moved, level=k, by=sign * step))
     return model, cost
 
 
@@ -404,7 +403,7 @@ def search_lines(task: Task, model: Extended, cost: float) -> tuple[Extended, fl
             for direction, sign in itertools.product(directions, (1.0, -1.0)):
                 model, cost = descend(
                     model, cost, task.cost,
-                    lambda m, c=c, d=direction, by=sign * share: _along(m, c, d, by),
+                    partial(_along, c=c, direction=direction, by=sign * share),
                 )  # fmt: skip
     return model, cost
 

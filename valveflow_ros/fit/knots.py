@@ -14,6 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -380,7 +381,7 @@ def _search_place(
             model,
             cost,
             lambda m: problem.cost(m, ar),
-            lambda m, by=sign * share * span: moved(m, by),
+            partial(moved, by=sign * share * span),
         )
     return model, cost
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -251,6 +252,6 @@ def search_levels(
         for step, sign in itertools.product(_LEVEL_STEPS_MW, (1.0, -1.0)):
             model, cost = descend(
                 model, cost, lambda m: problem.cost(m, ar),
-                lambda m, k=k, by=sign * step: with_level_moved(m, k, by),
+                partial(with_level_moved, level=k, by=sign * step),
             )  # fmt: skip
     return model, cost

@@ -11,15 +11,13 @@ the curve (`run_length`): they belong to a wanted time between false alarms.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from valveflow_ros.curve.characteristic import ChartDesign
 from valveflow_ros.numerics import jit
 from valveflow_ros.records import NS_PER_S, ByteArray, FloatArray, IntArray
-from valveflow_ros.state import ArrayMemory
+from valveflow_ros.state import Memory
 
 # One wild block cannot raise the alarm alone.
 _CLIP = 4.0
@@ -107,7 +105,7 @@ def _run(
         shift[t] = state[_SHIFT]
 
 
-class ResidualChart(ArrayMemory):
+class ResidualChart(Memory):
     """Watch the residual of one curve, in constant time a row.
 
     Parameters
@@ -116,6 +114,8 @@ class ResidualChart(ArrayMemory):
     step_s : float
         Step of the rows. Blocks with less than half their rows are not judged.
     """
+
+    REMEMBERED = ('_place', '_state', '_sums')
 
     def __init__(self, design: ChartDesign, step_s: float) -> None:
         self.design = design
@@ -126,9 +126,6 @@ class ResidualChart(ArrayMemory):
         self._place = np.array([-1, 0], dtype=np.int64)
         self._state = np.array([0.0, math.nan, math.nan, math.nan])
         self._sums = np.zeros((4, 3))
-
-    def _memory(self) -> dict[str, NDArray[Any]]:
-        return {'place': self._place, 'state': self._state, 'sums': self._sums}
 
     def follow(self, other: ResidualChart) -> None:
         """Go on where the chart of an earlier curve was: a new curve undoes no evidence.

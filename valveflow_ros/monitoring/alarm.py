@@ -1,4 +1,4 @@
-"""What both alarms have in common: a life, and a voice that announces its changes."""
+"""An alarm by ANSI/ISA-18.2: its states, the ways between them, and what is announced."""
 
 from __future__ import annotations
 
@@ -6,15 +6,13 @@ import enum
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S
-from valveflow_ros.state import State
-
-# What there is to say of an alarm: its states, its priority, one change.
+from valveflow_ros.state import Memory, State
 
 
 class AlarmState(enum.IntEnum):
@@ -27,6 +25,14 @@ class AlarmState(enum.IntEnum):
     SHELVED = 4
     SUPPRESSED = 5
     OUT_OF_SERVICE = 6
+
+
+class AlarmAction(enum.Enum):
+    """What an operator can do to alarms."""
+
+    ACKNOWLEDGE = 'acknowledge'
+    SHELVE = 'shelve'
+    UNSHELVE = 'unshelve'
 
 
 class Priority(enum.IntEnum):
@@ -67,7 +73,7 @@ class AlarmChange:
     first_out: str = ''
 
     def snapshot(self) -> State:
-        """Return it as plain values; see `core.state`."""
+        """Return it as plain values."""
         numbers = {name: int(getattr(self, name)) for name in ('state', 'previous', 'priority')}
         return {**asdict(self), **numbers}
 
@@ -86,10 +92,7 @@ class Judged(NamedTuple):
     shift_mw: float
 
 
-# The life of one alarm by ISA-18.2: states and what leads from one to the next.
-
-
-class AlarmLife:
+class AlarmLife(Memory):
     """Keep the state of one alarm; know neither why it comes nor who is told.
 
     Three layers lie upon one another: the condition with its acknowledgement, suppression while
@@ -107,6 +110,10 @@ class AlarmLife:
     shelved_until_ns : int or None
         When the shelf lets it go by itself; None if it is not shelved.
     """
+
+    REMEMBERED: ClassVar[tuple[str, ...]] = (
+        'active', 'occurrence', 'raised_ns', 'shelved_until_ns', 'suppressed', '_below',
+    )  # fmt: skip
 
     def __init__(self) -> None:
         self.active = False
@@ -166,32 +173,6 @@ class AlarmLife:
         self._below = AlarmState.UNACKNOWLEDGED if self.active else AlarmState.NORMAL
         return True
 
-    def suppress(self) -> None:
-        """Keep it as it is while it cannot be judged."""
-        self.suppressed = True
-
-    def resume(self) -> None:
-        """Let it be what it was; it can be judged again."""
-        self.suppressed = False
-
-    def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`."""
-        return {
-            'active': self.active,
-            'occurrence': self.occurrence,
-            'raised_ns': self.raised_ns,
-            'shelved_until_ns': self.shelved_until_ns,
-            'suppressed': self.suppressed,
-            'below': int(self._below),
-        }
-
-    def restore(self, saved: State) -> None:
-        """Go on from a snapshot."""
-        self.active, self.occurrence = saved['active'], saved['occurrence']
-        self.raised_ns, self.suppressed = saved['raised_ns'], saved['suppressed']
-        self.shelved_until_ns = saved['shelved_until_ns']
-        self._below = AlarmState(saved['below'])
-
 
 # How often one alarm may be announced: a chattering one must not bury the others.
 
@@ -201,7 +182,7 @@ _MINUTE_NS = 60 * NS_PER_S
 _CHATTER = 3
 
 
-class FloodLimit:
+class FloodLimit(Memory):
     """Count the announcements of one alarm in the samples' own time.
 
     The first one always passes: only what was said shortly before can hold another back.
@@ -213,6 +194,8 @@ class FloodLimit:
     held : int
         How many were held back since the last one that passed.
     """
+
+    REMEMBERED = ('held', '_times_ns')
 
     def __init__(self) -> None:
         self.most = 1
@@ -243,14 +226,6 @@ class FloodLimit:
         """Follow a clock that was set by a step, so that no time is waited for twice."""
         self._times_ns = [t + step_ns for t in self._times_ns]
 
-    def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`."""
-        return {'held': self.held, 'times_ns': list(self._times_ns)}
-
-    def restore(self, saved: State) -> None:
-        """Go on from a snapshot."""
-        self.held, self._times_ns = saved['held'], list(saved['times_ns'])
-
 
 _LAST_NS = (1 << 63) - 1
 # What has stood so long since it was told is told again, so that no shift takes it for old news.
@@ -268,8 +243,8 @@ class Content(NamedTuple):
     sentence: str
 
 
-class VoicedAlarm(ABC):
-    """An alarm that lives and is heard.
+class Alarm(AlarmLife, ABC):
+    """An alarm whose changes are announced.
 
     The state is always true; what is announced follows it, held back by the flood limit. What was
     held back and stands is announced as soon as the limit lets it, and the next announcement tells
@@ -290,15 +265,20 @@ class VoicedAlarm(ABC):
 
     NAME = ''
 
+    REMEMBERED = (
+        *AlarmLife.REMEMBERED, '_flood', '_told', '_now', '_before', '_waits', '_told_ns',
+        '_others',
+    )  # fmt: skip
+
     def __init__(self, settings: Settings) -> None:
-        self._life = AlarmLife()
+        super().__init__()
         self._flood = FloodLimit()
         self._told = self._now = self._before = AlarmState.NORMAL
         self._waits = False
         self._told_ns = 0
         self._others = 0  # announcements of other alarms since it was told
         self.last: AlarmChange | None = None
-        self._beside: Sequence[VoicedAlarm] = (self,)
+        self._beside: Sequence[Alarm] = (self,)
         self.configure(settings)
 
     def configure(self, settings: Settings) -> None:
@@ -316,36 +296,6 @@ class VoicedAlarm(ABC):
         """Say why it cannot be judged."""
 
     @property
-    def state(self) -> AlarmState:
-        """Return the state, announced or not."""
-        return self._life.state
-
-    @property
-    def active(self) -> bool:
-        """Tell whether the condition holds now."""
-        return self._life.active
-
-    @property
-    def standing(self) -> bool:
-        """Tell whether it has come and is not cleared, shelved and suppressed ones included."""
-        return self._life.standing
-
-    @property
-    def occurrence(self) -> int:
-        """Return how often the condition has begun."""
-        return self._life.occurrence
-
-    @property
-    def raised_ns(self) -> int:
-        """Return when it began last, 0 before."""
-        return self._life.raised_ns
-
-    @property
-    def shelved_until_ns(self) -> int | None:
-        """Return when the shelf lets it go, None if it is not shelved."""
-        return self._life.shelved_until_ns
-
-    @property
     def held(self) -> int:
         """Return how many announcements the flood limit has held back since the last one."""
         return self._flood.held
@@ -356,7 +306,7 @@ class VoicedAlarm(ABC):
         if self._waits:
             # None: the limit was raised meanwhile, and it may go out at once.
             return self._flood.free_ns or 0
-        due = (self._life.shelved_until_ns, self._again_ns)
+        due = (self.shelved_until_ns, self._again_ns)
         return min((ns for ns in due if ns is not None), default=None)
 
     @property
@@ -364,47 +314,45 @@ class VoicedAlarm(ABC):
         """Return when it is to be told again; None if there is nothing that could be forgotten."""
         if self._others >= BURIED and self._told != AlarmState.NORMAL:
             return self._told_ns
-        return self._told_ns + _AGAIN_NS if self._life.standing else None
+        return self._told_ns + _AGAIN_NS if self.standing else None
 
-    def stand_beside(self, alarms: Sequence[VoicedAlarm]) -> None:
+    def stand_beside(self, alarms: Sequence[Alarm]) -> None:
         """Know the others, and this one among them, to tell which came first."""
         self._beside = tuple(alarms)
 
     def pass_time(self, time_ns: int, model_id: str) -> list[AlarmChange]:
         """Do what is due; return the change that makes, if any."""
-        until_ns = self._life.shelved_until_ns
+        until_ns = self.shelved_until_ns
         if until_ns is not None and time_ns >= until_ns:
-            self._life.unshelve()
+            self.unshelve()
         return self._tell(time_ns, model_id)
 
     def shift_time(self, step_ns: int) -> None:
         """Follow a clock that was set back, so that no shelf outlives its time."""
         self._flood.shift(step_ns)
         self._told_ns += step_ns
-        if self._life.shelved_until_ns is not None:
-            self._life.shelved_until_ns += step_ns
+        if self.shelved_until_ns is not None:
+            self.shelved_until_ns += step_ns
 
-    def acknowledge(self, time_ns: int, model_id: str) -> list[AlarmChange]:
-        """Acknowledge; empty when there is nothing to acknowledge."""
-        return self._tell(time_ns, model_id) if self._life.acknowledge() else []
+    def operate(
+        self, action: AlarmAction, time_ns: int, model_id: str
+    ) -> tuple[bool, list[AlarmChange]]:
+        """Do what an operator asks; return whether it could be done, and the change announced.
 
-    def shelve(self, time_ns: int, model_id: str) -> tuple[bool, list[AlarmChange]]:
-        """Put it aside for a time, if it stands and is not; return whether, and the change.
-
-        There is none to announce if it was announced as shelved before and what came between
-        was held back.
+        There may be none to announce: what was said before may still be true, or the flood limit
+        holds it back.
         """
-        done = self._life.shelve(min(time_ns + self._shelf_ns, _LAST_NS))
-        return done, self._tell(time_ns, model_id) if done else []
-
-    def unshelve(self, time_ns: int, model_id: str) -> tuple[bool, list[AlarmChange]]:
-        """Take it from the shelf; return whether it was there, and the change."""
-        done = self._life.unshelve()
+        if action is AlarmAction.ACKNOWLEDGE:
+            done = self.acknowledge()
+        elif action is AlarmAction.SHELVE:
+            done = self.shelve(min(time_ns + self._shelf_ns, _LAST_NS))
+        else:
+            done = self.unshelve()
         return done, self._tell(time_ns, model_id) if done else []
 
     def _tell(self, time_ns: int, model_id: str) -> list[AlarmChange]:
         """Announce the state, unless that was done or is held back."""
-        state = self._life.state
+        state = self.state
         if state != self._now:
             self._before, self._now = self._now, state
         if state == self._told:
@@ -451,7 +399,7 @@ class VoicedAlarm(ABC):
 
     def _worded(self, state: AlarmState, previous: AlarmState, sentence: str) -> str:
         """Return the sentence, with what shelf and suppression have to do with it."""
-        until_ns = self._life.shelved_until_ns
+        until_ns = self.shelved_until_ns
         if until_ns is not None:
             return f'Put aside until {_utc(until_ns)}; new alarms are not hidden by that.'
         if state == AlarmState.SUPPRESSED:
@@ -470,27 +418,13 @@ class VoicedAlarm(ABC):
         return min(standing, key=lambda alarm: alarm.raised_ns).NAME if standing else ''
 
     def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`."""
-        return {
-            'life': self._life.snapshot(),
-            'flood': self._flood.snapshot(),
-            'told': int(self._told),
-            'now': int(self._now),
-            'before': int(self._before),
-            'waits': self._waits,
-            'told_ns': self._told_ns,
-            'others': self._others,
-            'last': None if self.last is None else self.last.snapshot(),
-        }
+        """Return what is remembered, the last announcement among it."""
+        return {**super().snapshot(), 'last': self.last and self.last.snapshot()}
 
     def restore(self, saved: State) -> None:
-        """Go on from a snapshot."""
-        self._life.restore(saved['life'])
-        self._flood.restore(saved['flood'])
-        self._told, self._now = AlarmState(saved['told']), AlarmState(saved['now'])
-        self._before, self._waits = AlarmState(saved['before']), saved['waits']
-        self._told_ns, self._others = saved['told_ns'], saved['others']
-        self.last = None if saved['last'] is None else AlarmChange.restored(saved['last'])
+        """Go on from a state."""
+        super().restore(saved)
+        self.last = saved['last'] and AlarmChange.restored(saved['last'])
 
 
 def _missed(count: int) -> str:

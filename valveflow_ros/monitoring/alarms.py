@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,17 +11,17 @@ import numpy as np
 from valveflow_ros.curve.shift import PieceShift, Shift
 from valveflow_ros.errors import DataError
 from valveflow_ros.monitoring.alarm import (
+    Alarm,
+    AlarmAction,
     AlarmChange,
     AlarmState,
     Content,
     Judged,
     Priority,
-    VoicedAlarm,
 )
 from valveflow_ros.numerics import jit
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
-from valveflow_ros.state import State, put_back
 
 if TYPE_CHECKING:
     from valveflow_ros.monitoring.prediction import PredictionBlock
@@ -142,7 +142,7 @@ def _watch(
     return 0
 
 
-class ResidualAlarm(VoicedAlarm):
+class ResidualAlarm(Alarm):
     """Judge the evidence that the plant has left the curve: beyond 1 or -1 it has.
 
     Where the evidence cannot be judged for long, the alarm is suppressed. By ISA-18.2 that is no
@@ -163,6 +163,7 @@ class ResidualAlarm(VoicedAlarm):
     """
 
     NAME = 'residual'
+    REMEMBERED = (*Alarm.REMEMBERED, '_memory', 'judged')
 
     def __init__(self, settings: Settings) -> None:
         self._memory = np.zeros(_PLACES, dtype=np.int64)
@@ -188,7 +189,7 @@ class ResidualAlarm(VoicedAlarm):
         evidence: FloatArray,
         shift_mw: FloatArray,
         model_id: str,
-        beside: Sequence[VoicedAlarm] = (),
+        beside: Sequence[Alarm] = (),
     ) -> list[tuple[int, AlarmChange]]:
         """Judge rows; return changes, each with the number of rows up to it.
 
@@ -200,7 +201,7 @@ class ResidualAlarm(VoicedAlarm):
         shift_mw : float64 (n,)
             The shift it speaks of, for the sentence.
         model_id : str
-        beside : sequence of VoicedAlarm
+        beside : sequence of Alarm
             Others, for which the time passes row by row as well.
         """
         changes: list[tuple[int, AlarmChange]] = []
@@ -222,20 +223,20 @@ class ResidualAlarm(VoicedAlarm):
             changes += [(done, c) for a in everyone for c in a.pass_time(now_ns, model_id)]
         return changes
 
-    def _happened(self, now_ns: int, everyone: Sequence[VoicedAlarm]) -> None:
+    def _happened(self, now_ns: int, everyone: Sequence[Alarm]) -> None:
         """Let lives go on by what happened at a row."""
         what = int(self._memory[_WHAT])
         if what & _SET_BACK:
             for alarm in everyone:
                 alarm.shift_time(int(self._memory[_STEP]))
         if what & _DARKENED:
-            self._life.suppress()
+            self.suppressed = True
         if what & _SEEING:
-            self._life.resume()
+            self.suppressed = False
         if what & _TURNED and self._memory[_ACTIVE]:
-            self._life.begin(now_ns)
+            self.begin(now_ns)
         elif what & _TURNED:
-            self._life.end(self._latch)
+            self.end(self._latch)
 
     def _content(self, state: AlarmState) -> Content:
         value, shift_mw = self.judged.evidence, self.judged.shift_mw
@@ -247,16 +248,6 @@ class ResidualAlarm(VoicedAlarm):
             f'The residual could not be judged for {minutes:g} min: inputs are bad, or the valve '
             'is outside the curve.'
         )
-
-    def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`."""
-        return {**super().snapshot(), 'memory': self._memory.copy(), 'judged': list(self.judged)}
-
-    def restore(self, saved: State) -> None:
-        """Go on from a snapshot; raises `DataError` if it does not fit."""
-        put_back({'memory': self._memory}, saved)
-        super().restore(saved)
-        self.judged = Judged(*saved['judged'])
 
 
 def _sentence(state: AlarmState, shift_mw: float) -> str:
@@ -289,7 +280,7 @@ _DOUBT = 10.0
 _COVERED = 0.8
 
 
-class ShiftAlarm(VoicedAlarm):
+class ShiftAlarm(Alarm):
     """Follow the judgements of adopted curves against the reference.
 
     Notes
@@ -306,6 +297,9 @@ class ShiftAlarm(VoicedAlarm):
     """
 
     NAME = 'curve_shift'
+    REMEMBERED = (
+        *Alarm.REMEMBERED, '_value', '_limit', '_sentence', '_problem', '_ranges',
+    )  # fmt: skip
 
     def __init__(self, settings: Settings | None = None) -> None:
         self._value = 0.0
@@ -318,19 +312,19 @@ class ShiftAlarm(VoicedAlarm):
     @property
     def ranges(self) -> tuple[tuple[float, float], ...]:
         """Return from which u to which u pieces moved that were not judged unmoved since."""
-        return tuple(self._ranges)
+        return tuple((low, high) for low, high in self._ranges)
 
     def judge(self, shift: Shift, time_ns: int, settings: Settings) -> list[AlarmChange]:
         """Take a judgement; return the change it makes, if any."""
         self.configure(settings)
-        self._life.resume()
+        self.suppressed = False
         worst = shift.largest
         if worst is not None:
             self._value, self._limit = worst.shift_mw, worst.smallest_mw
             self._sentence = shift.sentence
         self._remember(shift, settings)
         if not self.active and worst is not None:
-            self._life.begin(time_ns)
+            self.begin(time_ns)
         doubt = any(_stands(p, settings) for p in shift.pieces)
         if self.active and not doubt and not self._ranges:
             self._end(shift.sentence)
@@ -342,15 +336,15 @@ class ShiftAlarm(VoicedAlarm):
         """Be suppressed, since a curve could not be judged, until the next one is."""
         self.configure(settings)
         self._problem = problem
-        self._life.suppress()
+        self.suppressed = True
         return self._tell(time_ns, model_id)
 
-    def end(
+    def reset(
         self, sentence: str, time_ns: int, model_id: str, settings: Settings
     ) -> list[AlarmChange]:
         """Let the condition be over, as with a new reference."""
         self.configure(settings)
-        self._life.resume()
+        self.suppressed = False
         if self.active:
             self._end(sentence)
         return self._tell(time_ns, model_id)
@@ -358,7 +352,7 @@ class ShiftAlarm(VoicedAlarm):
     def _end(self, sentence: str) -> None:
         self._ranges = []
         self._sentence, self._value = sentence, 0.0
-        self._life.end(self._latch)
+        self.end(self._latch)
 
     def _remember(self, shift: Shift, settings: Settings) -> None:
         """Remember the ranges that moved; forget older ones that are judged anew."""
@@ -380,24 +374,6 @@ class ShiftAlarm(VoicedAlarm):
     def _blind(self) -> str:
         return f'The curve could not be judged against its reference: {self._problem}'
 
-    def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`."""
-        return {
-            **super().snapshot(),
-            'value': self._value,
-            'limit': self._limit,
-            'sentence': self._sentence,
-            'problem': self._problem,
-            'ranges': [list(r) for r in self._ranges],
-        }
-
-    def restore(self, saved: State) -> None:
-        """Go on from a snapshot."""
-        super().restore(saved)
-        self._value, self._limit = saved['value'], saved['limit']
-        self._sentence, self._problem = saved['sentence'], saved['problem']
-        self._ranges = [(r[0], r[1]) for r in saved['ranges']]
-
 
 def _covered(span: tuple[float, float], pieces: list[PieceShift]) -> bool:
     """Tell whether pieces cover nearly all of a range of u."""
@@ -413,15 +389,15 @@ def _stands(piece: PieceShift, settings: Settings) -> bool:
     return piece.p_value < chance and abs(piece.shift_mw) >= least
 
 
-# Where the alarms come together: fed in the order of the rows, handled by an operator.
+_NOTHING_TO_DO = {
+    AlarmAction.ACKNOWLEDGE: 'There is no alarm to acknowledge.',
+    AlarmAction.SHELVE: 'There is no alarm to shelve.',
+    AlarmAction.UNSHELVE: 'There is no shelved alarm.',
+}
 
 
-# Something an operator does: what was judged last, and by which curve, in; changes out.
-Act = Callable[[Judged, str], list[AlarmChange]]
-
-
-class AlarmDesk:
-    """Hold all alarms of the monitor.
+class Alarms:
+    """All alarms of the monitor, in one list.
 
     Parameters
     ----------
@@ -431,7 +407,7 @@ class AlarmDesk:
 
     def __init__(self, residual: ResidualAlarm, shift: ShiftAlarm) -> None:
         self._residual, self._shift = residual, shift
-        self._all = residual, shift
+        self._all: tuple[Alarm, ...] = (residual, shift)
         for alarm in self._all:
             alarm.stand_beside(self._all)
 
@@ -448,47 +424,24 @@ class AlarmDesk:
         )
         return [change for _, change in changes]
 
-    def acknowledge(self, judged: Judged, model_id: str) -> list[AlarmChange]:
-        """Acknowledge all alarms.
+    def operate(self, action: AlarmAction, judged: Judged, model_id: str) -> list[AlarmChange]:
+        """Do to every alarm what an operator asks; return what is announced.
+
+        Parameters
+        ----------
+        action : AlarmAction
+        judged : Judged
+            What was judged last.
+        model_id : str
+            The curve it was judged by.
 
         Raises
         ------
         DataError
-            There is nothing to acknowledge.
+            There is no alarm to which that can be done.
         """
         self._residual.judged = judged
-        changes = [c for a in self._all for c in a.acknowledge(judged.time_ns, model_id)]
-        if not changes:
-            raise DataError('There is no alarm to acknowledge.')
-        return changes
-
-    def shelve(self, judged: Judged, model_id: str) -> list[AlarmChange]:
-        """Put all alarms that stand aside for a time.
-
-        Raises
-        ------
-        DataError
-            None stands that is not shelved already.
-        """
-        self._residual.judged = judged
-        done = [alarm.shelve(judged.time_ns, model_id) for alarm in self._all]
-        return _changes(done, 'There is no alarm to shelve.')
-
-    def unshelve(self, judged: Judged, model_id: str) -> list[AlarmChange]:
-        """Take all alarms from the shelf; one that the flood limit holds back comes later.
-
-        Raises
-        ------
-        DataError
-            None is shelved.
-        """
-        self._residual.judged = judged
-        done = [alarm.unshelve(judged.time_ns, model_id) for alarm in self._all]
-        return _changes(done, 'There is no shelved alarm.')
-
-
-def _changes(done: list[tuple[bool, list[AlarmChange]]], otherwise: str) -> list[AlarmChange]:
-    """Return the changes of all alarms; say so if nothing was done to any."""
-    if not any(did for did, _ in done):
-        raise DataError(otherwise)
-    return [change for _, changes in done for change in changes]
+        done = [alarm.operate(action, judged.time_ns, model_id) for alarm in self._all]
+        if not any(could for could, _ in done):
+            raise DataError(_NOTHING_TO_DO[action])
+        return [change for _, changes in done for change in changes]

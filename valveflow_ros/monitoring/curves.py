@@ -17,7 +17,7 @@ from valveflow_ros.monitoring.rows import Rows
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, ByteArray, IntArray, SpecialSegment
 from valveflow_ros.segments.window import RollingWindow
-from valveflow_ros.state import State
+from valveflow_ros.state import Memory, State
 
 # What the running curve is worth.
 
@@ -93,7 +93,7 @@ class CurveInForce:
         return rows.shown(self._predictor.predict(*columns))
 
     def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`."""
+        """Return what is remembered."""
         predictor, curve = self._predictor, self.characteristic
         return {
             'curve': None if curve is None else to_json(curve),
@@ -128,7 +128,7 @@ class ReferenceKeeper:
         self.alarm = ShiftAlarm(settings)
 
     def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`. The last judgement is not."""
+        """Return what is remembered. The last judgement is not."""
         return {
             'curve': None if self.curve is None else to_json(self.curve),
             'problem': self.problem,
@@ -157,7 +157,7 @@ class ReferenceKeeper:
             )
         self.curve = curve
         self.shift, self.problem = None, ''
-        return self.alarm.end('There is a new reference.', time_ns, curve.model_id, settings)
+        return self.alarm.reset('There is a new reference.', time_ns, curve.model_id, settings)
 
     def judge(
         self,
@@ -193,11 +193,16 @@ class ReferenceKeeper:
 # When a fit is to be asked for, and which outcome is awaited.
 
 
-class Refits:
+class Refits(Memory):
     """Counts segments and time towards the next request, and names requests.
 
     A request's name is the time of the row after which it was made.
     """
+
+    REMEMBERED = (
+        'pending_ns', '_last_ns', '_later_ns', '_last_name_ns', '_segments_at_request',
+        'segments_seen',
+    )  # fmt: skip
 
     def __init__(self) -> None:
         self.pending_ns: int | None = None
@@ -271,21 +276,3 @@ class Refits:
     def owe(self) -> None:
         """Let the segments of the last request count as new."""
         self._segments_at_request = min(self._segments_at_request, self.segments_seen - 1)
-
-    def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`."""
-        return {
-            'pending_ns': self.pending_ns,
-            'last_ns': self._last_ns,
-            'later_ns': self._later_ns,
-            'last_name_ns': self._last_name_ns,
-            'segments_at_request': self._segments_at_request,
-            'segments_seen': self.segments_seen,
-        }
-
-    def restore(self, saved: State) -> None:
-        """Go on from a state."""
-        self.pending_ns, self._last_ns = saved['pending_ns'], saved['last_ns']
-        self._later_ns, self._last_name_ns = saved['later_ns'], saved['last_name_ns']
-        self._segments_at_request = saved['segments_at_request']
-        self.segments_seen = saved['segments_seen']

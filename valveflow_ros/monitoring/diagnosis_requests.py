@@ -174,7 +174,7 @@ class Diagnosing:
         return [self.last, self._journal(kind, request_ns, model_id, reason)]
 
     def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`. Of a task no rows are."""
+        """Return what is remembered. Of a task no rows are."""
         last, pending = self.last, self._pending
         return {
             'mismatch': self._mismatch.snapshot(),

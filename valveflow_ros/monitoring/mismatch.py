@@ -21,7 +21,7 @@ from valveflow_ros.curve.regional_model import RegionalModel, curve
 from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.numerics import jit
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
-from valveflow_ros.state import State, copies, put_back
+from valveflow_ros.state import Memory
 
 # One pass over rows: means of a minute, what they say, and sums that forget.
 
@@ -259,7 +259,7 @@ class Misfit:
 NOTHING = Misfit(0.0, '', '')
 
 
-class Mismatch:
+class Mismatch(Memory):
     """Recursive statistics of the residual, in constant memory and time a row.
 
     Parameters
@@ -267,6 +267,8 @@ class Mismatch:
     step_s : float
         Step of the rows.
     """
+
+    REMEMBERED = ('_place', '_minute', '_z', '_state', '_block', '_kept', '_ends')
 
     def __init__(self, step_s: float) -> None:
         self._minute_ns = max(MINUTE_NS, round(step_s * NS_PER_S))
@@ -296,25 +298,6 @@ class Mismatch:
             block.residual_mw, self._minute_ns, self._least, model.knots, model.left, model.right,
             self._place, self._minute, self._state, self._block, self._kept, self._z,
         )  # fmt: skip
-
-    def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`."""
-        return {**copies(self._memory()), 'ends': list(self._ends)}
-
-    def restore(self, saved: State) -> None:
-        """Go on from a state; raises `DataError` if it does not fit."""
-        put_back(self._memory(), saved)
-        self._ends = saved['ends'][0], saved['ends'][1]
-
-    def _memory(self) -> dict[str, FloatArray | IntArray]:
-        return {
-            'place': self._place,
-            'minute': self._minute,
-            'z': self._z,
-            'state': self._state,
-            'block': self._block,
-            'kept': self._kept,
-        }
 
     def scores(self) -> FloatArray:
         """Return the statistics as normal deviates, shape (len(NAMES),); 0 where not judged."""

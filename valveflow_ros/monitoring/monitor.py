@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+from functools import partialmethod
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.task import FitTask
-from valveflow_ros.monitoring.alarms import Act, AlarmDesk, Judged, ResidualAlarm
+from valveflow_ros.monitoring.alarm import AlarmAction
+from valveflow_ros.monitoring.alarms import Alarms, Judged, ResidualAlarm
 from valveflow_ros.monitoring.curves import CurveInForce, CurveStatus, ReferenceKeeper, Refits
 from valveflow_ros.monitoring.diagnosis_requests import Diagnosing
 from valveflow_ros.monitoring.events import (
@@ -27,12 +29,12 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.records import IntArray, SampleTable, SpecialSegment
 from valveflow_ros.segments.segmenter import NoiseLevel, Segmented, Segmenter
 from valveflow_ros.segments.window import RollingWindow
-from valveflow_ros.state import Continuing, State
+from valveflow_ros.state import Memory
 
 BY_HAND = 'asked for by hand'
 
 
-class Monitor:
+class Monitor(Memory):
     """Keep the window, the segments, the curve, the reference, the predictions and the alarms.
 
     Parameters
@@ -43,12 +45,16 @@ class Monitor:
 
     Notes
     -----
-    The state changes by rows and by the calls `adopt`, `refuse`, `acknowledge`, `shelve`,
-    `unshelve`, `request_fit`, `set_reference`, `request_diagnosis`, `restart` and
-    `reconfigure`, and those of `diagnosing`, nothing else, and each such call leaves a
-    `JournalEntry` with the number of rows before it. Rows and journal together give the same
-    events again, bit for bit.
+    The state changes by rows and by the calls `adopt`, `refuse`, `operate_alarms`, `request_fit`,
+    `set_reference`, `request_diagnosis`, `restart` and `reconfigure`, and those of `diagnosing`,
+    nothing else, and each such call leaves a `JournalEntry` with the number of rows before it.
+    Rows and journal together give the same events again, bit for bit.
     """
+
+    REMEMBERED = (
+        '_correction', '_segmenter', '_window', 'alarm', '_force', '_refits', 'reference',
+        'diagnosing', '_rows', '_last_ns', '_went_back', 'judged',
+    )  # fmt: skip
 
     def __init__(self, settings: Settings, corrector: Corrector | None = None) -> None:
         self.settings = settings
@@ -63,7 +69,7 @@ class Monitor:
         self.judged = Judged(0, math.nan, math.nan)
         self._refits = Refits()
         self.reference = ReferenceKeeper(settings)
-        self._desk = AlarmDesk(self.alarm, self.reference.alarm)
+        self._alarms = Alarms(self.alarm, self.reference.alarm)
         self.diagnosing = Diagnosing(settings, self.alarm, self._journal)
 
     @property
@@ -130,7 +136,7 @@ class Monitor:
         if not changed:
             return []
         self.settings = self.diagnosing.settings = settings
-        self._desk.configure(settings)
+        self._alarms.configure(settings)
         self._force.configure(settings)
         text = json.dumps(changed, sort_keys=True)
         return [self._journal(JournalKind.SETTINGS, 0, '', text)]
@@ -193,28 +199,21 @@ class Monitor:
         """Ask for a diagnosis now; raises `DataError` where that makes no sense."""
         return self.diagnosing.request(self._last_ns, self._window, self.characteristic)
 
-    def acknowledge(self) -> list[Event]:
-        """Acknowledge the alarms.
+    def operate_alarms(self, action: AlarmAction) -> list[Event]:
+        """Acknowledge, shelve or unshelve the alarms.
 
         Raises
         ------
         DataError
-            There is nothing to acknowledge.
+            There is no alarm to which that can be done.
         """
-        return self._by_hand(self._desk.acknowledge, JournalKind.ACKNOWLEDGE)
-
-    def shelve(self) -> list[Event]:
-        """Put the alarms that stand aside for a time; raises `DataError` if there is none."""
-        return self._by_hand(self._desk.shelve, JournalKind.SHELVE)
-
-    def unshelve(self) -> list[Event]:
-        """Take the alarms from the shelf; raises `DataError` if none is there."""
-        return self._by_hand(self._desk.unshelve, JournalKind.UNSHELVE)
-
-    def _by_hand(self, act: Act, kind: JournalKind) -> list[Event]:
         model_id = self._model_id()
-        changes = act(self.judged, model_id)
-        return [*changes, self._journal(kind, 0, model_id, '')]
+        changes = self._alarms.operate(action, self.judged, model_id)
+        return [*changes, self._journal(JournalKind[action.name], 0, model_id, '')]
+
+    acknowledge = partialmethod(operate_alarms, AlarmAction.ACKNOWLEDGE)
+    shelve = partialmethod(operate_alarms, AlarmAction.SHELVE)
+    unshelve = partialmethod(operate_alarms, AlarmAction.UNSHELVE)
 
     def set_reference(self, given: Characteristic | None = None) -> list[Event]:
         """Let the running curve, or one that is given, be what later ones are judged against.
@@ -256,44 +255,6 @@ class Monitor:
         self.diagnosing.ask_again(reason)
         return [self._journal(JournalKind.RESUMED, 0, self._model_id(), reason)]
 
-    def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`."""
-        own = {
-            'rows': self._rows,
-            'last_ns': self._last_ns,
-            'went_back': self._went_back,
-            'judged': list(self.judged),
-        }
-        return {**{name: part.snapshot() for name, part in self._parts().items()}, **own}
-
-    def restore(self, saved: State) -> None:
-        """Go on from a state that was made with the same settings.
-
-        What was being computed then is awaited still.
-
-        Raises
-        ------
-        DataError
-            It does not fit; the monitor is not to be used then.
-        """
-        for name, part in self._parts().items():
-            part.restore(saved[name])
-        self._rows, self._last_ns = saved['rows'], saved['last_ns']
-        self._went_back = saved['went_back']
-        self.judged = Judged(*saved['judged'])
-
-    def _parts(self) -> dict[str, Continuing]:
-        return {
-            'correction': self._correction,
-            'segmenter': self._segmenter,
-            'window': self._window,
-            'alarm': self.alarm,
-            'force': self._force,
-            'refits': self._refits,
-            'reference': self.reference,
-            'diagnosing': self.diagnosing,
-        }
-
     def check_clock(self) -> None:
         """Raise `DataError` between a step back of the clock and the row that tells how far."""
         if self._went_back:
@@ -328,7 +289,7 @@ class Monitor:
         """Append what the rows brought; a segment can only have closed at the last of them."""
         events.append(block)
         if self.characteristic is not None:
-            events += self._desk.feed(block)
+            events += self._alarms.feed(block)
         self._close(segmented, events)
 
     def _close(self, segmented: Segmented, events: list[Event]) -> None:

@@ -10,6 +10,7 @@ from valveflow_ros.curve.characteristic_json import from_json
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.fit.task import FitTask
+from valveflow_ros.monitoring.alarm import AlarmAction
 from valveflow_ros.monitoring.diagnosis_requests import ASKED
 from valveflow_ros.monitoring.events import (
     DiagnosisRequested,
@@ -24,12 +25,7 @@ from valveflow_ros.records import Readings, SampleTable
 from valveflow_ros.signals.align import Aligned, Aligner
 
 Progress = Callable[[float, str], None]
-# What an operator did to the alarms.
-_AT_DESK = {
-    JournalKind.ACKNOWLEDGE: Monitor.acknowledge,
-    JournalKind.SHELVE: Monitor.shelve,
-    JournalKind.UNSHELVE: Monitor.unshelve,
-}
+_ALARM_ACTIONS = {JournalKind[action.name]: action for action in AlarmAction}
 CLOCK_BACK = 'The clock went back; the rows it had passed are set aside.'
 
 
@@ -187,8 +183,8 @@ class JournalReplayer:
         if entry.kind == JournalKind.FIT_REFUSED:
             self._tasks.pop(entry.request_ns, None)
             return monitor.refuse(entry.request_ns, entry.text)
-        if entry.kind in _AT_DESK:
-            return _AT_DESK[entry.kind](monitor)
+        if entry.kind in _ALARM_ACTIONS:
+            return monitor.operate_alarms(_ALARM_ACTIONS[entry.kind])
         if entry.kind == JournalKind.RESET:
             self._reset_at = monitor.rows
             return monitor.restart(entry.text)

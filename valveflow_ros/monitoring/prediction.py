@@ -16,7 +16,7 @@ from valveflow_ros.numerics import jit
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, ByteArray, FloatArray, IntArray
 from valveflow_ros.segments.kernel import NO_DATA, SETTLED_SLOPE, SETTLED_STEADY
-from valveflow_ros.state import State, copies, put_back
+from valveflow_ros.state import Memory
 
 _LONGEST_DELAY_S = 600.0
 _AGE, _PLACE, _LAST_NS = range(3)
@@ -165,7 +165,7 @@ def _predict(
         out.average[t] = f.memory[_AVERAGE]
 
 
-class Predictor:
+class Predictor(Memory):
     """Predict from one curve, recursively, in constant time a row.
 
     Parameters
@@ -182,6 +182,8 @@ class Predictor:
         that of the chart that came with the curve.
     """
 
+    REMEMBERED = ('_place', '_memory', '_past', '_chart')
+
     def __init__(
         self,
         characteristic: Characteristic,
@@ -195,14 +197,17 @@ class Predictor:
         design = characteristic.residuals.chart
         self._chart = None if design is None else ResidualChart(design, step_s)
         m = characteristic.model
+        self._place = np.zeros(3, dtype=np.int64)
+        self._memory = np.array([0.0, math.nan])
+        self._past = np.zeros(int(_LONGEST_DELAY_S / step_s) + 4)
         self._filter = _Filter(
             m.knots, m.left, m.right, m.levels, m.taps(step_s),
             settle=round(settle_s / step_s),
             forget=math.exp(-step_s / average_s),
             gap_ns=round(1.5 * step_s * NS_PER_S),
-            place=np.zeros(3, dtype=np.int64),
-            memory=np.array([0.0, math.nan]),
-            past=np.zeros(int(_LONGEST_DELAY_S / step_s) + 4),
+            place=self._place,
+            memory=self._memory,
+            past=self._past,
         )  # fmt: skip
 
     @classmethod
@@ -244,21 +249,6 @@ class Predictor:
             shift, out.state, self.characteristic.residuals.width_mw,
             self.characteristic.model_id,
         )  # fmt: skip
-
-    def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`."""
-        chart = None if self._chart is None else self._chart.snapshot()
-        return {**copies(self._memory()), 'chart': chart}
-
-    def restore(self, saved: State) -> None:
-        """Go on from a state of the same curve; raises `DataError` if it does not fit."""
-        put_back(self._memory(), saved)
-        if self._chart is not None:
-            self._chart.restore(saved['chart'])
-
-    def _memory(self) -> dict[str, FloatArray | IntArray]:
-        f = self._filter
-        return {'place': f.place, 'memory': f.memory, 'past': f.past}
 
     def _rows(
         self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray, kinds: ByteArray

@@ -46,7 +46,7 @@ class Corrector(Protocol):
         ...
 
     def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`."""
+        """Return what is remembered."""
         ...
 
     def restore(self, saved: State) -> None:
@@ -101,7 +101,7 @@ class Correction:
         return self._ahead
 
     def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`."""
+        """Return what is remembered."""
         ahead = self._ahead
         return {
             'corrector': None if self._corrector is None else self._corrector.snapshot(),

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
@@ -20,7 +18,7 @@ from valveflow_ros.records import (
 )
 from valveflow_ros.segments import kernel as kernel
 from valveflow_ros.segments.kernel import BINS, LINE_SIZE, WARM_UP
-from valveflow_ros.state import State, copies, put_back
+from valveflow_ros.state import Memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +61,7 @@ class NoiseLevel:
     learnt: bool
 
 
-class Segmenter:
+class Segmenter(Memory):
     """Streaming segmentation in constant time a row and bounded memory.
 
     Parameters
@@ -76,6 +74,8 @@ class Segmenter:
     Any cutting of the rows into calls of `feed` gives the same segments and
     the same kinds, bit for bit.
     """
+
+    REMEMBERED = ('_state', '_sums', '_lines', '_blocks', '_histograms', '_number')
 
     def __init__(self, settings: Settings) -> None:
         period = settings.real('sample_period')
@@ -169,24 +169,6 @@ class Segmenter:
                 if most is not None and len(found) >= most:
                     break
         return Segmented(kinds[:done], found)
-
-    def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`."""
-        return {**copies(self._memory()), 'number': self._number}
-
-    def restore(self, saved: State) -> None:
-        """Go on from a state; raises `DataError` if it does not fit."""
-        put_back(self._memory(), saved)
-        self._number = int(saved['number'])
-
-    def _memory(self) -> dict[str, NDArray[Any]]:
-        return {
-            'state': self._state,
-            'sums': self._sums,
-            'lines': self._lines,
-            'blocks': self._blocks,
-            'histograms': self._histograms,
-        }
 
     def _describe(self) -> FoundSegment:
         """Turn the kernel's numbers into a record."""

@@ -274,7 +274,7 @@ class RollingWindow:
         )
 
     def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`."""
+        """Return what is remembered."""
         rows, aside = self._held(), self._aside
         return {
             'seen': self._seen,

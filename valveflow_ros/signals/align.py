@@ -14,11 +14,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from valveflow_ros import state
 from valveflow_ros.numerics import inlined, jit
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
@@ -33,7 +34,6 @@ from valveflow_ros.records import (
     SampleTable,
     Signal,
 )
-from valveflow_ros.state import ArrayMemory
 
 # The loop that turns readings into rows; see `valveflow_ros.signals.align` for the rules.
 
@@ -361,7 +361,7 @@ class Aligned:
     resets: IntArray
 
 
-class Aligner(ArrayMemory):
+class Aligner:
     """Turn readings into rows, in one pass and bounded memory.
 
     Parameters
@@ -426,8 +426,13 @@ class Aligner(ArrayMemory):
             for info in SIGNALS
         }
 
-    def _memory(self) -> dict[str, NDArray[Any]]:
-        return self._state._asdict()
+    def snapshot(self) -> state.State:
+        """Return what is remembered."""
+        return state.copies(self._state._asdict())
+
+    def restore(self, saved: state.State) -> None:
+        """Go on from a state; raises `DataError` if it does not fit."""
+        state.put_back(self._state._asdict(), saved)
 
     def _run(self, readings: Readings, final: bool) -> Aligned:
         tables: list[SampleTable] = []

@@ -8,7 +8,7 @@ import math
 from valveflow_ros.errors import counted
 from valveflow_ros.fit.result import weaknesses
 from valveflow_ros.logs import RecorderState
-from valveflow_ros.monitoring.alarm import AlarmState, VoicedAlarm
+from valveflow_ros.monitoring.alarm import Alarm, AlarmState
 from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.ros.conversions import NOT_YET
@@ -102,11 +102,11 @@ def alarm_item(monitor: Monitor) -> Item:
     return Item('alarm', Level.OK, 'No alarm.', values)
 
 
-def _words(alarm: VoicedAlarm) -> str:
+def _words(alarm: Alarm) -> str:
     return alarm.state.name.lower().replace('_', ' ')
 
 
-def _count_values(alarm: VoicedAlarm) -> dict[str, object]:
+def _count_values(alarm: Alarm) -> dict[str, object]:
     """Return what an announcement may not have told yet."""
     until_ns = alarm.shelved_until_ns
     return {

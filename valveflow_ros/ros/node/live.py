@@ -126,7 +126,7 @@ class LiveEngine:
         return self.monitor.reconfigure(settings)
 
     def snapshot(self) -> State:
-        """Return what is remembered; see `core.state`."""
+        """Return what is remembered."""
         return {'aligner': self.aligner.snapshot(), 'monitor': self.monitor.snapshot()}
 
     def restore(self, saved: State) -> None:
