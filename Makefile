@@ -1,7 +1,7 @@
 # make setup   .venv and install/, from pinned wheels; quick when nothing changed
 # make demo    set-up, then a simulated plant, the monitor, an alarm and a recording
 # make test    set-up, then every test on all cores (PYTEST_ARGS='-k partition' for some, PARALLEL= for one by one)
-# make test-slow   set-up, then the tests marked slow, also those that make test leaves out
+# make test-slow   set-up, then the tests marked slow, and those with drawn examples on fresh ones
 # make lint    set-up, then ruff and mypy           (make format rewrites the layout)
 # make bench   set-up, then what is fast, measured
 # make bench-gate  set-up, then this tree's speed against an earlier one's, by ratios (BASE=COMMIT; minutes)
@@ -46,7 +46,8 @@ test: setup
 	@$(ENV) VALVEFLOW_REQUIRE_ROS=1 python -m pytest $(PARALLEL) $(PYTEST_ARGS)
 
 test-slow: setup
-	@$(ENV) VALVEFLOW_REQUIRE_ROS=1 VALVEFLOW_SLOW=1 python -m pytest -m slow $(PYTEST_ARGS)
+	@$(ENV) VALVEFLOW_REQUIRE_ROS=1 VALVEFLOW_SLOW=1 python -m pytest -m 'slow or hypothesis' \
+	  $(PYTEST_ARGS)
 
 lint: setup
 	@$(ENV) ruff check .
