@@ -5,7 +5,8 @@
 # make lint    set-up, then ruff and mypy           (make format rewrites the layout)
 # make bench   set-up, then what is fast, measured
 # make bench-gate  set-up, then this tree's speed against an earlier one's, by ratios (BASE=COMMIT; minutes)
-# make mutation   set-up, then small mistakes in recorder, recovery and state: which do the tests notice?
+# make mutation   set-up, then small mistakes in recorder, recovery and state: which do the tests
+#                 notice? (hours; ONLY='valveflow_ros.state*' for some)
 # make repeat   set-up, then the quick tests of recorder, recovery and state, N=200 times
 # make torture   set-up, then kills, faults, flips, fuzz, signals and a year of soak, counted (hours)
 # make study   how good curve, choice, segments, shifts, alarm and baselines are (hours)
@@ -65,7 +66,7 @@ bench-gate: setup
 	@$(ENV) python -m benchmarks.regression $(if $(BASE),--base $(BASE))
 
 mutation: setup
-	@$(ENV) python -m benchmarks.mutation $(if $(SEED),--seed $(SEED))
+	@$(ENV) mutmut run $(ONLY)
 
 repeat: setup
 	@$(ENV) python -m benchmarks.repeats --count $(or $(N),200)

@@ -1,1 +1,0 @@
-"""Small mistakes put into recorder, recovery and snapshot, to see whether the tests notice."""
