@@ -16,7 +16,7 @@ from valveflow_ros.monitoring.diagnosis_requests import (
     ASKED,
     FITS_AGAIN,
     NIGHTLY,
-    Diagnosing,
+    DiagnosisRequests,
 )
 from valveflow_ros.monitoring.events import (
     Diagnosed,
@@ -39,15 +39,15 @@ CURVE = SimpleNamespace(model_id='curve')
 CONTENT = json.dumps({'verdict': 'nothing', 'sentence': 'All is well.'})
 
 
-class Bench:
-    """A `Diagnosing` with a window, an alarm and a misfit that the test sets."""
+class Screening:
+    """A `DiagnosisRequests` with a window, an alarm and a misfit that the test sets."""
 
     def __init__(self, **values):
         self.alarm = SimpleNamespace(active=False)
         self.window = SimpleNamespace(span_s=5 * 86400.0, contents=lambda: EMPTY)
         self.score, self.time_ns, self.curve = 0.0, MIDNIGHT_NS, CURVE
         settings = Settings({'mismatch_limit': 5.0, 'diagnosis_hour': 2, **values})
-        self.made = Diagnosing(settings, self.alarm, self.journal)
+        self.made = DiagnosisRequests(settings, self.alarm, self.journal)
         self.made._mismatch = SimpleNamespace(
             judge=lambda: Misfit(self.score, 'gain' if self.score else '', 'it drifts')
         )
@@ -89,7 +89,7 @@ def test_looks_fall_at_the_first_row_of_an_hour_however_the_stream_is_cut(steps,
     times = MIDNIGHT_NS + np.cumsum(steps) * NS_PER_S
     hours = [t // HOUR_NS for t in times.tolist()]
     truth = [k + 1 for k, (a, b) in enumerate(itertools.pairwise(hours)) if a != b]
-    bench, looked = Bench(diagnosis_hour=-1), []
+    bench, looked = Screening(diagnosis_hour=-1), []
     for start, end in blocks_of(len(times), data.draw(cuts(len(times)))):
         done = start
         while done < end:
@@ -102,23 +102,23 @@ def test_looks_fall_at_the_first_row_of_an_hour_however_the_stream_is_cut(steps,
 
 
 def test_every_night_at_the_hour_of_the_samples_unless_switched_off():
-    bench = Bench()
+    bench = Screening()
     said = []
     for _ in range(3):
         said += settle(bench, bench.until(24))
     assert reasons(said) == [((24 * k + 2) * HOUR_NS, NIGHTLY) for k in range(3)]
-    assert not reasons(Bench(diagnosis_hour=-1).until(72))
+    assert not reasons(Screening(diagnosis_hour=-1).until(72))
 
 
 def test_a_night_in_which_nobody_was_there_is_made_up_for():
-    bench = Bench()
+    bench = Screening()
     bench.run([MIDNIGHT_NS])
     late = MIDNIGHT_NS + 5 * HOUR_NS
     assert reasons(bench.run([late])) == [(5 * HOUR_NS, NIGHTLY)]
 
 
 def test_no_second_one_is_asked_for_while_one_runs_or_within_the_pause():
-    bench = Bench(diagnosis_pause=30.0)
+    bench = Screening(diagnosis_pause=30.0)
     first = bench.until(24)
     assert len(reasons(first)) == 1
     assert bench.made.pending
@@ -128,7 +128,7 @@ def test_no_second_one_is_asked_for_while_one_runs_or_within_the_pause():
 
 
 def test_the_alarm_asks_once_and_waits_for_the_pause():
-    bench = Bench(diagnosis_hour=-1, diagnosis_pause=4.0)
+    bench = Screening(diagnosis_hour=-1, diagnosis_pause=4.0)
     bench.until(1)
     bench.alarm.active = True
     assert reasons(settle(bench, bench.until(9))) == [(2 * HOUR_NS, ALARM)]
@@ -138,13 +138,13 @@ def test_the_alarm_asks_once_and_waits_for_the_pause():
     bench.alarm.active = True
     (asked,) = reasons(bench.until(9))
     assert asked == (15 * HOUR_NS, ALARM)
-    quiet = Bench(diagnosis_hour=-1, diagnosis_on_mismatch=False)
+    quiet = Screening(diagnosis_hour=-1, diagnosis_on_mismatch=False)
     quiet.alarm.active = True
     assert not reasons(quiet.until(5))
 
 
 def test_a_misfit_is_said_once_and_its_end_too():
-    bench = Bench(diagnosis_hour=-1)
+    bench = Screening(diagnosis_hour=-1)
     bench.until(1)
     story = [4.9, -5.1, 7.0, 4.0, -3.4, 3.0, 5.2]
     said = []
@@ -162,7 +162,7 @@ def test_a_misfit_is_said_once_and_its_end_too():
 
 
 def test_what_cannot_be_diagnosed_is_said_by_hand_and_waited_for_by_itself():
-    bench = Bench(diagnosis_hour=-1)
+    bench = Screening(diagnosis_hour=-1)
     bench.curve, bench.alarm.active = None, True
     with pytest.raises(DataError, match='no curve'):
         bench.made.request(bench.time_ns, bench.window, bench.curve)
@@ -177,7 +177,7 @@ def test_what_cannot_be_diagnosed_is_said_by_hand_and_waited_for_by_itself():
 
 
 def test_only_the_outcome_that_is_awaited_counts():
-    bench = Bench()
+    bench = Screening()
     entry, asked = bench.made.request(MIDNIGHT_NS, bench.window, bench.curve)
     assert (entry.kind, entry.text, entry.model_id) == (JournalKind.DIAGNOSE, ASKED, 'curve')
     name = asked.task.request_ns
@@ -192,7 +192,7 @@ def test_only_the_outcome_that_is_awaited_counts():
 
 
 def test_a_clock_that_goes_back_ends_what_runs_and_names_do_not_come_again():
-    bench = Bench(diagnosis_hour=-1)
+    bench = Screening(diagnosis_hour=-1)
     (_, first) = bench.made.request(bench.time_ns, bench.window, bench.curve)
     bench.score = 9.0
     bench.until(2)

@@ -206,7 +206,7 @@ class Cause:
     act : callable
         See `Stage`.
     starts : callable
-        Takes the `Bench` and returns promising values, none if there are none.
+        Takes the `Screening` and returns promising values, none if there are none.
     sentence : callable
         Takes what is to be told (see `Told`) and says what is wrong, for an operator.
     hindered : callable

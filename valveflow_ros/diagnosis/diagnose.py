@@ -32,7 +32,7 @@ from valveflow_ros.diagnosis.result import (
     NamedCause,
 )
 from valveflow_ros.diagnosis.scene import ORDER, Scene, make_scene
-from valveflow_ros.diagnosis.screening import Bench
+from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.diagnosis.search import Found, Progress, search, simplified
 from valveflow_ros.diagnosis.structure import Period, Structure, Wander, period, structure, wander
 from valveflow_ros.errors import DataError
@@ -243,16 +243,16 @@ def _moves(scene: Scene) -> None:
         )
 
 
-def _wandering(scene: Scene, bench: Bench, slow: Wander) -> FloatArray | None:
+def _wandering(scene: Scene, screening: Screening, slow: Wander) -> FloatArray | None:
     """Return the disturbance in MW of every mean, None if there is none."""
-    return slow.level[scene.sub] * bench.here if slow.there else None
+    return slow.level[scene.sub] * screening.here if slow.there else None
 
 
 def _look_again(found: Found) -> _Rest:
     """Look at what the model with all causes leaves."""
-    bench = Bench(found.task, found.model)
-    slow = wander(bench)
-    left = structure(found.task, found.model, _wandering(found.task.scene, bench, slow))
+    screening = Screening(found.task, found.model)
+    slow = wander(screening)
+    left = structure(found.task, found.model, _wandering(found.task.scene, screening, slow))
     return _Rest(slow, left, period(found.task, found.model))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import Task, base_tangents, cause_tangents
 from valveflow_ros.diagnosis.scene import FOLDS, SEALED_FOLD
-from valveflow_ros.diagnosis.screening import Bench, nuisance
+from valveflow_ros.diagnosis.screening import Screening, nuisance
 from valveflow_ros.fit.whitening import inflation
 from valveflow_ros.records import BoolArray, FloatArray, IntArray
 
@@ -28,8 +28,8 @@ def inferred(task: Task, model: Extended, allowed: BoolArray) -> Extended:
     """
     for a in model.active:
         if a.cause.infer is not None:
-            bench = Bench(task, model.without(a.name))
-            model = model.having(replace(a, extra=a.cause.infer(bench, a, allowed)))
+            screening = Screening(task, model.without(a.name))
+            model = model.having(replace(a, extra=a.cause.infer(screening, a, allowed)))
     return model
 
 

@@ -1,4 +1,4 @@
-"""The workbench of the screening: what is unexplained, and cheap ways to try a cause on it.
+"""Screening: what a model leaves unexplained, and cheap ways to try a cause on it.
 
 All tries are regressions of the whitened residual on whitened columns, freed of what curve,
 dynamics and the causes found so far could take up themselves. Products of columns are summed
@@ -54,8 +54,8 @@ _EDGE_SHARE = 0.04
 GAIN, INPUT, OFFSET, CURVE = 0, 1, 2, 3  # carriers; the hats of the curve begin at CURVE
 
 
-class Bench:
-    """Screening of one model.
+class Screening:
+    """The unexplained residual of one model, ready for causes to be tried on it.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ from valveflow_ros.diagnosis.fitting import (
     settle,
 )
 from valveflow_ros.diagnosis.scene import Scene
-from valveflow_ros.diagnosis.screening import Bench
+from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.fit.refine import search as search_plain
@@ -96,13 +96,13 @@ def _width(plain: Extended, knot: int) -> float:
 
 def _as_good(task: Task, plain: Extended, smaller: Extended, u: float, width: float) -> bool:
     """Tell whether a bump at ``u`` brings the smaller model to the cost of the plain one."""
-    bench, cause = Bench(task, smaller), catalogue()['curve_shape']
+    screening, cause = Screening(task, smaller), catalogue()['curve_shape']
     gain = max(
-        bench.scaled_height(cause, (u + place * width, share * width)).gain
+        screening.scaled_height(cause, (u + place * width, share * width)).gain
         for share in _WIDTHS
         for place in _PLACES
     )
-    return bench.floor - 2.0 * bench.variance * gain <= task.cost(plain)
+    return screening.floor - 2.0 * screening.variance * gain <= task.cost(plain)
 
 
 # Curve and regions found anew behind a strong cause.
@@ -305,12 +305,12 @@ def _absorb(found: Found, rival: Rival) -> None:
     found.plain, _ = improve(found.task, plain, 4)
 
 
-def _shortlist(bench: Bench, barred: set[str]) -> list[tuple[str, Start]]:
+def _shortlist(screening: Screening, barred: set[str]) -> list[tuple[str, Start]]:
     """Return starts worth a full refit: the best, and the families of the best."""
     starts: dict[str, list[Start]] = {}
     for name, cause in catalogue().items():
-        if name not in barred and name not in bench.model.names:
-            starts[name] = list(cause.starts(bench))
+        if name not in barred and name not in screening.model.names:
+            starts[name] = list(cause.starts(screening))
     best = {n: max(s.gain for s in found) for n, found in starts.items() if found}
     if not best or max(best.values()) < SCREEN_LEAST:
         return []
@@ -323,8 +323,8 @@ def _shortlist(bench: Bench, barred: set[str]) -> list[tuple[str, Start]]:
 
 def _rivals(found: Found, barred: set[str]) -> list[Rival]:
     """Refit every promising cause; best score first, one entry a cause."""
-    bench = Bench(found.task, found.model, found.rough)
-    shortlist = _shortlist(bench, barred)
+    screening = Screening(found.task, found.model, found.rough)
+    shortlist = _shortlist(screening, barred)
     tangents = base_tangents(found.task, found.model) if shortlist else None
     refits = []
     for name, start in shortlist:

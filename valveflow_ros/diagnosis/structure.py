@@ -18,7 +18,7 @@ from scipy.ndimage import median_filter
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import Task
 from valveflow_ros.diagnosis.scene import FOLDS, SEALED_FOLD
-from valveflow_ros.diagnosis.screening import Bench
+from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.fit.whitening import inflation
 from valveflow_ros.records import BoolArray, FloatArray
 
@@ -291,14 +291,14 @@ class Wander:
         return self.gain > LEAST_WANDER_GAIN
 
 
-def wander(bench: Bench) -> Wander:
+def wander(screening: Screening) -> Wander:
     """Estimate the level of each sub-block from its neighbours, and what that is worth.
 
     Kernels of several widths are tried; each sub-block is predicted without itself, so that
     what the noise does inside it cannot pay.
     """
-    own, toward = bench.gain_by_sub()
-    middle_h = bench.scene.sub_middle_s / 3600.0
+    own, toward = screening.gain_by_sub()
+    middle_h = screening.scene.sub_middle_s / 3600.0
     distance = np.abs(middle_h[:, None] - middle_h[None, :])
     np.fill_diagonal(distance, np.inf)
     usual = float(np.median(own[own > 0.0])) if np.any(own > 0.0) else 1.0
@@ -307,9 +307,11 @@ def wander(bench: Bench) -> Wander:
         weight = np.exp(-0.5 * (distance / width) ** 2)
         for shrink in _WANDER_SHRINK:
             level = (weight @ toward) / (weight @ own + shrink * usual)
-            gain = float(np.sum(2.0 * level * toward - level**2 * own)) / (2.0 * bench.variance)
+            gain = float(np.sum(2.0 * level * toward - level**2 * own)) / (
+                2.0 * screening.variance
+            )
             if gain > best.gain:
-                power = float(np.mean(bench.here[bench.scene.scored]))
+                power = float(np.mean(screening.here[screening.scene.scored]))
                 rms = float(np.sqrt(np.mean(level[own > 0.0] ** 2))) * power
                 best = Wander(gain, rms, width * 3600.0, level)
     return best

@@ -113,7 +113,7 @@ class CurveInForce:
 # The reference of the running monitor: kept, and what later curves are judged against.
 
 
-class ReferenceKeeper:
+class ReferenceCurve:
     """Keep the reference and the alarm on a shift.
 
     Parameters

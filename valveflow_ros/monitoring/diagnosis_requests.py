@@ -52,7 +52,7 @@ class Journal(Protocol):
         """Return the line."""
 
 
-class Diagnosing:
+class DiagnosisRequests:
     """Watches whether the model fits, asks for diagnoses, and keeps the last one.
 
     Parameters

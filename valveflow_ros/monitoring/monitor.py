@@ -12,8 +12,8 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.fit.task import FitTask
 from valveflow_ros.monitoring.alarm import AlarmAction
 from valveflow_ros.monitoring.alarms import Alarms, Judged, ResidualAlarm
-from valveflow_ros.monitoring.curves import CurveInForce, CurveStatus, ReferenceKeeper, Refits
-from valveflow_ros.monitoring.diagnosis_requests import Diagnosing
+from valveflow_ros.monitoring.curves import CurveInForce, CurveStatus, ReferenceCurve, Refits
+from valveflow_ros.monitoring.diagnosis_requests import DiagnosisRequests
 from valveflow_ros.monitoring.events import (
     CurveAdopted,
     Event,
@@ -68,9 +68,9 @@ class Monitor(Memory):
         self._went_back = False
         self.judged = Judged(0, math.nan, math.nan)
         self._refits = Refits()
-        self.reference = ReferenceKeeper(settings)
+        self.reference = ReferenceCurve(settings)
         self._alarms = Alarms(self.alarm, self.reference.alarm)
-        self.diagnosing = Diagnosing(settings, self.alarm, self._journal)
+        self.diagnosing = DiagnosisRequests(settings, self.alarm, self._journal)
 
     @property
     def rows(self) -> int:

@@ -10,7 +10,7 @@ from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import Active, Cause, Kind, Stage, Start, Told, Unknown, Values
 from valveflow_ros.diagnosis.scene import DAY_S, Scene
-from valveflow_ros.diagnosis.screening import GAIN, INPUT, OFFSET, Bench
+from valveflow_ros.diagnosis.screening import GAIN, INPUT, OFFSET, Screening
 from valveflow_ros.errors import counted
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
@@ -72,10 +72,12 @@ def apply_gain_drift(values: Values, scene: Scene, extra: Values) -> FloatArray:
     return np.asarray(1.0 + values[0] * ramp(scene, scene.time_s))
 
 
-def gain_drift_starts(bench: Bench) -> Sequence[Start]:
+def gain_drift_starts(screening: Screening) -> Sequence[Start]:
     """Regress on the power times a ramp in time."""
-    _, found = bench.modulated([GAIN], ramp(bench.scene, bench.scene.sub_middle_s)[None, :])
-    return bench.best(GAIN_DRIFT, [(float(found[0]),)])
+    _, found = screening.modulated(
+        [GAIN], ramp(screening.scene, screening.scene.sub_middle_s)[None, :]
+    )
+    return screening.best(GAIN_DRIFT, [(float(found[0]),)])
 
 
 def gain_drift_sentence(values: dict[str, float]) -> str:
@@ -107,9 +109,9 @@ def apply_gain_step(values: Values, scene: Scene, extra: Values) -> FloatArray:
     return np.asarray(1.0 + values[0] * since(scene, values[1]))
 
 
-def gain_step_starts(bench: Bench) -> Sequence[Start]:
+def gain_step_starts(screening: Screening) -> Sequence[Start]:
     """Try a step at every half hour."""
-    return bench.best_onset(GAIN_STEP, bench.only(GAIN))
+    return screening.best_onset(GAIN_STEP, screening.only(GAIN))
 
 
 def gain_step_sentence(values: Told) -> str:
@@ -144,11 +146,13 @@ def apply_input_drift(
     return np.asarray(1.0 + values[0] * ramp(scene, scene.time_s))
 
 
-def input_drift_starts(bench: Bench) -> Sequence[Start]:
+def input_drift_starts(screening: Screening) -> Sequence[Start]:
     """Regress on the input's effect times a ramp in time."""
-    _, found = bench.modulated([INPUT], ramp(bench.scene, bench.scene.sub_middle_s)[None, :])
+    _, found = screening.modulated(
+        [INPUT], ramp(screening.scene, screening.scene.sub_middle_s)[None, :]
+    )
     g = float(found[0])
-    return bench.best(INPUT_DRIFT, [(g,), (0.6 * g,)])
+    return screening.best(INPUT_DRIFT, [(g,), (0.6 * g,)])
 
 
 def input_drift_sentence(values: dict[str, float]) -> str:
@@ -182,9 +186,9 @@ def apply_input_step(
     return np.asarray(1.0 + values[0] * since(scene, values[1]))
 
 
-def input_step_starts(bench: Bench) -> Sequence[Start]:
+def input_step_starts(screening: Screening) -> Sequence[Start]:
     """Try a step at every half hour."""
-    return bench.best_onset(INPUT_STEP, bench.only(INPUT))
+    return screening.best_onset(INPUT_STEP, screening.only(INPUT))
 
 
 def input_step_sentence(values: Told) -> str:
@@ -217,10 +221,12 @@ def apply_output_offset_drift(y: FloatArray, values: Values, scene: Scene) -> Fl
     return np.asarray(y + values[0] * ramp(scene, scene.time_s))
 
 
-def output_offset_drift_starts(bench: Bench) -> Sequence[Start]:
+def output_offset_drift_starts(screening: Screening) -> Sequence[Start]:
     """Regress on a ramp in time."""
-    _, found = bench.modulated([OFFSET], ramp(bench.scene, bench.scene.sub_middle_s)[None, :])
-    return bench.best(OUTPUT_OFFSET_DRIFT, [(float(found[0]),)])
+    _, found = screening.modulated(
+        [OFFSET], ramp(screening.scene, screening.scene.sub_middle_s)[None, :]
+    )
+    return screening.best(OUTPUT_OFFSET_DRIFT, [(float(found[0]),)])
 
 
 def output_offset_drift_sentence(values: dict[str, float]) -> str:
@@ -269,60 +275,67 @@ def apply_intervals(values: Values, scene: Scene, extra: Values) -> FloatArray:
     return np.asarray(1.0 + values[0] * (inside - share))
 
 
-def intervals_starts(bench: Bench) -> Sequence[Start]:
+def intervals_starts(screening: Screening) -> Sequence[Start]:
     """Alternate between the path and the size, from several sizes of both signs."""
     tried = []
     for sign in (1.0, -1.0):
         for size in _FIRST_SIZES:
-            tried.append(_search(bench, sign * size))
+            tried.append(_search(screening, sign * size))
     good = [s for s in tried if s is not None and s.gain > 0.0]
     return sorted(good, key=lambda s: -(s.gain - 5.0 * len(s.extra)))[:1]
 
 
-def _search(bench: Bench, size: float) -> Start | None:
-    own, toward = bench.gain_by_sub()
+def _search(screening: Screening, size: float) -> Start | None:
+    own, toward = screening.gain_by_sub()
     path = np.zeros(len(own), dtype=np.uint8)
     share = _FIRST_SHARE
     for _ in range(_ROUNDS):
         before = path.copy()
-        _path(bench, own, toward, size, share, path)
+        _path(screening, own, toward, size, share, path)
         if not path.any() or path.all() or np.array_equal(path, before):
             break
-        _, found = bench.modulated([GAIN], path[None, :].astype(np.float64))
+        _, found = screening.modulated([GAIN], path[None, :].astype(np.float64))
         size, share = float(found[0]), float(path.mean())
     if path.mean() > 0.5:  # what is rarer is the event
         path, size = (1 - path).astype(np.uint8), -size
-    times = _switches(bench, path)
-    return bench.displaced(INTERVALS, (size,), times) if len(times) >= _LEAST_SWITCHES else None
+    times = _switches(screening, path)
+    return (
+        screening.displaced(INTERVALS, (size,), times) if len(times) >= _LEAST_SWITCHES else None
+    )
 
 
 def _path(
-    bench: Bench, own: FloatArray, toward: FloatArray, size: float, share: float, path: ByteArray
+    screening: Screening,
+    own: FloatArray,
+    toward: FloatArray,
+    size: float,
+    share: float,
+    path: ByteArray,
 ) -> None:
     """Write the cheapest path of the state for a size and the share of time it is on."""
     # The curve has taken up the mean: outside, the level lies as far below as it must.
     on, off = size * (1.0 - share), -size * share
     cost = (on * on - off * off) * own - 2.0 * (on - off) * toward
-    kernels.viterbi(cost / (2.0 * bench.variance), _SWITCH_PENALTY, path)
+    kernels.viterbi(cost / (2.0 * screening.variance), _SWITCH_PENALTY, path)
 
 
-def _switches(bench: Bench, path: ByteArray) -> Values:
+def _switches(screening: Screening, path: ByteArray) -> Values:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], path]).astype(int)))
-    return tuple(bench.sub_start_s(int(k)) for k in edges)
+    return tuple(screening.sub_start_s(int(k)) for k in edges)
 
 
-def infer(bench: Bench, active: Active, allowed: BoolArray) -> Values:
+def infer(screening: Screening, active: Active, allowed: BoolArray) -> Values:
     """Return the switches that the allowed sub-blocks show, for a size that is known.
 
-    The bench is that of the model without this cause.
+    The screening is that of the model without this cause.
     """
-    own, toward = (np.where(allowed, x, 0.0) for x in bench.gain_by_sub())
+    own, toward = (np.where(allowed, x, 0.0) for x in screening.gain_by_sub())
     edges = np.asarray(active.extra)
-    middle = bench.scene.sub_middle_s
+    middle = screening.scene.sub_middle_s
     share = float((np.searchsorted(edges, middle, side='right') % 2).mean())
     path = np.zeros(len(own), dtype=np.uint8)
-    _path(bench, own, toward, active.values[0], share, path)
-    return _switches(bench, path)
+    _path(screening, own, toward, active.values[0], share, path)
+    return _switches(screening, path)
 
 
 def intervals_sentence(values: dict[str, float]) -> str:
@@ -358,12 +371,12 @@ def apply_diurnal(values: Values, scene: Scene, extra: Values) -> FloatArray:
     return np.asarray(1.0 + a * np.cos(angle))
 
 
-def diurnal_starts(bench: Bench) -> Sequence[Start]:
+def diurnal_starts(screening: Screening) -> Sequence[Start]:
     """Regress on the power times a daily sine and cosine."""
-    angle = 2.0 * np.pi * bench.scene.clock_s(bench.scene.sub_middle_s) / DAY_S
-    _, found = bench.modulated([GAIN, GAIN], np.stack([np.cos(angle), np.sin(angle)]))
+    angle = 2.0 * np.pi * screening.scene.clock_s(screening.scene.sub_middle_s) / DAY_S
+    _, found = screening.modulated([GAIN, GAIN], np.stack([np.cos(angle), np.sin(angle)]))
     peak_h = float(np.mod(np.arctan2(found[1], found[0]) / (2.0 * np.pi) * 24.0, 24.0))
-    return bench.best(DIURNAL, [(float(np.hypot(*found)), peak_h)])
+    return screening.best(DIURNAL, [(float(np.hypot(*found)), peak_h)])
 
 
 def diurnal_sentence(values: dict[str, float]) -> str:

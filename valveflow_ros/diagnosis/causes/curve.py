@@ -13,7 +13,7 @@ from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import Cause, Kind, Stage, Start, Told, Unknown, Values
 from valveflow_ros.diagnosis.causes.changes import ONSET, a_day, since
 from valveflow_ros.diagnosis.scene import Scene
-from valveflow_ros.diagnosis.screening import CURVE, HATS, Bench
+from valveflow_ros.diagnosis.screening import CURVE, HATS, Screening
 from valveflow_ros.records import FloatArray
 
 _KEPT = 3
@@ -34,19 +34,19 @@ def apply_curve_shape(u: FloatArray, values: Values, scene: Scene) -> FloatArray
     return h * out
 
 
-def curve_shape_starts(bench: Bench) -> Sequence[Start]:
+def curve_shape_starts(screening: Screening) -> Sequence[Start]:
     """Try bumps of some widths everywhere on the curve; keep the best of each width."""
-    low, high = bench.hats[0], bench.hats[-1]
+    low, high = screening.hats[0], screening.hats[-1]
     found: list[Start] = []
     for share in _WIDTHS:
         width = share * (high - low)
         places = np.arange(low + 0.5 * width, high, 0.8 * width)
         tried = [
-            bench.scaled_height(CURVE_SHAPE, (float(u), float(width))) for u in places.tolist()
+            screening.scaled_height(CURVE_SHAPE, (float(u), float(width))) for u in places.tolist()
         ]
         found.append(max(tried, key=lambda s: s.gain))
     best = sorted(found, key=lambda s: -s.gain)[:_KEPT]
-    return [replace(s, base=_levels_under(bench.model.base, s.values)) for s in best]
+    return [replace(s, base=_levels_under(screening.model.base, s.values)) for s in best]
 
 
 def _levels_under(base: RegionalModel, values: Values) -> RegionalModel:
@@ -98,20 +98,21 @@ def apply_curve_step(u: FloatArray, values: Values, scene: Scene) -> FloatArray:
     return np.asarray(s * share * since(scene, t0))
 
 
-def curve_step_starts(bench: Bench) -> Sequence[Start]:
+def curve_step_starts(screening: Screening) -> Sequence[Start]:
     """Try shares between all pairs of places on the curve, at every half hour."""
     pairs = [(i, k) for i, k in itertools.combinations(range(HATS), 2) if i >= 1 and k <= HATS - 1]
     shapes = np.zeros((len(pairs), 3 + HATS))
     for row, (i, k) in enumerate(pairs):
-        at = (bench.hats - bench.hats[i]) / (bench.hats[k] - bench.hats[i])
+        at = (screening.hats - screening.hats[i]) / (screening.hats[k] - screening.hats[i])
         shapes[row, CURVE:] = np.clip(at, 0.0, 1.0)
-    gains, found = bench.onsets(shapes)
+    gains, found = screening.onsets(shapes)
     sub, row = divmod(int(np.argmax(gains)), len(pairs))
     i, k = pairs[row]
     values = (
-        float(found[sub, row]), float(bench.hats[i]), float(bench.hats[k]), bench.onset_days(sub)
+        float(found[sub, row]), float(screening.hats[i]), float(screening.hats[k]),
+        screening.onset_days(sub),
     )  # fmt: skip
-    return bench.best(CURVE_STEP, [values])
+    return screening.best(CURVE_STEP, [values])
 
 
 def curve_step_sentence(values: Told) -> str:

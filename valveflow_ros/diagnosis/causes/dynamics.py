@@ -12,7 +12,7 @@ from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import Active, Cause, Kind, Stage, Start, Unknown, Values
 from valveflow_ros.diagnosis.fitting import improve
 from valveflow_ros.diagnosis.scene import Scene
-from valveflow_ros.diagnosis.screening import Bench
+from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.records import FloatArray
 
 _TRIED_SHARES = (0.1, 0.3, 0.5, 0.7)
@@ -35,9 +35,9 @@ def apply_region_lag(model: RegionalModel, values: Values) -> RegionalModel:
     )
 
 
-def region_lag_starts(bench: Bench) -> Sequence[Start]:
+def region_lag_starts(screening: Screening) -> Sequence[Start]:
     """Try other time constants above some loads, the model's own levels among them."""
-    scene, base = bench.scene, bench.model.base
+    scene, base = screening.scene, screening.model.base
     x = base.static(scene.u[scene.usable > 0][::10])
     levels = [*np.quantile(x, _TRIED_SHARES).tolist(), *(base.levels + 0.01).tolist()]
     grid: list[Values] = []
@@ -47,7 +47,7 @@ def region_lag_starts(bench: Bench) -> Sequence[Start]:
             grid.append(
                 (float(base.time_constants[own]) * factor, float(base.delays[own]), float(level))
             )
-    return bench.best(REGION_LAG, grid)
+    return screening.best(REGION_LAG, grid)
 
 
 def region_lag_sentence(values: dict[str, float]) -> str:
@@ -91,21 +91,21 @@ def apply_reheater(y: FloatArray, values: Values, scene: Scene) -> FloatArray:
     return np.asarray(alpha * y + (1.0 - alpha) * late)
 
 
-def reheater_starts(bench: Bench) -> Sequence[Start]:
+def reheater_starts(screening: Screening) -> Sequence[Start]:
     """Try shares and time constants, and fit one with the whole model on a quicker base.
 
     The plain model took much of the lag for its own; its tangents do not lead out of that.
     """
-    task, base = bench.task, bench.model.base
+    task, base = screening.task, screening.model.base
     alpha, time_s = _SLOW
     less = _SWALLOWED * (1.0 - alpha) * time_s
     quicker = np.maximum(base.time_constants - less, _SHORTEST * base.time_constants)
-    model = replace(bench.model, base=replace(base, time_constants=quicker))
+    model = replace(screening.model, base=replace(base, time_constants=quicker))
     model, cost = improve(task, model.with_cause(Active(REHEATER, _SLOW)), _STEPS)
-    gain = (task.cost(bench.model) - cost) / (2.0 * bench.variance)
+    gain = (task.cost(screening.model) - cost) / (2.0 * screening.variance)
     fitted = Start(model.active[-1].values, gain, base=model.base)
     return [
-        *bench.best(REHEATER, list(_REHEATER_TRIED), keep=1),
+        *screening.best(REHEATER, list(_REHEATER_TRIED), keep=1),
         *([fitted] if gain > 0.0 else []),
     ]
 
@@ -155,9 +155,9 @@ def apply_clock(y: FloatArray, values: Values, scene: Scene) -> FloatArray:
     return np.asarray(y[at] * (1.0 - part) + y[after] * part)
 
 
-def clock_starts(bench: Bench) -> Sequence[Start]:
+def clock_starts(screening: Screening) -> Sequence[Start]:
     """Try some offsets."""
-    return bench.best(CLOCK, [(d,) for d in _TRIED_S], keep=2)
+    return screening.best(CLOCK, [(d,) for d in _TRIED_S], keep=2)
 
 
 def clock_sentence(values: dict[str, float]) -> str:

@@ -10,7 +10,7 @@ from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import Cause, Stage, Start, Unknown, Values
 from valveflow_ros.diagnosis.scene import Scene
-from valveflow_ros.diagnosis.screening import Bench
+from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.records import FloatArray
 
 
@@ -31,9 +31,9 @@ def apply_exponent(
     return np.asarray(np.exp(values[0] * (log - scene.reference.log_pressure)))
 
 
-def exponent_starts(bench: Bench) -> Sequence[Start]:
+def exponent_starts(screening: Screening) -> Sequence[Start]:
     """Try both signs: behind the regions a tangent understates it."""
-    return bench.scaled(EXPONENT, (0.02,))
+    return screening.scaled(EXPONENT, (0.02,))
 
 
 def exponent_sentence(values: dict[str, float]) -> str:
@@ -94,15 +94,15 @@ def apply_choked(u: FloatArray, values: Values, scene: Scene, model: RegionalMod
     return np.asarray(_psi(kappa * x / p) / _psi(kappa * x / line))
 
 
-def choked_starts(bench: Bench) -> Sequence[Start]:
+def choked_starts(screening: Screening) -> Sequence[Start]:
     """Try sizes that reach different pressure ratios at high load."""
-    scene = bench.scene
+    scene = screening.scene
     here = scene.usable > 0
-    x = _flow(scene.u[here], bench.model.base)
+    x = _flow(scene.u[here], screening.model.base)
     top = float(np.quantile(x / np.maximum(scene.pressure[here], 1e-6), 0.98))
     if not top > 0.0:
         return []
-    return bench.best(CHOKED, [(r / top,) for r in _TRIED_RATIOS])
+    return screening.best(CHOKED, [(r / top,) for r in _TRIED_RATIOS])
 
 
 def choked_sentence(values: dict[str, float]) -> str:
@@ -137,9 +137,9 @@ def apply_temperature(values: Values, scene: Scene, extra: Values) -> FloatArray
     return np.asarray(1.0 + values[0] * (scene.temperature - scene.reference.temperature_degc))
 
 
-def temperature_starts(bench: Bench) -> Sequence[Start]:
+def temperature_starts(screening: Screening) -> Sequence[Start]:
     """Try the slope of the residual against T."""
-    return bench.scaled(TEMPERATURE, (2e-4,))
+    return screening.scaled(TEMPERATURE, (2e-4,))
 
 
 def temperature_sentence(values: dict[str, float]) -> str:

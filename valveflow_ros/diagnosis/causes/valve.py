@@ -10,7 +10,7 @@ import numpy as np
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import Cause, Kind, Stage, Start, Unknown, Values
 from valveflow_ros.diagnosis.scene import Scene
-from valveflow_ros.diagnosis.screening import Bench
+from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.records import FloatArray
 
 _BACKLASH_TRIED = (0.1, 0.2, 0.35, 0.6, 1.0, 1.6, 2.7, 4.5)
@@ -30,9 +30,9 @@ def apply_backlash(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
     return out
 
 
-def backlash_starts(bench: Bench) -> Sequence[Start]:
+def backlash_starts(screening: Screening) -> Sequence[Start]:
     """Try some widths."""
-    return bench.best(BACKLASH, [(w,) for w in _BACKLASH_TRIED])
+    return screening.best(BACKLASH, [(w,) for w in _BACKLASH_TRIED])
 
 
 def backlash_sentence(values: dict[str, float]) -> str:
@@ -97,19 +97,21 @@ def apply_stiction(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
     return np.asarray(total / _DRAWS)
 
 
-def stiction_starts(bench: Bench) -> Sequence[Start]:
+def stiction_starts(screening: Screening) -> Sequence[Start]:
     """Begin at the slack it looks like, then walk downhill: the path forgives little."""
-    slack = bench.best(BACKLASH, [(s,) for s in _BANDS])
+    slack = screening.best(BACKLASH, [(s,) for s in _BANDS])
     if not slack or slack[0].gain < _LIKE_SLACK:
         return []  # a valve that sticks looks loose first of all
-    (near,) = bench.best(BACKLASH, [(slack[0].values[0] * f,) for f in _FACTORS])
+    (near,) = screening.best(BACKLASH, [(slack[0].values[0] * f,) for f in _FACTORS])
     rough = replace(STICTION, draws=_ROUGH_DRAWS)
     width = near.values[0]
-    tried = bench.best(rough, [(width * f, width * f * j) for f in _OVER_SLACK for j in _SHARES])
-    return [_downhill(bench, rough, tried[0], width)] if tried else []
+    tried = screening.best(
+        rough, [(width * f, width * f * j) for f in _OVER_SLACK for j in _SHARES]
+    )
+    return [_downhill(screening, rough, tried[0], width)] if tried else []
 
 
-def _downhill(bench: Bench, cause: Cause, best: Start, width: float) -> Start:
+def _downhill(screening: Screening, cause: Cause, best: Start, width: float) -> Start:
     """Move where the valve breaks loose, (S + J)/2, and where it stops, (S - J)/2, in turn."""
     for step in _STEPS:
         for by_band, by_jump in ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0)):
@@ -118,7 +120,7 @@ def _downhill(bench: Bench, cause: Cause, best: Start, width: float) -> Start:
                 jump += step * width * by_jump
                 if not 0.0 <= jump <= band:
                     break
-                trial = bench.displaced(cause, (band, jump))
+                trial = screening.displaced(cause, (band, jump))
                 if not trial.gain > best.gain:
                     break
                 best = trial
@@ -166,9 +168,9 @@ def apply_rate_limit(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
     return out
 
 
-def rate_limit_starts(bench: Bench) -> Sequence[Start]:
+def rate_limit_starts(screening: Screening) -> Sequence[Start]:
     """Try some speeds."""
-    return bench.best(RATE_LIMIT, [(r,) for r in _RATE_LIMIT_TRIED])
+    return screening.best(RATE_LIMIT, [(r,) for r in _RATE_LIMIT_TRIED])
 
 
 def rate_limit_sentence(values: dict[str, float]) -> str:
@@ -200,10 +202,10 @@ def apply_saturation(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
     return np.minimum(v, values[0])
 
 
-def saturation_starts(bench: Bench) -> Sequence[Start]:
+def saturation_starts(screening: Screening) -> Sequence[Start]:
     """Try some places among the highest openings."""
-    places = np.quantile(bench.scene.v[np.isfinite(bench.scene.v)], _TRIED_SHARES)
-    return bench.best(SATURATION, [(float(p),) for p in places])
+    places = np.quantile(screening.scene.v[np.isfinite(screening.scene.v)], _TRIED_SHARES)
+    return screening.best(SATURATION, [(float(p),) for p in places])
 
 
 def saturation_sentence(values: dict[str, float]) -> str:
