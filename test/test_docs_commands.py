@@ -66,7 +66,7 @@ def test_every_block_says_what_it_is(block: Block) -> None:
 
 
 def _parser(verb: str) -> ArgumentParser:
-    from valveflow_ros.cli.verbs import load
+    from valveflow_ros.cli.main import load
 
     parser = ArgumentParser(exit_on_error=False)
     load(verb).arguments(parser)
@@ -136,7 +136,7 @@ def _shim(folder: Path) -> dict[str, str]:
     """Return an environment in which the command and this Python are found first."""
     tools = folder / '.tools'
     tools.mkdir()
-    for name, arguments in (('valveflow', '-m valveflow_ros.cli'), ('python', '')):
+    for name, arguments in (('valveflow', '-m valveflow_ros.cli.main'), ('python', '')):
         path = tools / name
         path.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} {arguments} "$@"\n')
         path.chmod(0o755)

@@ -1,4 +1,4 @@
-"""A historian's table as readings, with everything that had to be understood about it."""
+"""Read a historian's table once, judge it, and give it out in the order of time."""
 
 from __future__ import annotations
 
@@ -13,21 +13,17 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from valveflow_ros.cli.console import Console
-from valveflow_ros.cli.historian_open import joined
-from valveflow_ros.cli.log_input import (
-    advice,
+from valveflow_ros.errors import DataError, RecordingError
+from valveflow_ros.interface import Progress
+from valveflow_ros.interface.files import reason
+from valveflow_ros.interface.mapping import LogMapping, joined
+from valveflow_ros.interface.plausibility import (
     air_note,
     check_constants,
     doubt,
-    names_for,
     refuse_guesses,
-    unit_for,
-    unknown_unit,
     with_constants,
 )
-from valveflow_ros.cli.options import LogMapping
-from valveflow_ros.errors import DataError, InputError, RecordingError
 from valveflow_ros.logs.reader import TABLE_SUFFIXES
 from valveflow_ros.logs.tables.reader import RawBlock, TableReader
 from valveflow_ros.logs.tables.refusal import RefusedError
@@ -46,9 +42,6 @@ from valveflow_ros.records import (
 )
 from valveflow_ros.report.data import Gap, gaps
 from valveflow_ros.signals.units import convert
-
-# What is to be told of a table that was imported.
-
 
 _SAMPLE = 500_000  # so many values are enough to judge a unit by
 
@@ -174,9 +167,6 @@ class Tally:
         return np.concatenate([*self._parts, *ends]) if self._parts else np.empty(0)
 
 
-# In which order the rows of a table are taken, and which are left out.
-
-
 @dataclass(frozen=True, slots=True)
 class Ordered:
     """In which order the rows of a file are to be taken.
@@ -254,9 +244,6 @@ class Ordered:
                 yield self.time_ns[rows], rows
 
 
-# Keeps the numbers of a long table on disk while its times decide their order.
-
-
 Array = NDArray[Any]
 
 
@@ -325,25 +312,24 @@ def _said(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RecordingError(folder, f'has no room for the work ({reason})') from None
+        raise RecordingError(folder, f'has no room for the work ({reason(error)})') from None
 
 
 _ROWS = 200_000  # in memory at a time
 _BY_COLUMN = {info.column: info for info in SIGNALS}
 
 
-class Historian:
+class TableImport:
     """A table that is read once, judged, and then given out in the order of time.
 
     Parameters
     ----------
     path : Path
         The table.
-    mapping : Mapping
+    mapping : LogMapping
         What the person said of it.
-    console : Console
-        Hears what was understood and what looks wrong.
+    progress : Progress
+        Receives what was understood and what looks wrong.
     strict : bool
         Refuse also a column that the person named without its unit, where its values speak
         against the usual one; otherwise that is a warning.
@@ -355,23 +341,21 @@ class Historian:
     """
 
     def __init__(
-        self, path: Path, mapping: LogMapping, console: Console, *, strict: bool = False
+        self, path: Path, mapping: LogMapping, progress: Progress, *, strict: bool = False
     ) -> None:
         if path.suffix.lower() not in TABLE_SUFFIXES:
             raise RecordingError(path, 'is no .csv, .xlsx or .parquet table')
-        self._console = console
+        self._progress = progress
         self._mapping = mapping
         self._strict = strict
-        self._reader = _reader(path, mapping)
-        self._constants = {
-            info.signal: mapping.constants[info.topic].value
-            for info in SIGNALS
-            if info.topic in mapping.constants
-        }
+        self._reader = mapping.opened(
+            lambda names: TableReader(path, names, list(mapping.constants), mapping.table)
+        )
+        self._constants = mapping.constant_signals
         check_constants(self._constants)
         told = {_BY_COLUMN[n].signal: unit for n, unit in self._reader.units.items()}
         self._units = {
-            name: unit_for(_BY_COLUMN[name].signal, mapping, told) for name in self._reader.names
+            name: mapping.unit_of(_BY_COLUMN[name].signal, told) for name in self._reader.names
         }
         self._used = [
             name for name in self._reader.names if _BY_COLUMN[name].signal not in self._constants
@@ -402,7 +386,7 @@ class Historian:
         uncertain = 0
         for block in self._reader.blocks():
             times.append(block.time_ns)
-            self._console.progress(0.1 + 0.5 * self._reader.share, 'reading')
+            self._progress(0.1 + 0.5 * self._reader.share, 'reading')
             for name in self._used:
                 there = block.present.get(name)
                 column = block.columns[name]
@@ -425,13 +409,13 @@ class Historian:
         )
         notes += [note for note in airs if note]
         for note in notes:
-            self._console.say(note)
+            self._progress.say(note)
         if not any(tally.known for tally in tallies.values()):
             path = self._reader.path
             raise DataError(f'{path}: there is no number in any of the columns used.')
         self._judge(tallies, refused)
         if uncertain:
-            self._console.warn(
+            self._progress.warn(
                 f'{uncertain} values are marked uncertain; a plain recording has no place for '
                 'that mark, they stand there as good.'
             )
@@ -485,7 +469,7 @@ class Historian:
     def _warn_of_constants(self) -> None:
         for name, theirs in self._reader.names.items():
             if _BY_COLUMN[name].signal in self._constants:
-                self._console.warn(
+                self._progress.warn(
                     f"{_BY_COLUMN[name].topic} stands in the table as '{theirs}' too; the "
                     'constant is used instead.'
                 )
@@ -513,10 +497,10 @@ class Historian:
         if refused:
             # What was understood until then is of use to who has to correct it.
             for sentence in self._reader.understood():
-                self._console.say(sentence)
+                self._progress.say(sentence)
             raise joined(self._reader.path, refused)
         for name, found in doubts.items():
-            self._console.warn(advice(found, self._reader.names[name]))
+            self._progress.warn(found.advice(self._reader.names[name]))
 
     def _told(self, tallies: dict[str, Tally], ordered: Ordered, notes: list[str]) -> Imported:
         reader = self._reader
@@ -558,16 +542,6 @@ class Historian:
                     )
                 )
         return sources
-
-
-def _reader(path: Path, mapping: LogMapping) -> TableReader:
-    columns, strange = names_for(mapping)
-    try:
-        return TableReader(path, columns, list(mapping.constants), mapping.table)
-    except InputError as error:
-        if not strange:
-            raise
-        raise unknown_unit(strange[0]) from error
 
 
 def _uncertain(block: RawBlock, name: str) -> int:

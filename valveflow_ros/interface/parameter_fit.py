@@ -1,23 +1,23 @@
-"""Finds out which parameters a log of the plant speaks about."""
+"""Parameters of the monitor that follow from a log of the plant, and the file with them."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
-import numpy as np
-
-from valveflow_ros.cli.alignment import Progress, aligned_blocks
-from valveflow_ros.cli.console import Console
-from valveflow_ros.cli.log_input import LogInput, steps_of
-from valveflow_ros.cli.options import fitting
+from valveflow_ros import __version__
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit
+from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface.logs import Log, as_log
+from valveflow_ros.interface.observation import aligned_blocks
+from valveflow_ros.interface.settings import ONE_FIT, fitting
 from valveflow_ros.monitoring.events import FitRequested
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_aligned
-from valveflow_ros.parameters import PARAMETERS, Settings, Value
+from valveflow_ros.parameters import PARAMETERS, TABLE, Settings, Value, as_yaml
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.terminal.text import clean
 from valveflow_ros.report.words import duration
@@ -28,7 +28,6 @@ from valveflow_ros.signals.units import air_in
 # down in large ones.
 _MORE, _LESS = 0.05, 0.2
 _SURE = 2.0  # standard errors
-_OFFLINE = {'refit_period': 0.0, 'refit_segments': 0}
 _OF_STEP = ('sample_period', 'hold_limit', 'lateness', 'block', 'longest_segment', 'alarm_block',
             'alarm_average')  # fmt: skip
 
@@ -65,14 +64,23 @@ class Fitted(dict[str, FittedValue]):
         return {name: one.value for name, one in self.items()}
 
 
-def fitted(log: LogInput, unit_tag: str | None, console: Console) -> Fitted:
-    """Return the parameters that a log tells.
+def fit_parameters(log: Any, unit_tag: str = '', *, progress: Progress = SILENT) -> Fitted:
+    """Return the parameters of the monitor that follow from a log.
+
+    Parameters
+    ----------
+    log : Log, str, Path or pandas.DataFrame
+        What `open_log` returned, or anything it opens.
+    unit_tag : str
+        Tag of the unit.
+    progress : Progress
 
     Raises
     ------
     DataError
         It holds no readings.
     """
+    log = as_log(log, progress)
     if not len(log.readings):
         raise DataError(f'{log.contents.path} holds no readings of the inputs.')
     found = Fitted()
@@ -80,14 +88,16 @@ def fitted(log: LogInput, unit_tag: str | None, console: Console) -> Fitted:
         found.put('unit_tag', unit_tag, 'as you said')
     _units(log, found)
     _steps(log, found)
-    settings = Settings({**found.changes(), **_window(log, found), **_OFFLINE})
-    monitor = _watched(log, settings, console.progress)
+    settings = Settings({**found.changes(), **_window(log, found), **ONE_FIT})
+    monitor = Monitor(settings)
+    for aligned in aligned_blocks(Aligner(settings), log.readings, progress, 'finding segments'):
+        feed_aligned(monitor, aligned)
     _noise(monitor, found)
-    _dynamics(monitor, found, console.progress)
+    _dynamics(monitor, found, progress)
     return found
 
 
-def _units(log: LogInput, found: Fitted) -> None:
+def _units(log: Log, found: Fitted) -> None:
     for signal, unit in log.units.items():
         name = f'{SIGNALS[signal].topic}_unit'
         if signal in log.constants or unit == PARAMETERS[name].default:
@@ -102,9 +112,8 @@ def _units(log: LogInput, found: Fitted) -> None:
         found.left.append(f'{name}: {clean(said)}; let the gateway send one of {choices}.')
 
 
-def _steps(log: LogInput, found: Fitted) -> None:
-    steps = steps_of(log.readings)
-    measured = {s: step for s, step in steps.items() if s not in log.constants}
+def _steps(log: Log, found: Fitted) -> None:
+    measured = {s: step for s, step in log.steps().items() if s not in log.constants}
     adapted = fitting(measured, 0.0, {})
     if not measured:
         return
@@ -115,18 +124,10 @@ def _steps(log: LogInput, found: Fitted) -> None:
             found.put(name, adapted[name], f'the log has a value every {duration(step)}')
 
 
-def _window(log: LogInput, found: Fitted) -> dict[str, float]:
+def _window(log: Log, found: Fitted) -> dict[str, float]:
     """Return a window that holds the whole log; that of the monitor stays as it is."""
-    span_s = float(np.ptp(log.readings.time_ns)) / 1e9
-    adapted = fitting(steps_of(log.readings), span_s, found.changes())
+    adapted = fitting(log.steps(), log.span_s, found.changes())
     return {name: value for name, value in adapted.items() if name == 'window_days'}
-
-
-def _watched(log: LogInput, settings: Settings, progress: Progress) -> Monitor:
-    monitor = Monitor(settings)
-    for aligned in aligned_blocks(Aligner(settings), log.readings, progress, 'finding segments'):
-        feed_aligned(monitor, aligned)
-    return monitor
 
 
 def _noise(monitor: Monitor, found: Fitted) -> None:
@@ -175,3 +176,36 @@ def _largest(curve: Characteristic, found: Fitted) -> None:
             if error:
                 ground += f' (standard error {error:.2g} s)'
             found.put(name, wanted, ground)
+
+
+def parameter_file(source: str, found: Fitted) -> str:
+    """Return the text of a ROS 2 parameter file for any node name.
+
+    Parameters
+    ----------
+    source : str
+        Name of the log.
+    found : Fitted
+        Parameters that follow from it.
+
+    Raises
+    ------
+    ParameterError
+        Values are at odds with each other.
+    """
+    values = found.changes()
+    Settings(values)
+    # Names of files and columns come from others: a line break in one would end the comment.
+    lines = [
+        f'# Parameters of the monitor, fitted to {clean(source)} by valveflow {__version__}.',
+        "# Lines marked 'fitted' follow from the data; all others are the defaults.",
+        *(f'# {clean(sentence)}' for sentence in found.left),
+        *as_yaml([], {}).splitlines(),
+    ]
+    for row in TABLE:
+        about, value = as_yaml([row], values).splitlines()[2:]
+        lines.append(about)
+        if row.name in found:
+            lines.append(f'    # fitted: {clean(found[row.name].ground)}.')
+        lines.append(value)
+    return '\n'.join(lines) + '\n'

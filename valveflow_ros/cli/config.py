@@ -5,9 +5,8 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.options import MAPPING_HELP, add_mapping, read_mapping
-from valveflow_ros.cli.usage import UsageError
+from valveflow_ros.cli.command import Console, Outcome, add_mapping, mapping_of
+from valveflow_ros.errors import InputError, ParameterError, UsageError, counted
 
 _DESCRIPTION = """\
 init LOG reads a log of the plant and writes a parameter file for the monitor: every parameter
@@ -26,7 +25,6 @@ def arguments(parser: ArgumentParser) -> None:
     parser.usage = (
         'valveflow config init LOG [-o FILE] [options]\n       valveflow config check FILE'
     )
-    parser.epilog = MAPPING_HELP
     parser.add_argument('task', metavar='init|check', help='make a parameter file, or check one')
     parser.add_argument('place', metavar='LOG|FILE', type=Path, help='the log, or the file')
     parser.add_argument(
@@ -40,25 +38,22 @@ def arguments(parser: ArgumentParser) -> None:
 
 def run(options: Namespace, console: Console) -> Outcome:
     """Make or check a parameter file."""
-    mapping = read_mapping(options.column, options.constant)
+    mapping = mapping_of(options)
     if options.task == 'check':
-        from valveflow_ros.cli.config_check import check
-
-        return check(options.place)
+        return _checked(options.place)
     if options.task != 'init':
         raise UsageError(f"config can init or check, not '{options.task}'.")
-    from valveflow_ros.cli.config_fit import fitted
-    from valveflow_ros.cli.config_text import parameter_file
-    from valveflow_ros.cli.files import check_output, whole_file
-    from valveflow_ros.cli.log_input import open_input
+    from valveflow_ros.interface.files import check_output, whole_file
+    from valveflow_ros.interface.logs import open_log
+    from valveflow_ros.interface.parameter_fit import fit_parameters, parameter_file
 
     if options.output is not None:
         check_output(
             options.output, ('.yaml', '.yml'), source=options.place, overwrite=options.overwrite
         )
-    console.progress(0.02, 'reading')
-    log = open_input(options.place, mapping, console)
-    found = fitted(log, options.unit_tag, console)
+    console(0.02, 'reading')
+    log = open_log(options.place, mapping, progress=console)
+    found = fit_parameters(log, options.unit_tag or '', progress=console)
     text = parameter_file(options.place.name, found)
     data = {
         'file': None if options.output is None else str(options.output),
@@ -72,3 +67,34 @@ def run(options: Namespace, console: Console) -> Outcome:
     lines = [f'  {f.name}: {f.shown}  ({f.ground})' for f in found.values()]
     said = ['Fitted to the data:', *lines] if lines else ['Nothing differs from the defaults.']
     return Outcome('\n'.join([*said, *found.left, f'Wrote {options.output}.']), data)
+
+
+def _checked(file: Path) -> Outcome:
+    """Read a parameter file as the monitor would, and say what it changes."""
+    from valveflow_ros.interface.settings import read_parameters
+    from valveflow_ros.parameters import PARAMETERS, Settings
+
+    given = read_parameters(file, [])
+    try:
+        settings = Settings(given)
+    except ParameterError as error:
+        raise InputError(f'{file}: {error}') from None
+    changed = {
+        name: settings[name] for name in settings if settings[name] != PARAMETERS[name].default
+    }
+    many = (
+        'all as the defaults' if not changed else
+        '1 differs from its default' if len(changed) == 1 else
+        f'{len(changed)} differ from their defaults'
+    )  # fmt: skip
+    lines = [f'{file}: the monitor takes it; {counted(len(given), "parameter")}, {many}.']
+    for name, value in changed.items():
+        unit, default = PARAMETERS[name].unit, PARAMETERS[name].default
+        lines.append(f'  {name}: {_shown(value, unit)}, default {_shown(default, unit)}')
+    return Outcome('\n'.join(lines), {'file': str(file), 'good': True, 'changed': changed})
+
+
+def _shown(value: object, unit: str) -> str:
+    text = f'{value:g}' if isinstance(value, float) else f"'{value}'" if isinstance(
+        value, str) else str(value).lower()  # fmt: skip
+    return f'{text} {unit}' if unit else text
