@@ -136,7 +136,7 @@ def _shim(folder: Path) -> dict[str, str]:
     """Return an environment in which the command and this Python are found first."""
     tools = folder / '.tools'
     tools.mkdir()
-    for name, arguments in (('valveflow', '-m valveflow_ros.cli.main'), ('python', '')):
+    for name, arguments in (('valveflow', '-m valveflow_ros.cli'), ('python', '')):
         path = tools / name
         path.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} {arguments} "$@"\n')
         path.chmod(0o755)

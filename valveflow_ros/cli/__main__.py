@@ -1,0 +1,8 @@
+"""So that ``python -m valveflow_ros.cli`` is the command."""
+
+import sys
+
+from valveflow_ros.cli.main import main
+
+if __name__ == '__main__':
+    sys.exit(main())
