@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 
-from valveflow_ros.cli import historian
+from valveflow_ros.interface import table_import
 from valveflow_ros.logs import open_log
-from valveflow_ros.logs.tables.table import table_file
+from valveflow_ros.logs.tables import file
 from valveflow_ros.records import Signal
 
 GERMAN = 'Zeitstempel;Ventilstellung;Frischdampfdruck;FD-Temperatur;Bruttoleistung;Drehzahl'
@@ -130,8 +130,8 @@ def test_blocks_and_order_change_nothing(run, german, tmp_path, monkeypatch, ord
     elif order == 'shuffled':
         rows = [rows[k] for k in np.random.default_rng(3).permutation(N)]
     german.write_bytes(b'\r\n'.join([*head, *rows]))
-    monkeypatch.setattr(table_file, 'BLOCK_ROWS', 7)
-    monkeypatch.setattr(historian, '_ROWS', 11)
+    monkeypatch.setattr(file, 'BLOCK_ROWS', 7)
+    monkeypatch.setattr(table_import, '_ROWS', 11)
     (tmp_path / 'parts').mkdir()
     ran = run('import', german, '-o', tmp_path / 'parts' / 'x.mcap')
     assert ran.status == 0, ran.err

@@ -65,7 +65,7 @@ def complete(verbs: list[tuple[str, str]], parser_of: Callable[[str], ArgumentPa
             if action.dest in known:
                 action.completer = known[action.dest]  # type: ignore[attr-defined]
         below.add_parser(name, help=about, parents=[parser], add_help=False, allow_abbrev=False)
-    argcomplete.autocomplete(whole, always_complete_options='long')
+    argcomplete.autocomplete(whole, always_complete_options=False)
 
 
 def _effects(**_: object) -> list[str]:

@@ -146,10 +146,10 @@ class _Formatter(RawDescriptionHelpFormatter):
         super().__init__(prog, max_help_position=28, width=92)
 
 
-def parser_of(verb: str) -> Parser:
+def parser_of(name: str, verb: Verb | None = None) -> Parser:
     """Return the parser of a verb; raises `UsageError` if there is none of that name."""
-    parser = Parser(f'valveflow {verb}')
-    load(verb).arguments(parser)
+    parser = Parser(f'valveflow {name}')
+    (verb or load(name)).arguments(parser)
     parser.add_argument(
         '--json', action='store_true', help='print the result as JSON, for programs'
     )
@@ -292,7 +292,7 @@ def _command(words: list[str], console: Console) -> int:
     if words[0].startswith('-'):
         raise UsageError(f"The verb comes first, options after it: '{words[0]}' is no verb.")
     verb = load(words[0])
-    parser = parser_of(words[0])
+    parser = parser_of(words[0], verb)
     try:
         options = parser.parse_args(words[1:])
     except SystemExit as done:  # --help was asked for

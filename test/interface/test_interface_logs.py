@@ -2,8 +2,8 @@
 
 import json
 
-from valveflow_ros.cli.log_input import units_told
-from valveflow_ros.logs import open_log, write_samples
+from valveflow_ros.interface.logs import open_log
+from valveflow_ros.logs import write_samples
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import SampleTable, Signal
 
@@ -20,9 +20,12 @@ def recording(path, parameters):
 
 def test_the_units_are_those_the_monitor_was_told(tmp_path):
     log = recording(tmp_path / 'a.mcap', {'main_steam_pressure_unit': 'bar'})
-    assert units_told(log) == {Signal.MAIN_STEAM_PRESSURE: 'bar'}
+    assert log.units[Signal.MAIN_STEAM_PRESSURE] == 'bar'
+    mine = log.readings.value[log.readings.signal == Signal.MAIN_STEAM_PRESSURE]
+    assert 5.0 < mine.min() < mine.max() < 20.0
 
 
 def test_words_that_are_no_units_are_not_believed(tmp_path):
     for k, parameters in enumerate(({'main_steam_pressure_unit': 'ell'}, {}, [1])):
-        assert units_told(recording(tmp_path / f'x_{k}' / 'a.mcap', parameters)) == {}
+        log = recording(tmp_path / f'x_{k}' / 'a.mcap', parameters)
+        assert log.units[Signal.MAIN_STEAM_PRESSURE] == 'MPa'

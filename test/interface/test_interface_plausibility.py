@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from valveflow_ros.cli.log_input import doubt
+from valveflow_ros.interface.plausibility import doubt
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SIGNALS, Signal
 from valveflow_ros.signals.units import UNITS

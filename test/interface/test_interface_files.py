@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import json
-from argparse import Namespace
 
 import pytest
 
 from valveflow_ros.baselines import comparison, validation
-from valveflow_ros.cli.console import Outcome
-from valveflow_ros.cli.files import REPORT, keep_others, renamed, signed, write_texts, writer
-from valveflow_ros.cli.report_files import _others_pictures, with_report
 from valveflow_ros.curve import characteristic_json, shift
 from valveflow_ros.diagnosis import result
 from valveflow_ros.errors import RecordingError
+from valveflow_ros.interface.files import REPORT, Result, back_up, signed, write_texts, writer
 from valveflow_ros.report.page import Figure, Page, Section
 
 MODEL = 'extended_model.json'
 VERBS = ('identify', 'diagnose', 'compare', 'validate')
+
+
+def renamed(name, mark):
+    stem, dot, kind = name.rpartition('.')
+    return f'{stem}_{mark}{dot}{kind}'
 
 
 def report_of(verb, words='x'):
@@ -27,7 +29,7 @@ def report_of(verb, words='x'):
 def write(folder, verb, words='x', **others):
     """Write as a verb does, after keeping what is another's."""
     files = {**others, REPORT: report_of(verb, words)}
-    kept = keep_others(folder, verb, files)
+    kept = back_up(folder, verb, files)
     write_texts(folder, files)
     return kept
 
@@ -149,26 +151,30 @@ def test_every_file_for_programs_tells_its_verb(tmp_path, form, verb):
         assert writer(path) == verb
 
 
-def test_pictures_that_showed_something_else_are_named(tmp_path):
-    made = {'tables': {'history.csv': 'a', 'curve.csv': 'b'}, 'figures': {'alarms.png': b'c'}}
-    assert _others_pictures(tmp_path, made) == ''
-    for folder, files in made.items():
-        write_texts(tmp_path / folder, files)
-    assert _others_pictures(tmp_path, made) == ''
-    made['tables'] = {'history.csv': 'new', 'curve.csv': 'new'}
-    told = _others_pictures(tmp_path, made)
-    assert told == 'tables/history.csv: what was there showed something else and is replaced.'
-
-
 def test_a_verb_says_whose_pictures_it_replaced(tmp_path):
-    options = Namespace(output=tmp_path, table=True, figures=False)
+    class Drawn(Result):
+        def __init__(self, verb, y):
+            self.verb, self.y = verb, y
+
+        def texts(self):
+            return {}
+
+        def page(self):
+            trace = {
+                'type': 'scatter',
+                'mode': 'lines',
+                'name': 'a',
+                'x': [0, 1],
+                'y': [0, self.y],
+            }
+            names = ('history', 'curve')
+            figures = [Figure(n, 'A caption.', 'Words.', [trace], {}, 300) for n in names]
+            return Page('Title', '', [Section('A section', figures)], '', self.verb)
 
     def written(verb, y):
-        trace = {'type': 'scatter', 'mode': 'lines', 'name': 'a', 'x': [0, 1], 'y': [0, y]}
-        figure = Figure('history', 'A caption.', 'Words.', [trace], {}, 300)
-        page = Page('Title', '', [Section('A section', [figure])], '', verb)
-        return with_report(options, {}, page, lambda _: Outcome('Done.', {'files': {}})).text
+        return '\n'.join(Drawn(verb, y).write(tmp_path, tables=True).words)
 
     assert 'replaced' not in written('identify', 1)
     assert 'replaced' not in written('diagnose', 1)
-    assert 'tables/history.csv: what was there showed something else' in written('identify', 2)
+    told = 'tables/history.csv: what was there showed something else and is replaced.'
+    assert told in written('identify', 2)

@@ -8,15 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from valveflow_ros.cli.options import (
+from valveflow_ros.errors import InputError, RecordingError, UsageError
+from valveflow_ros.interface.mapping import read_mapping
+from valveflow_ros.interface.settings import (
     fitting,
-    read_mapping,
     read_parameters,
     sample_period,
     settings_for,
 )
-from valveflow_ros.cli.usage import UsageError
-from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.parameters import PARAMETERS, Settings, as_yaml
 from valveflow_ros.records import SIGNALS, Signal
 from valveflow_ros.signals.units import UNITS, convert
@@ -44,7 +43,7 @@ def test_spellings_of_a_column():
 def test_a_constant_is_converted(value, info, data):
     unit = data.draw(st.sampled_from(sorted(UNITS[info.signal])))
     found = read_mapping([], [f'{info.topic}={value!r}:{unit}']).constants[info.topic]
-    assert found.value == float(convert(info.signal, unit, value))
+    assert found == float(convert(info.signal, unit, value))
 
 
 @pytest.mark.parametrize(
