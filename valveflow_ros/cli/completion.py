@@ -34,7 +34,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     """Print the script, which calls the command itself at each Tab."""
     from argcomplete.shell_integration import shellcode
 
-    text = shellcode(['valveflow'], shell=options.shell)
+    text = shellcode(['valveflow'], True, options.shell)
     return Outcome(text, {'shell': options.shell, 'script': text})
 
 

@@ -92,6 +92,8 @@ def write_texts(folder: Path, texts: Mapping[str, str] | Mapping[str, bytes]) ->
     try:
         for name, text in texts.items():
             drafts[name].write_bytes(text if isinstance(text, bytes) else text.encode())
+            if (folder / name).is_dir():
+                raise IsADirectoryError(errno.EISDIR, f'{name} is a folder')
         for name, draft in drafts.items():
             os.replace(draft, folder / name)
     except OSError as error:

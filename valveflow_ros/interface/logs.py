@@ -158,7 +158,8 @@ def open_log(
             **{name: value for name, value in table.items() if value},
         )
     if hasattr(source, 'columns'):
-        return _understood('DataFrame', _from_dataframe(source, mapping), mapping, progress)
+        contents = mapping.opened(lambda names: _from_dataframe(source, names))
+        return _understood('DataFrame', contents, mapping, progress)
     path = Path(source)
 
     def look(said: LogMapping) -> LogContents:
@@ -254,11 +255,10 @@ def _converted(readings: Readings, units: dict[Signal, str]) -> Readings:
     return replace(readings, value=value)
 
 
-def _from_dataframe(frame: Any, mapping: LogMapping) -> LogContents:
+def _from_dataframe(frame: Any, names: Mapping[str, str]) -> LogContents:
     """Return a DataFrame as a log; raises `InputError` or `DataError`."""
     import pandas as pd
 
-    names = mapping.names()
     if missing := [theirs for theirs in names.values() if theirs not in frame.columns]:
         raise InputError(f"The DataFrame has no column '{missing[0]}'.")
     theirs = names.get(TIME, TIME)
