@@ -61,6 +61,7 @@ setup(
     package_data={'': ['py.typed', '*.css', '*.html', '*.js', '*.yaml']},
     zip_safe=False,
     install_requires=[
+        'argcomplete',
         'lz4',
         'mcap>=1.5',
         'numba',

@@ -3,7 +3,7 @@
     python -m benchmarks.pace [DAYS]
 
 Prints for each verb where its parts begin, as shares of its time: the numbers of
-``valveflow_ros/cli/console.py``.
+``valveflow_ros/cli/command.py``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from valveflow_ros.cli import console, main
+from valveflow_ros.cli import command, main
 
 VERBS = ('identify', 'diagnose', 'validate', 'compare')
 
@@ -29,13 +29,13 @@ def parts(words: list[str]) -> list[tuple[float, float, str]]:
         if not seen or seen[-1][2] != what:
             seen.append((time.perf_counter() - begun, share, what))
 
-    usual = console.Console.progress
-    console.Console.progress = note  # type: ignore[method-assign, assignment]
+    usual = command.Console.__call__
+    command.Console.__call__ = note  # type: ignore[method-assign, assignment]
     try:
         with contextlib.redirect_stdout(io.StringIO()):
             status = main.main(words)
     finally:
-        console.Console.progress = usual  # type: ignore[method-assign]
+        command.Console.__call__ = usual  # type: ignore[method-assign]
     if status:
         raise SystemExit(f'{words} ended with {status}')
     seen.append((time.perf_counter() - begun, 1.0, 'end'))

@@ -24,10 +24,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from valveflow_ros.cli import engine
-from valveflow_ros.cli.log_input import steps_of
-from valveflow_ros.cli.options import settings_for
-from valveflow_ros.cli.report_words import columns
+from valveflow_ros.cli.command import columns
+from valveflow_ros.interface.logs import steps_of
+from valveflow_ros.interface.observation import observe
+from valveflow_ros.interface.settings import settings_for
 from valveflow_ros.logs import open_log, write_samples
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.spec import EffectSpec
@@ -76,14 +76,14 @@ def identify(path: Path, watch: Stopwatch) -> dict[str, Any]:
     )
     readings = contents.readings
     span_s = float(np.ptp(readings.time_ns)) / 1e9
-    settings, _ = settings_for(steps_of(readings), span_s, {})
+    settings, _ = settings_for(steps_of(readings.by_signal()), span_s, {})
     seen = watch.measure(
-        'rows and segments', lambda: engine.watch(readings, settings),
+        'rows and segments', lambda: observe(readings, settings),
         lambda w: f'{len(w.table):,} rows, {len(w.segments)} segments',
     )  # fmt: skip
     rate = len(seen.table) / watch.rows[-1]['wall_s']
     curve = watch.measure(
-        'fit', lambda: engine.identify(seen),
+        'fit', lambda: seen.fit(),
         lambda c: f'{len(c.pieces)} pieces from {c.source.samples:,} special samples',
     )  # fmt: skip
     found = Identified(path.name, curve, seen.table, seen.segments, seen.counts, settings)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from valveflow_ros.cli.verbs import VERBS
+from valveflow_ros.cli.main import VERBS
 from valveflow_ros.parameters import TABLE, Parameter
 from valveflow_ros.records import SIGNALS
 

@@ -142,27 +142,19 @@ def _record(name: str, faulty: Any, sound: Any) -> dict[str, Any]:
 
 def _healthy(days: int, folder: Path) -> Any:
     """Return the curve of the same unit in other, healthy days."""
-    from valveflow_ros.cli.console import Console
-    from valveflow_ros.cli.identification import found_in
-    from valveflow_ros.cli.log_input import open_input
-    from valveflow_ros.cli.options import read_mapping
+    from valveflow_ros.interface.identify import identify
     from valveflow_ros.logs.tables.write import write_table
     from valveflow_ros.plant.simulator import simulate
 
     path = folder / 'healthy.parquet'
     write_table(simulate(days, SEED + 1).table, path)
-    console = Console(sys.stdout, sys.stderr, quiet=True)
-    read = open_input(path, read_mapping([], []), console)
-    return found_in(read, {}, path, console).characteristic
+    return identify(path).characteristic
 
 
 def gather(name: str) -> dict[str, Any]:
     """Simulate, diagnose, and return what is shown and what the program said."""
-    from valveflow_ros.cli.console import Console
-    from valveflow_ros.cli.diagnosing import diagnosed_in
-    from valveflow_ros.cli.log_input import open_input
-    from valveflow_ros.cli.options import read_mapping
     from valveflow_ros.diagnosis.result import to_json
+    from valveflow_ros.interface.diagnose import diagnose
     from valveflow_ros.logs.tables.write import write_table
     from valveflow_ros.plant.simulator import simulate
     from valveflow_ros.plant.spec import EffectSpec
@@ -173,18 +165,16 @@ def gather(name: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f'{name}.parquet'
         write_table(log.table, path)
-        console = Console(sys.stdout, sys.stderr, quiet=True)
-        read = open_input(path, read_mapping([], []), console)
         model = _healthy(case.days, Path(folder)) if case.earlier else None
-        found = diagnosed_in(read, model, {}, path, console)
-    told = to_json(found.page.diagnosis)
-    views = _views(found.page, case.views)
+        found = diagnose(path, model=model).data
+    told = to_json(found.diagnosis)
+    views = _views(found, case.views)
     if 'record' in case.views:
         views['record'] = _record(name, log, simulate(case.days, SEED))
     return {
         'effect': name, 'parameters': case.parameters,
         'commands': commands(name),
-        'start_ns': int(found.page.start_ns), 'sentence': found.page.diagnosis.sentence,
+        'start_ns': int(found.start_ns), 'sentence': found.diagnosis.sentence,
         'diagnosis': {k: told[k] for k in _TOLD},
         'views': views,
     }  # fmt: skip
@@ -192,11 +182,8 @@ def gather(name: str) -> dict[str, Any]:
 
 def curve() -> dict[str, Any]:
     """Identify a healthy plant, and return curve, band and density of the special samples."""
-    from valveflow_ros.cli.console import Console
-    from valveflow_ros.cli.identification import found_in
-    from valveflow_ros.cli.log_input import open_input
-    from valveflow_ros.cli.options import read_mapping
     from valveflow_ros.curve.characteristic_json import to_json
+    from valveflow_ros.interface.identify import identify
     from valveflow_ros.logs.tables.write import write_table
     from valveflow_ros.plant.simulator import simulate
     from valveflow_ros.report.curve import band
@@ -205,8 +192,7 @@ def curve() -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / 'plant.parquet'
         write_table(log.table, path)
-        console = Console(sys.stdout, sys.stderr, quiet=True)
-        found = found_in(open_input(path, read_mapping([], []), console), {}, path, console)
+        found = identify(path).data
     u, power = found.u[found.special], found.power[found.special]
     counts, x, y = np.histogram2d(u, power, bins=(110, 70))
     pieces = []

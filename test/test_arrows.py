@@ -19,9 +19,9 @@ SIGNAL = BASE | {'signals'}
 SEGMENT = SIGNAL | {'segments', 'partition'}
 MODEL = SEGMENT | {'curve', 'fit'}
 METHOD = MODEL | {'monitoring', 'diagnosis', 'baselines', 'plant'}
-FACES = METHOD | {'logs', 'report'}
+FACES = METHOD | {'logs', 'report', 'interface'}
 ALLOWED: dict[str, set[str]] = {
-    '': set(),
+    '': {'interface'},
     'errors': set(),
     'records': {'errors'},
     'parameters': {'errors', 'records'},
@@ -38,6 +38,7 @@ ALLOWED: dict[str, set[str]] = {
     'plant': BASE,
     'logs': {'errors', 'records'},
     'report': METHOD,
+    'interface': FACES,
     'cli': FACES,
     'ros': FACES,
 }
@@ -123,6 +124,9 @@ def circles() -> list[list[str]]:
     uses: dict[str, set[str]] = {}
     for name, path in names.items():
         found = {there for _, there in imported(path) if there in names and there != name}
+        # The package's own __init__ loads the Python interface when it is asked for; others
+        # only take the version from it.
+        found.discard(PACKAGE)
         # ``from a import b`` names the package a as well, where b is a module of it.
         uses[name] = {n for n in found if not any(m.startswith(f'{n}.') for m in found)}
     # What imports nothing that is left, or is imported by nothing that is left, is in no circle.

@@ -66,7 +66,7 @@ def test_every_block_says_what_it_is(block: Block) -> None:
 
 
 def _parser(verb: str) -> ArgumentParser:
-    from valveflow_ros.cli.verbs import load
+    from valveflow_ros.cli.main import load
 
     parser = ArgumentParser(exit_on_error=False)
     load(verb).arguments(parser)

@@ -15,6 +15,10 @@ class InputError(ValveflowError):
     """An argument, option, column, unit or value given by a person cannot be used."""
 
 
+class UsageError(InputError):
+    """Arguments are of the wrong form or contradict each other, whatever the data hold."""
+
+
 class ParameterError(InputError):
     """A parameter is unknown, of the wrong type, out of range, or at odds with another."""
 

@@ -11,9 +11,8 @@ import re
 import numpy as np
 import pytest
 
-from valveflow_ros.cli.log_input import open_input
-from valveflow_ros.cli.options import read_mapping
-from valveflow_ros.cli.watching import cut_in_two
+from valveflow_ros.interface.logs import open_log
+from valveflow_ros.interface.observation import cut_in_two
 
 pytestmark = pytest.mark.skipif(
     os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
@@ -173,8 +172,8 @@ def test_other_days_and_json(run, logs, tmp_path):
     assert head == 'u,paper,proposed,hammerstein,sparse'
 
 
-def test_the_cut_lies_at_the_border_of_a_block(logs, console):
-    log = open_input(logs / 'plant.mcap', read_mapping([], []), console)
+def test_the_cut_lies_at_the_border_of_a_block(logs):
+    log = open_log(logs / 'plant.mcap')
     first, second = cut_in_two(log, 10.0)
     times = log.readings.time_ns
     assert len(first.readings) + len(second.readings) == len(log.readings)
@@ -182,15 +181,6 @@ def test_the_cut_lies_at_the_border_of_a_block(logs, console):
     assert (second.readings.time_ns.min() - times.min()) % 10_000_000_000 == 0
     share = len(first.readings) / len(log.readings)
     assert share == pytest.approx(2.0 / 3.0, abs=0.01)
-
-
-@pytest.fixture
-def console():
-    import sys
-
-    from valveflow_ros.cli.console import Console
-
-    return Console(sys.stdout, sys.stderr, quiet=True)
 
 
 @pytest.mark.parametrize(
@@ -227,10 +217,3 @@ def test_a_missing_test_log_is_refused(run, logs, tmp_path):
         'compare', logs / 'plant.mcap', '-o', tmp_path / 'o', '--test', tmp_path / 'none.csv'
     ).refused()
     assert 'none.csv' in said
-
-
-def test_help_has_an_example(run):
-    ran = run('compare', '--help')
-    assert ran.status == 0
-    assert 'example:' in ran.out
-    assert 'valveflow compare plant.mcap -o result' in ran.out

@@ -1,125 +1,107 @@
-"""``valveflow completion``: the scripts are asked in the shells themselves."""
+"""``valveflow completion``: the shells ask the command itself what can follow."""
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
+import sys
 
 import pytest
 
-from valveflow_ros.cli.completion_table import Kind, table
-from valveflow_ros.cli.verbs import VERBS
+from valveflow_ros.cli.completion import SHELLS
+from valveflow_ros.cli.main import VERBS
 from valveflow_ros.parameters import TABLE
 from valveflow_ros.plant.effects import catalogue
 from valveflow_ros.records import SIGNALS
 
 NAMES = [name for name, _, _ in VERBS]
-
-
-@pytest.fixture(scope='module')
-def scripts():
-    from valveflow_ros.cli.completion_scripts import script
-
-    return {shell: script(shell, table()) for shell in ('bash', 'zsh', 'fish')}
+HEAVY = {'numba', 'scipy', 'pandas', 'pyarrow', 'plotly', 'rclpy'}
 
 
 @pytest.fixture
-def complete(scripts, tmp_path):
-    """Press Tab in bash behind some words; the last is what was begun."""
-    path = tmp_path / 'completion.bash'
-    path.write_text(scripts['bash'])
+def complete(tmp_path):
+    """Press Tab behind a line as the scripts of the shells do; return what is offered."""
 
-    def press(*words):
-        code = (
-            'source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(( $# - 1 )); '
-            '_valveflow; (( ${#COMPREPLY[@]} )) && printf "%s\\n" "${COMPREPLY[@]}"; true'
-        )
+    def press(line, code='from valveflow_ros.cli.main import main; main()'):
+        answer = tmp_path / 'answer'
         done = subprocess.run(
-            ['bash', '-c', code, '-', str(path), 'valveflow', *words],
-            capture_output=True, text=True, check=True,
+            [sys.executable, '-c', code], capture_output=True, text=True, check=True,
+            env={**os.environ, '_ARGCOMPLETE': '1', '_ARGCOMPLETE_IFS': '\n',
+                 'COMP_LINE': line, 'COMP_POINT': str(len(line)), 'COMP_TYPE': '9',
+                 '_ARGCOMPLETE_STDOUT_FILENAME': str(answer)},
         )  # fmt: skip
         assert done.stderr == ''
-        return done.stdout.split('\n')[:-1]
+        return [word.strip() for word in answer.read_text().split('\n') if word]
 
     return press
 
 
 def test_verbs(complete):
-    assert complete('') == [*NAMES, '--help', '--version']
-    assert complete('ide') == ['identify']
-    assert complete('comp') == ['compare', 'compensate', 'completion']
-    assert complete('xyz') == []
+    assert complete('valveflow ') == NAMES
+    assert complete('valveflow ide') == ['identify']
+    assert complete('valveflow comp') == ['compare', 'compensate', 'completion']
+    assert complete('valveflow xyz') == []
 
 
-@pytest.mark.parametrize('name', NAMES)
-def test_every_option_of_every_verb(complete, run, name):
-    offered = complete(name, '--')
-    assert '--json' in offered
+@pytest.mark.parametrize('name', ['identify', 'watch', 'config'])
+def test_every_option_of_a_verb(complete, run, name):
+    offered = complete(f'valveflow {name} --')
     page = run(name, '--help').out
-    for option in offered:
-        assert option in page
+    assert '--json' in offered
+    assert len(offered) > 4
+    assert all(option in page for option in offered)
 
 
 def test_names_that_are_known(complete):
-    assert complete('simulate', '--effect', '') == list(catalogue())
-    assert complete('simulate', '--effect', 'gain_') == ['gain_drift', 'gain_step']
-    assert complete('identify', '--column', '') == ['time=', *(f'{i.topic}=' for i in SIGNALS)]
-    assert complete('identify', '--constant', 'main_steam_t') == ['main_steam_temperature=']
-    assert complete('identify', '--set', 'time_c') == ['time_constant=']
-    assert len(complete('identify', '--set', '')) == len(TABLE)
-    assert complete('completion', '')[:3] == ['bash', 'zsh', 'fish']
+    assert complete('valveflow simulate --effect ') == list(catalogue())
+    assert complete('valveflow simulate --effect gain_') == ['gain_drift', 'gain_step']
+    columns = complete('valveflow identify --column ')
+    assert columns == ['time=', *(f'{i.topic}=' for i in SIGNALS)]
+    assert complete('valveflow identify --constant main_steam_t') == ['main_steam_temperature=']
+    assert complete('valveflow identify --set time_c') == ['time_constant=']
+    assert len(complete('valveflow identify --set ')) == len(TABLE)
+    assert complete('valveflow completion ') == list(SHELLS)
 
 
-def test_where_a_file_is_meant_the_shell_is_left_alone(complete):
-    assert complete('identify', 'plant.m') == []
-    assert complete('validate', '--model', '') == []
-    assert complete('identify', '-o', '') == []
-    assert complete('simulate', '--seed', '') == []
+def test_a_file_is_offered_where_one_is_meant(complete, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'plant.mcap').touch()
+    assert complete('valveflow identify pl') == ['plant.mcap']
+    assert complete('valveflow validate --model pl') == ['plant.mcap']
 
 
-def test_files_are_told_from_values():
-    kinds = {
-        (verb.name, option.flags[-1]): option.kind for verb in table() for option in verb.options
-    }
-    assert kinds['validate', '--model'] is Kind.FILE
-    assert kinds['simulate', '--seed'] is Kind.VALUE
-    assert kinds['simulate', '--overwrite'] is Kind.NOTHING
-
-
-@pytest.mark.skipif(shutil.which('zsh') is None, reason='zsh is not here')
-def test_zsh_understands_its_script(scripts, tmp_path):
-    path = tmp_path / 'completion.zsh'
-    path.write_text(scripts['zsh'])
-    code = 'autoload -Uz compinit; compinit -D; source "$1"; print -r -- $_comps[valveflow]'
-    done = subprocess.run(
-        ['zsh', '-f', '-c', code, '-', str(path)], capture_output=True, text=True, check=True
+def test_nothing_heavy_is_loaded(complete, tmp_path):
+    code = (
+        'import os, sys\n'
+        f'os._exit = lambda n: (open({str(tmp_path / "seen")!r}, "w").write(" ".join('
+        'sys.modules)), sys.exit(0))\n'
+        'from valveflow_ros.cli.main import main\nmain()'
     )
-    assert done.stdout.split() == ['_valveflow']
+    for line in ('valveflow identify --', 'valveflow diagnose --set '):
+        complete(line, code)
+        seen = set((tmp_path / 'seen').read_text().split())
+        assert 'valveflow_ros.cli.main' in seen
+        assert not HEAVY & seen
+
+
+@pytest.mark.parametrize('shell', SHELLS)
+def test_each_shell_understands_its_script(run, tmp_path, shell):
+    text = run('completion', shell).out
+    assert run('completion', shell, '--json').json['script'].strip() == text.strip()
+    assert '_ARGCOMPLETE' in text
+    assert 'valveflow' in text
+    if shutil.which(shell) is None:
+        return
+    path = tmp_path / 'script'
+    path.write_text(text)
+    more = ['-f'] if shell == 'zsh' else []
+    before = 'autoload -Uz compinit; compinit -D; ' if shell == 'zsh' else ''
+    done = subprocess.run(
+        [shell, *more, '-c', f'{before}source {path}'], capture_output=True, text=True, check=True
+    )
     assert done.stderr == ''
 
 
-@pytest.mark.parametrize('shell', ['zsh', 'fish'])
-def test_the_other_shells_are_told_the_same(scripts, shell):
-    text = scripts[shell]
-    for name in NAMES:
-        assert name in text
-    for name in catalogue():
-        assert name in text
-    assert 'main_steam_pressure=' in text
-
-
-@pytest.mark.skipif(shutil.which('fish') is None, reason='fish is not here')
-def test_fish_understands_its_script(scripts, tmp_path):
-    path = tmp_path / 'completion.fish'
-    path.write_text(scripts['fish'])
-    code = f'source {path}; complete -C "valveflow simulate --effect gain_"'
-    done = subprocess.run(['fish', '-c', code], capture_output=True, text=True, check=True)
-    assert [line.split('\t')[0] for line in done.stdout.splitlines()] == [
-        'gain_drift',
-        'gain_step',
-    ]
-
-
-def test_the_verb_prints_it(run, scripts):
-    assert run('completion', 'bash').out == scripts['bash']
+def test_another_shell_is_refused(run):
     assert run('completion', 'tcsh').refused(2).startswith('valveflow: SHELL must be one of bash')

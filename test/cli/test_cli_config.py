@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from valveflow_ros.cli.options import read_parameters
+from valveflow_ros.interface.settings import read_parameters
 from valveflow_ros.parameters import PARAMETERS, Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import SampleTable, Signal

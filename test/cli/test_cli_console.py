@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.report_words import columns
+from valveflow_ros.cli.command import Console, Outcome, columns
 
 
 class Terminal(io.StringIO):
@@ -33,10 +32,10 @@ def usual_terminal(monkeypatch):
 
 def test_progress_is_for_terminals_only():
     err = io.StringIO()
-    Console(io.StringIO(), err).progress(0.5, 'working')
+    Console(io.StringIO(), err)(0.5, 'working')
     assert err.getvalue() == ''
     err = Terminal()
-    Console(io.StringIO(), err).progress(0.5, 'working')
+    Console(io.StringIO(), err)(0.5, 'working')
     assert '50 %  working' in err.getvalue()
 
 
@@ -44,18 +43,18 @@ def test_progress_is_for_terminals_only():
 def test_progress_can_be_silenced(monkeypatch, setting):
     monkeypatch.setenv('TERM', 'dumb' if setting == 'dumb' else 'xterm')
     err = Terminal()
-    Console(io.StringIO(), err, quiet=setting == 'quiet').progress(0.5, 'working')
+    Console(io.StringIO(), err, quiet=setting == 'quiet')(0.5, 'working')
     assert err.getvalue() == ''
 
 
 def test_a_message_takes_the_place_of_the_bar():
     err = Terminal()
     console = Console(io.StringIO(), err)
-    console.progress(0.1, 'first')
+    console(0.1, 'first')
     console.say('Found something.')
-    console.progress(0.2, 'second')
+    console(0.2, 'second')
     console.warn('Look here.')
-    console.progress(0.3, 'third')
+    console(0.3, 'third')
     console.finish(Outcome('done', {}))
     assert shown(err.getvalue()) == ['Found something.', 'Warning: Look here.', '']
 
@@ -64,7 +63,7 @@ def test_a_bar_of_one_piece_of_work_is_not_redrawn_all_the_time():
     err = Terminal()
     console = Console(io.StringIO(), err)
     for k in range(10_000):
-        console.progress(k / 10_000, 'working')
+        console(k / 10_000, 'working')
     assert err.getvalue().count('\r') < 100
 
 

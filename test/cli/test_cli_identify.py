@@ -9,10 +9,9 @@ import re
 import numpy as np
 import pytest
 
-from valveflow_ros.cli.alignment import align
-from valveflow_ros.cli.engine import watch
 from valveflow_ros.curve.characteristic_json import from_json
 from valveflow_ros.errors import DataError
+from valveflow_ros.interface.observation import align, observe
 from valveflow_ros.logs import open_log, write_table
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.unit import UnitDescription
@@ -247,8 +246,8 @@ def test_only_what_follows_the_last_step_back_of_the_clock_counts(run, tmp_path)
         np.concatenate([getattr(first, name), getattr(second, name)])
         for name in ('time_ns', 'signal', 'value', 'quality')
     ))  # fmt: skip
-    watched = watch(joined, Settings({'refit_period': 0.0}))
-    alone = watch(second, Settings({'refit_period': 0.0}))
+    watched = observe(joined, Settings({'refit_period': 0.0}))
+    alone = observe(second, Settings({'refit_period': 0.0}))
     assert watched.clock_resets == 1
     assert (np.diff(watched.table.time_ns) > 0).all()
     assert len(alone.table) - 30 < len(watched.table) <= len(alone.table)
@@ -265,7 +264,7 @@ def test_stamps_of_1970_for_a_minute_cost_that_minute():
     time_ns[slip] -= true.time_ns[0]
     settings = Settings({'refit_period': 0.0})
     wrong = Readings(time_ns, true.signal, true.value, true.quality)
-    watched, whole = watch(wrong, settings), watch(true, settings)
+    watched, whole = observe(wrong, settings), observe(true, settings)
     assert watched.clock_resets == 1
     lost = set(whole.table.time_ns.tolist()) - set(watched.table.time_ns.tolist())
     assert 0 < len(lost) <= 80
@@ -278,7 +277,7 @@ def test_stamps_of_1970_for_a_minute_cost_that_minute():
 
 def test_a_log_without_any_reading_is_refused():
     with pytest.raises(DataError, match='The log has no valve_opening; name yours with --column'):
-        watch(Readings.of([]), Settings())
+        observe(Readings.of([]), Settings())
 
 
 def test_readings_that_were_not_used_are_told(run, logs, tmp_path):

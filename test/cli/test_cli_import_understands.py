@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from valveflow_ros.cli import historian
+from valveflow_ros.interface import table_import
 from valveflow_ros.logs import open_log
 from valveflow_ros.logs.tables import file
 from valveflow_ros.records import Signal
@@ -131,7 +131,7 @@ def test_blocks_and_order_change_nothing(run, german, tmp_path, monkeypatch, ord
         rows = [rows[k] for k in np.random.default_rng(3).permutation(N)]
     german.write_bytes(b'\r\n'.join([*head, *rows]))
     monkeypatch.setattr(file, 'BLOCK_ROWS', 7)
-    monkeypatch.setattr(historian, '_ROWS', 11)
+    monkeypatch.setattr(table_import, '_ROWS', 11)
     (tmp_path / 'parts').mkdir()
     ran = run('import', german, '-o', tmp_path / 'parts' / 'x.mcap')
     assert ran.status == 0, ran.err

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from valveflow_ros.cli.alignment import align
-from valveflow_ros.cli.inspection import fates
+from valveflow_ros.cli.info import _fates
+from valveflow_ros.interface.observation import align
 from valveflow_ros.logs import open_log, read_table
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Readings, Signal
@@ -133,7 +133,7 @@ def test_what_looks_in_order_is_what_the_engine_accepts(rows, tidy):
             {(t, s): (t, s, 55.0 if s == 2 else 30.0, 0) for t, s, _, _ in rows}.values()
         )
     readings = Readings.of([(t * NS_PER_S, s, v, q) for t, s, v, q in rows])
-    told = fates(readings, readings.by_signal(), settings)
+    told = _fates(readings, readings.by_signal(), settings)
     if tidy:
         assert all(set(by_reason) == {'accepted'} for by_reason in told.values())
     _, _, counts = align(readings, settings)

@@ -11,8 +11,8 @@ import time
 
 import pytest
 
-from valveflow_ros.cli import console
-from valveflow_ros.cli.verbs import VERBS
+from valveflow_ros.cli import command as shared
+from valveflow_ros.cli.main import VERBS
 
 SAID = 'valveflow: stopped; nothing was left half-written.\n'
 # Verbs that are done before anybody could press a key.
@@ -37,7 +37,7 @@ def stopped_at(run, monkeypatch):
                 if len(seen) == part:
                     os.kill(os.getpid(), number)
 
-        monkeypatch.setattr(console.Console, 'progress', progress)
+        monkeypatch.setattr(shared.Console, '__call__', progress)
         return run(*words)
 
     yield command

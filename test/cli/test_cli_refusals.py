@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from valveflow_ros.cli.files import check_folder
-from valveflow_ros.cli.usage import Parser, UsageError
-from valveflow_ros.cli.verbs import VERBS, load
+from valveflow_ros.cli.main import VERBS, Parser, load
+from valveflow_ros.errors import UsageError
+from valveflow_ros.interface.files import check_folder
 from valveflow_ros.report.terminal import text
 
 

@@ -157,9 +157,3 @@ def test_a_log_without_segments_is_refused_with_what_would_help(run, model, tmp_
 def test_wrong_usage(run, logs, model, tmp_path, words):
     options = ['--model', model(), *words] if words else []
     run('validate', logs / 'plant.csv', '-o', tmp_path / 'o', *options).refused(status=2)
-
-
-def test_help_has_an_example(run):
-    ran = run('validate', '--help')
-    assert ran.status == 0
-    assert 'valveflow validate other.mcap --model result/characteristic.json' in ran.out

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from monitor_recording import START_NS, Monitor, alarm, cdr, recording, stamp
 
-from valveflow_ros.cli import watch_run
-from valveflow_ros.cli.watch_log import LogWatch
+from valveflow_ros.cli import watch as verb
+from valveflow_ros.interface.recording_view import LogWatch
 from valveflow_ros.report.terminal.board import AGE, HEALTH, KEPT, Board
 from valveflow_ros.report.terminal.frame import OK, STALE, WARN
 
@@ -195,7 +195,7 @@ def test_what_cannot_be_watched(run, tmp_path, monkeypatch, words, status, part)
 
 
 def test_without_ros_it_says_so_and_what_else_there_is(run, monkeypatch):
-    monkeypatch.setattr(watch_run, 'find_spec', lambda name: None)
+    monkeypatch.setattr(verb, 'find_spec', lambda name: None)
     sentence = run('watch').refused()
     assert 'rclpy and valveflow_msgs' in sentence
     assert 'valveflow watch valveflow_recordings' in sentence
@@ -203,7 +203,7 @@ def test_without_ros_it_says_so_and_what_else_there_is(run, monkeypatch):
 
 def test_with_ros_another_process_takes_over(run, monkeypatch):
     taken = []
-    monkeypatch.setattr(watch_run, 'find_spec', lambda name: name)
+    monkeypatch.setattr(verb, 'find_spec', lambda name: name)
     monkeypatch.setattr(os, 'execv', lambda path, words: taken.append(words) or _end())
 
     def _end():

@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import re
 import shutil
 import subprocess
-from argparse import Namespace
 from dataclasses import replace
 
 import pytest
 from report_stories import diagnosed, history
 
-from valveflow_ros.cli.comparing import compared
-from valveflow_ros.cli.console import Console
 from valveflow_ros.cli.main import main
-from valveflow_ros.cli.options import read_mapping
-from valveflow_ros.cli.truth_file import read_truth_file
-from valveflow_ros.cli.validating import validated
-from valveflow_ros.report.comparison import comparison_page
+from valveflow_ros.interface.compare import compare, validate
 from valveflow_ros.report.diagnosis import diagnosis_page
 from valveflow_ros.report.identification import identification_page
-from valveflow_ros.report.validation import validation_page
 
 PHONE, DESKTOP = 390, 1280
 LEAST_PX = 14.0
@@ -46,13 +38,10 @@ def judged_pages(folder):
     log, truth = folder / 'plant.mcap', folder / 'truth.json'
     words = ['simulate', '-o', log, '--days', '0.4', '--seed', '1', '--truth', truth, '--quiet']
     assert main([str(word) for word in words]) == 0
-    console, mapping = Console(io.StringIO(), io.StringIO()), read_mapping([], [])
     quick = {'refine': False, 'selection_rule': 'paper'}
-    found = compared(log, None, read_truth_file(truth), mapping, quick, console)
-    options = Namespace(log=log, model=folder / 'a.json', against=None, tolerance=None)
-    curve = found.result.characteristic
-    checked = validated(options, curve, None, mapping, {}, console)
-    return {'compare': comparison_page(found), 'validate': validation_page(checked)}
+    found = compare(log, truth=truth, parameters=quick)
+    checked = validate(log, found.comparison.characteristic)
+    return {'compare': found.page(), 'validate': checked.page()}
 
 
 # What is asked of the page in its present look; one answer serves several tests.

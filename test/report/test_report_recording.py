@@ -9,7 +9,7 @@ import pytest
 from mcap_ros2.writer import Writer
 from report_stories import HOUR_NS, START_NS, history
 
-from valveflow_ros.cli.monitor_history import history_in
+from valveflow_ros.interface.monitor import recorded_history
 from valveflow_ros.logs import Definitions, open_log
 from valveflow_ros.monitoring.alarm import AlarmState
 from valveflow_ros.records import NS_PER_S
@@ -109,7 +109,7 @@ def test_what_was_published_comes_back_under_any_name_of_the_node(tape):
     for d in told.diagnoses:
         tape.add('/boiler/watch/why', DIAGNOSIS, d.time_ns - 1, diagnosis_message(d, verdict=0))
         tape.add('/boiler/watch/why', DIAGNOSIS, d.time_ns, diagnosis_message(d))
-    found = history_in(tape.done())
+    found = recorded_history(tape.done())
     assert [c.model_id for c in found.curves] == [c.model_id for c in told.curves]
     for mine, theirs in zip(found.curves, told.curves, strict=True):
         assert mine.time_ns == theirs.time_ns
@@ -133,28 +133,28 @@ def test_what_is_told_again_is_no_change(tape):
     d = history().diagnoses[0]
     for _ in range(3):
         tape.add('/m/diagnosis', DIAGNOSIS, d.time_ns, diagnosis_message(d))
-    found = history_in(tape.done())
+    found = recorded_history(tape.done())
     # That which stood when the recording began is known by its first word alone.
     assert found.alarms == (old, raised)
     assert found.diagnoses == (d,)
 
 
 def test_a_plants_log_is_no_monitors(tape):
-    assert history_in(tape.done()) is None
+    assert recorded_history(tape.done()) is None
 
 
 def test_no_curve_yet_is_no_curve(tape):
     c = history().curves[0]
     none = curve_message(c, breakpoints=[], values=[], breakpoint_low=[], breakpoint_high=[])
     tape.add('/m/characteristic', CURVE, c.time_ns, none)
-    assert history_in(tape.done()) is None
+    assert recorded_history(tape.done()) is None
 
 
 def test_two_monitors_in_one_log_are_said(tape):
     c = history().curves[0]
     tape.add('/b/characteristic', CURVE, c.time_ns, curve_message(c, model_id='b'))
     tape.add('/a/characteristic', CURVE, c.time_ns, curve_message(c, model_id='a'))
-    found = history_in(tape.done())
+    found = recorded_history(tape.done())
     assert [x.model_id for x in found.curves] == ['a']
     (note,) = found.notes
     assert '/a/characteristic and /b/characteristic; only /a/characteristic is shown' in note
@@ -163,7 +163,7 @@ def test_two_monitors_in_one_log_are_said(tape):
 def test_a_schema_of_another_day_is_said_and_nothing_is_lost(tape):
     old = 'string name\nstring sentence\n'
     tape.add('/m/alarms', ALARM, START_NS, {'name': 'x', 'sentence': 'y'}, old)
-    found = history_in(tape.done())
+    found = recorded_history(tape.done())
     assert found.alarms == ()
     (note,) = found.notes
     assert 'What the monitor published on /m/alarms cannot be shown' in note
@@ -173,6 +173,6 @@ def test_a_schema_of_another_day_is_said_and_nothing_is_lost(tape):
 def test_a_state_nobody_knows_is_said(tape):
     a = history().alarms[0]
     tape.add('/m/alarms', ALARM, a.time_ns, {**alarm_message(a), 'state': 77})
-    (note,) = history_in(tape.done()).notes
+    (note,) = recorded_history(tape.done()).notes
     assert '77' in note
     assert 'lacks' not in note

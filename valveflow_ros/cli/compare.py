@@ -4,10 +4,24 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.options import MAPPING_HELP, add_mapping, add_parameters, read_mapping
-from valveflow_ros.cli.report_files import add_report_files, check_report_files, with_report
+from valveflow_ros.cli.command import (
+    Console,
+    Outcome,
+    add_beside,
+    add_mapping,
+    add_parameters,
+    add_results,
+    checked_parameters,
+    columns,
+    lines,
+    mapping_of,
+    written,
+)
+
+if TYPE_CHECKING:
+    from valveflow_ros.report.comparison_tables import Compared
 
 _DESCRIPTION = """\
 Identify the flow characteristic in three ways - from special segments, as a Hammerstein model
@@ -29,12 +43,8 @@ def arguments(parser: ArgumentParser) -> None:
     """Add description, example and options."""
     parser.description = _DESCRIPTION
     parser.usage = 'valveflow compare LOG -o DIR [options]'
-    parser.epilog = MAPPING_HELP
     parser.add_argument('log', metavar='LOG', type=Path, help='the log to learn from')
-    parser.add_argument(
-        '-o', '--output', metavar='DIR', type=Path, required=True,
-        help='folder for the results, made if absent; the report of another verb there is kept',
-    )  # fmt: skip
+    add_results(parser)
     parser.add_argument(
         '--test', metavar='LOG2', type=Path, help='a log of other days to judge by'
     )
@@ -43,27 +53,70 @@ def arguments(parser: ArgumentParser) -> None:
         help='the true curve, as "simulate --truth" writes it; a characteristic.json too',
     )  # fmt: skip
     add_parameters(parser)
-    add_report_files(parser)
+    add_beside(parser)
     add_mapping(parser)
 
 
 def run(options: Namespace, console: Console) -> Outcome:
-    """Read, identify in three ways, judge, write."""
-    mapping = read_mapping(options.column, options.constant)
-    console.progress(0.0, 'starting')
-    from valveflow_ros.cli.comparing import compared, outcome, texts
-    from valveflow_ros.cli.files import check_folder
-    from valveflow_ros.cli.options import read_parameters
-    from valveflow_ros.cli.truth_file import read_truth_file
-    from valveflow_ros.report.comparison import comparison_page
+    """Open, identify in three ways and judge, write."""
+    mapping = mapping_of(options)
+    console(0.0, 'starting')
+    from valveflow_ros.interface.compare import compare
+    from valveflow_ros.interface.logs import open_log
+    from valveflow_ros.interface.models import load_truth
+    from valveflow_ros.report.comparison import data_words, finding_words
 
-    given = read_parameters(options.params, options.pairs)
-    check_folder(options.output)
-    check_report_files(options)
-    truth = None if options.truth is None else read_truth_file(options.truth)
-    data = compared(options.log, options.test, truth, mapping, given, console)
-    console.progress(0.95, 'writing the report')
-    content, files = texts(data)
-    return with_report(
-        options, files, comparison_page(data), lambda written: outcome(data, content, written)
-    )
+    given = checked_parameters(options)
+    truth = None if options.truth is None else load_truth(options.truth)
+    console(0.02, 'reading')
+    log = open_log(options.log, mapping, progress=console)
+    test = None if options.test is None else open_log(options.test, mapping, progress=console)
+    found = compare(log, test=test, truth=truth, parameters=given, progress=console)
+    console(0.95, 'writing the report')
+    data = found.data
+    text = lines(data_words(data), *finding_words(data), _parameters(data), _errors(data))
+    # The segments stand in the file only.
+    brief = {k: v for k, v in found.to_json().items() if k != 'segments'}
+    return written(found, options, text, brief)
+
+
+def _parameters(data: Compared) -> str:
+    from valveflow_ros.report.comparison_tables import LABELS, METHODS
+    from valveflow_ros.report.words import decimals, input_unit_plain, plain
+
+    rows = []
+    for method in METHODS:
+        line = data.result.lines.get(method)
+        for j in range(0 if line is None else len(line.slopes)):
+            assert line is not None
+            rows.append(
+                [
+                    LABELS[method] if j == 0 else '',
+                    f'{decimals(float(line.knots[j]), 1)} to '
+                    f'{decimals(float(line.knots[j + 1]), 1)}',
+                    plain(float(line.slopes[j])),
+                    decimals(float(line.intercepts[j]), 2),
+                ]
+            )
+    unit = input_unit_plain(data.result.characteristic.pressure_exponent)
+    return columns(rows, ['curve', f'u ({unit})', 'slope (MW per u)', 'intercept (MW)'])
+
+
+def _errors(data: Compared) -> str:
+    from valveflow_ros.records import SegmentKind
+    from valveflow_ros.report.comparison_tables import PREDICTIONS, mse_cell
+
+    r = data.result
+    rows = [
+        [
+            PREDICTIONS[name],
+            *(
+                mse_cell(r.judgement.mse(name, k)) if r.judgement.kinds(k) else '–'
+                for k in (None, SegmentKind.STEADY, SegmentKind.SLOPE)
+            ),
+            mse_cell(r.all_rows[name]) if name in r.all_rows else '–',
+        ]
+        for name in data.predictions
+    ]
+    head = ['mean squared error (MW^2)', 'segments', 'steady', 'slope', 'all rows']
+    return columns(rows, head)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from argparse import ArgumentParser, Namespace
+from collections.abc import Callable
+from typing import Any
 
-from valveflow_ros.cli.console import Console, Outcome
+from valveflow_ros.cli.command import Console, Outcome
 
 SHELLS = ('bash', 'zsh', 'fish')
 
@@ -28,9 +31,60 @@ def arguments(parser: ArgumentParser) -> None:
 
 
 def run(options: Namespace, console: Console) -> Outcome:
-    """Print the script."""
-    from valveflow_ros.cli.completion_scripts import script
-    from valveflow_ros.cli.completion_table import table
+    """Print the script, which calls the command itself at each Tab."""
+    from argcomplete.shell_integration import shellcode
 
-    text = script(options.shell, table())
+    text = shellcode(['valveflow'], True, options.shell)
     return Outcome(text, {'shell': options.shell, 'script': text})
+
+
+def complete(verbs: list[tuple[str, str]], parser_of: Callable[[str], ArgumentParser]) -> None:
+    """Answer the shell, which calls the command with what was typed so far, and exit.
+
+    Parameters
+    ----------
+    verbs : list of (str, str)
+        Names, and what they do.
+    parser_of : callable
+        Returns the parser of a verb.
+    """
+    import argcomplete
+
+    typed = os.environ.get('COMP_LINE', '').split()
+    known = {'effect': _effects, 'column': _columns, 'constant': _signals, 'pairs': _parameters}
+    whole = ArgumentParser('valveflow', allow_abbrev=False)
+    whole.add_argument('--version', action='store_true')
+    below: Any = whole.add_subparsers()
+    for name, about in verbs:
+        # Only the verb that is typed is loaded.
+        if name not in typed[1:2]:
+            below.add_parser(name, help=about)
+            continue
+        parser = parser_of(name)
+        for action in parser._actions:
+            if action.dest in known:
+                action.completer = known[action.dest]  # type: ignore[attr-defined]
+        below.add_parser(name, help=about, parents=[parser], add_help=False, allow_abbrev=False)
+    argcomplete.autocomplete(whole, always_complete_options=False)
+
+
+def _effects(**_: object) -> list[str]:
+    from valveflow_ros.plant.effects import catalogue
+
+    return list(catalogue())
+
+
+def _signals(**_: object) -> list[str]:
+    from valveflow_ros.records import SIGNALS
+
+    return [f'{info.topic}=' for info in SIGNALS]
+
+
+def _columns(action: Any, **_: object) -> list[str]:
+    return ['time=', *_signals()] if '--column' in action.option_strings else []
+
+
+def _parameters(**_: object) -> list[str]:
+    from valveflow_ros.parameters import TABLE
+
+    return [f'{row.name}=' for row in TABLE]

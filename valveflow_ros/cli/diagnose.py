@@ -4,14 +4,24 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.options import MAPPING_HELP, add_mapping, add_parameters, read_mapping
-from valveflow_ros.cli.report_files import (
-    add_report_files,
-    check_report_files,
-    with_report,
+from valveflow_ros.cli.command import (
+    Console,
+    Outcome,
+    add_beside,
+    add_mapping,
+    add_parameters,
+    add_results,
+    checked_parameters,
+    columns,
+    lines,
+    mapping_of,
+    written,
 )
+
+if TYPE_CHECKING:
+    from valveflow_ros.interface.diagnose import DiagnosisResult
 
 _DESCRIPTION = """\
 Compare the simulation (flow characteristic and regional dynamics, run on the measured opening
@@ -30,43 +40,67 @@ def arguments(parser: ArgumentParser) -> None:
     """Add description, example and options."""
     parser.description = _DESCRIPTION
     parser.usage = 'valveflow diagnose LOG -o DIR [options]'
-    parser.epilog = MAPPING_HELP
     parser.add_argument('log', metavar='LOG', type=Path, help='the log to read')
-    parser.add_argument(
-        '-o', '--output', metavar='DIR', type=Path, required=True,
-        help='folder for the results, made if absent; the report of another verb there is kept',
-    )  # fmt: skip
+    add_results(parser)
     parser.add_argument(
         '--model', metavar='FILE', type=Path,
         help='characteristic.json or extended_model.json of an earlier log, to be held against '
         'this one; found anew without it',
     )  # fmt: skip
     add_parameters(parser)
-    add_report_files(parser)
+    add_beside(parser)
     add_mapping(parser)
 
 
 def run(options: Namespace, console: Console) -> Outcome:
-    """Read, simulate, search, write."""
-    mapping = read_mapping(options.column, options.constant)
-    console.progress(0.0, 'starting')
-    from valveflow_ros.cli.diagnosing import diagnosed_in, outcome, read_model, texts
-    from valveflow_ros.cli.files import check_folder
-    from valveflow_ros.cli.log_input import open_input
-    from valveflow_ros.cli.model_file import check_exponent
-    from valveflow_ros.cli.options import read_parameters
-    from valveflow_ros.report.diagnosis import diagnosis_page
+    """Open, diagnose, write."""
+    mapping = mapping_of(options)
+    console(0.0, 'starting')
+    from valveflow_ros.diagnosis.result import to_json
+    from valveflow_ros.interface.diagnose import diagnose, load_diagnosable
+    from valveflow_ros.interface.logs import open_log
+    from valveflow_ros.interface.models import with_exponent
 
-    given = read_parameters(options.params, options.pairs)
-    model = read_model(options.model) if options.model else None
-    if model is not None:
-        check_exponent(model, options.model, given)
-        given = {**given, 'pressure_exponent': model.pressure_exponent}
-    check_folder(options.output)
-    check_report_files(options)
-    console.progress(0.02, 'reading')
-    log = open_input(options.log, mapping, console)
-    found = diagnosed_in(log, model, given, options.log, console)
-    console.progress(0.95, 'writing the report')
-    page = diagnosis_page(found.page)
-    return with_report(options, texts(found), page, lambda written: outcome(found, written))
+    given = checked_parameters(options)
+    model = None
+    if options.model is not None:
+        model = load_diagnosable(options.model)
+        given = with_exponent(model, given, options.model)
+    console(0.02, 'reading')
+    log = open_log(options.log, mapping, progress=console)
+    found = diagnose(log, parameters=given, model=model, progress=console)
+    console(0.95, 'writing the report')
+    return written(found, options, _text(found), to_json(found.diagnosis))
+
+
+def _text(found: DiagnosisResult) -> str:
+    from valveflow_ros.diagnosis.result import NAMED, NOTHING, UNEXPLAINED
+    from valveflow_ros.report.diagnosis_figures import cells
+    from valveflow_ros.report.words import decimals
+
+    verdicts = {
+        NAMED: 'cause found', NOTHING: 'nothing is wrong', UNEXPLAINED: 'something is unexplained',
+    }  # fmt: skip
+    d = found.diagnosis
+    rows = [
+        [c.name, key, *cells(e, found.exponent)]
+        for c in d.causes
+        for key, e in c.parameters.items()
+    ]
+    blind = 'cannot be judged'
+    judged = [
+        f'  {name}: {why.removeprefix(blind).removeprefix(": ").strip()}'
+        for name, why in d.rejected
+        if why.startswith(blind)
+    ]
+    return lines(
+        f'{found.data.source}: {verdicts[d.verdict]}. {d.sentence}',
+        columns(rows, ['cause', 'parameter', 'value', '95 % interval']) if rows else '',
+        f'Not told apart: {", ".join(d.not_told_apart)}.' if d.not_told_apart else '',
+        *(f'What would tell them apart: {e}' for e in d.experiments),
+        'Error (RMSE) on blocks of time that nothing was fitted to: simulation '
+        f'{decimals(d.rmse_simulation, 3)} MW, extended model {decimals(d.rmse_extended, 3)} MW, '
+        f'noise alone about {decimals(d.rmse_noise_floor, 3)} MW.',
+        '\n'.join(['Not judged:', *judged]) if judged else '',
+        *d.notes,
+    )

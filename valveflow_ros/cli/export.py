@@ -5,8 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.options import MAPPING_HELP, add_mapping, read_mapping
+from valveflow_ros.cli.command import Console, Outcome, add_mapping, mapping_of, rejected_words
 
 _DESCRIPTION = """\
 Write a log as a table with one row a sample: the rows the engine sees, in its units. Where a
@@ -20,7 +19,6 @@ def arguments(parser: ArgumentParser) -> None:
     """Add description, example and options."""
     parser.description = _DESCRIPTION
     parser.usage = 'valveflow export LOG -o TABLE [options]'
-    parser.epilog = MAPPING_HELP
     parser.add_argument('log', metavar='LOG', type=Path, help='the log to read')
     parser.add_argument(
         '-o', '--output', metavar='TABLE', type=Path, required=True, help='a .csv or .parquet file'
@@ -35,24 +33,22 @@ def arguments(parser: ArgumentParser) -> None:
 
 def run(options: Namespace, console: Console) -> Outcome:
     """Align and write."""
-    mapping = read_mapping(options.column, options.constant)
-    from valveflow_ros.cli.alignment import align
-    from valveflow_ros.cli.files import check_output
-    from valveflow_ros.cli.log_input import open_input, steps_of
-    from valveflow_ros.cli.options import read_parameters, settings_for
-    from valveflow_ros.cli.outputs import TABLES, write_log
-    from valveflow_ros.cli.report_words import rejected_words
+    mapping = mapping_of(options)
     from valveflow_ros.errors import DataError
+    from valveflow_ros.interface.files import TABLES, check_output, write_log
+    from valveflow_ros.interface.logs import open_log
+    from valveflow_ros.interface.observation import align
+    from valveflow_ros.interface.settings import read_parameters, settings_for
     from valveflow_ros.report.words import counted, duration, moment
 
     given = read_parameters(None, options.pairs)
     check_output(options.output, TABLES, source=options.log, overwrite=options.overwrite)
-    console.progress(0.1, 'reading')
-    log = open_input(options.log, mapping, console)
-    settings, notes = settings_for(steps_of(log.readings), 0.0, given)
+    console(0.1, 'reading')
+    log = open_log(options.log, mapping, progress=console)
+    settings, notes = settings_for(log.steps(), 0.0, given)
     for sentence in notes:
         console.say(sentence)
-    table, resets, counts = align(log.readings, settings, console.progress)
+    table, resets, counts = align(log.readings, settings, console)
     if not len(table):
         raise DataError('The log holds no usable reading, so there is no row to write.')
     if len(resets):
@@ -60,8 +56,8 @@ def run(options: Namespace, console: Console) -> Outcome:
             'The clock goes back within the log, and a table must go forward in time; '
             'split the log there first.'
         )
-    console.progress(0.7, 'writing')
-    write_log(table, options.output, overwrite=options.overwrite)
+    console(0.7, 'writing')
+    write_log(table, options.output, options.overwrite)
     first, last = int(table.time_ns[0]), int(table.time_ns[-1])
     step = duration(settings.real('sample_period'))
     text = (

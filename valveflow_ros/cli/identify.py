@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import math
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.options import MAPPING_HELP, add_mapping, add_parameters, read_mapping
-from valveflow_ros.cli.report_files import (
-    add_report_files,
-    check_report_files,
-    with_report,
+from valveflow_ros.cli.command import (
+    Console,
+    Outcome,
+    add_beside,
+    add_mapping,
+    add_parameters,
+    add_results,
+    checked_parameters,
+    columns,
+    lines,
+    mapping_of,
+    rejected_words,
+    written,
 )
-from valveflow_ros.cli.usage import UsageError
+from valveflow_ros.errors import UsageError
 
 if TYPE_CHECKING:
+    from valveflow_ros.curve.characteristic import Characteristic
+    from valveflow_ros.interface.identify import Identification
     from valveflow_ros.report.identified import Identified
 
 _DESCRIPTION = """\
@@ -40,12 +50,8 @@ def arguments(parser: ArgumentParser) -> None:
     """Add description, example and options."""
     parser.description = _DESCRIPTION
     parser.usage = 'valveflow identify LOG -o DIR [options]'
-    parser.epilog = MAPPING_HELP
     parser.add_argument('log', metavar='LOG', type=Path, help='the log to read')
-    parser.add_argument(
-        '-o', '--output', metavar='DIR', type=Path, required=True,
-        help='folder for the results, made if absent; the report of another verb there is kept',
-    )  # fmt: skip
+    add_results(parser)
     add_parameters(parser)
     parser.add_argument(
         '--model', metavar='FILE', type=Path,
@@ -60,40 +66,134 @@ def arguments(parser: ArgumentParser) -> None:
         '--step-test', action='store_true',
         help='the log is a manual test: pressure constant, the opening in steps, each held',
     )  # fmt: skip
-    add_report_files(parser)
+    add_beside(parser)
     add_mapping(parser)
 
 
 def run(options: Namespace, console: Console) -> Outcome:
-    """Read, watch, fit, write."""
-    mapping = read_mapping(options.column, options.constant)
-    console.progress(0.0, 'starting')
-    from valveflow_ros.cli.files import check_folder
-    from valveflow_ros.cli.identification import found_in, judged, outcome, texts
-    from valveflow_ros.cli.log_input import open_input
-    from valveflow_ros.cli.model_file import check_exponent, read_extended, read_model
-    from valveflow_ros.cli.options import read_parameters
-    from valveflow_ros.report.identification import identification_page
+    """Open, identify, write."""
+    mapping = mapping_of(options)
+    console(0.0, 'starting')
+    from valveflow_ros.interface.identify import identify
+    from valveflow_ros.interface.logs import open_log
+    from valveflow_ros.interface.models import (
+        load_characteristic,
+        load_extended,
+        with_exponent,
+    )
 
-    given = read_parameters(options.params, options.pairs)
-    check_folder(options.output)
-    check_report_files(options)
-    reference = read_model(options.reference) if options.reference else None
-    extended = None
+    given = checked_parameters(options)
+    reference = load_characteristic(options.reference) if options.reference else None
+    model = None
     # A file of the node's parameters may name a model too.
     if named := options.model or given.get('model_file'):
         path = Path(str(named)).expanduser()
         if options.step_test:
             raise UsageError('--step-test and --model do not go together.')
-        extended = read_extended(path)
-        check_exponent(extended, path, given)
-        given = {**given, 'pressure_exponent': extended.pressure_exponent}
-    console.progress(0.02, 'reading')
-    log = open_input(options.log, mapping, console)
-    found: Identified = found_in(log, given, options.log, console, options.step_test, extended)
-    if reference is not None:
-        found = judged(found, reference)
-    console.progress(0.9, 'writing the report')
-    page = identification_page(found)
-    files = texts(found, extended)
-    return with_report(options, files, page, lambda written: outcome(found, written, log))
+        model = load_extended(path)
+        given = with_exponent(model, given, path)
+    console(0.02, 'reading')
+    log = open_log(options.log, mapping, progress=console)
+    found = identify(
+        log, parameters=given, model=model, reference=reference, step_test=options.step_test,
+        progress=console,
+    )  # fmt: skip
+    console(0.9, 'writing the report')
+    return written(found, options, _text(found.data), _data(found))
+
+
+def _data(found: Identification) -> dict[str, Any]:
+    from valveflow_ros.curve.characteristic_json import to_json
+    from valveflow_ros.curve.shift import shift_json
+    from valveflow_ros.records import SIGNALS
+    from valveflow_ros.report.answer import explained
+
+    data, log = found.data, found.log
+    return {
+        **to_json(data.characteristic),
+        'explained': explained(data),
+        'readings': data.counts,
+        'sample_period_s': data.settings.real('sample_period'),
+        'inputs': {SIGNALS[s].topic: name for s, name in log.contents.signals.items()},
+        'constants': {SIGNALS[s].topic: value for s, value in log.constants.items()},
+        'reading_notes': list(data.notes),
+        **({} if data.shift is None else {'shift': shift_json(data.shift)}),
+    }
+
+
+def _text(found: Identified) -> str:
+    from valveflow_ros.report.answer import doubt, explained, temperature_words
+    from valveflow_ros.report.data import rejected
+    from valveflow_ros.report.words import counted, held_words, moment, percent, plain
+
+    c = found.characteristic
+    return lines(
+        f'{found.source}: {moment(c.source.window_start_ns)} to {moment(c.source.window_end_ns)}',
+        f'The flow characteristic has {counted(len(c.pieces), "piece")} and explains '
+        f'{percent(explained(found))} of the variance of the power.',
+        doubt(found),
+        _pieces(found),
+        _breakpoints(c),
+        _dynamics(c),
+        'Behind ± stands one standard error; 95 % lie within 1.96 of them.',
+        f'Found in {counted(c.source.steady, "steady-state segment")} and '
+        f'{counted(c.source.slope_response, "slope-response segment")}, '
+        f'{counted(c.source.samples, "sample")}. Typical difference '
+        f'{plain(c.residuals.rmse_mw, 2)} MW.',
+        temperature_words(c),
+        held_words(c.held),
+        *c.notes,
+        '' if found.shift is None else f'Against the reference: {found.shift.sentence}',
+        rejected_words(found.counts) if rejected(found.counts) else '',
+    )
+
+
+def _pieces(found: Identified) -> str:
+    from valveflow_ros.report.answer import opening_gain
+    from valveflow_ros.report.words import count, decimals, input_unit_plain, plain, with_error
+
+    c = found.characteristic
+    rows = []
+    for k, piece in enumerate(c.pieces):
+        gain, pressure = opening_gain(found, piece)
+        at = f'{plain(gain, 3)} at {plain(pressure, 3)} MPa' if math.isfinite(gain) else '-'
+        rows.append(
+            [
+                str(k + 1),
+                f'{decimals(piece.u_from, 1)} to {decimals(piece.u_to, 1)}',
+                with_error(piece.slope, piece.slope_stderr),
+                with_error(piece.intercept, piece.intercept_stderr),
+                at,
+                count(piece.samples),
+            ]
+        )
+    unit = input_unit_plain(c.pressure_exponent)
+    head = ['piece', f'u ({unit})', 'slope (MW per u)', 'intercept (MW)', 'MW per 1 % opening',
+            'samples']  # fmt: skip
+    return columns(rows, head)
+
+
+def _breakpoints(c: Characteristic) -> str:
+    from valveflow_ros.report.words import decimals, interval
+
+    rows = [
+        [decimals(piece.u_to, 1), f'{interval(low, high)}', f'{decimals(float(value), 1)} MW']
+        for piece, (low, high), value in zip(
+            c.pieces[:-1], c.breakpoint_intervals, c.values()[1:-1], strict=True
+        )
+    ]
+    return columns(rows, ['breakpoint u', '95 % interval', 'power']) if rows else ''
+
+
+def _dynamics(c: Characteristic) -> str:
+    from valveflow_ros.report.words import decimals, with_error
+
+    rows = [
+        [
+            f'{decimals(d.power_from, 0)} to {decimals(d.power_to, 0)} MW',
+            with_error(d.time_constant_s, d.time_constant_stderr_s, 's'),
+            with_error(d.delay_s, d.delay_stderr_s, 's'),
+        ]
+        for d in c.dynamics
+    ]
+    return columns(rows, ['dynamics', 'time constant', 'delay']) if rows else ''

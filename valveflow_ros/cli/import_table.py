@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import os
 from argparse import ArgumentParser, Namespace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.options import MAPPING_HELP, LogMapping, add_mapping, read_mapping
-from valveflow_ros.cli.usage import UsageError
+from valveflow_ros.cli.command import (
+    Console,
+    Outcome,
+    TableOption,
+    add_mapping,
+    columns,
+    mapping_of,
+)
+from valveflow_ros.errors import DataError, InputError, UsageError
 
 if TYPE_CHECKING:
-    from valveflow_ros.cli.historian import Historian, Imported, Ordered, SignalSource, Spool
+    from valveflow_ros.interface.mapping import LogMapping
+    from valveflow_ros.interface.table_import import Imported, Ordered, Spool, TableImport
+    from valveflow_ros.logs.tables.refusal import RefusedError, Remedy
 
 _DESCRIPTION = """\
 Read a table exported from a historian (CSV, Excel or Parquet; a column a signal, or a row a
@@ -31,13 +38,15 @@ and with columns whose names say nothing:
       --constant main_steam_temperature=540 --time-zone Europe/Berlin"""
 
 _HEAD = ('your column', 'is', 'why', 'in', 'runs from', '', '')
+_FLAGS = ('dry_run', 'overwrite', 'quiet', 'json')
+# Of these the table shows that one is needed, and not which.
+_CHOICES = ('time-zone', 'date-order', 'decimal', 'sheet')
 
 
 def arguments(parser: ArgumentParser) -> None:
     """Add description, example and options."""
     parser.description = _DESCRIPTION
     parser.usage = 'valveflow import TABLE -o LOG.mcap [options]'
-    parser.epilog = MAPPING_HELP
     parser.add_argument('table', metavar='TABLE', type=Path, help='a .csv, .xlsx or .parquet file')
     parser.add_argument(
         '-o', '--output', metavar='LOG', type=Path,
@@ -52,101 +61,78 @@ def arguments(parser: ArgumentParser) -> None:
 
 def run(options: Namespace, console: Console) -> Outcome:
     """Read, convert, write, and say what was understood."""
-    mapping = read_mapping(options.column, options.constant)
+    mapping = mapping_of(options)
     if options.output is None and not options.dry_run:
         raise UsageError('Name the log to write with -o LOG.mcap, or add --dry-run to look only.')
-    from valveflow_ros.cli.historian_command import told
-    from valveflow_ros.cli.historian_open import looked_through
-    from valveflow_ros.cli.outputs import check_log
-    from valveflow_ros.errors import InputError
+    from valveflow_ros.interface import SILENT
+    from valveflow_ros.interface.files import check_log
+    from valveflow_ros.interface.mapping import LOOKING_ON, looked_through
+    from valveflow_ros.interface.table_import import TableImport
     from valveflow_ros.logs.tables.refusal import RefusedError
 
     if options.output is not None:
         check_log(options.output, source=options.table, overwrite=options.overwrite)
 
-    def look(said: LogMapping) -> Outcome:
-        return _imported(options, said, console)
+    def again(said: LogMapping) -> None:
+        console(0.1, LOOKING_ON)
+        TableImport(options.table, said, SILENT, strict=True).read(None)
 
     try:
         return looked_through(
-            options.table, look, mapping, partial(_looked, options.table, console)
+            options.table, lambda said: _imported(options, said, console), mapping, again
         )
     except RefusedError as refused:
-        raise InputError(told(refused, options)) from None
-
-
-def _looked(table: Path, console: Console, mapping: LogMapping) -> None:
-    """Read a table for what else is open, and say nothing of what is understood."""
-    from valveflow_ros.cli.historian import Historian
-    from valveflow_ros.cli.historian_open import LOOKING_ON
-
-    console.progress(0.1, LOOKING_ON)
-    with Path(os.devnull).open('w', encoding='utf-8') as nowhere:
-        Historian(table, mapping, Console(nowhere, nowhere, quiet=True), strict=True).read(None)
+        raise InputError(_refusal(refused, options)) from None
 
 
 def _imported(options: Namespace, mapping: LogMapping, console: Console) -> Outcome:
-    from valveflow_ros.cli.historian import Historian, Spool
+    from valveflow_ros.interface.table_import import Spool, TableImport
 
-    console.progress(0.05, 'looking at the table')
-    historian = Historian(options.table, mapping, console)
-    console.progress(0.1, 'reading')
+    console(0.05, 'looking at the table')
+    table = TableImport(options.table, mapping, console)
+    console(0.1, 'reading')
+    place = None
     if options.dry_run:
-        imported, _ = historian.read(None)
-        return _outcome(imported, None, historian.is_long)
-    spool = Spool(options.output.absolute().parent)
-    try:
-        imported, ordered = historian.read(spool)
-        console.progress(0.6, 'writing')
-        return _written(options, historian, spool, imported, ordered, console)
-    finally:
-        spool.close()
+        imported, _ = table.read(None)
+    else:
+        spool = Spool(options.output.absolute().parent)
+        try:
+            imported, ordered = table.read(spool)
+            console(0.6, 'writing')
+            place = _written(options, table, spool, imported, ordered)
+        finally:
+            spool.close()
+    last = 'Nothing was written (--dry-run).' if place is None else f'Wrote {place}.'
+    text = '\n'.join([*_understood(imported, table.is_long), last])
+    return Outcome(text, {'log': None if place is None else str(place), **imported.summary()})
 
 
 def _written(
-    options: Namespace,
-    historian: Historian,
-    spool: Spool,
-    imported: Imported,
-    ordered: Ordered,
-    console: Console,
-) -> Outcome:
-    from valveflow_ros.cli.outputs import TABLES, write_log
-    from valveflow_ros.errors import DataError
+    options: Namespace, table: TableImport, spool: Spool, imported: Imported, ordered: Ordered
+) -> Path:
+    from valveflow_ros.interface.files import TABLES, is_empty, write_log
     from valveflow_ros.logs.mcap.importing import write_readings
     from valveflow_ros.records import SampleTable
 
     path: Path = options.output
-    attachments = {'import.json': imported.as_json().encode()}
-    if path.suffix.lower() in TABLES:
-        if historian.is_long:
-            raise DataError(
-                f'{options.table}: each of its signals has times of its own, which a table cannot '
-                'hold; write an .mcap file.'
-            )
-        table = SampleTable.concatenate(list(historian.tables(spool, ordered)))
-        place = write_log(table, path, overwrite=options.overwrite)
-    else:
-        # An empty file is no obstacle, and the writer knows no third way.
-        replace = options.overwrite or (path.is_file() and path.stat().st_size == 0)
-        place = write_readings(
-            historian.readings(spool, ordered), historian.signals, path,
-            attachments=attachments, overwrite=replace,
+    if path.suffix.lower() not in TABLES:
+        return write_readings(
+            table.readings(spool, ordered), table.signals, path,
+            attachments={'import.json': imported.as_json().encode()},
+            overwrite=options.overwrite or is_empty(path),
         ).path  # fmt: skip
-    return _outcome(imported, place, historian.is_long)
-
-
-def _outcome(imported: Imported, written: Path | None, long: bool) -> Outcome:
-    last = 'Nothing was written (--dry-run).' if written is None else f'Wrote {written}.'
-    log = None if written is None else str(written)
-    text = '\n'.join([*_understood(imported, long), last])
-    return Outcome(text, {'log': log, **imported.summary()})
+    if table.is_long:
+        raise DataError(
+            f'{options.table}: each of its signals has times of its own, which a table cannot '
+            'hold; write an .mcap file.'
+        )
+    rows = SampleTable.concatenate(list(table.tables(spool, ordered)))
+    return write_log(rows, path, options.overwrite)
 
 
 def _understood(imported: Imported, long: bool) -> list[str]:
     """Return what a person should check before trusting the log."""
-    from valveflow_ros.cli.report_words import columns
-    from valveflow_ros.report.words import count, counted, duration, moment
+    from valveflow_ros.report.words import count, counted, duration, moment, plain
 
     first, last = imported.span_ns
     # In a long table a row is one value of one signal.
@@ -154,10 +140,22 @@ def _understood(imported: Imported, long: bool) -> list[str]:
     step = f'one of each signal every {duration(imported.period_s)}' if long else (
         f'one every {duration(imported.period_s)}'
     )  # fmt: skip
+    zone = imported.time_zone
+    if 'name no zone' in zone:
+        zone += '; if they are local, add --time-zone, such as --time-zone Europe/Berlin'
+    rows = []
+    for s in imported.sources:
+        if s.constant:
+            rows.append(['(constant)', s.topic, 'as you said', '', plain(s.low), s.unit, ''])
+            continue
+        taken = f'from {s.written_unit}' if s.written_unit != s.unit else ''
+        lost = f'{counted(s.missing, "value")} missing' if s.missing else ''
+        span = f'{plain(s.low)} to {plain(s.high)}'
+        rows.append([s.column, s.topic, s.ground or '', taken, span, s.unit, lost])
     lines = [
         f'Read {read}, {step}, {moment(first)} to {moment(last)}.',
-        f'Times: {imported.time_words}; zone: {_zone(imported.time_zone)}.',
-        columns(_rows(imported), _HEAD),
+        f'Times: {imported.time_words}; zone: {zone}.',
+        columns(rows, _HEAD),
     ]
     lines += [source.air for source in imported.sources if source.air]
     for source in imported.sources:
@@ -182,23 +180,53 @@ def _understood(imported: Imported, long: bool) -> list[str]:
     return lines
 
 
-def _zone(zone: str) -> str:
-    if 'name no zone' not in zone:
-        return zone
-    return f'{zone}; if they are local, add --time-zone, such as --time-zone Europe/Berlin'
+def _refusal(refused: RefusedError, options: Namespace) -> str:
+    """Return what is open, and below it the whole command with everything said."""
+    from valveflow_ros.logs.tables.refusal import THEIRS
+
+    if not refused.remedies:
+        return refused.listing
+    checks = []
+    if any(r.value.endswith(f'={THEIRS}') for r in refused.remedies):
+        checks.append(f'with your names in place of {THEIRS}')
+    if any(r.option in _CHOICES for r in refused.remedies) or ' or --' in refused.listing:
+        checks.append('with the first of each choice: check it')
+    head = ', '.join(['Then this reads it', *checks])
+    return f'{refused.listing.rstrip()}\n{head}:\n  {_command(refused, options)}'
 
 
-def _rows(imported: Imported) -> list[list[str]]:
-    return [_row(source) for source in imported.sources]
+def _command(refused: RefusedError, options: Namespace) -> str:
+    """Return the command as it was given, with the options that were missing."""
+    from valveflow_ros.logs.tables.refusal import Remedy
+
+    given = [
+        Remedy(said.option, said.value)
+        if isinstance(said, TableOption)
+        else Remedy('column', said)
+        for said in options.column
+    ]
+    given += [Remedy('constant', said) for said in options.constant]
+    new = {_subject(remedy) for remedy in refused.remedies}
+    words = ['valveflow', 'import', _quoted(options.table)]
+    if options.output is not None:
+        words += ['-o', _quoted(options.output)]
+    words += [f'--{name.replace("_", "-")}' for name in _FLAGS if getattr(options, name, False)]
+    words += [str(old) for old in given if _subject(old) not in new]
+    return ' '.join([*words, refused.options])
 
 
-def _row(source: SignalSource) -> list[str]:
-    from valveflow_ros.report.words import counted, plain
+def _quoted(path: Path) -> str:
+    """Return a path as a shell takes it, and as no option."""
+    from valveflow_ros.logs.tables.refusal import quoted
 
-    if source.constant:
-        return ['(constant)', source.topic, 'as you said', '', plain(source.low), source.unit, '']
-    span = f'{plain(source.low)} to {plain(source.high)}'
-    lost = f'{counted(source.missing, "value")} missing' if source.missing else ''
-    taken = f'from {source.written_unit}' if source.written_unit != source.unit else ''
-    ground = source.ground or ''
-    return [source.column, source.topic, ground, taken, span, source.unit, lost]
+    told = str(path)
+    return quoted(f'.{os.sep}{told}' if told.startswith('-') else told)
+
+
+def _subject(remedy: Remedy) -> str:
+    """Return what an option speaks of, whichever of a signal's names was used."""
+    from valveflow_ros.interface.mapping import read_mapping, subject
+
+    if remedy.option == 'column':
+        return next(iter(read_mapping([remedy.value], []).columns))
+    return subject(remedy) if remedy.option != 'constant' else remedy.value

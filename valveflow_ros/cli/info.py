@@ -4,9 +4,26 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.options import MAPPING_HELP, add_mapping, read_mapping
+from valveflow_ros.cli.command import (
+    Console,
+    Outcome,
+    add_mapping,
+    columns,
+    lines,
+    mapping_of,
+    rejected_words,
+)
+from valveflow_ros.errors import RecordingError
+
+if TYPE_CHECKING:
+    from valveflow_ros.interface.logs import Log
+    from valveflow_ros.parameters import Settings
+    from valveflow_ros.records import Readings, Signal
+
+_LARGE_BYTES = 20_000_000  # a smaller file is read before anybody has to wait
+_GAP_STEPS = 3.5  # a pause of more than this many usual steps is a gap
 
 _DESCRIPTION = """\
 Look into a log before working with it: its span, topics and rates, the range of each signal,
@@ -20,23 +37,208 @@ def arguments(parser: ArgumentParser) -> None:
     """Add description, example and options."""
     parser.description = _DESCRIPTION
     parser.usage = 'valveflow info LOG [options]'
-    parser.epilog = MAPPING_HELP
     parser.add_argument('log', metavar='LOG', type=Path, help='the log to look into')
     add_mapping(parser)
 
 
 def run(options: Namespace, console: Console) -> Outcome:
     """Read and describe."""
-    mapping = read_mapping(options.column, options.constant)
-    console.progress(0.1, 'reading')
-    if not options.json:
-        from valveflow_ros.cli.first_facts import first_facts
+    mapping = mapping_of(options)
+    console(0.1, 'reading')
+    if not options.json and (told := _summary(options.log)):
+        console.say(told)
+    from valveflow_ros.interface.logs import open_log, steps_of
+    from valveflow_ros.interface.settings import settings_for
 
-        told = first_facts(options.log)
-        if told:
-            console.say(told)
-    from valveflow_ros.cli.inspection import inspect
-    from valveflow_ros.cli.log_input import open_input
+    log = open_log(options.log, mapping, progress=console)
+    parts = log.readings.by_signal()
+    steps = steps_of(parts)
+    settings, _ = settings_for(steps, 0.0, {})
+    counts = _fates(log.readings, parts, settings)
+    contents = log.contents
+    start, end = contents.start_ns, contents.end_ns
+    seconds = 0.0 if start is None or end is None else (end - start) / 1e9
+    signals = {
+        info['topic']: info
+        for s in sorted({*contents.signals, *log.constants})
+        if s in parts
+        for info in [_facts(log, s, parts[s], steps.get(s, float('nan')))]
+    }
+    data = {
+        'log': contents.path,
+        'start_ns': None if end is None else start,
+        'end_ns': None if start is None else end,
+        'duration_s': seconds,
+        'topics': [
+            {
+                'name': t.name,
+                'type': t.type,
+                'messages': t.count,
+                'rate_hz': t.count / seconds if seconds else None,
+            }
+            for t in contents.topics.values()
+        ],
+        'signals': {
+            topic: {
+                **{k: v for k, v in facts.items() if k not in ('topic', 'gaps')},
+                'gaps': len(facts['gaps']),
+                'longest_gap_s': facts['gaps'][0].seconds if facts['gaps'] else 0.0,
+            }
+            for topic, facts in signals.items()
+        },
+        'readings': counts,
+        'attachments': {name: len(data) for name, data in contents.attachments.items()},
+        'metadata': {k: v for k, v in contents.metadata.items() if k != 'rosbag2'},
+        'damaged_chunks': contents.damaged_chunks,
+        'warnings': list(log.notes),
+    }
+    return Outcome(_text(data, signals), data)
 
-    inspected = inspect(open_input(options.log, mapping, console))
-    return Outcome(inspected.text(), inspected.data())
+
+def _text(data: dict[str, Any], signals: dict[str, dict[str, Any]]) -> str:
+    from valveflow_ros.records import SIGNALS
+    from valveflow_ros.report.words import count, counted, duration, moment, plain
+
+    span = ''
+    if data['start_ns'] is not None:
+        span = f'  {moment(data["start_ns"])} to {moment(data["end_ns"])} '
+        span += f'({duration(data["duration_s"])})'
+    topics = [
+        [
+            t['name'], t['type'], count(t['messages']),
+            '' if t['rate_hz'] is None else f'{plain(t["rate_hz"], 3)} Hz',
+        ]
+        for t in data['topics']
+    ]  # fmt: skip
+    rows = [
+        [
+            topic, s['source'], count(s['readings']), duration(s['step_s']), plain(s['low']),
+            plain(s['median']), plain(s['high']), s['unit'],
+        ]
+        for topic, s in signals.items()
+    ]  # fmt: skip
+    head = ['signal', 'from', 'readings', 'step', 'lowest', 'median', 'highest', 'unit']
+    absent = [i.topic for i in SIGNALS if i.required and i.topic not in signals]
+    found = [
+        f'{topic}: {counted(len(gaps), "gap")}, the longest {duration(gaps[0].seconds)} '
+        f'from {moment(gaps[0].start_ns)}.'
+        for topic, s in signals.items()
+        if (gaps := s['gaps'])
+    ]
+    attached = ', '.join(
+        f'{name} ({count(size)} bytes)' for name, size in data['attachments'].items()
+    )
+    damaged = data['damaged_chunks'] and counted(data['damaged_chunks'], 'place')
+    return lines(
+        data['log'],
+        span,
+        columns(topics, ['topic', 'type', 'messages', 'rate']) if topics else '',
+        columns(rows, head) if rows else '',
+        f'Not in the log: {", ".join(absent)}.' if absent else '',
+        rejected_words(data['readings']),
+        *found,
+        'No gaps.' if signals and not found else '',
+        f'Attached: {attached}.' if attached else '',
+        f'Damaged: {damaged}; "valveflow recover" makes a whole file of the rest.'
+        if damaged
+        else '',
+    )
+
+
+def _summary(path: Path) -> str:
+    """Return a sentence from the summary of a large finished recording, else nothing."""
+    from valveflow_ros.logs.mcap.summary import read_summary
+    from valveflow_ros.logs.source import Source
+    from valveflow_ros.report.words import count, duration, moment
+
+    if path.suffix.lower() != '.mcap':
+        return ''
+    try:
+        with Source.open(path) as source:
+            summary = read_summary(source) if source.size >= _LARGE_BYTES else None
+    except RecordingError:
+        # Whoever reads the file will say what is wrong with it.
+        return ''
+    if summary is None or not summary.messages:
+        return ''
+    length = duration((summary.end_ns - summary.start_ns) / 1e9)
+    topics = sorted(c.topic for n, c in summary.table.channels.items() if summary.counts.get(n))
+    return (
+        f'{path}: {count(summary.messages)} messages in {length} from {moment(summary.start_ns)}, '
+        f'on {", ".join(topics)}. Every value is now looked at.'
+    )
+
+
+def _fates(
+    readings: Readings, parts: dict[int, Readings], settings: Settings
+) -> dict[str, dict[str, int]]:
+    """Return how many readings of each signal are accepted or rejected, by reason.
+
+    Where it can be seen at once that nothing is wrong, the engine is not loaded.
+    """
+    from valveflow_ros.records import SIGNALS
+
+    if _in_order(readings, parts, settings):
+        return {
+            info.topic: {'accepted': len(parts[info.signal]) if info.signal in parts else 0}
+            for info in SIGNALS
+        }
+    from valveflow_ros.interface.observation import align
+
+    _, _, counts = align(readings, settings)
+    return {
+        topic: {reason: n for reason, n in by_reason.items() if reason != 'late'}
+        for topic, by_reason in counts.items()
+    }
+
+
+def _in_order(readings: Readings, parts: dict[int, Readings], settings: Settings) -> bool:
+    """Return whether every reading is plausible and in order, so that none can be rejected."""
+    import numpy as np
+
+    from valveflow_ros.interface.plausibility import limits
+    from valveflow_ros.records import NS_PER_S, Quality, Signal
+
+    if not len(readings):
+        return True
+    step = np.diff(readings.time_ns)
+    longest = round(settings.real('clock_jump') * NS_PER_S)
+    if step.min(initial=0) < 0 or step.max(initial=0) > longest:
+        return False
+    if not (readings.quality < Quality.BAD).all():
+        return False
+    for signal, part in parts.items():
+        low, high = limits(Signal(signal), settings)
+        # Comparisons with NaN are false, so NaN is out of order too.
+        plausible = part.value.min() >= low and part.value.max() <= high
+        if not (plausible and (np.diff(part.time_ns) > 0).all()):
+            return False
+    return True
+
+
+def _facts(log: Log, signal: Signal, part: Readings, step_s: float) -> dict[str, Any]:
+    """Return what there is to say of one signal, in the engine's unit."""
+    import numpy as np
+
+    from valveflow_ros.records import SIGNALS
+    from valveflow_ros.report.data import gaps
+
+    values, times = part.value, part.time_ns
+    if (times[1:] < times[:-1]).any():
+        times = np.sort(times)
+    finite = np.isfinite(values)
+    known = values if finite.all() else values[finite]
+    low, middle, high = (
+        (known.min(), np.median(known), known.max()) if len(known) else (np.nan,) * 3
+    )
+    return {
+        'topic': SIGNALS[signal].topic,
+        'source': 'constant' if signal in log.constants else log.name_of(signal),
+        'unit': SIGNALS[signal].unit,
+        'readings': len(values),
+        'step_s': step_s,
+        'low': float(low),
+        'median': float(middle),
+        'high': float(high),
+        'gaps': gaps(times, round(step_s * 1e9), _GAP_STEPS) if np.isfinite(step_s) else [],
+    }

@@ -1,23 +1,225 @@
-"""The command: choose the verb, run it, turn what happens into an exit status."""
+"""The command: choose the verb, read its options, run it, turn what happens into a status."""
 
 from __future__ import annotations
 
+import difflib
+import importlib
 import os
+import re
+import signal
 import sys
+import time
 import traceback
-from collections.abc import Sequence
+from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn, Protocol, cast
 
-from valveflow_ros.cli.console import Console
-from valveflow_ros.cli.early import check_paths
-from valveflow_ros.cli.stopping import Stop
-from valveflow_ros.cli.usage import Parser, UsageError, add_common
-from valveflow_ros.cli.verbs import load, overview
-from valveflow_ros.errors import ValveflowError
+from valveflow_ros.cli.command import Console, Outcome
+from valveflow_ros.errors import UsageError, ValveflowError
+from valveflow_ros.interface.files import check_folder, check_readable, check_writable
 
 DONE, NOT_DONE, WRONG_USAGE = 0, 1, 2
 # As a shell tells of a process that a signal has ended: 130 after Ctrl-C.
 _SIGNALLED = 128
+# A second signal within so many seconds is the same wish: the clean-up must not be cut short.
+_ONCE_S = 2.0
+
+# In the order in which a newcomer needs them: verb, module, what it does.
+VERBS: tuple[tuple[str, str, str], ...] = (
+    ('simulate', 'simulate', "the paper's plant, with any effect switched on"),
+    ('import', 'import_table', 'a historian table becomes a log'),
+    ('info', 'info', 'what is in a log, and is it any good'),
+    ('identify', 'identify', 'find the flow characteristic'),
+    ('diagnose', 'diagnose', 'what the simulation gets wrong, and why'),
+    ('validate', 'validate', 'hold a characteristic against other days'),
+    ('compare', 'compare', 'the proposed method beside two of the literature'),
+    ('compensate', 'compensate', 'the inverse curve as a table for the turbine controller'),
+    ('export', 'export', 'a log becomes a table'),
+    ('recover', 'recover', 'repair a broken recording'),
+    ('config', 'config', 'a parameter file for the monitor, fitted to a log'),
+    ('watch', 'watch', 'look on while a monitor works'),
+    ('completion', 'completion', 'let the shell finish what you type'),
+)
+
+OVERVIEW = """\
+valveflow finds the flow characteristic of main steam valves in ordinary operating data.
+
+{verbs}
+
+Try it:
+  valveflow simulate -o plant.mcap
+  valveflow identify plant.mcap -o result
+and open result/report.html.
+
+A log is an .mcap file, a rosbag2 folder, or a table: .csv, .xlsx or .parquet.
+"valveflow VERB --help" tells more about a verb, "valveflow --version" which version this is.
+"""
+
+
+class Verb(Protocol):
+    """What the module of a verb offers."""
+
+    def arguments(self, parser: ArgumentParser) -> None:
+        """Add description, example and options."""
+
+    def run(self, options: Namespace, console: Console) -> Outcome:
+        """Do it."""
+
+
+def overview() -> str:
+    """Return what ``valveflow`` says without a verb."""
+    lines = [f'  valveflow {name:<11} {about}' for name, _, about in VERBS]
+    return OVERVIEW.format(verbs='\n'.join(lines))
+
+
+def load(name: str) -> Verb:
+    """Return the module of a verb.
+
+    Raises
+    ------
+    UsageError
+        There is no such verb; the sentence names the nearest one.
+    """
+    for verb, module, _ in VERBS:
+        if verb == name:
+            return cast(Verb, importlib.import_module(f'valveflow_ros.cli.{module}'))
+    known = [verb for verb, _, _ in VERBS]
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f" Did you mean '{near[0]}'?" if near else f' The verbs are {", ".join(known)}.'
+    raise UsageError(f"There is no verb '{name}'.{hint}")
+
+
+class Parser(ArgumentParser):
+    """A parser that refuses with `UsageError` and keeps the layout of what we wrote."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog=prog, formatter_class=_Formatter, allow_abbrev=False, add_help=False)
+        self._positionals.title = 'arguments'
+        self.add_argument('-h', '--help', action='help', help='show this page')
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse; an option that does not exist is told before anything that is missing."""
+        for word in [] if args is None else list(args):
+            if word == '--':
+                break
+            name = word.partition('=')[0]
+            if name.startswith('--') and name not in self._option_string_actions:
+                known = [o for o in self._option_string_actions if o.startswith('--')]
+                near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+                hint = f" Did you mean '{near[0]}'?" if near else ''
+                raise UsageError(f"There is no option '{name}'.{hint}")
+        return super().parse_args(args, namespace)
+
+    def error(self, message: str) -> NoReturn:
+        """Refuse what argparse found wrong, as a sentence."""
+        missing = message.removeprefix('the following arguments are required: ')
+        if missing != message:
+            *most, last = missing.split(', ')
+            text = f'Something is missing: {", ".join(most)}{" and " if most else ""}{last}.'
+            raise UsageError(text)
+        text = _sentence(message)
+        raise UsageError(text if text.endswith('.') else f'{text}.')
+
+
+def _sentence(message: str) -> str:
+    """Put what argparse says into words: the option first, then what is wrong with it."""
+    about = re.fullmatch(r'argument (\S+): (.*)', message, re.DOTALL)
+    if about is None:
+        words = message.removeprefix('unrecognized arguments: ')
+        return message[:1].upper() + message[1:] if words == message else (
+            f"There is no place for '{words}' here."
+        )  # fmt: skip
+    name, problem = about[1].rpartition('/')[2], about[2]
+    if problem.startswith('expected one argument'):
+        return f'{name} wants a value after it'
+    choice = re.fullmatch(r'invalid choice: (.*) \(choose from (.*)\)', problem)
+    if choice is not None:
+        return f'{name} must be one of {choice[2].replace(chr(39), "")}, not {choice[1]}'
+    return f'{name} {problem}' if problem.startswith('must ') else f'{name}: {problem}'
+
+
+class _Formatter(RawDescriptionHelpFormatter):
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=28, width=92)
+
+
+def parser_of(name: str, verb: Verb | None = None) -> Parser:
+    """Return the parser of a verb; raises `UsageError` if there is none of that name."""
+    parser = Parser(f'valveflow {name}')
+    (verb or load(name)).arguments(parser)
+    parser.add_argument(
+        '--json', action='store_true', help='print the result as JSON, for programs'
+    )
+    parser.add_argument(
+        '--quiet', action='store_true', help='say nothing but warnings and the result'
+    )
+    return parser
+
+
+def check_paths(parser: ArgumentParser, options: Namespace) -> None:
+    """Refuse, before anything is loaded, options that name what cannot be read or written.
+
+    What is wrong within a file is for the verb to say.
+
+    Raises
+    ------
+    RecordingError
+        The first of them, with the reason.
+    """
+    for action in parser._actions:
+        path = getattr(options, action.dest, None)
+        if not isinstance(path, Path):
+            continue
+        if action.metavar == 'DIR':
+            check_folder(path)
+        elif action.dest == 'truth' and 'seed' in options:  # the only FILE that is written
+            check_writable(path)
+        elif action.metavar == 'FILE' and action.dest != 'output':
+            check_readable(path.expanduser(), 'cannot be read')
+        elif action.metavar in ('LOG', 'LOG2', 'TABLE', 'BROKEN') and action.dest != 'output':
+            check_readable(path, 'cannot be opened')
+
+
+class Stop:
+    """Turns signals into `KeyboardInterrupt` and remembers the first.
+
+    Attributes
+    ----------
+    number : int
+        The signal that came; 0: none.
+    """
+
+    def __init__(self) -> None:
+        self.number = 0
+        self._at_s = 0.0
+
+    def _come(self, number: int, frame: FrameType | None) -> None:
+        now = time.monotonic()
+        if self.number and now - self._at_s < _ONCE_S:
+            return
+        self.number, self._at_s = number, now
+        # Half-made objects of libraries complain when they are cleared away; ignore that.
+        sys.unraisablehook = lambda _: None
+        raise KeyboardInterrupt
+
+    @contextmanager
+    def listening(self) -> Iterator[Stop]:
+        """Handle the signals within a block; the handlers before come back after it."""
+        before: dict[int, object] = {}
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            # A shell lets what it starts in the background ignore Ctrl-C, and nohup a hang-up.
+            if signal.getsignal(number) == signal.SIG_IGN:
+                continue
+            with suppress(ValueError):  # not in the main thread
+                before[number] = signal.signal(number, self._come)
+        try:
+            yield self
+        finally:
+            for taken, handler in before.items():
+                signal.signal(taken, handler)  # type: ignore[arg-type]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -33,6 +235,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         0 done, 1 could not be done, 2 wrong usage, 130 stopped by Ctrl-C, 143 by the system.
     """
+    if '_ARGCOMPLETE' in os.environ:
+        from valveflow_ros.cli.completion import complete
+
+        complete([(name, about) for name, _, about in VERBS], parser_of)
     words = list(sys.argv[1:] if arguments is None else arguments)
     console = Console(
         sys.stdout, sys.stderr, as_json='--json' in words, quiet='--quiet' in words,
@@ -64,7 +270,7 @@ def _guarded(words: list[str], console: Console, stop: Stop) -> int:
             # Libraries that were interrupted while they load raise errors of their own.
             return _stopped(console, stop)
         _show_traceback()
-        console.fail(_sentence(error))
+        console.fail(_unforeseen(error))
     return NOT_DONE
 
 
@@ -86,15 +292,15 @@ def _command(words: list[str], console: Console) -> int:
     if words[0].startswith('-'):
         raise UsageError(f"The verb comes first, options after it: '{words[0]}' is no verb.")
     verb = load(words[0])
-    parser = Parser(f'valveflow {words[0]}')
-    verb.arguments(parser)
-    add_common(parser)
+    parser = parser_of(words[0], verb)
     try:
         options = parser.parse_args(words[1:])
     except SystemExit as done:  # --help was asked for
         sys.stdout.flush()
         return int(done.code or DONE)
-    check_paths(words[0], parser, options)
+    # watch waits for what is not there yet, and says so itself.
+    if words[0] != 'watch':
+        check_paths(parser, options)
     console.finish(verb.run(options, console))
     return DONE
 
@@ -112,7 +318,7 @@ def _show_traceback() -> None:
         traceback.print_exc()
 
 
-def _sentence(error: Exception) -> str:
+def _unforeseen(error: Exception) -> str:
     """Return one sentence for an error nobody foresaw, or one of the operating system."""
     if isinstance(error, OSError) and error.strerror:
         named = f'{error.filename}: ' if error.filename else ''

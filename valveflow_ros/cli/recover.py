@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from valveflow_ros.cli.console import Console, Outcome
+from valveflow_ros.cli.command import Console, Outcome
 
 _DESCRIPTION = """\
 Repair a recording that a crash, a full disk or a bad sector has left: everything that is
@@ -28,15 +28,15 @@ def arguments(parser: ArgumentParser) -> None:
 
 def run(options: Namespace, console: Console) -> Outcome:
     """Recover and say what was kept."""
-    from valveflow_ros.cli.files import check_output
-    from valveflow_ros.logs.mcap.recover import recover
+    from valveflow_ros.interface.files import check_output
+    from valveflow_ros.logs import recover
     from valveflow_ros.report.words import count, counted
 
     check_output(options.output, ('.mcap',), source=options.broken)
-    console.progress(0.0, 'recovering')
+    console(0.0, 'recovering')
     report = recover(
         options.broken, options.output,
-        progress=lambda done, total: console.progress(done / max(total, 1), 'recovering'),
+        progress=lambda done, total: console(done / max(total, 1), 'recovering'),
     )  # fmt: skip
     for sentence in report.warnings:
         console.warn(sentence)

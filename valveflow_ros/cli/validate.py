@@ -4,11 +4,25 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from valveflow_ros.cli.console import Console, Outcome
-from valveflow_ros.cli.options import MAPPING_HELP, add_mapping, add_parameters, read_mapping
-from valveflow_ros.cli.report_files import add_report_files, check_report_files, with_report
+from valveflow_ros.cli.command import (
+    Console,
+    Outcome,
+    add_beside,
+    add_mapping,
+    add_parameters,
+    add_results,
+    checked_parameters,
+    columns,
+    lines,
+    mapping_of,
+    written,
+)
 from valveflow_ros.report.terminal.text import number
+
+if TYPE_CHECKING:
+    from valveflow_ros.report.validation import Validated
 
 _DESCRIPTION = """\
 Hold a characteristic against a log it was not made from: in each steady-state and
@@ -24,16 +38,12 @@ def arguments(parser: ArgumentParser) -> None:
     """Add description, example and options."""
     parser.description = _DESCRIPTION
     parser.usage = 'valveflow validate LOG --model FILE -o DIR [options]'
-    parser.epilog = MAPPING_HELP
     parser.add_argument('log', metavar='LOG', type=Path, help='the log to judge by')
     parser.add_argument(
         '--model', metavar='FILE', type=Path, required=True,
         help='a characteristic.json of identify, or an extended_model.json of diagnose',
     )  # fmt: skip
-    parser.add_argument(
-        '-o', '--output', metavar='DIR', type=Path, required=True,
-        help='folder for the results, made if absent; the report of another verb there is kept',
-    )  # fmt: skip
+    add_results(parser)
     parser.add_argument(
         '--against', metavar='FILE', type=Path,
         help='a second characteristic.json, to see which of the two is better',
@@ -44,30 +54,65 @@ def arguments(parser: ArgumentParser) -> None:
         help='a mean difference that does not matter (default: the parameter alarm_floor, 1 MW)',
     )  # fmt: skip
     add_parameters(parser)
-    add_report_files(parser)
+    add_beside(parser)
     add_mapping(parser)
 
 
 def run(options: Namespace, console: Console) -> Outcome:
-    """Read, find segments, judge, write."""
-    mapping = read_mapping(options.column, options.constant)
-    console.progress(0.0, 'starting')
-    from valveflow_ros.cli.files import check_folder
-    from valveflow_ros.cli.model_file import check_exponent, read_either, read_model
-    from valveflow_ros.cli.options import read_parameters
-    from valveflow_ros.cli.validating import outcome, refuse_two, texts, validated
-    from valveflow_ros.report.validation import validation_page
+    """Open, find segments and judge, write."""
+    mapping = mapping_of(options)
+    console(0.0, 'starting')
+    from valveflow_ros.interface.compare import check_models, validate
+    from valveflow_ros.interface.logs import open_log
+    from valveflow_ros.report.validation import verdict_words
 
-    given = read_parameters(options.params, options.pairs)
-    check_folder(options.output)
-    check_report_files(options)
-    model = read_either(options.model)
-    against = None if options.against is None else read_model(options.against)
-    refuse_two(model, against)
-    check_exponent(model, options.model, given)
-    data = validated(options, model, against, mapping, given, console)
-    console.progress(0.9, 'writing the report')
-    content, files = texts(data)
-    return with_report(
-        options, files, validation_page(data), lambda written: outcome(data, content, written)
-    )
+    given = checked_parameters(options)
+    check_models(options.model, options.against, given)
+    console(0.02, 'reading')
+    log = open_log(options.log, mapping, progress=console)
+    found = validate(
+        log, options.model, against=options.against, tolerance_mw=options.tolerance,
+        parameters=given, progress=console,
+    )  # fmt: skip
+    console(0.9, 'writing the report')
+    data = found.data
+    text = lines(
+        f'{data.model}, held against {data.source}:', *verdict_words(data), data.held,
+        _pieces(data), _errors(data),
+    )  # fmt: skip
+    # The segments stand in the file only.
+    brief = {k: v for k, v in found.to_json().items() if k != 'segments'}
+    return written(found, options, text, brief)
+
+
+def _pieces(data: Validated) -> str:
+    from valveflow_ros.report.words import decimals, input_unit_plain, interval
+
+    v = data.result
+    rows = [
+        [
+            'all' if k == 0 else str(k),
+            f'{decimals(c.u_from, 1)} to {decimals(c.u_to, 1)}',
+            str(c.segments),
+            decimals(c.test.mean, 2),
+            interval(c.low_mw, c.high_mw),
+        ]
+        for k, c in enumerate((v.overall, *v.pieces))
+    ]
+    unit = input_unit_plain(v.characteristic.pressure_exponent)
+    head = ['piece', f'u ({unit})', 'segments', 'measured - predicted (MW)', '95 % (MW)']
+    return columns(rows, head)
+
+
+def _errors(data: Validated) -> str:
+    from valveflow_ros.records import SegmentKind
+    from valveflow_ros.report.validation import LABELS
+    from valveflow_ros.report.words import plain
+
+    j = data.result.judgement
+    kinds = (None, SegmentKind.STEADY, SegmentKind.SLOPE)
+    rows = [
+        [LABELS[name], *(plain(j.mse(name, k)) if j.kinds(k) else '-' for k in kinds)]
+        for name in data.result.predictions
+    ]
+    return columns(rows, ['mean squared error (MW^2)', 'segments', 'steady', 'slope'])

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
+import os
+import sys
+import time
 from argparse import ArgumentParser, Namespace
+from importlib.util import find_spec
 from pathlib import Path
+from typing import NoReturn
 
-from valveflow_ros.cli.console import Console, Outcome
+from valveflow_ros.cli.command import Console, Outcome
+from valveflow_ros.errors import DataError, UsageError
 from valveflow_ros.report.terminal.text import number
+
+_MODULE = 'valveflow_ros.ros.watch_main'
+_TABLES = ('.csv', '.tsv', '.txt', '.parquet', '.pq', '.xlsx')
 
 _DESCRIPTION = """\
 Show how a monitor is doing, drawn anew once a second: the curve with today's operating point,
@@ -52,13 +62,67 @@ def arguments(parser: ArgumentParser) -> None:
 
 def run(options: Namespace, console: Console) -> Outcome:
     """Watch until there is nothing more to see."""
-    from valveflow_ros.cli.usage import UsageError
-    from valveflow_ros.cli.watch_run import watch_log, watch_ros
-
     if options.log is None:
-        return watch_ros(options)
+        _watch_ros(options)
     if options.node is not None:
         raise UsageError('--node chooses a running monitor and does not go with a LOG.')
     if options.ask is not None:
         raise UsageError('--ask is for a running monitor and does not go with a LOG.')
-    return watch_log(options, console)
+    if options.log.suffix.lower() in _TABLES:
+        raise UsageError(
+            f'{options.log} is a table, which does not grow: look into it with '
+            f'"valveflow info {options.log}".'
+        )
+    return _watch_log(options, console)
+
+
+def _watch_log(options: Namespace, console: Console) -> Outcome:
+    """Follow a recording; Ctrl-C is the usual end."""
+    from valveflow_ros.interface.recording_view import LogWatch
+    from valveflow_ros.report.terminal.screen import Screen
+
+    watch = LogWatch(options.log)
+    if options.once:
+        for _ in watch.read():
+            console(watch.share, 'reading what was recorded so far')
+        frame = watch.frame()
+        return Outcome(Screen(sys.stdout).text(frame), dataclasses.asdict(frame), drawn=True)
+    if options.json:
+        raise UsageError('--json goes with --once: one picture is one object.')
+    drawn_s = -options.interval
+    with Screen(sys.stdout) as screen:
+        try:
+            while True:
+                for _ in watch.read():
+                    # A long recording takes a while to catch up with, and that is to be seen.
+                    if screen.in_place and time.monotonic() - drawn_s >= options.interval:
+                        screen.show(watch.frame())
+                        drawn_s = time.monotonic()
+                screen.show(watch.frame())
+                drawn_s = time.monotonic()
+                if watch.finished and not screen.in_place:
+                    break
+                time.sleep(options.interval)
+        except KeyboardInterrupt:
+            # How one stops looking.
+            return Outcome('', {})
+    return Outcome('', {})
+
+
+def _watch_ros(options: Namespace) -> NoReturn:
+    """Become the process that listens over ROS."""
+    missing = [name for name in ('rclpy', 'valveflow_msgs') if find_spec(name) is None]
+    if missing:
+        raise DataError(
+            f'Listening to a running monitor needs ROS 2 ({" and ".join(missing)} not found). '
+            'Source its setup first, or name the recording to follow: '
+            'valveflow watch valveflow_recordings.'
+        )
+    words = ['--interval', str(options.interval)]
+    words += ['--once'] if options.once else []
+    words += ['--json'] if options.json else []
+    words += ['--node', options.node] if options.node else []
+    words += ['--ask', options.ask] if options.ask else []
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execv(sys.executable, [sys.executable, '-m', _MODULE, *words])

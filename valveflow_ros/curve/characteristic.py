@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.errors import DataError
@@ -224,6 +225,75 @@ class Characteristic:
             share = (power - x[i - 1]) / (x[i] - x[i - 1])
         found = u[i - 1] + share * (u[i] - u[i - 1])
         return np.where((power >= x[0]) & (power <= x[-1]), found, np.nan)
+
+    def power(self, opening_percent: ArrayLike, pressure_mpa: ArrayLike) -> FloatArray:
+        """Return the static power at an opening and a main steam pressure in MW.
+
+        Parameters
+        ----------
+        opening_percent : array_like of float
+            Valve opening V, % of full opening.
+        pressure_mpa : array_like of float
+            Main steam pressure p, MPa absolute; broadcast against the opening.
+
+        Returns
+        -------
+        float64
+            F(V p^m). NaN outside the identified range of u = V p^m, where the pressure is not
+            positive, and where an argument is NaN.
+        """
+        opening, pressure = np.broadcast_arrays(
+            np.asarray(opening_percent, dtype=np.float64),
+            np.asarray(pressure_mpa, dtype=np.float64),
+        )
+        positive = np.where(pressure > 0.0, pressure, np.nan)
+        return self(opening * positive**self.pressure_exponent)
+
+    def opening(self, power_mw: ArrayLike, pressure_mpa: ArrayLike) -> FloatArray:
+        """Return the opening that gives a power at a main steam pressure in %.
+
+        Parameters
+        ----------
+        power_mw : array_like of float
+            Static power, MW.
+        pressure_mpa : array_like of float
+            Main steam pressure, MPa absolute; broadcast against the power.
+
+        Returns
+        -------
+        float64
+            The only opening from 0 to 100 % at which `power` is ``power_mw``, but for rounding.
+            NaN where there is none: beyond the ends of the curve, within a jump, above full
+            opening. NaN where there are several: on a flat piece, and where the curve falls.
+
+        See Also
+        --------
+        inverse : the same in u, for curves that rise throughout; it answers within a jump.
+        """
+        power, pressure = np.broadcast_arrays(
+            np.asarray(power_mw, dtype=np.float64), np.asarray(pressure_mpa, dtype=np.float64)
+        )
+        m = self.model
+        found = np.full(power.shape, np.nan)
+        for k, slope in enumerate(m.slopes()):
+            low, high = float(m.knots[k]), float(m.knots[k + 1])
+            rounding = 1e-9 * max(abs(low), abs(high))
+            if slope == 0.0:
+                found[power == m.left[k]] = np.inf
+                continue
+            at = low + (power - m.left[k]) / slope
+            here = (at >= low - rounding) & (at <= high + rounding)
+            at = np.clip(at, low, high)
+            # At a knot the pieces on both sides give the same answer, unless there is a jump.
+            other = here & ~np.isnan(found) & ~(np.abs(found - at) <= 2.0 * rounding)
+            found = np.where(here & np.isnan(found), at, found)
+            found[other] = np.inf
+        # What is at the lower end of a jump belongs to the other side of it: F counts.
+        with np.errstate(invalid='ignore', divide='ignore'):
+            reached = np.abs(self(found) - power) <= 1e-9 * np.maximum(1.0, np.abs(power))
+            opening = found / np.where(pressure > 0.0, pressure, np.nan) ** self.pressure_exponent
+        known = reached & (opening >= 0.0) & (opening <= 100.0 * (1.0 + 1e-12))
+        return np.where(known, np.minimum(opening, 100.0), np.nan)
 
     def with_id(self) -> Characteristic:
         """Return a copy whose `model_id` is a hash of its numbers."""

@@ -47,8 +47,13 @@ def align_all(aligner: Aligner, readings: Readings) -> Iterator[Aligned]:
     yield aligner.finish()
 
 
-def feed_rows(monitor: Monitor, table: SampleTable) -> list[Event]:
-    """Feed rows, computing every fit in place."""
+def feed_rows(
+    monitor: Monitor, table: SampleTable, diagnose: Callable[[DiagnosisTask], str] | None = None
+) -> list[Event]:
+    """Feed rows, computing every fit in place; with ``diagnose`` every diagnosis too.
+
+    It returns what `diagnosis.json` would hold, or raises `DataError`.
+    """
     events: list[Event] = []
     done = 0
     while done < len(table):
@@ -58,18 +63,26 @@ def feed_rows(monitor: Monitor, table: SampleTable) -> list[Event]:
         for event in fed.events:
             if isinstance(event, FitRequested):
                 events += outcome_of(monitor, event.task)
+            elif isinstance(event, DiagnosisRequested) and diagnose is not None:
+                request_ns = event.task.request_ns
+                try:
+                    events += monitor.diagnosing.adopt(request_ns, diagnose(event.task))
+                except DataError as error:
+                    events += monitor.diagnosing.refuse(request_ns, str(error))
     return events
 
 
-def feed_aligned(monitor: Monitor, aligned: Aligned) -> list[Event]:
-    """Feed rows with restarts of the clock among them, computing every fit in place."""
+def feed_aligned(
+    monitor: Monitor, aligned: Aligned, diagnose: Callable[[DiagnosisTask], str] | None = None
+) -> list[Event]:
+    """Feed rows with restarts of the clock among them, as `feed_rows` does."""
     events: list[Event] = []
     start = 0
     for reset in aligned.resets.tolist():
-        events += feed_rows(monitor, aligned.table.part(start, reset))
+        events += feed_rows(monitor, aligned.table.part(start, reset), diagnose)
         events += monitor.restart(CLOCK_BACK)
         start = reset
-    return events + feed_rows(monitor, aligned.table.part(start, len(aligned.table)))
+    return events + feed_rows(monitor, aligned.table.part(start, len(aligned.table)), diagnose)
 
 
 class JournalReplayer:

@@ -25,17 +25,13 @@ def read_text(name: str) -> str:
     return resources.files('valveflow_ros.report').joinpath(name).read_text(encoding='utf-8')
 
 
-@functools.cache
-def packed_plotly() -> str:
-    """Return plotly.js, gzip-compressed, in base64 (about 2 MB instead of 5).
-
-    The file is read without importing plotly's Python side, which takes longer
-    than the whole report.
+def plotly_script() -> Path:
+    """Return the path of plotly.js, found without importing plotly, which takes long.
 
     Raises
     ------
     InputError
-        plotly is not installed.
+        plotly is not installed, or not completely.
     """
     spec = find_spec('plotly')
     if spec is None or spec.origin is None:
@@ -44,12 +40,17 @@ def packed_plotly() -> str:
             'pip install plotly.'
         )
     source = Path(spec.origin).parent / 'package_data' / 'plotly.min.js'
-    try:
-        script = source.read_bytes()
-    except OSError:
+    if not source.is_file():
         raise InputError(
             f"The installed package 'plotly' is incomplete: {source} is missing; install it again."
-        ) from None
+        )
+    return source
+
+
+@functools.cache
+def packed_plotly() -> str:
+    """Return plotly.js, gzip-compressed, in base64 (about 2 MB instead of 5)."""
+    script = plotly_script().read_bytes()
     return base64.b64encode(gzip.compress(script, 9, mtime=0)).decode()
 
 

@@ -1,0 +1,325 @@
+"""``import valveflow_ros as vf``: the verbs as functions, DataFrames in and out, results."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import valveflow_ros as vf
+from valveflow_ros.errors import DataError, InputError, RecordingError, UsageError
+from valveflow_ros.logs import write_table
+from valveflow_ros.records import SIGNALS
+
+needs_jit = pytest.mark.skipif(
+    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
+)
+QUICK = {'refine': False, 'selection_rule': 'paper'}
+HEAVY = {'numpy', 'numba', 'scipy', 'pandas', 'pyarrow', 'plotly', 'yaml'}
+
+
+@pytest.fixture(scope='module')
+def identified(log):
+    return vf.identify(log)
+
+
+def test_the_package_loads_nothing_before_it_is_asked():
+    code = 'import sys, valveflow_ros as vf; dir(vf); print(*sys.modules)'
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
+    assert not HEAVY & set(done.stdout.split())
+
+
+def test_what_it_offers_is_listed_and_there():
+    assert set(vf.__all__) <= set(dir(vf))
+    for name in vf.__all__:
+        assert getattr(vf, name).__doc__
+    with pytest.raises(AttributeError, match="no attribute 'identity'"):
+        _ = vf.identity
+
+
+class TestLog:
+    def test_a_dataframe_comes_back_as_it_was(self, simulation):
+        frame = simulation.to_dataframe().head(5000)
+        frame.loc[100:120, 'generated_power_mw'] = np.nan
+        back = vf.open_log(frame).to_dataframe()
+        assert list(back) == list(frame)
+        assert back['time'].tolist() == frame['time'].tolist()
+        for info in SIGNALS:
+            np.testing.assert_array_equal(back[info.column], frame[info.column])
+
+    def test_order_time_kinds_and_gaps_of_a_dataframe(self, simulation):
+        frame = simulation.to_dataframe().head(60)
+        want = vf.open_log(frame).to_dataframe()
+        stamps = frame['time']
+        for times in (
+            stamps.dt.tz_localize(None), stamps.dt.tz_convert('Asia/Tokyo'),
+            stamps.map(lambda t: t.isoformat()), stamps.astype('int64') / 1e9,
+        ):  # fmt: skip
+            told = frame.assign(time=times).sample(frac=1.0, random_state=3)
+            pd.testing.assert_frame_equal(vf.open_log(told).to_dataframe(), want)
+        indexed = vf.open_log(frame.set_index('time')).to_dataframe()
+        pd.testing.assert_frame_equal(indexed, want)
+        late = frame.astype({'time': object})
+        late.loc[7, 'time'] = None
+        assert len(vf.open_log(late).to_dataframe()) == 59
+
+    def test_columns_constants_and_units(self, simulation):
+        frame = simulation.to_dataframe().head(100).drop(columns='main_steam_temperature_degc')
+        frame['P'] = 10.0 * frame.pop('main_steam_pressure_mpa') - 1.01325
+        log = vf.open_log(
+            frame, columns={'main_steam_pressure': 'P:barg'},
+            constants={'main_steam_temperature': '1004:degF'},
+        )  # fmt: skip
+        back, want = log.to_dataframe(), simulation.to_dataframe().head(100)
+        np.testing.assert_allclose(
+            back['main_steam_pressure_mpa'], want['main_steam_pressure_mpa'], atol=1e-9
+        )
+        assert back['main_steam_temperature_degc'].tolist() == pytest.approx([540.0] * 100)
+
+    def test_doubtful_values_keep_their_mark(self, simulation):
+        frame = simulation.to_dataframe().head(50)
+        frame['valve_opening_percent_quality'] = np.uint8([0, 1] * 25)
+        back = vf.open_log(frame).to_dataframe()
+        assert back['valve_opening_percent_quality'].tolist() == [0, 1] * 25
+
+    def test_a_file_and_its_dataframe_are_the_same_log(self, simulation, tmp_path):
+        write_table(simulation.data.table.part(0, 1000), tmp_path / 'a.parquet')
+        file = vf.open_log(tmp_path / 'a.parquet')
+        frame = vf.open_log(pd.read_parquet(tmp_path / 'a.parquet'))
+        for name in ('time_ns', 'signal', 'value', 'quality'):
+            np.testing.assert_array_equal(
+                getattr(file.readings, name), getattr(frame.readings, name)
+            )
+        assert (file.name, frame.name) == ('a.parquet', 'DataFrame')
+
+    @pytest.mark.parametrize(
+        ('change', 'options', 'error', 'part'),
+        [
+            ({'time': None}, {}, DataError, 'no row with a time'),
+            ({}, {'columns': {'valve_opening': 'V'}}, InputError, "no column 'V'"),
+            ({}, {'columns': {'valve_openin': 'V'}}, UsageError, "did you mean 'valve_opening'"),
+            ({}, {'columns': {'generated_power': 'generated_power_mw:stone'}}, InputError,
+             "Unit 'stone'"),
+            ({}, {'constants': {'main_steam_pressure': 160}}, UsageError, 'impossible'),
+            ({}, {'constants': {'main_steam_pressure': 'high'}}, UsageError, 'no number'),
+            ({}, {'time_zone': 'Europe/Nowhere'}, UsageError, 'not known'),
+        ],
+    )  # fmt: skip
+    def test_what_cannot_be_read_is_one_sentence(self, simulation, change, options, error, part):
+        frame = simulation.to_dataframe().head(10).assign(**change)
+        with pytest.raises(error, match=part):
+            vf.open_log(frame, **options)
+
+    def test_a_frame_without_times_or_signals_is_refused(self):
+        with pytest.raises(InputError, match="no column 'time'"):
+            vf.open_log(pd.DataFrame({'valve_opening_percent': [1.0]}))
+        with pytest.raises(DataError, match='none of the columns valve_opening_percent'):
+            vf.open_log(pd.DataFrame({'time': [1.0], 'x': [2.0]}))
+        with pytest.raises(RecordingError, match='no such file'):
+            vf.open_log('nowhere.mcap')
+
+
+@needs_jit
+class TestIdentify:
+    def test_it_is_the_verb(self, identified, simulation, tmp_path):
+        from valveflow_ros.cli.main import main
+
+        log = str(simulation.write(tmp_path / 'plant.parquet'))
+        assert main(['identify', log, '-o', str(tmp_path / 'verb'), '--quiet']) == 0
+        done = vf.identify(log).write(tmp_path / 'call')
+        for name in ('characteristic.json', 'report.html'):
+            assert (tmp_path / 'call' / name).read_text() == (tmp_path / 'verb' / name).read_text()
+        assert done.files['report.html'] == tmp_path / 'call' / 'report.html'
+        told = json.loads((tmp_path / 'call' / 'characteristic.json').read_text())
+        assert told == identified.to_json()
+        read = vf.load_characteristic(tmp_path / 'call')
+        assert read.model_id == identified.characteristic.model_id
+        assert read.pieces == identified.characteristic.pieces
+
+    def test_a_picture_is_a_plotly_figure(self, identified):
+        figure = identified.plot()
+        assert len(figure.data) > 2
+        assert 'token:' not in figure.to_json()
+        assert identified.plot('signals') != figure
+        with pytest.raises(InputError, match="no picture 'nothing'; it has: curve"):
+            identified.plot('nothing')
+
+    def test_options_of_the_verb(self, log, identified, tmp_path):
+        identified.write(tmp_path)
+        again = vf.identify(log, parameters=QUICK, reference=tmp_path)
+        assert again.data.shift is not None
+        assert 'shift.json' in again.texts()
+        assert again.characteristic.dynamics == ()
+        with pytest.raises(InputError, match="did you mean 'time_constant'"):
+            vf.identify(log, parameters={'time_constnt': 3})
+        with pytest.raises(DataError, match='no step test'):
+            vf.identify(log, step_test=True)
+        with pytest.raises(UsageError, match='do not go together'):
+            vf.identify(log, step_test=True, model='x.json')
+
+    def test_progress_and_messages_are_heard(self, simulation):
+        class Heard(vf.Progress):
+            def __init__(self):
+                self.shares, self.said = [], []
+
+            def __call__(self, share, what):
+                self.shares.append(share)
+
+            def say(self, sentence):
+                self.said.append(sentence)
+
+        heard = Heard()
+        frame = simulation.to_dataframe()[::10]
+        found = vf.identify(frame, parameters=QUICK, progress=heard)
+        assert heard.shares == sorted(heard.shares)
+        assert any('a value every 10 s' in sentence for sentence in heard.said)
+        assert set(heard.said) & set(found.notes)
+
+    def test_nothing_is_replaced_if_a_file_cannot_be_written(self, identified, tmp_path):
+        (tmp_path / 'characteristic.json').write_text('mine')
+        (tmp_path / 'report.html').mkdir()
+        with pytest.raises(RecordingError, match='cannot be written into'):
+            identified.write(tmp_path)
+        assert (tmp_path / 'characteristic.json').read_text() == 'mine'
+        assert sorted(p.name for p in tmp_path.glob('*.draft')) == []
+
+    def test_results_are_there_before_pictures_are_drawn(self, identified, tmp_path, monkeypatch):
+        def fail(_figure):
+            raise MemoryError
+
+        monkeypatch.setattr('valveflow_ros.report.figure.figure_csv', fail)
+        with pytest.raises(MemoryError):
+            identified.write(tmp_path, tables=True)
+        assert (tmp_path / 'characteristic.json').is_file()
+        assert (tmp_path / 'report.html').is_file()
+
+    def test_that_plotly_is_missing_is_told_before_any_work(self, tmp_path, monkeypatch, capsys):
+        from valveflow_ros.cli.main import main
+
+        (tmp_path / 'log.mcap').write_bytes(b'cannot even be read')
+        monkeypatch.setattr('valveflow_ros.report.page.find_spec', lambda name: None)
+        assert main(['identify', str(tmp_path / 'log.mcap'), '-o', str(tmp_path / 'o')]) == 1
+        assert 'pip install plotly' in capsys.readouterr().err
+        assert not (tmp_path / 'o').exists()
+
+
+@needs_jit
+class TestJudged:
+    def test_a_curve_is_held_against_other_days(self, log, identified, tmp_path):
+        found = vf.validate(log, identified.characteristic, parameters=QUICK)
+        assert found.to_json()['model'] == identified.characteristic.model_id
+        assert found.validation.overall.segments > 5
+        assert len(found.plot().data) > 0
+        names = set(found.write(tmp_path).files)
+        assert names == {'validation.json', 'segments.csv', 'report.html'}
+        written = json.loads((tmp_path / 'validation.json').read_text())
+        assert written == found.to_json()
+        with pytest.raises(UsageError, match='The model is a curve over V p'):
+            vf.validate(log, identified.characteristic, parameters={'pressure_exponent': 1.0})
+
+    def test_three_methods_are_compared(self, log, simulation, tmp_path):
+        truth = tmp_path / 'truth.json'
+        truth.write_text(json.dumps(simulation.to_json()))
+        found = vf.compare(log, test=log, truth=truth, parameters=QUICK)
+        content = found.to_json()
+        assert set(content['methods']) == {'paper', 'proposed', 'hammerstein', 'sparse'}
+        assert content['held_out'] is False
+        assert content['errors_against_truth']['proposed']['rmse_mw'] < 10.0
+        assert {f.name for f in found.page().figures} >= {'curves', 'truth'}
+
+    def test_a_log_without_readings_is_refused(self, log):
+        empty = vf.open_log(log.to_dataframe().head(1))
+        with pytest.raises(DataError, match='DataFrame'):
+            vf.compare(empty)
+
+
+@needs_jit
+def test_a_diagnosis_names_extends_and_writes(tmp_path):
+    spiky = vf.simulate(1.3, 2, effects=['spikes:height=60,per_day=60']).log
+    found = vf.diagnose(spiky)
+    content = found.to_json()
+    assert (content['verdict'], [c['name'] for c in content['causes']]) == ('named', ['spikes'])
+    assert found.diagnosis.rmse_extended <= found.diagnosis.rmse_simulation
+    assert found.extended_model.pressure_exponent == 1.125
+    assert len(found.plot().data) > 0
+    assert set(found.write(tmp_path).files) == {
+        'diagnosis.json', 'extended_model.json', 'report.html',
+    }  # fmt: skip
+    assert json.loads((tmp_path / 'diagnosis.json').read_text()) == content
+    # An identification on top of the model hands its causes on.
+    assert 'extended_model.json' in vf.identify(spiky, model=tmp_path).texts()
+
+
+@needs_jit
+class TestMonitor:
+    @pytest.fixture(scope='class')
+    @classmethod
+    def told(cls):
+        drifting = vf.simulate(1.0, 5, effects=['output_offset_drift:b_mw=40']).log
+        given = {**QUICK, 'refit_segments': 10}
+        return vf.monitor(drifting, diagnose=False, parameters=given)
+
+    def test_curves_alarms_and_predictions(self, told):
+        content = told.to_json()
+        assert (content['format'], content['version']) == ('valveflow/monitor', 1)
+        assert [c['model_id'] for c in content['curves']] == [c.model_id for _, c in told.curves]
+        assert len(content['curves']) > 3
+        for entry in content['curves']:
+            assert entry['window_from'] < entry['window_to'] <= entry['adopted']
+        assert {a['name'] for a in content['alarms']} >= {'residual'}
+        for alarm in content['alarms']:
+            assert told.start_ns < alarm['raised'] <= told.end_ns
+            assert alarm['cleared'] is None or alarm['cleared'] >= alarm['raised']
+            assert alarm['sentence'].endswith('.')
+        assert content['diagnoses'] == []
+        columns = told.predictions()
+        assert len({len(column) for column in columns.values()}) == 1
+        assert len(columns['time_ns']) == 86400
+        assert np.isfinite(columns['residual_mw']).any()
+
+    def test_report_and_picture(self, told, tmp_path):
+        assert set(told.write(tmp_path).files) == {'monitor.json', 'report.html'}
+        page = (tmp_path / 'report.html').read_text()
+        assert 'How the curve moved' in page
+        assert 'What the monitor said' in page
+        assert len(told.plot('alarms').data) > 0
+
+    def test_it_says_what_the_engine_fed_in_one_go_says(self, log):
+        from valveflow_ros.interface.observation import settings_for
+        from valveflow_ros.monitoring.monitor import Monitor
+        from valveflow_ros.monitoring.offline import align_all, feed_aligned
+        from valveflow_ros.signals.align import Aligner
+
+        given = {**QUICK, 'refit_segments': 8, 'diagnosis_hour': -1}
+        settings, _ = settings_for(log.steps(), 0.0, given, live=True)
+        engine, events = Monitor(settings), []
+        for aligned in align_all(Aligner(settings), log.readings):
+            events += feed_aligned(engine, aligned)
+        told = vf.monitor(log, parameters=given)
+        ids = [e.characteristic.model_id for e in events if type(e).__name__ == 'CurveAdopted']
+        assert [c.model_id for _, c in told.curves] == ids != []
+
+    def test_a_log_without_power_is_refused(self, simulation):
+        frame = simulation.to_dataframe().head(5000).assign(generated_power_mw=np.nan)
+        with pytest.raises(DataError, match='generated_power has no usable value'):
+            vf.monitor(frame, diagnose=False)
+
+
+def test_a_simulation_is_written_with_its_truth(tmp_path):
+    plant = vf.simulate(0.01, 3, effects=['gain_drift:g=0.02'])
+    assert len(plant.data) == 864
+    assert plant.write(tmp_path / 'a.csv', truth=tmp_path / 't.json') == tmp_path / 'a.csv'
+    assert json.loads((tmp_path / 't.json').read_text()) == plant.to_json()
+    back = vf.open_log(tmp_path / 'a.csv').to_dataframe()
+    pd.testing.assert_frame_equal(back, plant.log.to_dataframe())
+    with pytest.raises(RecordingError, match='exists already'):
+        plant.write(tmp_path / 'a.csv')
+    with pytest.raises(InputError, match='more than 0'):
+        vf.simulate(-1.0)
+    with pytest.raises(InputError, match="Did you mean 'gain_drift'"):
+        vf.simulate(1.0, effects=['gain_drif'])

@@ -1,0 +1,114 @@
+"""``Characteristic.power`` and ``.opening``: each undoes the other, and says what it knows."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from valveflow_ros.curve.characteristic_json import from_json
+
+
+def curve(knots, left, right, exponent=1.125):
+    pieces = []
+    for u_from, u_to, a, b in zip(knots[:-1], knots[1:], left, right, strict=True):
+        slope = (b - a) / (u_to - u_from)
+        pieces.append(
+            {'u_from': u_from, 'u_to': u_to, 'slope': slope, 'intercept': a - slope * u_from,
+             'slope_stderr': 0.001, 'intercept_stderr': 1.0, 'samples': 100}
+        )  # fmt: skip
+    return from_json(
+        {
+            'format': 'valveflow/characteristic', 'version': 1, 'pressure_exponent': exponent,
+            'pieces': pieces, 'breakpoint_intervals': [[None, None]] * (len(pieces) - 1),
+            'selection': {'rule': 'paper', 'cost': {}, 'turning_angle': {}},
+            'segments': {'steady': 1, 'slope_response': 1, 'samples': 100}, 'dynamics': [],
+        }
+    )  # fmt: skip
+
+
+@st.composite
+def rising(draw):
+    """A continuous curve that rises, and its exponent."""
+    n = draw(st.integers(1, 5))
+    widths = draw(st.lists(st.floats(50.0, 500.0), min_size=n, max_size=n))
+    steps = draw(st.lists(st.floats(0.5, 80.0), min_size=n, max_size=n))
+    knots = np.cumsum([draw(st.floats(100.0, 1000.0)), *widths])
+    powers = np.cumsum([draw(st.floats(0.0, 200.0)), *steps])
+    return curve(knots, powers[:-1], powers[1:], draw(st.floats(0.5, 1.5)))
+
+
+@given(rising(), st.floats(0.0, 1.0), st.floats(2.0, 30.0))
+def test_the_opening_of_a_power_is_the_opening_that_gave_it(c, share, pressure):
+    knots = c.breakpoints
+    u = knots[0] + share * (knots[-1] - knots[0])
+    opening = u / pressure**c.pressure_exponent
+    power = c.power(opening, pressure)
+    # At an outer end the rounding of u decides whether it still belongs to the curve.
+    if math.isnan(power):
+        assert share < 1e-9 or share > 1.0 - 1e-9
+        return
+    found = c.opening(power, pressure)
+    if opening > 100.0 + 1e-6:
+        assert math.isnan(found)
+    elif opening < 100.0 - 1e-6:
+        assert found == pytest.approx(opening, rel=1e-8)
+        assert c.power(found, pressure) == pytest.approx(float(power), rel=1e-9) or share in (0, 1)
+
+
+@given(rising(), st.floats(-1e4, 1e4), st.floats(2.0, 30.0))
+def test_a_power_is_attained_or_nan(c, power, pressure):
+    opening = float(c.opening(power, pressure))
+    low, high = c.values()[[0, -1]]
+    if (
+        low <= power <= high
+        and c.inverse(np.array([power]))[0] < 99.0 * pressure**c.pressure_exponent
+    ):
+        assert 0.0 <= opening <= 100.0
+    if power < low - 1e-6 or power > high + 1e-6:
+        assert math.isnan(opening)
+
+
+@given(rising(), st.floats(1.1, 3.0))
+def test_more_pressure_needs_less_opening(c, factor):
+    power = float(c.values()[[0, -1]].mean())
+    openings = c.opening(power, np.array([20.0, 20.0 * factor]))
+    if np.isfinite(openings).all():
+        assert openings[0] / openings[1] == pytest.approx(factor**c.pressure_exponent)
+
+
+def test_what_is_known_and_what_is_not():
+    c = curve([1000.0, 1500.0, 2000.0], [150.0, 250.0], [250.0, 300.0], exponent=1.0)
+    assert c.power(60.0, 20.0) == pytest.approx(190.0)
+    table = c.power(np.array([[60.0], [90.0]]), np.array([20.0, 10.0]))
+    assert table.shape == (2, 2)
+    assert np.isnan(table).tolist() == [[False, True], [False, True]]
+    for opening, pressure in ((60.0, np.nan), (np.nan, 20.0), (60.0, 0.0), (60.0, -3.0), (1, 20)):
+        assert math.isnan(c.power(opening, pressure))
+        assert math.isnan(c.opening(opening + 140.0, 0.0))
+    assert c.opening([190.0, 149.0, 301.0, np.nan], 20.0).tolist() == pytest.approx(
+        [60.0, np.nan, np.nan, np.nan], nan_ok=True
+    )
+    # 300 MW at 19 MPa would need 105 %.
+    assert math.isnan(c.opening(300.0, 19.0))
+    assert c.opening(300.0, 20.0) == pytest.approx(100.0)
+
+
+@pytest.mark.parametrize(
+    ('left', 'right', 'known', 'unknown'),
+    [
+        ((150.0, 250.0, 250.0), (250.0, 250.0, 300.0), (200.0, 275.0), (250.0,)),
+        ((150.0, 260.0, 280.0), (250.0, 280.0, 300.0), (200.0, 270.0), (255.0,)),
+        ((150.0, 250.0, 240.0), (250.0, 240.0, 300.0), (200.0, 275.0), (245.0,)),
+        ((150.0, 240.0, 280.0), (250.0, 280.0, 300.0), (200.0, 270.0), (245.0,)),
+    ],
+    ids=['flat piece', 'jump up', 'falling piece', 'jump down'],
+)
+def test_a_power_of_no_or_of_several_openings_has_none(left, right, known, unknown):
+    c = curve([500.0, 1000.0, 1500.0, 2000.0], left, right, exponent=1.0)
+    openings = c.opening(np.array(known), 20.0)
+    assert c.power(openings, 20.0) == pytest.approx(known)
+    assert np.isnan(c.opening(np.array(unknown), 20.0)).all()

@@ -1,0 +1,339 @@
+"""What the verbs share: options, messages and progress on the terminal, the result."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
+
+from valveflow_ros.interface import Progress
+from valveflow_ros.report.terminal.progress import Progress as ProgressLine
+
+if TYPE_CHECKING:
+    from valveflow_ros.interface.files import Result
+    from valveflow_ros.interface.mapping import LogMapping
+
+# What commands a terminal, or turns the order of what it shows: all but tabs and line feeds.
+_COMMANDS = re.compile('[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]')
+
+# How long each part of a verb's work takes beside the others, so that a bar moves evenly: name
+# of the part, the shares a verb tells at its begin and end, and where it begins in the time.
+# Measured with ``benchmarks/pace.py`` on logs of one and three days; it is the proportions that
+# count.
+_PARTS: Mapping[str, Sequence[tuple[str, float, float, float]]] = {
+    'identify': (
+        ('starting', 0.0, 0.0, 0.0),
+        ('reading', 0.02, 0.02, 0.13),
+        ('finding segments', 0.1, 0.5, 0.21),
+        ('exact partition', 0.6, 0.6, 0.39),
+        ('curve and dynamics together', 0.6, 0.6, 0.57),
+        ('writing the report', 0.9, 0.9, 0.93),
+    ),
+    'diagnose': (
+        ('starting', 0.0, 0.0, 0.0),
+        ('reading', 0.02, 0.02, 0.06),
+        ('finding segments', 0.1, 0.5, 0.09),
+        ('exact partition', 0.6, 0.6, 0.16),
+        ('curve and dynamics together', 0.6, 0.6, 0.25),
+        ('the record itself', 0.41, 0.41, 0.33),
+        ('simulation fitted', 0.425, 0.425, 0.34),
+        ('causes tried', 0.475, 0.475, 0.4),
+        ('further causes tried', 0.475, 0.75, 0.4),
+        ('the sealed blocks', 0.75, 0.75, 0.74),
+        ('what is left', 0.8, 0.8, 0.75),
+        ('how sure it is', 0.85, 0.85, 0.79),
+        ('writing the report', 0.95, 0.95, 0.98),
+    ),
+    'validate': (
+        ('starting', 0.0, 0.0, 0.0),
+        ('reading', 0.02, 0.02, 0.3),
+        ('finding segments', 0.1, 0.5, 0.38),
+        ('judging', 0.7, 0.7, 0.65),
+        ('writing the report', 0.9, 0.9, 0.92),
+    ),
+    'compare': (
+        ('starting', 0.0, 0.0, 0.0),
+        ('reading', 0.02, 0.02, 0.14),
+        ('finding segments', 0.04, 0.4, 0.18),
+        ('curve of special segments', 0.4, 0.4, 0.27),
+        ('exact partition', 0.4, 0.4, 0.28),
+        ('curve and dynamics together', 0.4, 0.4, 0.3),
+        ('Hammerstein model: starts', 0.5, 0.5, 0.42),
+        ('Hammerstein model: orders', 0.5, 0.5, 0.5),
+        ('Hammerstein model: all data', 0.5, 0.5, 0.66),
+        ('sparse model: derivative', 0.75, 0.75, 0.79),
+        ('sparse model: weak', 0.75, 0.75, 0.84),
+        ('sparse model: all data', 0.75, 0.75, 0.92),
+        ('judging', 0.85, 0.85, 0.94),
+        ('writing the report', 0.95, 0.95, 0.95),
+    ),
+}
+
+
+def share_of_time(verb: str, told: float, what: str) -> float:
+    """Return the share of a verb's time that has gone by when ``told`` of ``what`` is done.
+
+    What is not in the table stays as it is told.
+    """
+    rows = _PARTS.get(verb, ())
+    for k, (name, told_from, told_to, begins) in enumerate(rows):
+        if what.startswith(name):
+            ends = rows[k + 1][3] if k + 1 < len(rows) else 1.0
+            width = told_to - told_from
+            inside = min(max((told - told_from) / width, 0.0), 1.0) if width else 0.0
+            return begins + (ends - begins) * inside
+    return told
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a verb has to say at its end.
+
+    Attributes
+    ----------
+    text : str
+        For a person.
+    data : mapping
+        The same for a program; what is not finite becomes null.
+    drawn : bool
+        The text is a picture that was made for this terminal, colours and all, of words that were
+        made harmless. Any other text is printed without what commands a terminal.
+    """
+
+    text: str
+    data: Mapping[str, Any]
+    drawn: bool = False
+
+
+class Console(Progress):
+    """Messages, warnings, a progress bar where there is a terminal, and the result.
+
+    Parameters
+    ----------
+    out, err : text streams
+    as_json : bool
+        Print the result as JSON.
+    quiet : bool
+        Say nothing but warnings and the result.
+    verb : str
+        Whose work it is.
+    """
+
+    def __init__(
+        self, out: TextIO, err: TextIO, *, as_json: bool = False, quiet: bool = False,
+        verb: str = '',
+    ) -> None:  # fmt: skip
+        self._out = out
+        self._as_json = as_json
+        self._quiet = quiet
+        bar = err.isatty() and os.environ.get('TERM') != 'dumb'
+        self._line = ProgressLine(err, bar, lambda told, what: share_of_time(verb, told, what))
+
+    def __call__(self, share: float, what: str) -> None:
+        """Show the progress: a bar on a terminal, anywhere else a line once it takes long."""
+        if not self._quiet:
+            self._line.at(share, _harmless(what))
+
+    def say(self, sentence: str) -> None:
+        """Print something that is good to know."""
+        if not self._quiet:
+            self._line.write(_harmless(sentence))
+
+    def warn(self, sentence: str) -> None:
+        """Print something that must not be overlooked."""
+        self._line.write(_harmless(f'Warning: {sentence}'))
+
+    def fail(self, sentence: str) -> None:
+        """Print why it could not be done."""
+        self._line.end()
+        self._line.write(_harmless(f'valveflow: {sentence}'))
+
+    def finish(self, outcome: Outcome) -> None:
+        """Print the result."""
+        self._line.end()
+        if self._as_json:
+            text = json.dumps(_finite(outcome.data), indent=2, allow_nan=False, ensure_ascii=False)
+            self._out.write(_COMMANDS.sub(lambda c: f'\\u{ord(c[0]):04x}', text) + '\n')
+        elif outcome.text:
+            text = outcome.text if outcome.drawn else _harmless(outcome.text)
+            self._out.write(text.rstrip('\n') + '\n')
+        self._out.flush()
+
+
+def _harmless(text: str) -> str:
+    """Return a text as it may go to a terminal: names and cells of others may stand in it."""
+    return _COMMANDS.sub('?', text)
+
+
+def _finite(value: Any) -> Any:
+    """Replace what JSON does not know."""
+    if isinstance(value, Mapping):
+        return {str(k): _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+class TableOption(NamedTuple):
+    """An option that says how a table is written, among those of ``--column``."""
+
+    option: str
+    value: str
+
+
+MAPPING_HELP = """\
+names and units (the usual unit first):
+  valve_opening             %, fraction
+  main_steam_pressure       MPa, kPa, Pa, bar, psi; absolute. MPag, kPag, barg, psig are gauge:
+                            0.101325 MPa of air is added
+  main_steam_temperature    degC, K, degF
+  generated_power           MW, kW, W
+  valve_command             %, fraction; optional
+  time, date                date and time of the usual kinds, or Unix seconds
+Columns of a table that are named after what they hold need no --column."""
+
+
+def add_mapping(parser: ArgumentParser) -> None:
+    """Add the options that say how a log is to be understood.
+
+    Those about tables are gathered in the same list as ``--column``, in their order.
+    """
+    parser.epilog = MAPPING_HELP
+    parser.add_argument(
+        '--column', action='append', default=[], metavar='NAME=THEIRS[:UNIT]',
+        help='which column or topic of yours is the signal NAME, and its unit if it is not the '
+        'usual one; may be given several times',
+    )  # fmt: skip
+    parser.add_argument(
+        '--constant', action='append', default=[], metavar='NAME=VALUE[:UNIT]',
+        help='a signal that was not logged and hardly changes',
+    )  # fmt: skip
+    about = parser.add_argument_group('how a table is written, where it does not show it itself')
+    for option, metavar, told in (
+        ('time-zone', 'ZONE',
+         'zone of times that name none, such as Europe/Berlin or +01:00; west of '
+         'Greenwich with an equals sign, --time-zone=-05:00 (default: UTC)'),
+        ('date-order', 'dmy|mdy',
+         'whether 01/02/2026 is in February (dmy) or in January (mdy)'),
+        ('decimal', 'point|comma', 'what stands before the decimals of a number'),
+        ('sheet', 'NAME', 'which sheet of a workbook'),
+    ):  # fmt: skip
+        about.add_argument(
+            f'--{option}', dest='column', action='append', metavar=metavar, help=told,
+            type=_table_option(option),
+        )  # fmt: skip
+
+
+def _table_option(option: str) -> Callable[[str], TableOption]:
+    return lambda value: TableOption(option, value)
+
+
+def mapping_of(options: Namespace) -> LogMapping:
+    """Read the options of `add_mapping`; raises `UsageError`."""
+    from valveflow_ros.interface.mapping import read_mapping
+
+    said = [c for c in options.column if isinstance(c, TableOption)]
+    table = {one.option.replace('-', '_'): one.value for one in said}
+    columns = [c for c in options.column if isinstance(c, str)]
+    return read_mapping(columns, options.constant, **table)
+
+
+def add_parameters(parser: ArgumentParser) -> None:
+    """Add ``--params`` and ``--set``."""
+    parser.add_argument(
+        '--params', metavar='FILE', type=Path, help='parameters, a YAML file as the node takes it'
+    )
+    parser.add_argument(
+        '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs',
+        help='one parameter, such as time_constant=120; stands above the file',
+    )  # fmt: skip
+
+
+def add_results(parser: ArgumentParser) -> None:
+    """Add the folder of the results."""
+    parser.add_argument(
+        '-o', '--output', metavar='DIR', type=Path, required=True,
+        help='folder for the results, made if absent; the report of another verb there is kept',
+    )  # fmt: skip
+
+
+def add_beside(parser: ArgumentParser) -> None:
+    """Add ``--figures`` and ``--table``."""
+    parser.add_argument(
+        '--figures', action='store_true',
+        help='also write each picture of the report as PNG and SVG: DIR/figures',
+    )  # fmt: skip
+    parser.add_argument(
+        '--table', action='store_true',
+        help='also write what each picture shows as CSV: DIR/tables',
+    )  # fmt: skip
+
+
+def checked_parameters(options: Namespace) -> dict[str, Any]:
+    """Return the parameters a person has set; refuse before long work what cannot be written.
+
+    Raises
+    ------
+    RecordingError, InputError, UsageError
+    """
+    from valveflow_ros.interface.files import check_results
+    from valveflow_ros.interface.settings import read_parameters
+
+    given = read_parameters(options.params, options.pairs)
+    check_results(options.output, options.figures, options.table)
+    return given
+
+
+def written(result: Result, options: Namespace, text: str, data: Mapping[str, Any]) -> Outcome:
+    """Write the files of a result; return its text and data with what was written.
+
+    Raises
+    ------
+    RecordingError
+        They cannot be written.
+    """
+    done = result.write(options.output, figures=options.figures, tables=options.table)
+    files = {'files': {name: str(path) for name, path in done.files.items()}}
+    kept = {'kept': dict(done.kept)} if done.kept else {}
+    return Outcome('\n'.join([text, *done.words]), {**data, **files, **kept})
+
+
+def lines(*parts: str) -> str:
+    """Return the parts that are not empty, one below the other."""
+    return '\n'.join(part for part in parts if part)
+
+
+def columns(rows: Sequence[Sequence[str]], head: Sequence[str] = (), indent: str = '  ') -> str:
+    """Return rows with their columns lined up; the first column left, the others right."""
+    everything = [list(head), *map(list, rows)] if head else [list(r) for r in rows]
+    if not everything:
+        return ''
+    widths = [max(len(row[k]) for row in everything) for k in range(len(everything[0]))]
+    told = []
+    for row in everything:
+        cells = [row[0].ljust(widths[0])]
+        cells += [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
+        told.append((indent + '  '.join(cells)).rstrip())
+    return '\n'.join(told)
+
+
+def rejected_words(counts: Mapping[str, Mapping[str, int]]) -> str:
+    """Return one line about the readings that were not used, per signal."""
+    from valveflow_ros.report.data import REASON_WORDS, rejected
+    from valveflow_ros.report.words import count
+
+    told = []
+    for topic, by_reason in counts.items():
+        refused = rejected({topic: by_reason})
+        if refused:
+            words = ', '.join(f'{count(n)} {REASON_WORDS[r]}' for r, n in refused.items())
+            told.append(f'  {topic}: {words}')
+    return '\n'.join(['Readings not used:', *told]) if told else 'Every reading was used.'

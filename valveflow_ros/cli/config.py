@@ -1,0 +1,100 @@
+"""``valveflow config``: a parameter file for the monitor, fitted to a log, or checked."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+
+from valveflow_ros.cli.command import Console, Outcome, add_mapping, mapping_of
+from valveflow_ros.errors import InputError, ParameterError, UsageError, counted
+
+_DESCRIPTION = """\
+init LOG reads a log of the plant and writes a parameter file for the monitor: every parameter
+with its meaning, unit and range; those that the data tell (the step, the units, the noise, time
+constants) are fitted and say from what, the rest has its default. check FILE reads a parameter
+file as the monitor would and names what is wrong with it, or what differs from the defaults.
+
+example:
+  valveflow config init plant.mcap -o monitor.yaml
+  valveflow config check monitor.yaml"""
+
+
+def arguments(parser: ArgumentParser) -> None:
+    """Add description, example and options."""
+    parser.description = _DESCRIPTION
+    parser.usage = (
+        'valveflow config init LOG [-o FILE] [options]\n       valveflow config check FILE'
+    )
+    parser.add_argument('task', metavar='init|check', help='make a parameter file, or check one')
+    parser.add_argument('place', metavar='LOG|FILE', type=Path, help='the log, or the file')
+    parser.add_argument(
+        '-o', '--output', metavar='FILE', type=Path,
+        help='where to write the parameters (default: on the screen)',
+    )  # fmt: skip
+    parser.add_argument('--unit-tag', metavar='TAG', help='tag of the unit, such as U3')
+    parser.add_argument('--overwrite', action='store_true', help='replace a file that is there')
+    add_mapping(parser)
+
+
+def run(options: Namespace, console: Console) -> Outcome:
+    """Make or check a parameter file."""
+    mapping = mapping_of(options)
+    if options.task == 'check':
+        return _checked(options.place)
+    if options.task != 'init':
+        raise UsageError(f"config can init or check, not '{options.task}'.")
+    from valveflow_ros.interface.files import check_output, whole_file
+    from valveflow_ros.interface.logs import open_log
+    from valveflow_ros.interface.parameter_fit import fit_parameters, parameter_file
+
+    if options.output is not None:
+        check_output(
+            options.output, ('.yaml', '.yml'), source=options.place, overwrite=options.overwrite
+        )
+    console(0.02, 'reading')
+    log = open_log(options.place, mapping, progress=console)
+    found = fit_parameters(log, options.unit_tag or '', progress=console)
+    text = parameter_file(options.place.name, found)
+    data = {
+        'file': None if options.output is None else str(options.output),
+        'fitted': {f.name: {'value': f.value, 'from': f.ground} for f in found.values()},
+        'left': list(found.left),
+    }
+    if options.output is None:
+        return Outcome(text, data)
+    with whole_file(options.output) as draft:
+        draft.write_text(text, encoding='utf-8')
+    lines = [f'  {f.name}: {f.shown}  ({f.ground})' for f in found.values()]
+    said = ['Fitted to the data:', *lines] if lines else ['Nothing differs from the defaults.']
+    return Outcome('\n'.join([*said, *found.left, f'Wrote {options.output}.']), data)
+
+
+def _checked(file: Path) -> Outcome:
+    """Read a parameter file as the monitor would, and say what it changes."""
+    from valveflow_ros.interface.settings import read_parameters
+    from valveflow_ros.parameters import PARAMETERS, Settings
+
+    given = read_parameters(file, [])
+    try:
+        settings = Settings(given)
+    except ParameterError as error:
+        raise InputError(f'{file}: {error}') from None
+    changed = {
+        name: settings[name] for name in settings if settings[name] != PARAMETERS[name].default
+    }
+    many = (
+        'all as the defaults' if not changed else
+        '1 differs from its default' if len(changed) == 1 else
+        f'{len(changed)} differ from their defaults'
+    )  # fmt: skip
+    lines = [f'{file}: the monitor takes it; {counted(len(given), "parameter")}, {many}.']
+    for name, value in changed.items():
+        unit, default = PARAMETERS[name].unit, PARAMETERS[name].default
+        lines.append(f'  {name}: {_shown(value, unit)}, default {_shown(default, unit)}')
+    return Outcome('\n'.join(lines), {'file': str(file), 'good': True, 'changed': changed})
+
+
+def _shown(value: object, unit: str) -> str:
+    text = f'{value:g}' if isinstance(value, float) else f"'{value}'" if isinstance(
+        value, str) else str(value).lower()  # fmt: skip
+    return f'{text} {unit}' if unit else text

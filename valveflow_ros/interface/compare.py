@@ -1,0 +1,308 @@
+"""``compare`` and ``validate``: curves judged on data that they were not made from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from valveflow_ros.baselines import comparison, validation
+from valveflow_ros.baselines.judged import other_data, samples_of
+from valveflow_ros.baselines.truth import Truth
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.diagnosis.extended import ExtendedModel
+from valveflow_ros.errors import DataError, UsageError
+from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface.files import Result
+from valveflow_ros.interface.logs import Log, as_log
+from valveflow_ros.interface.models import (
+    Model,
+    load_characteristic,
+    load_model,
+    load_truth,
+    model_path,
+    with_exponent,
+)
+from valveflow_ros.interface.observation import Observed, cut_in_two, observe_log, settings_of
+from valveflow_ros.parameters import PARAMETERS, Settings
+from valveflow_ros.report.comparison import comparison_page, data_words, finding_words
+from valveflow_ros.report.comparison_tables import (
+    Compared,
+    curves_csv,
+    parameters_csv,
+    segments_csv,
+)
+from valveflow_ros.report.page import Page
+from valveflow_ros.report.validation import (
+    OUTSIDE_FLAG,
+    Validated,
+    validation_page,
+    verdict_words,
+)
+from valveflow_ros.report.words import held_words, percent
+
+
+@dataclass(frozen=True, slots=True)
+class ComparisonResult(Result):
+    """The proposed method beside two of the literature; ``data`` is what the report shows."""
+
+    verb = 'compare'
+    data: Compared
+
+    @property
+    def comparison(self) -> comparison.Comparison:
+        """Return curves, errors and tests."""
+        return self.data.result
+
+    def page(self) -> Page:
+        """Return the report."""
+        return comparison_page(self.data)
+
+    def texts(self) -> dict[str, str]:
+        """Return ``comparison.json`` and three tables."""
+        data = self.data
+        content = {
+            **comparison.to_json(data.result),
+            'learnt_from': data.source,
+            'judged_on': data.other,
+            'held_out': data.held_out,
+            'words': [data_words(data), *finding_words(data)],
+        }
+        return {
+            'comparison.json': json.dumps(content, indent=1, allow_nan=False) + '\n',
+            'parameters.csv': parameters_csv(data),
+            'segments.csv': segments_csv(data.result.judgement, data.predictions),
+            'curves.csv': curves_csv(data),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class ValidationResult(Result):
+    """A curve held against a log; ``data`` is what the report shows."""
+
+    verb = 'validate'
+    data: Validated
+
+    @property
+    def validation(self) -> validation.Validation:
+        """Return verdict, pieces and errors."""
+        return self.data.result
+
+    def page(self) -> Page:
+        """Return the report."""
+        return validation_page(self.data)
+
+    def texts(self) -> dict[str, str]:
+        """Return ``validation.json`` and ``segments.csv``."""
+        data = self.data
+        content = {
+            **validation.to_json(data.result),
+            'log': data.source,
+            'model': data.model,
+            'against': data.other or None,
+            'held': [h.name for h in data.result.characteristic.held],
+            'words': verdict_words(data),
+        }
+        predictions = tuple(data.result.predictions)
+        return {
+            'validation.json': json.dumps(content, indent=1, allow_nan=False) + '\n',
+            'segments.csv': segments_csv(data.result.judgement, predictions),
+        }
+
+
+def compare(
+    log: Any,
+    *,
+    test: Any = None,
+    truth: Truth | str | Path | None = None,
+    parameters: Mapping[str, Any] | None = None,
+    progress: Progress = SILENT,
+) -> ComparisonResult:
+    """Identify the curve in three ways and judge all of them on data none has seen.
+
+    Parameters
+    ----------
+    log : Log, str, Path or pandas.DataFrame
+        The log to learn from: what `open_log` returned, or anything it opens.
+    test : Log, str, Path or pandas.DataFrame, optional
+        A log of other days to judge by; without it the last third of ``log`` is held back.
+    truth : Truth or path, optional
+        The true curve of a simulated plant.
+    parameters : mapping, optional
+        Parameters of the monitor by name.
+    progress : Progress
+
+    Raises
+    ------
+    RecordingError, InputError, DataError
+        A log cannot be read, carries no curve, or holds nothing to judge by.
+    """
+    given = dict(parameters or {})
+    if truth is not None and not isinstance(truth, Truth):
+        truth = load_truth(truth)
+    log = _not_empty(as_log(log, progress))
+    if test is None:
+        block = given.get('block', PARAMETERS['block'].default)
+        first, second = cut_in_two(log, float(block))
+        names = f'{log.name} (first two thirds)', f'{log.name} (last third)'
+    else:
+        first, second = log, _not_empty(as_log(test, progress))
+        names = first.name, second.name
+    learn = _see(first, names[0], given, progress, progress.part(0.0, 0.4))
+    # A discrete model runs at the step it was learnt at.
+    given['sample_period'] = learn.settings.real('sample_period')
+    judged = _see(second, names[1], given, progress, progress.part(0.2, 0.4))
+    progress(0.4, 'curve of special segments')
+    characteristic = learn.observed.fit(lambda _, what: progress(0.4, what))
+    result = comparison.compare(
+        samples_of(learn.observed.task.contents, learn.settings), characteristic,
+        other_data(judged.observed.task.contents, judged.settings), truth, progress,
+    )  # fmt: skip
+    notes = tuple(dict.fromkeys((*learn.notes, *judged.notes, *characteristic.notes)))
+    return ComparisonResult(
+        Compared(
+            log.name, second.name, test is None, result, learn.observed.task.contents,
+            judged.observed.task.contents, notes,
+        )
+    )  # fmt: skip
+
+
+def validate(
+    log: Any,
+    model: Model | str | Path,
+    *,
+    against: Characteristic | str | Path | None = None,
+    tolerance_mw: float | None = None,
+    parameters: Mapping[str, Any] | None = None,
+    progress: Progress = SILENT,
+) -> ValidationResult:
+    """Hold a characteristic against a log it was not made from.
+
+    Parameters
+    ----------
+    log : Log, str, Path or pandas.DataFrame
+        What `open_log` returned, or anything it opens.
+    model : Characteristic, ExtendedModel or path
+    against : Characteristic or path, optional
+        A second curve, to see which of the two is better.
+    tolerance_mw : float, optional
+        A mean difference that does not matter; the parameter ``alarm_floor`` by default.
+    parameters : mapping, optional
+        Parameters of the monitor by name.
+    progress : Progress
+
+    Raises
+    ------
+    RecordingError, InputError, DataError
+        The log cannot be read or holds nothing to judge by.
+    """
+    loaded = check_models(model, against, parameters or {})
+    log = _not_empty(as_log(log, progress))
+    extended, curve = None, loaded.model
+    if isinstance(curve, ExtendedModel):
+        extended, curve = curve, curve.characteristic()
+    seen = _see(log, log.name, loaded.given, progress, progress, extended)
+    progress(0.7, 'judging')
+    tolerance = tolerance_mw or seen.settings.real('alarm_floor')
+    other = other_data(seen.observed.task.contents, seen.settings)
+    result = validation.validate(curve, other, tolerance, loaded.against)
+    if result.outside_share > OUTSIDE_FLAG:
+        progress.warn(
+            f'{percent(result.outside_share, 2)} of the special samples lie beyond the ends of '
+            'the curve and were not judged.'
+        )
+    held = held_words(curve.held)
+    if curve.held and not extended:
+        held = (
+            'The curve was identified with causes held '
+            f'({", ".join(h.name for h in curve.held)}), which this log is not freed of: give the '
+            'extended_model.json beside it as --model.'
+        )
+        progress.warn(held)
+    second = '' if against is None else _name(against, model)
+    return ValidationResult(
+        Validated(
+            log.name, _name(model, against), second, result, seen.observed.task.contents,
+            seen.notes, held,
+        )
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedModels:
+    """The curves to hold against a log, and the parameters with their pressure exponent."""
+
+    model: Model
+    against: Characteristic | None
+    given: dict[str, Any]
+
+
+def check_models(
+    model: Model | str | Path, against: Characteristic | str | Path | None,
+    parameters: Mapping[str, Any],
+) -> CheckedModels:  # fmt: skip
+    """Read the curves of a validation and refuse what does not go together.
+
+    Raises
+    ------
+    RecordingError
+        A file cannot be read.
+    UsageError
+        An extended model judges rows freed of its causes, which another curve is not made
+        for; or the parameters name another pressure exponent.
+    """
+    first = model if isinstance(model, Characteristic | ExtendedModel) else load_model(model)
+    second = against
+    if second is not None and not isinstance(second, Characteristic):
+        second = load_characteristic(second)
+    if second is not None and isinstance(first, ExtendedModel):
+        raise UsageError(
+            '--against takes two curves over the same rows, and those of an extended model are '
+            'freed of its causes: validate each by itself and compare their errors.'
+        )
+    name = 'The model' if first is model else model
+    return CheckedModels(first, second, with_exponent(first, parameters, name))
+
+
+def _name(model: Model | str | Path, other: Model | str | Path | None) -> str:
+    """Return a file's name, with its folder where that was named or two would read alike."""
+    if isinstance(model, Characteristic | ExtendedModel):
+        return getattr(model, 'model_id', '') or 'the model'
+    file = model_path(Path(model))
+    alike = isinstance(other, str | Path) and model_path(Path(other)).name == file.name
+    return str(file) if alike or file != Path(model) else file.name
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """A log, or a part of one, after the engine saw it, and sentences about how it was read."""
+
+    settings: Settings
+    observed: Observed
+    notes: tuple[str, ...]
+
+
+def _see(
+    log: Log, name: str, given: Mapping[str, Any], progress: Progress,
+    shown: Callable[[float, str], None], model: ExtendedModel | None = None,
+) -> _Seen:  # fmt: skip
+    """Run the engine over a log; an error says of which log it speaks."""
+    settings, notes = settings_of(log, given, progress, constants=False)
+    try:
+        observed = observe_log(log, settings, progress, model, shown)
+    except DataError as error:
+        raise DataError(f'{name}: {error}') from None
+    told = (*log.notes, *notes)
+    if observed.clock_resets:
+        back = f'{name}: the clock went back; where it stayed, what it had passed is out.'
+        progress.warn(back)
+        told = (*told, back)
+    return _Seen(settings, observed, told)
+
+
+def _not_empty(log: Log) -> Log:
+    if not len(log.readings):
+        raise DataError(f'{log.contents.path}: there is not one reading in it.')
+    return log

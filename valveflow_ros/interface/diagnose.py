@@ -1,0 +1,202 @@
+"""``diagnose``: what the simulation gets wrong, the cause, the gain."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.regional_model import RegionalModel
+from valveflow_ros.diagnosis import diagnose as search
+from valveflow_ros.diagnosis.corrector import corrector_of
+from valveflow_ros.diagnosis.extended import ExtendedModel
+from valveflow_ros.diagnosis.from_window import first_model, on_top
+from valveflow_ros.diagnosis.result import Diagnosis, model_to_json, to_json
+from valveflow_ros.diagnosis.signature import views
+from valveflow_ros.errors import DataError
+from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface.files import Result, signed
+from valveflow_ros.interface.logs import Log, as_log
+from valveflow_ros.interface.models import Model, load_model, with_exponent
+from valveflow_ros.interface.monitor import recorded_history
+from valveflow_ros.interface.observation import align, observe_log, settings_of
+from valveflow_ros.parameters import Settings
+from valveflow_ros.records import SIGNALS, IntArray, SampleTable
+from valveflow_ros.report.diagnosis import Diagnosed, diagnosis_page
+from valveflow_ros.report.page import Page
+from valveflow_ros.report.words import held_words
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosisResult(Result):
+    """A diagnosis.
+
+    Attributes
+    ----------
+    data : Diagnosed
+        Everything the report is made from.
+    exponent : float
+        Of the pressure in u.
+    on_top_of : ExtendedModel or None
+        The model whose causes were taken out of the rows before.
+    """
+
+    verb = 'diagnose'
+    data: Diagnosed
+    exponent: float
+    on_top_of: ExtendedModel | None = None
+
+    @property
+    def diagnosis(self) -> Diagnosis:
+        """Return verdict, causes and gain."""
+        return self.data.diagnosis
+
+    @property
+    def extended_model(self) -> ExtendedModel:
+        """Return the model extended by the causes that were found."""
+        d = self.diagnosis
+        return ExtendedModel(
+            d.final, self.exponent, self.data.start_ns, d.reference, self.on_top_of
+        )
+
+    def page(self) -> Page:
+        """Return the report."""
+        return diagnosis_page(self.data)
+
+    def texts(self) -> dict[str, str]:
+        """Return ``diagnosis.json`` and ``extended_model.json``."""
+        contents = {
+            'diagnosis.json': to_json(self.diagnosis),
+            'extended_model.json': signed(model_to_json(self.extended_model), self.verb),
+        }
+        return {
+            name: json.dumps(content, indent=2, allow_nan=False) + '\n'
+            for name, content in contents.items()
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """Aligned rows, special segments, and the model where one was found.
+
+    The places are those of the rows among all of the log; None: they are all.
+    """
+
+    table: SampleTable
+    spans_ns: IntArray
+    model: RegionalModel | None
+    why: str = ''
+    places: IntArray | None = None
+
+
+def load_diagnosable(path: str | Path) -> Model:
+    """Return the model in a file, to hold a log against.
+
+    Raises
+    ------
+    RecordingError, DataError
+        It cannot be read, or is a curve without dynamics.
+    """
+    model = load_model(path)
+    if isinstance(model, Characteristic) and not model.dynamics:
+        raise DataError(
+            f'{path}: this curve has no dynamics, and without them every ramp would look like a '
+            'fault; identify it from a longer record, or leave out --model.'
+        )
+    return model
+
+
+def diagnose(
+    log: Any,
+    *,
+    parameters: Mapping[str, Any] | None = None,
+    model: Model | str | Path | None = None,
+    progress: Progress = SILENT,
+) -> DiagnosisResult:
+    """Compare the simulation with the measured power and name the cause of what differs.
+
+    Parameters
+    ----------
+    log : Log, str, Path or pandas.DataFrame
+        What `open_log` returned, or anything it opens.
+    parameters : mapping, optional
+        Parameters of the monitor by name.
+    model : Characteristic, ExtendedModel or path, optional
+        What the log is held against; found in the log itself without it. The causes of an
+        extended model are taken out of the rows first, and what differs after that is found.
+    progress : Progress
+
+    Raises
+    ------
+    DataError
+        The record cannot carry a diagnosis; the sentence says why.
+    RecordingError, InputError
+        A file cannot be read, or a parameter is wrong.
+    """
+    given = dict(parameters or {})
+    if model is not None:
+        name = 'The model' if isinstance(model, Characteristic | ExtendedModel) else model
+        if not isinstance(model, Characteristic | ExtendedModel):
+            model = load_diagnosable(model)
+        given = with_exponent(model, given, name)
+    log = as_log(log, progress)
+    settings, notes = settings_of(log, given, progress)
+    earlier = model if isinstance(model, ExtendedModel) and model.held else None
+    rows = _rows(log, settings, model is None, progress, earlier)
+    if rows.why:
+        progress.warn(rows.why)
+        notes.append(rows.why)
+    step, settle = settings.real('sample_period'), settings.settle_s
+    exponent = settings.real('pressure_exponent')
+    regional = rows.model
+    if model is not None:
+        exponent = model.pressure_exponent
+        regional = model.model.base if isinstance(model, ExtendedModel) else model.model
+    if regional is None:
+        regional = first_model(rows.table, step, exponent, settle)
+    record = search.Record(rows.table, step, exponent, settle, rows.spans_ns)
+    if earlier is not None:
+        measured = align(log.readings, settings)[0]
+        record = on_top(
+            record, earlier, measured if rows.places is None else measured.take(rows.places)
+        )
+        notes.append(held_words(earlier.held))
+    found = search.diagnose(record, regional, model is not None, progress.part(0.4, 0.5))
+    signatures, answers, maps = views(record, found)
+    found = replace(found, notes=(*log.contents.warnings, *notes, *found.notes))
+    times = rows.table.time_ns
+    data = Diagnosed(
+        log.name, int(times[0]), int(times[-1]), found, signatures, answers, maps,
+        recorded_history(log.contents), exponent,
+    )  # fmt: skip
+    return DiagnosisResult(data, exponent, earlier)
+
+
+def _rows(
+    log: Log, settings: Settings, wanted: bool, progress: Progress, earlier: ExtendedModel | None
+) -> _Rows:
+    """Align the log and find special segments; go on without them where all signals are there."""
+    try:
+        observed = observe_log(log, settings, progress, earlier)
+    except DataError as error:
+        step_s = settings.real('sample_period')
+        corrector = None if earlier is None else corrector_of(earlier, step_s)
+        table, _, _ = align(log.readings, settings, corrector=corrector)
+        needed = [info.signal for info in SIGNALS if info.required]
+        if not len(table) or not all(np.isfinite(table.column(s)).any() for s in needed):
+            raise
+        why = f'{error} The model is found from all rows instead, without special segments.'
+        return _Rows(table, np.empty((0, 2), dtype=np.int64), None, why)
+    spans = np.array([(s.start_ns, s.end_ns) for s in observed.segments], dtype=np.int64)
+    rows = _Rows(observed.table, spans.reshape(-1, 2), None, places=observed.rows)
+    if not wanted:
+        return rows
+    try:
+        return replace(rows, model=observed.outline(progress))
+    except DataError as error:
+        return replace(rows, why=f'{error} All rows are used instead.')

@@ -1,0 +1,516 @@
+"""Output files, whole or not there, and results: their files, report and main picture."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import tempfile
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from valveflow_ros.errors import InputError, RecordingError
+
+if TYPE_CHECKING:
+    from valveflow_ros.records import SampleTable
+    from valveflow_ros.report.page import Page
+
+TABLES = ('.csv', '.parquet')
+REPORT = 'report.html'
+FIGURES_FOLDER, TABLES_FOLDER = 'figures', 'tables'
+# Every verb that reads the recording of a monitor draws these, alike for one log.
+_DRAWN_BY_SEVERAL = ('history', 'alarms')
+
+# How a file of results tells which verb wrote it. The heads of our pages and files stand well
+# within so many bytes.
+_HEAD = 4096
+_PAGE = re.compile(rb'<meta name="generator" content="valveflow ([a-z]+) ')
+_FORMAT = re.compile(rb'\A\{\s*"format":\s*"valveflow/([a-z_]+)"')
+_WRITTEN_BY = re.compile(
+    rb'\A\{\s*"format":\s*"valveflow/extended_model",\s*"written_by":\s*"([a-z]+)"'
+)
+_FORMATS = {
+    'characteristic': 'identify',
+    'shift': 'identify',
+    'diagnosis': 'diagnose',
+    'comparison': 'compare',
+    'validation': 'validate',
+    'monitor': 'monitor',
+}
+_TABLES = {
+    'compare': re.compile(
+        rb'\A(segment,kind,(\S*,)?proposed\.|method,piece,slope,intercept,|u,(\w+,)*proposed\b)'
+    ),
+    'validate': re.compile(rb'\Asegment,kind,(\S*,)?curve\.'),
+}
+# The mark of a backup of a file that is not ours, or of a version that did not say.
+_UNKNOWN = 'before'
+
+
+def reason(error: OSError) -> str:
+    """Return what the operating system said, as a part of a sentence."""
+    return (error.strerror or str(error)).lower()
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Give a name beside ``path`` to write to; the file becomes ``path`` if all went well.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be written.
+    """
+    # The suffix stays last: writers choose the format by it.
+    draft = path.with_name(f'.{path.stem}.{os.getpid()}.draft{path.suffix}')
+    try:
+        yield draft
+        os.replace(draft, path)
+    except OSError as error:
+        raise RecordingError(path, f'cannot be written ({reason(error)})') from None
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def write_texts(folder: Path, texts: Mapping[str, str] | Mapping[str, bytes]) -> dict[str, Path]:
+    """Write files of a folder, made if absent: all of them, or none is replaced.
+
+    Raises
+    ------
+    RecordingError
+        The folder or a file cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordingError(folder, f'cannot be made ({reason(error)})') from None
+    drafts = {name: folder / f'.{name}.{os.getpid()}.draft' for name in texts}
+    try:
+        for name, text in texts.items():
+            drafts[name].write_bytes(text if isinstance(text, bytes) else text.encode())
+            if (folder / name).is_dir():
+                raise IsADirectoryError(errno.EISDIR, f'{name} is a folder')
+        for name, draft in drafts.items():
+            os.replace(draft, folder / name)
+    except OSError as error:
+        raise RecordingError(folder, f'cannot be written into ({reason(error)})') from None
+    finally:
+        for draft in drafts.values():
+            draft.unlink(missing_ok=True)
+    return {name: folder / name for name in texts}
+
+
+def write_log(table: SampleTable, path: Path, overwrite: bool = False) -> Path:
+    """Write rows as CSV, Parquet, MCAP or a recording's folder, by the suffix; return where.
+
+    Raises
+    ------
+    RecordingError
+        It cannot be written, or is there already.
+    """
+    from valveflow_ros.logs import write_samples, write_table
+
+    if path.suffix.lower() in TABLES:
+        with whole_file(path) as draft:
+            write_table(table, draft)
+        return path
+    return write_samples(table, path, overwrite=overwrite or is_empty(path)).path
+
+
+def is_empty(path: Path) -> bool:
+    """Return whether a file is there and holds nothing that could be lost."""
+    return path.is_file() and path.stat().st_size == 0
+
+
+def check_readable(path: Path, what: str) -> None:
+    """Refuse a file that is not there; ``what`` says what cannot be done.
+
+    Raises
+    ------
+    RecordingError
+    """
+    try:
+        path.stat()
+    except OSError as error:
+        raise RecordingError(path, f'{what} ({reason(error)})') from None
+    except ValueError:  # a zero byte in the name
+        raise RecordingError(path, 'is not a name of a file') from None
+
+
+def check_writable(path: Path) -> None:
+    """Refuse a file that could not be written.
+
+    Raises
+    ------
+    RecordingError
+    """
+    folder = path.absolute().parent
+    if path.is_dir():
+        raise RecordingError(path, 'is a folder; name a file')
+    if not folder.is_dir():
+        raise RecordingError(path, f"cannot be written: there is no folder '{path.parent}'")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise RecordingError(path, f'cannot be written ({os.strerror(errno.EACCES).lower()})')
+    _try_folder(folder, 'choose another place for it')
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse what cannot become a folder of results.
+
+    Raises
+    ------
+    RecordingError
+        It is a file, or may not be written into.
+    """
+    place = folder
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    if not place.is_dir():
+        raise RecordingError(place, 'is not a folder; choose another -o DIR')
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise RecordingError(place, 'may not be written into; choose another -o DIR')
+    _try_folder(folder, 'choose another -o DIR')
+
+
+def check_output(
+    path: Path, suffixes: tuple[str, ...], *, source: Path | None = None, overwrite: bool = False
+) -> None:
+    """Refuse an output file that cannot be written or must not be replaced.
+
+    Raises
+    ------
+    RecordingError
+        It is of an unknown kind, in no folder, equal to the input, or there already.
+    """
+    if path.suffix.lower() not in suffixes:
+        raise RecordingError(path, f'must end in {" or ".join(suffixes)}')
+    if path.is_dir():
+        raise RecordingError(path, 'is a folder; name a file')
+    if not path.absolute().parent.is_dir():
+        raise RecordingError(path, f"cannot be written: there is no folder '{path.parent}'")
+    _try_folder(path.absolute().parent, 'choose another place for the output')
+    if not path.exists():
+        return
+    if source is not None and source.exists() and path.samefile(source):
+        raise RecordingError(path, 'is the log that is read; choose another name for the output')
+    if not overwrite and not is_empty(path):
+        raise RecordingError(path, 'exists already; add --overwrite to replace it')
+
+
+def check_log(path: Path, *, source: Path | None = None, overwrite: bool = False) -> None:
+    """Refuse a log that cannot be written; a name without a suffix is a folder.
+
+    Raises
+    ------
+    RecordingError
+    """
+    if path.suffix:
+        check_output(path, ('.mcap', *TABLES), source=source, overwrite=overwrite)
+    elif path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise RecordingError(path, 'exists already and is not empty; choose another folder')
+    else:
+        _try_folder(path, 'choose another place for the output')
+
+
+def _try_folder(folder: Path, advice: str) -> None:
+    """Write a byte into a folder, made if absent, and remove both again.
+
+    Rights alone do not tell: a disk may be full, and not every place that root may write to
+    takes files.
+    """
+    absent = [place for place in (folder, *folder.parents) if not place.exists()]
+    what = 'made' if absent else 'written into'
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        what = 'written into'
+        with tempfile.TemporaryFile(dir=folder) as trial:
+            trial.write(b'x')
+    except OSError as error:
+        raise RecordingError(folder, f'cannot be {what} ({reason(error)}); {advice}') from None
+    finally:
+        for place in absent:
+            with suppress(OSError):
+                place.rmdir()
+
+
+class Result:
+    """What a verb found: shown, drawn and written in the same way for all of them."""
+
+    verb: ClassVar[str]
+
+    def page(self) -> Page:
+        """Return the report."""
+        raise NotImplementedError
+
+    def texts(self) -> dict[str, str]:
+        """Return the files for programs by name; the first is the JSON of the result."""
+        raise NotImplementedError
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the result as a dict, equal to the content of its JSON file."""
+        content: dict[str, Any] = json.loads(next(iter(self.texts().values())))
+        return content
+
+    def plot(self, name: str = '') -> Any:
+        """Return a picture of the report as a plotly figure.
+
+        Parameters
+        ----------
+        name : str
+            One of the report's pictures; the main one by default.
+
+        Returns
+        -------
+        plotly.graph_objects.Figure
+
+        Raises
+        ------
+        InputError
+            The report has no picture of that name.
+        """
+        import plotly.graph_objects as go
+
+        from valveflow_ros.report.drawing import palette
+
+        drawn = {figure.name: figure for figure in self.page().figures}
+        if (name and name not in drawn) or not drawn:
+            there = ', '.join(drawn) or 'none'
+            raise InputError(f"The report has no picture '{name}'; it has: {there}.")
+        figure = drawn[name] if name else next(iter(drawn.values()))
+        colours = palette()
+        content = _painted(json.loads(figure.to_json()), colours)
+        base = {
+            'template': 'plotly_white',
+            'paper_bgcolor': colours['paper'],
+            'plot_bgcolor': colours['paper'],
+            'legend': {'orientation': 'h', 'x': 0, 'y': 1.02, 'yanchor': 'bottom'},
+        }
+        return go.Figure(content['data'], {**base, **content['layout']})
+
+    def write(
+        self, folder: str | Path, *, figures: bool = False, tables: bool = False
+    ) -> WrittenFiles:
+        """Write the files of the result, then pictures and tables where they are wanted.
+
+        Parameters
+        ----------
+        folder : str or Path
+            Made if absent. What another verb wrote under one of the names is kept under
+            another.
+        figures : bool
+            Also write each picture of the report as PNG and SVG, into ``figures``.
+        tables : bool
+            Also write what each picture shows as CSV, into ``tables``.
+
+        Raises
+        ------
+        RecordingError
+            The folder or a file cannot be written; then no file of the result is replaced.
+        InputError
+            plotly is missing, or matplotlib and pictures are wanted.
+        """
+        folder = Path(folder)
+        check_results(folder, figures, tables)
+        page = self.page()
+        content = {**self.texts(), REPORT: page.to_html()}
+        backup = back_up(folder, self.verb, content)
+        files = write_texts(folder, content)
+        *most, last = [str(files[REPORT]), *(name for name in content if name != REPORT)]
+        lines = [f'Wrote {", ".join(most)} and {last}.']
+        beside, replaced = {}, []
+        if tables:
+            from valveflow_ros.report.figure import figure_csv
+
+            made = {f'{f.name}.csv': figure_csv(f).encode() for f in page.figures}
+            beside['tables'] = folder / TABLES_FOLDER, made
+        if figures:
+            from valveflow_ros.report.drawing import figure_files
+
+            made = {k: v for f in page.figures for k, v in figure_files(f).items()}
+            beside['pictures'] = folder / FIGURES_FOLDER, made
+        for place, made in beside.values():
+            replaced += [
+                f'{place.name}/{name}'
+                for name, new in made.items()
+                if Path(name).stem in _DRAWN_BY_SEVERAL and _differs(place / name, new)
+            ]
+            written = write_texts(place, made)
+            files |= {f'{place.name}/{name}': path for name, path in written.items()}
+        if beside:
+            told = ' and '.join(f'{what} in {place}' for what, (place, _) in beside.items())
+            lines.append(f'Wrote {told}.')
+        lines.append(backup.words())
+        if replaced and REPORT in backup.names:
+            lines.append(
+                f'{", ".join(replaced)}: what was there showed something else and is replaced.'
+            )
+        return WrittenFiles(files, backup.names, tuple(line for line in lines if line))
+
+
+@dataclass(frozen=True, slots=True)
+class WrittenFiles:
+    """Where the files of a result are.
+
+    Attributes
+    ----------
+    files : dict of str to Path
+        By name.
+    kept : mapping of str to str
+        Files that stood there, by old name, and the names they are kept under.
+    words : tuple of str
+        The same as sentences.
+    """
+
+    files: dict[str, Path]
+    kept: Mapping[str, str]
+    words: tuple[str, ...]
+
+
+def check_results(folder: Path, figures: bool, tables: bool) -> None:
+    """Refuse before long work what could not be written after it.
+
+    Raises
+    ------
+    InputError
+        plotly is not installed, or matplotlib where pictures are wanted.
+    RecordingError
+        A folder may not be written into.
+    """
+    from valveflow_ros.report.page import plotly_script
+
+    check_folder(folder)
+    plotly_script()
+    if figures:
+        from valveflow_ros.report.drawing import check_drawing
+
+        check_drawing()
+        check_folder(folder / FIGURES_FOLDER)
+    if tables:
+        check_folder(folder / TABLES_FOLDER)
+
+
+def signed(content: Mapping[str, Any], verb: str) -> dict[str, Any]:
+    """Return the content of an extended model with the verb that writes it, near its head.
+
+    Two verbs write one, and its format alone does not tell which.
+    """
+    return {'format': content['format'], 'written_by': verb, **content}
+
+
+def writer(path: Path) -> str:
+    """Return the verb that wrote a file, empty if that is not sure."""
+    try:
+        with path.open('rb') as file:
+            head = file.read(_HEAD)
+    except OSError:
+        return ''
+    if path.suffix == '.html':
+        found = _PAGE.search(head)
+        return found[1].decode() if found else ''
+    if path.suffix == '.json':
+        if found := _WRITTEN_BY.match(head):
+            return found[1].decode()
+        found = _FORMAT.match(head)
+        return _FORMATS.get(found[1].decode(), '') if found else ''
+    first = head.partition(b'\n')[0]
+    return next((verb for verb, columns in _TABLES.items() if columns.match(first)), '')
+
+
+@dataclass(frozen=True, slots=True)
+class Backup:
+    """What another verb or somebody else had written, and where it stands now.
+
+    Attributes
+    ----------
+    names : mapping of str to str
+        Old names to new ones.
+    verb : str
+        Whose report was kept, empty if none was or that cannot be told.
+    old : str
+        An earlier report of the verb at work that stands beside the new one, or empty.
+    """
+
+    names: Mapping[str, str] = field(default_factory=dict)
+    verb: str = ''
+    old: str = ''
+
+    def words(self) -> str:
+        """Return one line for a person; empty if there is nothing to say."""
+        told = []
+        for name, new in self.names.items():
+            report = f'report of valveflow {self.verb}' if self.verb else 'report'
+            what = f'The {report}' if name == REPORT else f'The {name}'
+            told.append(f'{what} that was there is now {new}.')
+        if self.old:
+            told.append(f'{self.old} is of an earlier run; the new one is {REPORT}.')
+        return ' '.join(told)
+
+
+def back_up(folder: Path, verb: str, names: Collection[str]) -> Backup:
+    """Copy the files that ``verb`` is about to replace and has not surely written itself.
+
+    Raises
+    ------
+    RecordingError
+        A copy cannot be made; nothing has been replaced then.
+    """
+    kept: dict[str, str] = {}
+    # The report is named first.
+    for name in sorted(names, key=lambda n: n != REPORT):
+        path = folder / name
+        if not path.is_file() or (theirs := writer(path)) == verb:
+            continue
+        kept[name] = _free_name(folder, name, theirs, names)
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise RecordingError(
+                path, f'cannot be read to keep it ({reason(error)}); choose another -o DIR'
+            ) from None
+        write_texts(folder, {kept[name]: content})
+    own = _renamed(REPORT, verb)
+    old = own if writer(folder / own) == verb else ''
+    return Backup(kept, writer(folder / REPORT) if REPORT in kept else '', old)
+
+
+def _free_name(folder: Path, name: str, verb: str, taken: Collection[str]) -> str:
+    """Return a name for a copy: one that is free, or holds an older copy of the same verb."""
+    mark = verb or _UNKNOWN
+    new, number = _renamed(name, mark), 1
+
+    def same(path: Path) -> bool:
+        return bool(verb) and path.is_file() and writer(path) == verb
+
+    while new in taken or (os.path.lexists(folder / new) and not same(folder / new)):
+        number += 1
+        new = _renamed(name, f'{mark}_{number}')
+    return new
+
+
+def _renamed(name: str, mark: str) -> str:
+    """Return ``report_identify.html`` for ``report.html``."""
+    path = Path(name)
+    return f'{path.stem}_{mark}{path.suffix}'
+
+
+def _painted(value: Any, colours: Mapping[str, str]) -> Any:
+    """Return a part of a picture with each ``token:name`` replaced by the colour's value."""
+    if isinstance(value, str):
+        return colours[value[6:]] if value.startswith('token:') else value
+    if isinstance(value, list):
+        return [_painted(v, colours) for v in value]
+    if isinstance(value, dict):
+        # A second, shorter title is for narrow pages only.
+        return {k: _painted(v, colours) for k, v in value.items() if k != 'short'}
+    return value
+
+
+def _differs(path: Path, content: bytes) -> bool:
+    try:
+        return path.read_bytes() != content
+    except OSError:
+        return False

@@ -1,0 +1,193 @@
+"""``identify``: the flow characteristic of a log."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.characteristic_json import to_json
+from valveflow_ros.curve.shift import ShiftLimits, judge_shift, shift_json
+from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
+from valveflow_ros.diagnosis.result import model_to_json
+from valveflow_ros.errors import DataError, UsageError
+from valveflow_ros.fit.step_levels import looks_like_step_test
+from valveflow_ros.fit.step_test import identify_step_test
+from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface.files import Result, signed
+from valveflow_ros.interface.logs import Log, as_log
+from valveflow_ros.interface.models import load_characteristic, load_extended, with_exponent
+from valveflow_ros.interface.monitor import recorded_history
+from valveflow_ros.interface.observation import align, check_signals, observe_log, settings_of
+from valveflow_ros.records import SampleTable, SpecialSegment
+from valveflow_ros.report.identification import identification_page
+from valveflow_ros.report.identified import Identified
+from valveflow_ros.report.page import Page
+
+STEP_TEST_ADVICE = (
+    'This looks like a manual step test (few openings, each held): --step-test identifies it '
+    'from its steady states.'
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Identification(Result):
+    """An identified flow characteristic.
+
+    Attributes
+    ----------
+    data : Identified
+        Everything the report is made from.
+    log : Log
+    model : ExtendedModel or None
+        The model whose causes were held.
+    """
+
+    verb = 'identify'
+    data: Identified
+    log: Log
+    model: ExtendedModel | None = None
+
+    @property
+    def characteristic(self) -> Characteristic:
+        """Return the curve."""
+        return self.data.characteristic
+
+    @property
+    def table(self) -> SampleTable:
+        """Return the aligned rows that the engine saw."""
+        return self.data.table
+
+    @property
+    def segments(self) -> tuple[SpecialSegment, ...]:
+        """Return the special segments that the curve was found in."""
+        return self.data.segments
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return sentences about how the data were read, and about the curve."""
+        return (*self.data.notes, *self.characteristic.notes)
+
+    def page(self) -> Page:
+        """Return the report."""
+        return identification_page(self.data)
+
+    def texts(self) -> dict[str, str]:
+        """Return ``characteristic.json``, with a reference ``shift.json``, with a model its own.
+
+        The extended model gets the new curve.
+        """
+        c = self.characteristic
+        contents = {'characteristic.json': to_json(c)}
+        if self.data.shift is not None:
+            contents['shift.json'] = shift_json(self.data.shift)
+        files = {
+            name: json.dumps(content, indent=2, allow_nan=False) + '\n'
+            for name, content in contents.items()
+        }
+        if self.model is not None and c.dynamics:
+            anew = Extended(c.model, self.model.model.active)
+            model = signed(model_to_json(replace(self.model, model=anew)), self.verb)
+            files['extended_model.json'] = json.dumps(model, indent=2) + '\n'
+        return files
+
+
+def identify(
+    log: Any,
+    *,
+    parameters: Mapping[str, Any] | None = None,
+    model: ExtendedModel | str | Path | None = None,
+    reference: Characteristic | str | Path | None = None,
+    step_test: bool = False,
+    progress: Progress = SILENT,
+) -> Identification:
+    """Find the flow characteristic of the valve in a log of ordinary operation.
+
+    Parameters
+    ----------
+    log : Log, str, Path or pandas.DataFrame
+        What `open_log` returned, or anything it opens.
+    parameters : mapping, optional
+        Parameters of the monitor by name, such as ``{'time_constant': 120}``.
+    model : ExtendedModel or path, optional
+        An ``extended_model.json`` of a diagnosis: its causes are held, curve and dynamics
+        found anew.
+    reference : Characteristic or path, optional
+        A curve to judge the new one against.
+    step_test : bool
+        The log is a manual test: pressure constant, the opening in steps, each held.
+    progress : Progress
+
+    Raises
+    ------
+    DataError
+        The data carry no curve, or none that can be compared with the reference.
+    RecordingError, InputError
+        A file cannot be read, or a parameter is wrong.
+    """
+    given = dict(parameters or {})
+    if model is not None:
+        if step_test:
+            raise UsageError('--step-test and --model do not go together.')
+        name = 'The model' if isinstance(model, ExtendedModel) else model
+        model = model if isinstance(model, ExtendedModel) else load_extended(model)
+        given = with_exponent(model, given, name)
+    if reference is not None and not isinstance(reference, Characteristic):
+        reference = load_characteristic(reference)
+    log = as_log(log, progress)
+    found = (
+        _step_test(log, given, progress) if step_test else _identified(log, given, model, progress)
+    )
+    if reference is not None:
+        settings = found.settings
+        limits = ShiftLimits(settings.real('shift_confidence'), settings.real('shift_least'))
+        shift = judge_shift(reference, found.characteristic, found.segments, limits)
+        found = replace(found, shift=shift, reference=reference)
+    return Identification(found, log, model)
+
+
+def _identified(
+    log: Log, given: Mapping[str, Any], model: ExtendedModel | None, progress: Progress
+) -> Identified:
+    settings, notes = settings_of(log, given, progress)
+    try:
+        observed = observe_log(log, settings, progress, model)
+        characteristic = observed.fit(progress)
+    except DataError as error:
+        table, _, _ = align(log.readings, settings)
+        if looks_like_step_test(table, settings):
+            raise DataError(f'{error} {STEP_TEST_ADVICE}') from None
+        raise
+    told = []
+    if observed.clock_resets:
+        told.append(
+            'The clock went back within the log; where it stayed, what it had passed is out.'
+        )
+    if looks_like_step_test(observed.table, settings):
+        told.append(STEP_TEST_ADVICE)
+    for sentence in told:
+        progress.warn(sentence)
+    return Identified(
+        source=log.name, characteristic=characteristic, table=observed.table,
+        segments=observed.segments, counts=observed.counts, settings=settings,
+        notes=(*log.notes, *notes, *told), history=recorded_history(log.contents),
+    )  # fmt: skip
+
+
+def _step_test(log: Log, given: Mapping[str, Any], progress: Progress) -> Identified:
+    settings, notes = settings_of(log, given, progress, constants=False)
+    table, resets, counts = align(log.readings, settings, progress)
+    if len(resets):
+        raise DataError(
+            'The clock goes back within the log; a step test must be one stretch of time.'
+        )
+    check_signals(table, counts)
+    progress(0.6, 'levels')
+    test = identify_step_test(table, settings)
+    return Identified(
+        source=log.name, characteristic=test.characteristic, table=table,
+        segments=test.segments, counts=counts, settings=settings, notes=(*log.notes, *notes),
+    )  # fmt: skip

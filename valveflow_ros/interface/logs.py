@@ -1,0 +1,308 @@
+"""A log from a file or a DataFrame: readings in the engine's units, constants filled in."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from valveflow_ros.errors import DataError, InputError
+from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface.mapping import LOOKING_ON, LogMapping, looked_through, read_mapping
+from valveflow_ros.interface.plausibility import (
+    Doubt,
+    air_note,
+    check_constants,
+    doubt,
+    refuse_guesses,
+    with_constants,
+)
+from valveflow_ros.logs import LogContents
+from valveflow_ros.logs import open_log as read_file
+from valveflow_ros.logs.tables.cells import QUALITY_SUFFIX
+from valveflow_ros.logs.tables.match import TIME
+from valveflow_ros.parameters import Settings
+from valveflow_ros.records import (
+    N_SIGNALS,
+    SIGNALS,
+    IntArray,
+    Quality,
+    Readings,
+    SampleTable,
+    Signal,
+    table_to_readings,
+)
+from valveflow_ros.signals.units import UNITS, convert
+
+
+@dataclass(frozen=True, slots=True)
+class Log:
+    """A log that was read, and how it was understood.
+
+    Attributes
+    ----------
+    name : str
+        Name of the file, or 'DataFrame'.
+    contents : LogContents
+        As it stands in the file.
+    readings : Readings
+        In engine units; constants stand at the times of another signal.
+    units : dict
+        The unit each measured signal was taken to have.
+    constants : dict
+        Value of each constant signal, engine units.
+    doubts : list of Doubt
+        Signals whose values do not suit their unit.
+    """
+
+    name: str
+    contents: LogContents
+    readings: Readings
+    units: dict[Signal, str]
+    constants: dict[Signal, float]
+    doubts: list[Doubt]
+
+    @property
+    def span_s(self) -> float:
+        """Return the time from the first reading to the last, in s."""
+        return float(np.ptp(self.readings.time_ns)) / 1e9 if len(self.readings) else 0.0
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return sentences about how the file was read."""
+        return (*self.contents.warnings, *(d.sentence for d in self.doubts))
+
+    def name_of(self, signal: Signal) -> str:
+        """Return the topic or column a signal comes from, empty if it is not there."""
+        return '' if signal in self.constants else self.contents.signals.get(signal, '')
+
+    def steps(self) -> dict[Signal, float]:
+        """Return the median time between readings of each signal that has several, in s."""
+        return steps_of(self.readings.by_signal())
+
+    def to_dataframe(self) -> Any:
+        """Return the readings as a table: one row for each time at which anything was read.
+
+        Returns
+        -------
+        pandas.DataFrame
+            ``time`` (UTC) and a float64 column for each signal, in the engine's units and
+            with its name (``valve_opening_percent``, ...). NaN where a signal was not read
+            or its value is bad; of several values of one time the last. A column
+            ``..._quality`` stands beside a signal with uncertain values.
+        """
+        import pandas as pd
+
+        r = self.readings
+        times, row = np.unique(r.time_ns, return_inverse=True)
+        values = np.full((len(times), N_SIGNALS), np.nan)
+        quality = np.zeros((len(times), N_SIGNALS), dtype=np.uint8)
+        values[row, r.signal] = np.where(r.quality < Quality.BAD, r.value, np.nan)
+        quality[row, r.signal] = r.quality
+        columns: dict[str, Any] = {TIME: pd.to_datetime(times, utc=True)}
+        for info in SIGNALS:
+            value = values[:, info.signal]
+            if info.required or np.isfinite(value).any():
+                columns[info.column] = value
+            if (quality[:, info.signal] == Quality.UNCERTAIN).any():
+                columns[info.column + QUALITY_SUFFIX] = quality[:, info.signal]
+        return pd.DataFrame(columns)
+
+
+def open_log(
+    source: Any,
+    mapping: LogMapping | None = None,
+    *,
+    columns: Mapping[str, str] | None = None,
+    constants: Mapping[str, float | str] | None = None,
+    time_zone: str = '',
+    date_order: str = '',
+    decimal: str = '',
+    sheet: str = '',
+    progress: Progress = SILENT,
+) -> Log:
+    """Open a log, convert it, and report what looks wrong.
+
+    Parameters
+    ----------
+    source : str, Path or pandas.DataFrame
+        An ``.mcap`` file, a rosbag2 folder, a ``.csv``, ``.xlsx`` or ``.parquet`` table, or
+        a DataFrame with a column ``time`` (datetimes, those without a zone in UTC; ISO 8601
+        texts; or Unix seconds) and columns such as ``valve_opening_percent``.
+    mapping : LogMapping, optional
+        All of the following in one.
+    columns : mapping of str to str, optional
+        What a signal is called in the log and its unit: ``{'main_steam_pressure':
+        'PT_100:bar'}``. Columns of a table that say what they hold are found without it.
+    constants : mapping, optional
+        Signals that were not logged: ``{'main_steam_temperature': 540}``.
+    time_zone, date_order, decimal, sheet : str
+        How a table is written, where it does not show that itself.
+    progress : Progress
+
+    Raises
+    ------
+    RecordingError, InputError, DataError
+        The log cannot be read, a column is missing, a unit unknown.
+    """
+    if mapping is None:
+        table = {'time_zone': time_zone, 'date_order': date_order, 'decimal': decimal,
+                 'sheet': sheet}  # fmt: skip
+        mapping = read_mapping(
+            [f'{name}={theirs}' for name, theirs in (columns or {}).items()],
+            [f'{name}={value}' for name, value in (constants or {}).items()],
+            **{name: value for name, value in table.items() if value},
+        )
+    if hasattr(source, 'columns'):
+        contents = mapping.opened(lambda names: _from_dataframe(source, names))
+        return _understood('DataFrame', contents, mapping, progress)
+    path = Path(source)
+
+    def look(said: LogMapping) -> LogContents:
+        absent = list(said.constants)
+        return said.opened(
+            lambda names: read_file(path, columns=names, absent=absent, table=said.table)
+        )
+
+    def again(said: LogMapping) -> LogContents:
+        progress(0.02, LOOKING_ON)
+        return look(said)
+
+    contents = looked_through(path, look, mapping, again)
+    return _understood(path.name, contents, mapping, progress)
+
+
+def as_log(log: Any, progress: Progress) -> Log:
+    """Return a log as it is, or open what stands for one."""
+    return log if isinstance(log, Log) else open_log(log, progress=progress)
+
+
+def steps_of(parts: dict[int, Readings]) -> dict[Signal, float]:
+    """Return the median time between readings, by signal, in s."""
+    steps: dict[Signal, float] = {}
+    for signal, part in parts.items():
+        gaps = np.diff(part.time_ns)
+        if gaps.min(initial=1) <= 0:
+            gaps = gaps[gaps > 0]
+        if len(gaps):
+            steps[Signal(signal)] = float(np.median(gaps)) / 1e9
+    return steps
+
+
+def _understood(name: str, contents: LogContents, mapping: LogMapping, progress: Progress) -> Log:
+    for sentence in contents.warnings:
+        progress.warn(sentence)
+    for sentence in contents.understood:
+        progress.say(sentence)
+    told = _units_told(contents)
+    units = {s: mapping.unit_of(s, told) for s in contents.signals}
+    constants = mapping.constant_signals
+    check_constants(constants)
+    measured = sorted(units.keys() - constants.keys())
+    for signal in measured:
+        if note := air_note(signal, units[signal], contents.signals[signal]):
+            progress.say(note)
+    raw, settings = contents.readings, Settings()
+    doubts = [
+        found
+        for s in measured
+        if (found := doubt(s, raw.value[raw.signal == s], units[s], settings)) is not None
+    ]
+    refuse_guesses(contents.path, doubts, contents.grounds, contents.signals)
+    for found in doubts:
+        progress.warn(found.advice(contents.signals[found.signal]))
+    for signal in constants.keys() & contents.signals.keys():
+        progress.warn(
+            f"{SIGNALS[signal].topic} stands in the log as '{contents.signals[signal]}' too; "
+            'the constant is used instead.'
+        )
+    readings = with_constants(_converted(raw, units), constants)
+    return Log(name, contents, readings, units, constants, doubts)
+
+
+def _units_told(contents: LogContents) -> dict[Signal, str]:
+    """Return the units that a log names itself.
+
+    The columns of a table may name them. A monitor records what the gateway sent, as it was
+    sent, and its own parameters beside it; stamped samples carry the units of the contract.
+    """
+    if contents.units:
+        return dict(contents.units)
+    try:
+        parameters = json.loads(contents.attachments['parameters.json'])
+        named = {s: parameters.get(f'{SIGNALS[s].topic}_unit') for s in contents.signals}
+    except (KeyError, ValueError, AttributeError):
+        return {}
+    return {
+        signal: unit
+        for signal, unit in named.items()
+        if unit in UNITS[signal] and not contents.signals[signal].endswith('plant_sample')
+    }
+
+
+def _converted(readings: Readings, units: dict[Signal, str]) -> Readings:
+    value = readings.value
+    for signal, unit in units.items():
+        if unit == SIGNALS[signal].unit:
+            continue
+        mine = readings.signal == signal
+        value = value.copy() if value is readings.value else value
+        value[mine] = convert(signal, unit, value[mine])
+    return replace(readings, value=value)
+
+
+def _from_dataframe(frame: Any, names: Mapping[str, str]) -> LogContents:
+    """Return a DataFrame as a log; raises `InputError` or `DataError`."""
+    import pandas as pd
+
+    if missing := [theirs for theirs in names.values() if theirs not in frame.columns]:
+        raise InputError(f"The DataFrame has no column '{missing[0]}'.")
+    theirs = names.get(TIME, TIME)
+    if theirs not in frame.columns and not isinstance(frame.index, pd.DatetimeIndex):
+        raise InputError("The DataFrame has no column 'time', and its index holds no times.")
+    time_ns, there = _nanoseconds(frame[theirs] if theirs in frame.columns else frame.index)
+    order = np.flatnonzero(there)[np.argsort(time_ns[there], kind='stable')]
+    columns, quality, signals = {}, {}, {}
+    for info in SIGNALS:
+        usual = (info.column, info.topic)
+        theirs = names.get(info.topic) or next((c for c in usual if c in frame.columns), '')
+        if not theirs:
+            continue
+        signals[info.signal] = theirs
+        numbers = pd.to_numeric(frame[theirs], errors='coerce').to_numpy(np.float64)
+        columns[info.signal] = numbers[order]
+        if theirs + QUALITY_SUFFIX in frame.columns:
+            quality[info.signal] = frame[theirs + QUALITY_SUFFIX].to_numpy(np.uint8)[order]
+    if not columns or not len(order):
+        raise DataError(
+            'The DataFrame has no row with a time.' if columns else
+            f'The DataFrame has none of the columns {", ".join(i.column for i in SIGNALS)}.'
+        )  # fmt: skip
+    table = SampleTable.from_columns(time_ns[order], columns, quality)
+    readings = table_to_readings(table)
+    return LogContents(
+        'DataFrame', readings, readings.time_ns, signals=signals,
+        start_ns=int(table.time_ns[0]), end_ns=int(table.time_ns[-1]),
+    )  # fmt: skip
+
+
+def _nanoseconds(times: Any) -> tuple[IntArray, Any]:
+    """Return times in ns since 1970, and which of them can be read."""
+    import pandas as pd
+
+    series = pd.Series(times).reset_index(drop=True)
+    if pd.api.types.is_numeric_dtype(series):
+        seconds = series.to_numpy(np.float64)
+        there = np.isfinite(seconds)
+        # Whole seconds apart: a float64 of ns would round them.
+        whole = np.floor(np.where(there, seconds, 0.0))
+        part = np.round((np.where(there, seconds, 0.0) - whole) * 1e9).astype(np.int64)
+        return whole.astype(np.int64) * 1_000_000_000 + part, there
+    stamps = pd.to_datetime(series, utc=True, errors='coerce')
+    return stamps.astype('datetime64[ns, UTC]').astype(
+        np.int64
+    ).to_numpy(), stamps.notna().to_numpy()

@@ -1,0 +1,296 @@
+"""What a person says of a log: names, units, constants, and how a table is written."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+import numpy as np
+
+from valveflow_ros.errors import InputError, UsageError, ValveflowError
+from valveflow_ros.logs.tables.dates import zone_of
+from valveflow_ros.logs.tables.refusal import (
+    AS_SEEN,
+    THEIRS,
+    RefusedError,
+    Remedy,
+    TableOptions,
+)
+from valveflow_ros.logs.tables.words import unit_named
+from valveflow_ros.records import SIGNALS, Signal
+from valveflow_ros.signals.units import convert, known_units
+
+Answer = TypeVar('Answer')
+_TIMES = ('time', 'date')
+_BY_NAME = {name: info for info in SIGNALS for name in (info.topic, info.column)}
+_TABLE = {'time-zone': 'time_zone', 'date-order': 'date_order', 'decimal': 'decimal',
+          'sheet': 'sheet'}  # fmt: skip
+# Stands in for a signal that nobody has named yet, to find what else a table leaves open.
+_STAND_IN = {
+    'valve_opening': 50.0,
+    'main_steam_pressure': 15.0,
+    'main_steam_temperature': 540.0,
+    'generated_power': 300.0,
+    'valve_command': 50.0,
+}
+_MOST_LOOKS = 12
+# Each further look may read the whole table.
+LOOKING_ON = 'looking for what else the table leaves open'
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One ``name=THEIRS[:unit]``.
+
+    Attributes
+    ----------
+    name : str
+        The topic's name of a signal, or 'time' or 'date'.
+    theirs : str
+        What it is called in the log.
+    unit : str
+        As written; empty means the engine's own unit.
+    whole : str
+        Everything after the equals sign: a column's name may itself hold a colon.
+    """
+
+    name: str
+    theirs: str
+    unit: str
+    whole: str
+
+    @property
+    def known(self) -> bool:
+        """Return whether the unit is one of the signal's, or none was given."""
+        return not self.unit or self.unit in known_units(_BY_NAME[self.name].signal)
+
+
+@dataclass(frozen=True, slots=True)
+class LogMapping:
+    """Columns and constants by the topic's name; constants in the engine's units."""
+
+    columns: dict[str, Column] = field(default_factory=dict)
+    constants: dict[str, float] = field(default_factory=dict)
+    table: TableOptions = AS_SEEN
+
+    @property
+    def constant_signals(self) -> dict[Signal, float]:
+        """Return the constants by signal."""
+        return {_BY_NAME[name].signal: value for name, value in self.constants.items()}
+
+    def names(self) -> dict[str, str]:
+        """Return the name in the log of each column that was named.
+
+        Where what follows the last colon is no unit, the colon is taken to belong to the
+        column's name.
+        """
+        return {c.name: c.theirs if c.known else c.whole for c in self.columns.values()}
+
+    def opened(self, look: Callable[[dict[str, str]], Answer]) -> Answer:
+        """Return what ``look`` gives for these names; an unknown unit explains a failure.
+
+        Raises
+        ------
+        UsageError
+            ``look`` found no such column, and the unit of one is unknown.
+        """
+        try:
+            return look(self.names())
+        except InputError as error:
+            unknown = next((c for c in self.columns.values() if not c.known), None)
+            if unknown is None:
+                raise
+            units = ', '.join(known_units(_BY_NAME[unknown.name].signal))
+            raise UsageError(
+                f"Unit '{unknown.unit}' is unknown for {unknown.name}: use one of {units} "
+                f"(and the log has nothing called '{unknown.whole}')."
+            ) from error
+
+    def unit_of(self, signal: Signal, told: dict[Signal, str]) -> str:
+        """Return the unit a signal is taken to have.
+
+        What the person says stands above what the log says of itself (``told``), and that
+        above the unit of the contract.
+        """
+        info = SIGNALS[signal]
+        column = self.columns.get(info.topic)
+        if column and column.unit and column.known:
+            return column.unit
+        return told.get(signal, info.unit)
+
+
+def read_mapping(columns: Sequence[str], constants: Sequence[str], **table: str) -> LogMapping:
+    """Read what a person says of a log.
+
+    Parameters
+    ----------
+    columns : sequence of str
+        Each ``NAME=THEIRS[:UNIT]``.
+    constants : sequence of str
+        Each ``NAME=VALUE[:UNIT]``.
+    **table : str
+        Of a table: ``time_zone``, ``date_order``, ``decimal``, ``sheet``.
+
+    Raises
+    ------
+    UsageError
+        Something is not of the right form, given twice, or contradictory.
+    """
+    found = LogMapping(table=_table_options(table))
+    for text in columns:
+        column = _column(text)
+        if column.name in found.columns:
+            raise UsageError(f'--column {column.name} is given twice.')
+        found.columns[column.name] = column
+    for text in constants:
+        name, value = _constant(text)
+        if name in found.constants:
+            raise UsageError(f'--constant {name} is given twice.')
+        if name in found.columns:
+            raise UsageError(f'{name} is given both as --column and as --constant; leave one out.')
+        found.constants[name] = value
+    return found
+
+
+def _table_options(said: dict[str, str]) -> TableOptions:
+    options = AS_SEEN
+    try:
+        for name, value in said.items():
+            options = replace(options, **{name: value.strip()})
+        zone_of(options.time_zone)
+    except InputError as error:
+        raise UsageError(str(error)) from None
+    return options
+
+
+def _column(text: str) -> Column:
+    name, whole = _split('column', text)
+    if name in _TIMES:
+        return Column(name, whole, '', whole)
+    signal = _signal(name, 'column')
+    theirs, colon, unit = whole.rpartition(':')
+    if not colon or not theirs or not unit.strip():
+        return Column(SIGNALS[signal].topic, whole, '', whole)
+    return Column(SIGNALS[signal].topic, theirs.strip(), _unit(signal, unit), whole)
+
+
+def _constant(text: str) -> tuple[str, float]:
+    name, rest = _split('constant', text)
+    signal = _signal(name, 'constant')
+    number, colon, unit = rest.partition(':')
+    try:
+        value = float(number)
+    except ValueError:
+        raise UsageError(f"--constant {name}: '{number}' is no number.") from None
+    if not math.isfinite(value):
+        raise UsageError(f'--constant {name}: the value must be finite.')
+    if colon:
+        try:
+            value = float(convert(signal, _unit(signal, unit), np.array([value]))[0])
+        except InputError as error:
+            raise UsageError(f'--constant {name}: {error}') from None
+    return SIGNALS[signal].topic, value
+
+
+def _split(option: str, text: str) -> tuple[str, str]:
+    name, equals, rest = text.partition('=')
+    if not equals or not name.strip() or not rest.strip():
+        raise UsageError(f"--{option} '{text}' is not of the form NAME=... .")
+    return name.strip(), rest.strip()
+
+
+def _unit(signal: Signal, text: str) -> str:
+    """Return the project's name of a unit, the text itself if it spells none."""
+    written = text.strip()
+    known = {spelling.lower(): spelling for spelling in known_units(signal)}
+    return known.get(written.lower()) or unit_named(signal, written) or written
+
+
+def _signal(name: str, option: str) -> Signal:
+    """Return the signal of a topic's or a column's name."""
+    if name in _BY_NAME:
+        return _BY_NAME[name].signal
+    known = [info.topic for info in SIGNALS] + (list(_TIMES) if option == 'column' else [])
+    topics, columns = ([getattr(i, kind) for i in SIGNALS] for kind in ('topic', 'column'))
+    near = difflib.get_close_matches(name, [*topics, *columns, *_TIMES], n=1)
+    hint = f" did you mean '{near[0]}'?" if near else f' use one of {", ".join(known)}.'
+    raise UsageError(f"--{option} '{name}': there is no signal of that name,{hint}")
+
+
+def looked_through(
+    path: object,
+    look: Callable[[LogMapping], Answer],
+    mapping: LogMapping,
+    again: Callable[[LogMapping], object],
+) -> Answer:
+    """Return what a look at a table gives; gather everything that the table leaves open.
+
+    Where ``look`` is refused, ``again`` looks on as if the person had answered, so that all
+    questions are asked at once.
+
+    Raises
+    ------
+    RefusedError
+        With everything that would have been refused, one after the other.
+    """
+    try:
+        return look(mapping)
+    except RefusedError as refused:
+        found = [refused]
+    remedies = list(found[0].remedies)
+    for _ in range(_MOST_LOOKS):
+        if found[-1].last:
+            break
+        try:
+            mapping = _answered(mapping, found[-1].remedies)
+            again(mapping)
+            break
+        except RefusedError as refused:
+            if not set(refused.remedies) - set(remedies):
+                break
+            found.append(refused)
+            remedies += refused.remedies
+        except ValveflowError:
+            # What was open before has to be said first.
+            break
+    # Of two options about one thing the later one counts.
+    newest = list({subject(remedy): remedy for remedy in remedies}.values())
+    raise joined(path, found, newest) from None
+
+
+def _answered(mapping: LogMapping, remedies: Iterable[Remedy]) -> LogMapping:
+    """Return the mapping with these options added; what is not known yet is left out."""
+    columns, constants, table = dict(mapping.columns), dict(mapping.constants), mapping.table
+    for remedy in remedies:
+        if remedy.option in _TABLE:
+            table = replace(table, **{_TABLE[remedy.option]: remedy.value})
+            continue
+        column = _column(remedy.value)
+        if column.theirs != THEIRS:
+            columns[column.name] = column
+        elif column.name in _STAND_IN:
+            columns.pop(column.name, None)
+            constants[column.name] = _STAND_IN[column.name]
+        else:
+            raise UsageError(f'--column {column.name}={THEIRS} has to be answered first.')
+    return LogMapping(columns, constants, table)
+
+
+def joined(
+    path: object, refused: Sequence[RefusedError], remedies: Sequence[Remedy] | None = None
+) -> RefusedError:
+    """Return one refusal that says what all of these say."""
+    problems = []
+    for one in refused:
+        about = one.where.removeprefix(str(path)).lstrip(': ')
+        problems += [f'{about}: {problem}' if about else problem for problem in one.problems]
+    every = [r for one in refused for r in one.remedies] if remedies is None else list(remedies)
+    return RefusedError(path, problems, every, last=True)
+
+
+def subject(remedy: Remedy) -> str:
+    """Return what an option speaks of: a second one takes the place of the first."""
+    return remedy.value.partition('=')[0].strip() if remedy.option == 'column' else remedy.option

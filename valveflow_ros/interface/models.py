@@ -1,0 +1,122 @@
+"""Reads ``characteristic.json``, ``extended_model.json`` and the truth of a simulated plant."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from valveflow_ros.baselines.truth import Truth, read_truth
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.characteristic_json import FORMAT, from_json
+from valveflow_ros.diagnosis.extended import ExtendedModel
+from valveflow_ros.diagnosis.result import is_model, model_from_json
+from valveflow_ros.errors import DataError, RecordingError, UsageError
+from valveflow_ros.interface.files import reason
+
+Model = Characteristic | ExtendedModel
+_MOST_BYTES = 50_000_000
+_CURVE, _EXTENDED = 'characteristic.json', 'extended_model.json'
+
+
+def load_characteristic(path: str | Path) -> Characteristic:
+    """Return the flow characteristic in a file.
+
+    Parameters
+    ----------
+    path : str or Path
+        A ``characteristic.json``, or the folder that holds one.
+
+    Raises
+    ------
+    RecordingError
+        It cannot be read, or is no characteristic this version can read.
+    """
+    model = load_model(path)
+    if not isinstance(model, Characteristic):
+        raise RecordingError(path, 'is an extended model; here a characteristic.json is wanted')
+    return model
+
+
+def load_extended(path: str | Path) -> ExtendedModel:
+    """Return the extended model in a file or folder; raises as `load_characteristic`."""
+    model = load_model(path, (_EXTENDED,))
+    if isinstance(model, Characteristic):
+        raise RecordingError(path, 'is a characteristic; here an extended_model.json is wanted')
+    return model
+
+
+def load_model(path: str | Path, names: tuple[str, ...] = (_CURVE, _EXTENDED)) -> Model:
+    """Return what a file holds, a characteristic or an extended model.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, or a folder with one of ``names`` in it.
+    names : tuple of str
+
+    Raises
+    ------
+    RecordingError
+        It cannot be read, or is none this version can use.
+    """
+    path = model_path(Path(path), names)
+    raw = _read_json(path, 'a flow characteristic', 'flow characteristic')
+    try:
+        extended = isinstance(raw, dict) and raw.get('format') != FORMAT and is_model(raw)
+        return model_from_json(raw) if extended else from_json(raw)
+    except DataError as error:
+        raise RecordingError(path, f'cannot be used. {str(error).rstrip(".")}') from None
+    except (ValueError, RecursionError):
+        raise RecordingError(path, 'is no flow characteristic: it holds no JSON') from None
+
+
+def model_path(path: Path, names: tuple[str, ...] = (_CURVE, _EXTENDED)) -> Path:
+    """Return the file that is meant: of a folder, the first of ``names`` in it."""
+    if not path.is_dir():
+        return path
+    return next((path / name for name in names if (path / name).is_file()), path)
+
+
+def with_exponent(model: Model, given: Mapping[str, Any], name: object) -> dict[str, Any]:
+    """Return parameters with the pressure exponent of a model.
+
+    Raises
+    ------
+    UsageError
+        Another exponent is given; ``name`` is what the sentence calls the model.
+    """
+    wanted = given.get('pressure_exponent')
+    if wanted is not None and abs(float(wanted) - model.pressure_exponent) > 1e-9:
+        raise UsageError(
+            f'{name} is a curve over V p^{model.pressure_exponent:g}, but the parameter '
+            f'pressure_exponent is set to {float(wanted):g}: leave it out, the model decides.'
+        )
+    return {**given, 'pressure_exponent': model.pressure_exponent}
+
+
+def load_truth(path: str | Path) -> Truth:
+    """Return the truth in a file that ``simulate --truth`` wrote, or in a characteristic.
+
+    Raises
+    ------
+    RecordingError
+        It cannot be read, or is neither.
+    """
+    path = Path(path)
+    try:
+        return read_truth(_read_json(path, 'the truth of a plant', 'truth of a plant'))
+    except DataError as error:
+        raise RecordingError(path, f'cannot be used. {str(error).rstrip(".")}') from None
+
+
+def _read_json(path: Path, large: str, none: str) -> Any:
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise RecordingError(path, f'is too large to be {large}')
+        return json.loads(path.read_text(encoding='utf-8'))
+    except OSError as error:
+        raise RecordingError(path, f'cannot be read ({reason(error)})') from None
+    except (ValueError, RecursionError):
+        raise RecordingError(path, f'is no {none}: it holds no JSON') from None

@@ -1,0 +1,349 @@
+"""``monitor``: what the monitor tells over a log; and what one has told, from its recording."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from valveflow_ros import __version__
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.diagnosis.from_window import diagnose_window
+from valveflow_ros.errors import RecordingError
+from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface.files import Result
+from valveflow_ros.interface.logs import as_log
+from valveflow_ros.interface.observation import aligned_blocks, check_signals
+from valveflow_ros.interface.settings import settings_for
+from valveflow_ros.logs import LogContents
+from valveflow_ros.monitoring.alarm import AlarmChange, AlarmState
+from valveflow_ros.monitoring.events import (
+    CurveAdopted,
+    Diagnosed,
+    Event,
+    JournalEntry,
+    JournalKind,
+)
+from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.monitoring.offline import feed_aligned
+from valveflow_ros.monitoring.prediction import PredictionBlock
+from valveflow_ros.parameters import Settings
+from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SampleTable
+from valveflow_ros.report.history import (
+    AlarmMoment,
+    CurveMoment,
+    DiagnosisMoment,
+    History,
+    history_sections,
+)
+from valveflow_ros.report.page import Page, Section, paragraph, text
+from valveflow_ros.report.words import moment
+from valveflow_ros.signals.align import Aligner
+
+_CURVE = 'valveflow_msgs/msg/FlowCharacteristic'
+_ALARM = 'valveflow_msgs/msg/Alarm'
+_DIAGNOSIS = 'valveflow_msgs/msg/Diagnosis'
+_UNKNOWN = 0  # verdict of a diagnosis that says nothing yet
+# Without diagnoses; each takes as long as `diagnose` over the window.
+_NO_DIAGNOSIS = {'diagnosis_on_mismatch': False, 'diagnosis_hour': -1}
+
+Found = TypeVar('Found')
+Item = TypeVar('Item')
+
+
+@dataclass(frozen=True, slots=True)
+class MonitorResult(Result):
+    """What a monitor tells over a log.
+
+    Attributes
+    ----------
+    source : str
+        Name of the log.
+    events : tuple of Event
+        Everything the engine said, in order.
+    start_ns, end_ns : int
+        First and last row.
+    settings : Settings
+    """
+
+    verb = 'monitor'
+    source: str
+    events: tuple[Event, ...]
+    start_ns: int
+    end_ns: int
+    settings: Settings
+
+    @property
+    def curves(self) -> list[tuple[int, Characteristic]]:
+        """Return each curve with the time (ns) of the row after which it was adopted."""
+        adopted = [e.characteristic for e in self.events if isinstance(e, CurveAdopted)]
+        times = [
+            e.time_ns
+            for e in self.events
+            if isinstance(e, JournalEntry) and e.kind == JournalKind.FIT_ADOPTED
+        ]
+        return list(zip(times, adopted, strict=True))
+
+    @property
+    def alarms(self) -> list[AlarmChange]:
+        """Return the changes of the alarms' states, without mere repetitions."""
+        changes = [e for e in self.events if isinstance(e, AlarmChange)]
+        return [c for c in changes if c.state != c.previous]
+
+    @property
+    def diagnoses(self) -> list[tuple[int, dict[str, Any]]]:
+        """Return each diagnosis: the newest row (ns) it saw, and what its JSON would hold."""
+        ended = [e for e in self.events if isinstance(e, Diagnosed) and e.content]
+        return [(e.task.window_end_ns, json.loads(e.content)) for e in ended]
+
+    def predictions(self) -> dict[str, IntArray | FloatArray]:
+        """Return the predictions as arrays of shape (rows,), named as in `PredictionBlock`."""
+        blocks = [e for e in self.events if isinstance(e, PredictionBlock)]
+        names = ('time_ns', 'u', 'measured_mw', 'static_mw', 'dynamic_mw', 'residual_mw',
+                 'average_mw', 'evidence', 'shift_mw', 'state')  # fmt: skip
+        return {n: np.concatenate([getattr(b, n) for b in blocks]) for n in names if blocks}
+
+    def history(self) -> History:
+        """Return curves, alarms and diagnoses as the reports show them."""
+        return History(
+            self.start_ns,
+            self.end_ns,
+            tuple(_curve_moment(at, c) for at, c in self.curves),
+            tuple(AlarmMoment(a.time_ns, a.name, a.state, a.sentence) for a in self.alarms),
+            tuple(DiagnosisMoment(at, d['sentence']) for at, d in self.diagnoses),
+        )
+
+    def page(self) -> Page:
+        """Return the report: how the curve moved, and what the monitor said."""
+        lead = paragraph(text(self.source), 'where')
+        lead += paragraph(f'{moment(self.start_ns)} to {moment(self.end_ns)}', 'where')
+        sections = history_sections(self.history()) or [
+            Section('What the monitor said', [paragraph('No curve was found, and no alarm rose.')])
+        ]
+        foot = (
+            f'Made by valveflow {text(__version__)}. The same numbers, unrounded, stand in '
+            'monitor.json beside this page.'
+        )
+        return Page('What the monitor would have told', lead, sections, foot, self.verb)
+
+    def texts(self) -> dict[str, str]:
+        """Return ``monitor.json``; times are ns since 1970."""
+        content = {
+            'format': 'valveflow/monitor',
+            'version': 1,
+            'alarms': self._alarms_json(),
+            'curves': [
+                {
+                    'adopted': at,
+                    'model_id': c.model_id,
+                    'window_from': c.source.window_start_ns,
+                    'window_to': c.source.window_end_ns,
+                }
+                for at, c in self.curves
+            ],
+            'diagnoses': [
+                {
+                    'time': at,
+                    'verdict': d['verdict'],
+                    'causes': [cause['name'] for cause in d['causes']],
+                }
+                for at, d in self.diagnoses
+            ],
+            'reference': None,
+        }
+        return {'monitor.json': json.dumps(content, indent=2, allow_nan=False) + '\n'}
+
+    def _alarms_json(self) -> list[dict[str, Any]]:
+        """Return one entry for each time that an alarm rose."""
+        found: dict[tuple[str, int], dict[str, Any]] = {}
+        for change in self.alarms:
+            stands = change.state in (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
+            key = change.name, change.occurrence
+            if stands:
+                found.setdefault(
+                    key,
+                    {'name': change.name, 'raised': change.time_ns, 'cleared': None,
+                     'state': '', 'sentence': change.sentence},
+                )  # fmt: skip
+            if key in found:
+                found[key]['state'] = change.state.name.lower()
+                found[key]['cleared'] = None if stands else found[key]['cleared'] or change.time_ns
+        return list(found.values())
+
+
+def monitor(
+    log: Any,
+    *,
+    parameters: Mapping[str, Any] | None = None,
+    diagnose: bool = True,
+    progress: Progress = SILENT,
+) -> MonitorResult:
+    """Run the monitor over a log, as fast as it goes, with every fit computed in place.
+
+    Parameters
+    ----------
+    log : Log, str, Path or pandas.DataFrame
+        What `open_log` returned, or anything it opens.
+    parameters : mapping, optional
+        Parameters of the monitor by name. What follows from the step of the data is adapted.
+    diagnose : bool
+        Also compute the diagnoses that the monitor asks for; each takes as long as `diagnose`.
+    progress : Progress
+
+    Raises
+    ------
+    DataError
+        A needed signal has no usable value.
+    RecordingError, InputError
+        A file cannot be read, or a parameter is wrong.
+    """
+    log = as_log(log, progress)
+    given = {**({} if diagnose else _NO_DIAGNOSIS), **(parameters or {})}
+    # The window stays as long as that of a live monitor, however long the log is.
+    settings, notes = settings_for(log.steps(), 0.0, given, live=True)
+    for sentence in notes:
+        progress.say(sentence)
+    aligner, engine = Aligner(settings), Monitor(settings)
+    events: list[Event] = []
+    tables: list[SampleTable] = []
+    for aligned in aligned_blocks(aligner, log.readings, progress, 'monitoring'):
+        tables.append(aligned.table)
+        events += feed_aligned(engine, aligned, lambda task: diagnose_window(task).text)
+    table = SampleTable.concatenate(tables)
+    check_signals(table, aligner.counts())
+    times = table.time_ns
+    return MonitorResult(log.name, tuple(events), int(times[0]), int(times[-1]), settings)
+
+
+def _curve_moment(time_ns: int, c: Characteristic) -> CurveMoment:
+    ends = np.array(c.breakpoint_intervals, dtype=np.float64).reshape(-1, 2)
+    return CurveMoment(
+        time_ns, c.model_id, c.pressure_exponent, c.breakpoints, c.values(), ends[:, 0],
+        ends[:, 1], c.residuals.rmse_mw,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class _AlarmMessage:
+    """A message about an alarm, and whether the alarm was in that state before."""
+
+    time_ns: int
+    moment: AlarmMoment
+    again: bool
+
+
+def recorded_history(log: LogContents) -> History | None:
+    """Return what a monitor published; None if the log is no monitor's recording.
+
+    Topics are taken by their type: the node may have any name. What cannot be decoded
+    becomes a sentence among the notes.
+    """
+    notes: list[str] = []
+    curves = _all(log, _CURVE, _curve, notes)
+    alarms = _all(log, _ALARM, _alarm, notes)
+    diagnoses = _all(log, _DIAGNOSIS, _diagnosis, notes)
+    if not (curves or alarms or diagnoses or notes):
+        return None
+    times = [x.time_ns for part in (curves, alarms, diagnoses) for x in part]
+    if len(log.readings):
+        times += [int(log.readings.time_ns.min()), int(log.readings.time_ns.max())]
+    return History(
+        min(times, default=0),
+        max(times, default=0),
+        # What is latched is published again and again, and all that stands at a new start.
+        tuple(_once(sorted(curves, key=lambda c: c.time_ns), lambda c: c.model_id)),
+        tuple(_changes(sorted(alarms, key=lambda a: a.time_ns))),
+        tuple(_once(sorted(diagnoses, key=lambda d: d.time_ns), lambda d: d)),
+        tuple(notes),
+    )
+
+
+def _all(
+    log: LogContents,
+    kind: str,
+    made: Callable[[dict[str, Any]], Found | None],
+    notes: list[str],
+) -> list[Found]:
+    """Return what the messages of one type say; of several topics only the first is taken."""
+    topics = sorted(t.name for t in log.topics.values() if t.type == kind and t.count)
+    if not topics:
+        return []
+    if len(topics) > 1:
+        notes.append(
+            f'The log holds {kind.rsplit("/", 1)[-1]} messages on {" and ".join(topics)}; '
+            f'only {topics[0]} is shown.'
+        )
+    try:
+        return [x for m in _decoded(log, topics[0]) if (x := made(m)) is not None]
+    except (RecordingError, KeyError, TypeError, ValueError) as error:
+        told = f'it lacks {error}.' if isinstance(error, KeyError) else str(error)
+        notes.append(f'What the monitor published on {topics[0]} cannot be shown: {told}')
+        return []
+
+
+def _decoded(log: LogContents, topic: str) -> Iterator[dict[str, Any]]:
+    decoder = log.decoder(topic)
+    for message in log.iter_messages([topic]):
+        yield decoder.decode(message.data)
+
+
+def _stamp(message: dict[str, Any]) -> int:
+    stamp = message['header']['stamp']
+    return int(stamp['sec']) * NS_PER_S + int(stamp['nanosec'])
+
+
+def _curve(message: dict[str, Any]) -> CurveMoment | None:
+    """Return a curve; None while there is none to show."""
+    u = np.array(message['breakpoints'], dtype=np.float64)
+    power = np.array(message['values'], dtype=np.float64)
+    low = np.array(message['breakpoint_low'], dtype=np.float64)
+    high = np.array(message['breakpoint_high'], dtype=np.float64)
+    finite = np.all(np.isfinite(u)) and np.all(np.isfinite(power))
+    if len(u) < 2 or len(power) != len(u) or not finite or np.any(np.diff(u) <= 0.0):
+        return None
+    if len(low) != len(u) - 2 or len(high) != len(u) - 2:
+        low = high = np.full(len(u) - 2, np.nan)
+    return CurveMoment(
+        _stamp(message), str(message['model_id']), float(message['pressure_exponent']), u, power,
+        low, high, float(message['rmse_mw']),
+    )  # fmt: skip
+
+
+def _alarm(message: dict[str, Any]) -> _AlarmMessage:
+    moment = AlarmMoment(
+        _stamp(message), str(message['name']), AlarmState(message['state']),
+        str(message['sentence']),
+    )  # fmt: skip
+    return _AlarmMessage(moment.time_ns, moment, message.get('previous_state') == moment.state)
+
+
+def _diagnosis(message: dict[str, Any]) -> DiagnosisMoment | None:
+    if message['verdict'] == _UNKNOWN or not message['sentence']:
+        return None
+    return DiagnosisMoment(_stamp(message), str(message['sentence']))
+
+
+def _once(items: Iterable[Item], key: Callable[[Item], Hashable]) -> list[Item]:
+    """Return each item when it first came."""
+    first: dict[Hashable, Item] = {}
+    for item in items:
+        first.setdefault(key(item), item)
+    return list(first.values())
+
+
+def _changes(words: list[_AlarmMessage]) -> list[AlarmMoment]:
+    """Return the changes: that an alarm still stands, which is told every day, is none.
+
+    The first word of a standing alarm counts even so: it stood when the recording began.
+    """
+    known: set[str] = set()
+    found = []
+    for word in _once(words, lambda w: w.moment):
+        first = word.moment.name not in known and word.moment.state != AlarmState.NORMAL
+        known.add(word.moment.name)
+        if first or not word.again:
+            found.append(word.moment)
+    return found

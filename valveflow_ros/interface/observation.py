@@ -1,0 +1,248 @@
+"""Run the engine over a finished log: align, find special segments, ask for one fit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.regional_model import RegionalModel
+from valveflow_ros.diagnosis.corrector import corrector_of
+from valveflow_ros.diagnosis.extended import ExtendedModel
+from valveflow_ros.errors import DataError
+from valveflow_ros.fit.fit import fit, outline
+from valveflow_ros.fit.task import FitTask
+from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface.logs import Log
+from valveflow_ros.interface.settings import settings_for
+from valveflow_ros.monitoring.events import FitRequested
+from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.monitoring.offline import feed_aligned
+from valveflow_ros.monitoring.rows import Corrector
+from valveflow_ros.numerics import ahead
+from valveflow_ros.parameters import Settings
+from valveflow_ros.records import (
+    NS_PER_S,
+    SIGNALS,
+    IntArray,
+    Readings,
+    SampleTable,
+    SpecialSegment,
+)
+from valveflow_ros.report.data import REASON_WORDS
+from valveflow_ros.report.first_run import SENTENCE, is_first_run
+from valveflow_ros.report.words import duration
+from valveflow_ros.segments.kernel import WARM_UP, WINDOW
+from valveflow_ros.signals.align import Aligned, Aligner
+
+_NEEDED = tuple(i for i in SIGNALS if i.required and i.topic != 'main_steam_temperature')
+_BLOCK = 200_000  # readings between two reports of progress
+LEARN_SHARE = 2.0 / 3.0
+Counts = dict[str, dict[str, int]]
+
+
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """A log after the engine saw it, and what is needed for a fit.
+
+    Attributes
+    ----------
+    table : SampleTable
+        The rows in the engine's window; where the clock went back without those it had passed.
+    rows : int64 (n,)
+        Their places among all rows of the log.
+    segments : tuple of SpecialSegment
+    counts : dict
+        ``{topic: {reason: readings}}``.
+    task : FitTask
+    clock_resets : int
+        How often the clock went back.
+    """
+
+    table: SampleTable
+    rows: IntArray
+    segments: tuple[SpecialSegment, ...]
+    counts: Counts
+    task: FitTask
+    clock_resets: int
+
+    def fit(self, progress: Callable[[float, str], None] = SILENT) -> Characteristic:
+        """Return the curve; raises `DataError` with the reason if the data carry none."""
+        return fit(self.task, lambda what: progress(0.6, what))
+
+    def outline(self, progress: Callable[[float, str], None] = SILENT) -> RegionalModel:
+        """Return curve and dynamics to begin a diagnosis with; raises `DataError` as `fit`."""
+        return outline(self.task, lambda what: progress(0.6, what))
+
+
+def settings_of(
+    log: Log, given: Mapping[str, Any], progress: Progress, constants: bool = True
+) -> tuple[Settings, list[str]]:
+    """Return the settings for a log, and report what was adapted.
+
+    Raises
+    ------
+    ParameterError
+        Values are at odds with each other.
+    """
+    settings, notes = settings_for(log.steps(), log.span_s, given)
+    if constants:
+        notes += [
+            f'{SIGNALS[s].topic} was not logged and is taken as {value:g} {SIGNALS[s].unit}.'
+            for s, value in sorted(log.constants.items())
+        ]
+    for sentence in notes:
+        progress.say(sentence)
+    return settings, notes
+
+
+def observe(
+    readings: Readings,
+    settings: Settings,
+    progress: Callable[[float, str], None] = SILENT,
+    corrector: Corrector | None = None,
+) -> Observed:
+    """Feed readings to a monitor and ask it for a fit.
+
+    With a ``corrector`` everything sees the rows freed of its causes.
+
+    Raises
+    ------
+    DataError
+        There is nothing that could be fitted; the sentence says what is missing.
+    """
+    aligner, monitor = Aligner(settings), Monitor(settings)
+    tables: list[SampleTable] = []
+    resets = 0
+    blocks = aligned_blocks(aligner, readings, progress, 'finding segments')
+    for aligned in ahead(_corrected(blocks, corrector)):
+        resets += len(aligned.resets)
+        tables.append(aligned.table)
+        feed_aligned(monitor, aligned)
+    table, counts = SampleTable.concatenate(tables), aligner.counts()
+    check_signals(table, counts)
+    if not monitor.segments:
+        raise DataError(_no_segment(table, settings, monitor.noise().learnt))
+    task = next(e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
+    # A log longer than the window is longer than what the fit sees.
+    rows = monitor.numbers()
+    if corrector is not None:
+        task = replace(task, held=corrector.held)
+    return Observed(table.take(rows), rows, monitor.special_segments(), counts, task, resets)
+
+
+def observe_log(
+    log: Log, settings: Settings, progress: Progress, model: ExtendedModel | None = None,
+    shown: Callable[[float, str], None] | None = None,
+) -> Observed:  # fmt: skip
+    """Observe a log as `observe` does; with a ``model`` its causes are taken out of the rows."""
+    if is_first_run():
+        progress.say(SENTENCE)
+    corrector = None if model is None else corrector_of(model, settings.real('sample_period'))
+    return observe(log.readings, settings, shown or progress, corrector)
+
+
+def align(
+    readings: Readings,
+    settings: Settings,
+    progress: Callable[[float, str], None] = SILENT,
+    corrector: Corrector | None = None,
+) -> tuple[SampleTable, IntArray, Counts]:
+    """Return all rows, the rows before which the clock was set back, and the counts."""
+    aligner = Aligner(settings)
+    tables: list[SampleTable] = []
+    resets: list[int] = []
+    blocks = aligned_blocks(aligner, readings, progress, 'putting rows together')
+    for aligned in _corrected(blocks, corrector):
+        resets += [sum(map(len, tables)) + int(k) for k in aligned.resets]
+        tables.append(aligned.table)
+    table = SampleTable.concatenate(tables)
+    return table, np.array(resets, dtype=np.int64), aligner.counts()
+
+
+def aligned_blocks(
+    aligner: Aligner, readings: Readings, progress: Callable[[float, str], None], what: str
+) -> Iterator[Aligned]:
+    """Yield the rows block by block, with those that only the end closes."""
+    for start in range(0, len(readings), _BLOCK):
+        progress(0.1 + 0.4 * start / len(readings), what)
+        yield aligner.feed(readings.part(start, min(start + _BLOCK, len(readings))))
+    yield aligner.finish()
+
+
+def _corrected(blocks: Iterator[Aligned], corrector: Corrector | None) -> Iterator[Aligned]:
+    """Yield blocks whose rows are freed of the causes of a corrector, if there is one."""
+    if corrector is None:
+        yield from blocks
+        return
+    for block in blocks:
+        tables, start = [], 0
+        for reset in block.resets.tolist():
+            tables.append(corrector.correct(block.table.part(start, reset)))
+            corrector.restart()
+            start = reset
+        tables.append(corrector.correct(block.table.part(start, len(block.table))))
+        yield Aligned(SampleTable.concatenate(tables), block.resets)
+
+
+def cut_in_two(log: Log, block_s: float) -> tuple[Log, Log]:
+    """Return the first two thirds of a log and the last, cut at the border of a block.
+
+    Parameters
+    ----------
+    log : Log
+    block_s : float
+        Length of the segmenter's blocks.
+    """
+    r = log.readings
+    first, last = int(r.time_ns.min()), int(r.time_ns.max())
+    block = max(1, round(block_s * NS_PER_S))
+    cut = first + int(LEARN_SHARE * (last - first)) // block * block
+
+    def part(mask: Any) -> Log:
+        kept = Readings(r.time_ns[mask], r.signal[mask], r.value[mask], r.quality[mask])
+        return replace(log, readings=kept)
+
+    return part(r.time_ns < cut), part(r.time_ns >= cut)
+
+
+def check_signals(table: SampleTable, counts: Counts) -> None:
+    """Refuse a log in which a needed signal has no usable value; say which and why.
+
+    Raises
+    ------
+    DataError
+    """
+    for info in _NEEDED:
+        if len(table) and np.isfinite(table.column(info.signal)).any():
+            continue
+        refused = {r: n for r, n in counts[info.topic].items() if n and r != 'accepted'}
+        if not refused:
+            raise DataError(
+                f'The log has no {info.topic}; name yours with --column {info.topic}=THEIRS, '
+                f'or give --constant {info.topic}=VALUE if it hardly changes.'
+            )
+        told = ', '.join(f'{n} {REASON_WORDS.get(r, r)}' for r, n in refused.items())
+        raise DataError(f'{info.topic} has no usable value: {told}.')
+
+
+def _no_segment(table: SampleTable, settings: Settings, learnt: bool) -> str:
+    needed = [info.signal for info in _NEEDED]
+    usable = int(np.isfinite(table.values[:, needed]).all(axis=1).sum())
+    span = duration(usable * settings.real('sample_period'))
+    if not learnt:
+        first = duration(WARM_UP * WINDOW * settings.real('block'))
+        return (
+            f'The log holds {span} of usable data; it takes {first} without gaps to learn the '
+            'noise of the signals, and special segments after that to find the curve.'
+        )
+    least = settings.settle_s + min(settings.real('steady_min'), settings.real('slope_min'))
+    return (
+        f'No steady-state or slope-response segment was found in {span} of data: the valve must '
+        f'rest, or move along a straight ramp, for {duration(least)} or longer at a time. '
+        'A longer log, or shorter times by --set time_constant, delay, steady_min and slope_min, '
+        'may help.'
+    )

@@ -1,0 +1,211 @@
+"""Parameters of the monitor that follow from a log of the plant, and the file with them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from valveflow_ros import __version__
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.errors import DataError
+from valveflow_ros.fit.fit import fit
+from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface.logs import Log, as_log
+from valveflow_ros.interface.observation import aligned_blocks
+from valveflow_ros.interface.settings import ONE_FIT, fitting
+from valveflow_ros.monitoring.events import FitRequested
+from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.monitoring.offline import feed_aligned
+from valveflow_ros.parameters import PARAMETERS, TABLE, Settings, Value, as_yaml
+from valveflow_ros.records import SIGNALS
+from valveflow_ros.report.terminal.text import clean
+from valveflow_ros.report.words import duration
+from valveflow_ros.signals.align import Aligner
+from valveflow_ros.signals.units import air_in
+
+# A transient cut short spoils segments, one too long only costs some: up in small steps,
+# down in large ones.
+_MORE, _LESS = 0.05, 0.2
+_SURE = 2.0  # standard errors
+_OF_STEP = ('sample_period', 'hold_limit', 'lateness', 'block', 'longest_segment', 'alarm_block',
+            'alarm_average')  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class FittedValue:
+    """A parameter that follows from the data, and from what."""
+
+    name: str
+    value: Value
+    ground: str
+
+    @property
+    def shown(self) -> str:
+        """Return the value with its unit."""
+        unit = PARAMETERS[self.name].unit
+        text = f'{self.value:g}' if isinstance(self.value, float) else str(self.value)
+        return f'{text} {unit}'.strip()
+
+
+class Fitted(dict[str, FittedValue]):
+    """Fitted parameters by name; ``left`` has a sentence for each that could not be fitted."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.left: list[str] = []
+
+    def put(self, name: str, value: Value, ground: str) -> None:
+        """Add one."""
+        self[name] = FittedValue(name, PARAMETERS[name].check(value), clean(ground))
+
+    def changes(self) -> dict[str, Value]:
+        """Return the values alone."""
+        return {name: one.value for name, one in self.items()}
+
+
+def fit_parameters(log: Any, unit_tag: str = '', *, progress: Progress = SILENT) -> Fitted:
+    """Return the parameters of the monitor that follow from a log.
+
+    Parameters
+    ----------
+    log : Log, str, Path or pandas.DataFrame
+        What `open_log` returned, or anything it opens.
+    unit_tag : str
+        Tag of the unit.
+    progress : Progress
+
+    Raises
+    ------
+    DataError
+        It holds no readings.
+    """
+    log = as_log(log, progress)
+    if not len(log.readings):
+        raise DataError(f'{log.contents.path} holds no readings of the inputs.')
+    found = Fitted()
+    if unit_tag:
+        found.put('unit_tag', unit_tag, 'as you said')
+    _units(log, found)
+    _steps(log, found)
+    settings = Settings({**found.changes(), **_window(log, found), **ONE_FIT})
+    monitor = Monitor(settings)
+    for aligned in aligned_blocks(Aligner(settings), log.readings, progress, 'finding segments'):
+        feed_aligned(monitor, aligned)
+    _noise(monitor, found)
+    _dynamics(monitor, found, progress)
+    return found
+
+
+def _units(log: Log, found: Fitted) -> None:
+    for signal, unit in log.units.items():
+        name = f'{SIGNALS[signal].topic}_unit'
+        if signal in log.constants or unit == PARAMETERS[name].default:
+            continue
+        said = f"'{log.name_of(signal)}' of the log is in {unit}"
+        if unit in PARAMETERS[name].choices:
+            found.put(name, unit, said)
+            continue
+        if air_in(signal, unit):
+            said += ', a gauge pressure, and the monitor wants it absolute'
+        choices = ', '.join(PARAMETERS[name].choices)
+        found.left.append(f'{name}: {clean(said)}; let the gateway send one of {choices}.')
+
+
+def _steps(log: Log, found: Fitted) -> None:
+    measured = {s: step for s, step in log.steps().items() if s not in log.constants}
+    adapted = fitting(measured, 0.0, {})
+    if not measured:
+        return
+    quickest, slowest = min(measured.values()), max(measured.values())
+    for name in _OF_STEP:
+        if name in adapted:
+            step = slowest if name == 'hold_limit' else quickest
+            found.put(name, adapted[name], f'the log has a value every {duration(step)}')
+
+
+def _window(log: Log, found: Fitted) -> dict[str, float]:
+    """Return a window that holds the whole log; that of the monitor stays as it is."""
+    adapted = fitting(log.steps(), log.span_s, found.changes())
+    return {name: value for name, value in adapted.items() if name == 'window_days'}
+
+
+def _noise(monitor: Monitor, found: Fitted) -> None:
+    level = monitor.noise()
+    if not level.learnt:
+        found.left.append(
+            'input_noise and power_noise: the log is too short to learn the noise; the monitor '
+            'learns it while it runs.'
+        )
+        return
+    ground = 'sd of block means about a line in the log; 0 would learn it anew at each start'
+    for name, value in (('input_noise', level.input), ('power_noise', level.power_mw)):
+        if value > 0.0:
+            found.put(name, float(f'{value:.3g}'), ground)
+
+
+def _dynamics(monitor: Monitor, found: Fitted, progress: Progress) -> None:
+    kept = 'time_constant and delay: kept at their defaults, because '
+    if not monitor.segments:
+        found.left.append(f'{kept}the log shows no steady state or ramp to learn them from.')
+        return
+    task = next(e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
+    try:
+        curve = fit(task, lambda what: progress(0.6, what))
+    except DataError as error:
+        found.left.append(f'{kept}no curve could be fitted ({clean(str(error)).rstrip(".")}).')
+        return
+    if not curve.dynamics:
+        found.left.append(f'{kept}the log does not tell the dynamics.')
+        return
+    _largest(curve, found)
+
+
+def _largest(curve: Characteristic, found: Fitted) -> None:
+    for name, what, found_here in (
+        ('time_constant', 'time constant',
+         [(d.time_constant_s, d.time_constant_stderr_s) for d in curve.dynamics]),
+        ('delay', 'delay', [(d.delay_s, d.delay_stderr_s) for d in curve.dynamics]),
+    ):  # fmt: skip
+        value, error = max(found_here)
+        error = error if math.isfinite(error) else 0.0
+        default = float(PARAMETERS[name].default)
+        wanted = float(max(1, math.ceil(value + _SURE * error)))
+        if wanted > (1.0 + _MORE) * default or wanted < (1.0 - _LESS) * default:
+            ground = f'the largest {what} found in the log is {value:.3g} s'
+            if error:
+                ground += f' (standard error {error:.2g} s)'
+            found.put(name, wanted, ground)
+
+
+def parameter_file(source: str, found: Fitted) -> str:
+    """Return the text of a ROS 2 parameter file for any node name.
+
+    Parameters
+    ----------
+    source : str
+        Name of the log.
+    found : Fitted
+        Parameters that follow from it.
+
+    Raises
+    ------
+    ParameterError
+        Values are at odds with each other.
+    """
+    values = found.changes()
+    Settings(values)
+    # Names of files and columns come from others: a line break in one would end the comment.
+    lines = [
+        f'# Parameters of the monitor, fitted to {clean(source)} by valveflow {__version__}.',
+        "# Lines marked 'fitted' follow from the data; all others are the defaults.",
+        *(f'# {clean(sentence)}' for sentence in found.left),
+        *as_yaml([], {}).splitlines(),
+    ]
+    for row in TABLE:
+        about, value = as_yaml([row], values).splitlines()[2:]
+        lines.append(about)
+        if row.name in found:
+            lines.append(f'    # fitted: {clean(found[row.name].ground)}.')
+        lines.append(value)
+    return '\n'.join(lines) + '\n'

@@ -1,0 +1,207 @@
+"""Values that cannot be what their unit says, and signals that were not logged."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from valveflow_ros.errors import DataError, UsageError
+from valveflow_ros.logs.tables.match import choosing, option
+from valveflow_ros.logs.tables.refusal import THEIRS, RefusedError
+from valveflow_ros.parameters import Settings
+from valveflow_ros.records import SIGNALS, FloatArray, Quality, Readings, Signal
+from valveflow_ros.signals.units import UNITS, air_in, unit_of
+
+# What the signals of a steam unit in operation usually read, in engine units.
+_USUAL = {
+    Signal.VALVE_OPENING: (3.0, 102.0),
+    Signal.MAIN_STEAM_PRESSURE: (2.0, 35.0),
+    Signal.MAIN_STEAM_TEMPERATURE: (350.0, 680.0),
+    Signal.GENERATED_POWER: (3.0, 1800.0),
+    Signal.VALVE_COMMAND: (3.0, 102.0),
+}
+_MANY = 0.02  # share of impossible values that is reported
+_MOST = 0.5  # with so many, a column is not the signal it is named after
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """A signal whose values do not suit its unit.
+
+    Attributes
+    ----------
+    signal : Signal
+    impossible : float
+        Share of its values that the engine will reject.
+    looks_like : str
+        The unit that would suit, empty if none does.
+    sentence : str
+        What to tell a person, without the option that would help.
+    """
+
+    signal: Signal
+    impossible: float
+    looks_like: str
+    sentence: str
+
+    def advice(self, theirs: str) -> str:
+        """Return the sentence with the exact option that helps; ``theirs`` is the column."""
+        if not self.looks_like:
+            return self.sentence
+        chosen = option(SIGNALS[self.signal].topic, theirs, self.looks_like)
+        return f'{self.sentence} If so, add {chosen}'
+
+
+def limits(signal: Signal, settings: Settings) -> tuple[float, float]:
+    """Return the range outside of which a value is rejected."""
+    name = 'valve_opening' if signal == Signal.VALVE_COMMAND else SIGNALS[signal].topic
+    return settings.real(f'{name}_low'), settings.real(f'{name}_high')
+
+
+def doubt(signal: Signal, written: FloatArray, unit: str, settings: Settings) -> Doubt | None:
+    """Judge the values of one signal.
+
+    Parameters
+    ----------
+    written : float64 (n,)
+        As they stand in the log.
+    unit : str
+        The unit they are taken to have.
+    """
+    written = written[np.isfinite(written)]
+    if not len(written):
+        return None
+    low, high = limits(signal, settings)
+    taken = unit_of(signal, unit)
+    values = written * taken.scale + taken.offset
+    impossible = float(((values < low) | (values > high)).mean())
+    looks_like = _better_unit(signal, written, unit, (low, high))
+    if impossible < _MANY and not looks_like:
+        return None
+    info = SIGNALS[signal]
+    runs = f'its values run from {written.min():g} to {written.max():g}'
+    if impossible >= _MANY:
+        share = 'all' if impossible == 1.0 else f'{100.0 * impossible:.0f} %'
+        sentence = (
+            f'{info.topic}: {runs} and are taken as {unit}; {share} of them are impossible '
+            f'(outside {low:g} to {high:g} {info.unit}) and will be rejected.'
+        )
+    else:
+        sentence = f'{info.topic}: {runs} and are taken as {unit}, which is unusual.'
+    if looks_like:
+        sentence += f' They look like {looks_like}.'
+    return Doubt(signal, impossible, looks_like, sentence)
+
+
+def _better_unit(
+    signal: Signal, written: FloatArray, unit: str, allowed: tuple[float, float]
+) -> str:
+    """Return the unit in which the values would be usual when in their own they are not."""
+    middle = float(np.median(written))
+    low, high = _USUAL[signal]
+
+    def usual(name: str) -> bool:
+        other = unit_of(signal, name)
+        values = written * other.scale + other.offset
+        inside = (values >= allowed[0]) & (values <= allowed[1])
+        return low <= middle * other.scale + other.offset <= high and bool(inside.mean() > 0.95)
+
+    own = unit_of(signal, unit)
+    if usual(unit):
+        return ''
+    others = (name for name, other in UNITS[signal].items() if other != own and usual(name))
+    return next(others, '')
+
+
+def refuse_guesses(
+    path: object, doubts: Iterable[Doubt], guessed: Container[Signal], names: dict[Signal, str]
+) -> None:
+    """Refuse the columns that were found by their names and whose values speak against it.
+
+    Raises
+    ------
+    RefusedError
+        With the options that would help.
+    """
+    problems, remedies = [], []
+    for found in doubts:
+        if found.signal in guessed and (found.looks_like or found.impossible > _MOST):
+            theirs = names[found.signal]
+            topic = SIGNALS[found.signal].topic
+            said = found.advice(theirs)
+            remedy = choosing(topic, theirs, found.looks_like)
+            if not found.looks_like:
+                chosen = option(topic, theirs, SIGNALS[found.signal].unit)
+                said += f' If it is that signal all the same, add {chosen}; if not, name the right'
+                said += f' one with --column {topic}={THEIRS}[:unit]'
+                remedy = choosing(topic, THEIRS)
+            said = said.removeprefix(f'{topic}: ')
+            problems.append(f"'{theirs}' reads like {topic}, but {said}")
+            remedies.append(remedy)
+    if problems:
+        raise RefusedError(path, problems, remedies, last=True)
+
+
+def air_note(signal: Signal, unit: str, theirs: str) -> str:
+    """Return the sentence on what is added to a gauge pressure, empty for other units."""
+    air = air_in(signal, unit)
+    if not air:
+        return ''
+    return (
+        f"'{theirs}' is a gauge pressure ({unit}); {air:.6g} {unit.removesuffix('g')} of air, the "
+        'standard atmosphere, are added to make it absolute.'
+    )
+
+
+def check_constants(constants: dict[Signal, float]) -> None:
+    """Refuse constants that the engine would reject at each row.
+
+    Raises
+    ------
+    UsageError
+    """
+    settings = Settings()
+    for signal, value in constants.items():
+        low, high = limits(signal, settings)
+        if not low <= value <= high:
+            info = SIGNALS[signal]
+            others = ', '.join(list(UNITS[signal])[1:])
+            raise UsageError(
+                f'--constant {info.topic}: {value:g} {info.unit} is impossible ({low:g} to '
+                f'{high:g} {info.unit}); for another unit write {info.topic}=VALUE:UNIT with one '
+                f'of {others}.'
+            )
+
+
+def with_constants(readings: Readings, constants: dict[Signal, float]) -> Readings:
+    """Put each constant beside every reading of a measured signal.
+
+    Raises
+    ------
+    DataError
+        If no signal is measured.
+    """
+    if not constants:
+        return readings
+    kept = ~np.isin(readings.signal, [int(s) for s in constants])
+    readings = Readings(
+        readings.time_ns[kept], readings.signal[kept], readings.value[kept],
+        readings.quality[kept],
+    )  # fmt: skip
+    measured = [i.signal for i in SIGNALS if i.required and i.signal not in constants]
+    lead = next((s for s in measured if (readings.signal == s).any()), None)
+    if lead is None:
+        raise DataError('Every signal is a constant or missing; nothing is left to learn from.')
+    beside = np.flatnonzero(readings.signal == lead)
+    for signal, value in sorted(constants.items()):
+        n = len(beside)
+        readings = Readings(
+            np.insert(readings.time_ns, beside, readings.time_ns[beside]),
+            np.insert(readings.signal, beside, np.full(n, int(signal), dtype=np.int8)),
+            np.insert(readings.value, beside, np.full(n, value)),
+            np.insert(readings.quality, beside, np.full(n, int(Quality.GOOD), dtype=np.uint8)),
+        )
+        beside = beside + np.arange(1, n + 1)
+    return readings

@@ -1,0 +1,217 @@
+"""Parameters for a log: from its own step, a file, and what a person sets, in this order."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from valveflow_ros.errors import InputError, ParameterError, RecordingError, UsageError
+from valveflow_ros.interface.files import reason
+from valveflow_ros.parameters import PARAMETERS, Settings, parameter
+from valveflow_ros.records import Signal
+
+_ROUND_S = (1.0, 2.0, 5.0, 6.0, 10.0, 12.0, 15.0, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0, 900.0,
+            1800.0, 3600.0)  # fmt: skip
+# A finished log is fitted once, at its end, whatever a live monitor would do.
+ONE_FIT = {'refit_period': 0.0, 'refit_segments': 0}
+_TRUE, _FALSE = ('true', 'yes', 'on'), ('false', 'no', 'off')
+
+
+def sample_period(steps: Mapping[Signal, float]) -> float:
+    """Return the step of the table that suits readings with these steps, in s.
+
+    The quickest signal decides; below the default of one second the engine
+    averages anyway, so the table is never finer than that by itself.
+    """
+    base = float(PARAMETERS['sample_period'].default)
+    if not steps:
+        return base
+    step = min(steps.values())
+    if step <= 1.05 * base:
+        return base
+    for nice in _ROUND_S:
+        if abs(step - nice) <= 0.05 * nice:
+            return nice
+    return min(float(f'{step:.3g}'), 3600.0)
+
+
+def fitting(
+    steps: Mapping[Signal, float], span_s: float, given: Mapping[str, object]
+) -> dict[str, float]:
+    """Return the parameters that follow from the data and differ from the defaults.
+
+    Parameters
+    ----------
+    steps : mapping
+        Median step of each signal in s.
+    span_s : float
+        Length of the log.
+    given : mapping
+        What a person has set; it decides over what would be inferred.
+    """
+    default = {name: row.default for name, row in PARAMETERS.items()}
+    period = given.get('sample_period', sample_period(steps))
+    if isinstance(period, bool) or not isinstance(period, int | float):
+        return {}
+    slowest = max([period, *steps.values()])
+    block = max(float(default['block']), float(period))
+    longest = max(float(default['longest_segment']), 30.0 * block)
+    wanted = {
+        'sample_period': float(period),
+        'hold_limit': max(float(default['hold_limit']), 2.5 * slowest),
+        'lateness': max(float(default['lateness']), float(period)),
+        'block': block,
+        'longest_segment': longest,
+        'alarm_block': max(float(default['alarm_block']), 2.0 * float(period)),
+        'alarm_average': max(float(default['alarm_average']), 5.0 * float(period)),
+        'window_days': _window_days(span_s, float(period), longest),
+    }
+    return {
+        name: min(max(value, PARAMETERS[name].low or value), PARAMETERS[name].high or value)
+        for name, value in wanted.items()
+        if name not in given and value != default[name]
+    }
+
+
+def _window_days(span_s: float, period: float, longest_s: float) -> float:
+    """Return a window that holds the whole log, not shorter than the default.
+
+    Of rows finer than usual only as many as the log has, for the sake of memory.
+    """
+    fine = period < float(PARAMETERS['sample_period'].default)
+    least = 1.1 * longest_s / 86400.0 if fine else float(PARAMETERS['window_days'].default)
+    return max(least, math.ceil(100.0 * (span_s / 86400.0 + 0.01)) / 100.0)
+
+
+def read_parameters(file: Path | None, pairs: Sequence[str]) -> dict[str, Any]:
+    """Return what a person has set: the file's values, then those of ``--set``.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be read.
+    InputError
+        The file is no parameter file; a name or value in it is wrong.
+    UsageError
+        A name or value of ``--set`` is wrong.
+    """
+    given: dict[str, Any] = {} if file is None else _from_file(file)
+    for text in pairs:
+        name, equals, value = text.partition('=')
+        if not equals or not name.strip():
+            raise UsageError(f"--set '{text}' is not of the form NAME=VALUE.")
+        try:
+            given[name.strip()] = parameter(name.strip()).check(
+                _value(name.strip(), value.strip())
+            )
+        except ParameterError as error:
+            raise UsageError(str(error)) from None
+    return given
+
+
+def _value(name: str, text: str) -> object:
+    """Read a text as what the parameter is."""
+    default = parameter(name).default
+    if isinstance(default, str):
+        return text
+    if isinstance(default, bool):
+        word = text.lower()
+        return word in _TRUE if word in _TRUE + _FALSE else text
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _from_file(file: Path) -> dict[str, Any]:
+    try:
+        content = yaml.safe_load(file.read_text(encoding='utf-8'))
+    except OSError as error:
+        raise RecordingError(file, f'cannot be read ({reason(error)})') from None
+    except (yaml.YAMLError, UnicodeDecodeError, ValueError) as error:
+        told = ' '.join(str(error).split())
+        raise InputError(f'{file} is no YAML file: {told}.') from None
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise InputError(f'{file} is no parameter file: it must hold names and values.')
+    try:
+        return {name: parameter(name).check(value) for name, value in _flat(content).items()}
+    except ParameterError as error:
+        raise InputError(f'{file}: {error}') from None
+
+
+def _flat(content: dict[Any, Any]) -> dict[str, Any]:
+    """Take the values out of ``node: ros__parameters:`` or from the top."""
+    values: dict[str, Any] = {}
+    for name, value in content.items():
+        if isinstance(value, dict):
+            inner = value.get('ros__parameters', value)
+            values |= _flat(inner if isinstance(inner, dict) else {})
+        elif name != 'use_sim_time':
+            values[str(name)] = value
+    return values
+
+
+def settings_for(
+    steps: Mapping[Signal, float],
+    span_s: float,
+    given: Mapping[str, object],
+    *,
+    live: bool = False,
+) -> tuple[Settings, list[str]]:
+    """Return the complete settings for a log, and sentences about what was adapted.
+
+    The curve is fitted once, at the end, unless all is to go as in a ``live`` monitor.
+
+    Raises
+    ------
+    ParameterError
+        Values are at odds with each other.
+    """
+    adapted = fitting(steps, span_s, given)
+    settings = Settings({**adapted, **given, **({} if live else ONE_FIT)})
+    return settings, _words(adapted, given, settings, steps, span_s)
+
+
+def _words(
+    adapted: Mapping[str, float],
+    given: Mapping[str, object],
+    settings: Settings,
+    steps: Mapping[Signal, float],
+    span_s: float,
+) -> list[str]:
+    said = []
+    period = settings.real('sample_period')
+    told = [
+        f'{name} {adapted[name]:g} {PARAMETERS[name].unit}'
+        for name in (
+            'hold_limit',
+            'lateness',
+            'block',
+            'longest_segment',
+            'alarm_block',
+            'alarm_average',
+        )
+        if name in adapted
+    ]
+    if 'sample_period' in adapted:
+        said.append(f'The log has a value every {period:g} s, so the table has that step.')
+    if told:
+        said.append(f'Adapted to the step of the data: {", ".join(told)}.')
+    natural = sample_period(steps)
+    if 'sample_period' in given and steps and period < 0.5 * natural:
+        said.append(
+            f'sample_period is set to {period:g} s, but the data come every {natural:g} s; '
+            'values are held in between.'
+        )
+    if span_s > 86400.0 * settings.real('window_days'):
+        said.append(
+            f'The log is longer than window_days ({settings.real("window_days"):g} d); '
+            'only its last part counts.'
+        )
+    return said
