@@ -11,8 +11,8 @@ from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import actuator
 from valveflow_ros.diagnosis.cause import Estimate, Told
 from valveflow_ros.diagnosis.causes import catalogue
-from valveflow_ros.diagnosis.confidence import Certainty
 from valveflow_ros.diagnosis.evidence import (
+    Certainty,
     Gain,
     by_segment,
     inferred,
