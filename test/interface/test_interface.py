@@ -13,8 +13,8 @@ import pytest
 
 import valveflow_ros as vf
 from valveflow_ros.errors import DataError, InputError, RecordingError, UsageError
-from valveflow_ros.logs import write_table
-from valveflow_ros.records import SIGNALS
+from valveflow_ros.logs import write_samples, write_table
+from valveflow_ros.records import SIGNALS, SampleTable, Signal
 
 needs_jit = pytest.mark.skipif(
     os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
@@ -323,3 +323,26 @@ def test_a_simulation_is_written_with_its_truth(tmp_path):
         vf.simulate(-1.0)
     with pytest.raises(InputError, match="Did you mean 'gain_drift'"):
         vf.simulate(1.0, effects=['gain_drif'])
+
+
+def recording(path, parameters):
+    table = vf.simulate(0.01, 1).data.table
+    values = table.values.copy()
+    values[:, Signal.MAIN_STEAM_PRESSURE] *= 10.0
+    sent = SampleTable(table.time_ns, values, table.quality)
+    attached = {'parameters.json': json.dumps(parameters).encode()}
+    write_samples(sent, path, attachments=attached)
+    return vf.open_log(path)
+
+
+def test_the_units_are_those_the_monitor_was_told(tmp_path):
+    log = recording(tmp_path / 'a.mcap', {'main_steam_pressure_unit': 'bar'})
+    assert log.units[Signal.MAIN_STEAM_PRESSURE] == 'bar'
+    mine = log.readings.value[log.readings.signal == Signal.MAIN_STEAM_PRESSURE]
+    assert 5.0 < mine.min() < mine.max() < 20.0
+
+
+def test_words_that_are_no_units_are_not_believed(tmp_path):
+    for k, parameters in enumerate(({'main_steam_pressure_unit': 'ell'}, {}, [1])):
+        log = recording(tmp_path / f'x_{k}' / 'a.mcap', parameters)
+        assert log.units[Signal.MAIN_STEAM_PRESSURE] == 'MPa'

@@ -124,7 +124,7 @@ class Spool:
         """
         try:
             if name not in self._files:
-                file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115 - `close` ends it
+                file: IO[bytes] = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115 - `close` ends it
                 self._files[name] = file, values.dtype
             file, dtype = self._files[name]
             file.write(np.ascontiguousarray(values, dtype).data.cast('B'))
