@@ -10,6 +10,7 @@ import sys
 import numpy as np
 import pandas as pd
 import pytest
+from extended_file import write_extended
 
 import valveflow_ros as vf
 from valveflow_ros.errors import DataError, InputError, RecordingError, UsageError
@@ -260,9 +261,8 @@ class TestMonitor:
     @pytest.fixture(scope='class')
     @classmethod
     def told(cls):
-        drifting = vf.simulate(1.0, 5, effects=['output_offset_drift:b_mw=40']).log
-        given = {**QUICK, 'refit_segments': 10}
-        return vf.monitor(drifting, diagnose=False, parameters=given)
+        drifting = vf.simulate(1.2, 5, effects=['output_offset_drift:b_mw=30']).log
+        return vf.monitor(drifting, parameters={**QUICK, 'refit_segments': 40})
 
     def test_curves_alarms_and_predictions(self, told):
         content = told.to_json()
@@ -276,10 +276,11 @@ class TestMonitor:
             assert told.start_ns < alarm['raised'] <= told.end_ns
             assert alarm['cleared'] is None or alarm['cleared'] >= alarm['raised']
             assert alarm['sentence'].endswith('.')
-        assert content['diagnoses'] == []
+        assert [d['causes'] for d in content['diagnoses']] == [['output_offset_drift']]
+        assert content['reference'] is None
         columns = told.predictions()
         assert len({len(column) for column in columns.values()}) == 1
-        assert len(columns['time_ns']) == 86400
+        assert len(columns['time_ns']) == 1.2 * 86400
         assert np.isfinite(columns['residual_mw']).any()
 
     def test_report_and_picture(self, told, tmp_path):
@@ -303,6 +304,19 @@ class TestMonitor:
         told = vf.monitor(log, parameters=given)
         ids = [e.characteristic.model_id for e in events if type(e).__name__ == 'CurveAdopted']
         assert [c.model_id for _, c in told.curves] == ids != []
+
+    def test_a_model_and_a_reference_go_with_it(self, log, identified, tmp_path):
+        model = write_extended(tmp_path / 'model.json', output_offset_drift={'b_mw': 8.0})
+        given = {**QUICK, 'refit_segments': 8}
+        told = vf.monitor(
+            log, diagnose=False, parameters=given, model=model,
+            reference=identified.characteristic,
+        )  # fmt: skip
+        model_id = identified.characteristic.model_id
+        assert told.to_json()['reference'] == {'set': told.start_ns, 'model_id': model_id}
+        assert len(told.curves) > 3
+        for _, curve in told.curves:
+            assert [h.name for h in curve.held] == ['output_offset_drift']
 
     def test_a_log_without_power_is_refused(self, simulation):
         frame = simulation.to_dataframe().head(5000).assign(generated_power_mw=np.nan)
