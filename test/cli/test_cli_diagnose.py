@@ -58,12 +58,3 @@ def test_the_page_tells_four_steps(diagnosed):
     assert 'single wild values' in page
     assert 'time (UTC)' in page
     assert 'days after' not in page
-
-
-def test_a_model_that_is_none_is_refused(run, logs, tmp_path):
-    wrong = tmp_path / 'model.json'
-    wrong.write_text('{"format": "other"}')
-    told = run('diagnose', logs / 'plant.csv', '-o', tmp_path / 'o', '--model', wrong).refused()
-    assert 'flow characteristic' in told
-    told = run('diagnose', logs / 'plant.csv', '-o', tmp_path / 'o', '--model', tmp_path / 'no')
-    assert 'cannot be read' in told.refused()

@@ -217,14 +217,6 @@ def test_wrong_parameters_are_wrong_usage(run, logs, tmp_path):
     assert not (tmp_path / 'out').exists()
 
 
-def test_a_place_that_cannot_be_a_folder_is_refused_before_the_work(run, logs, tmp_path):
-    (tmp_path / 'file').write_text('mine')
-    for place in (tmp_path / 'file', tmp_path / 'file' / 'deeper'):
-        sentence = run('identify', logs / 'plant.csv', '-o', place).refused()
-        assert 'is not a folder' in sentence
-    assert (tmp_path / 'file').read_text() == 'mine'
-
-
 def test_slow_data_are_met_with_fitting_parameters(run, tmp_path):
     log = table(240, stairs, lambda t, rng: 4.0 * stairs(t) + rng.standard_normal(len(t)),
                 step_s=60)  # fmt: skip

@@ -76,10 +76,3 @@ def test_a_curve_is_judged_against_a_reference(run, logs, tmp_path):
     page = (tmp_path / 'b' / 'report.html').read_text(encoding='utf-8')
     assert 'Against the reference' in page
     assert 'id="shift"' in page
-
-
-def test_a_reference_that_is_none_is_refused_before_any_work(run, logs, tmp_path):
-    ran = run('identify', logs / 'plant.mcap', '-o', tmp_path / 'b', '--reference',
-              tmp_path / 'gone.json')  # fmt: skip
-    assert 'gone.json: cannot be read' in ran.refused()
-    assert not (tmp_path / 'b').exists()

@@ -81,6 +81,8 @@ def test_wrong_usage_is_told_without_jargon(run, words, said):
         ['simulate', '-o', '/proc/x'],
         ['simulate', '-o', 'a.csv', '--truth', '/proc/x.json'],
         ['export', 'LOG', '-o', '/proc/x.csv'],
+        ['identify', 'LOG', '-o', 'LOG'],
+        ['identify', 'LOG', '-o', 'LOG/deeper'],
     ],
 )
 @pytest.mark.skipif(not Path('/proc/self').is_dir(), reason='there is no place like /proc here')
@@ -90,10 +92,43 @@ def test_a_place_that_takes_no_files_is_refused_before_the_work(run, tmp_path, m
     Path('LOG').write_bytes(b'nothing')
     days = ['--days', '400'] if words[0] == 'simulate' else []
     said = run(*words, *days).refused()
-    assert '/proc' in said
+    assert ('/proc' if '/proc' in ' '.join(words) else 'LOG: is not a folder') in said
     assert 'choose another' in said
+    assert Path('LOG').read_bytes() == b'nothing'
 
 
 def test_a_folder_that_was_only_tried_is_not_left_behind(tmp_path):
     check_folder(tmp_path / 'a' / 'b')
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ('content', 'part'),
+    [
+        ('{', 'holds no JSON'),
+        ('[' * 100_000, 'holds no JSON'),
+        ('{"format": "other", "pieces": 3}', 'cannot be used'),
+    ],
+)
+@pytest.mark.parametrize('words', [
+    ['identify', '--reference'], ['identify', '--model'], ['diagnose', '--model'],
+    ['validate', '--model'], ['validate', '--model', 'MODEL', '--against'],
+    ['compare', '--truth'], ['compensate', '--model'],
+])  # fmt: skip
+def test_a_file_that_is_no_model_is_refused_before_any_work(
+    run, tmp_path, identified, words, content, part
+):
+    """The log cannot even be read."""
+    (tmp_path / 'log.mcap').write_bytes(b'nothing')
+    path = tmp_path / 'wrong.json'
+    path.write_text(content)
+    verb, *more = [identified if word == 'MODEL' else word for word in words]
+    log = [] if verb == 'compensate' else [tmp_path / 'log.mcap']
+    output = tmp_path / ('o.csv' if verb == 'compensate' else 'o')
+    said = run(verb, *log, '-o', output, *more, path).refused()
+    assert part in said
+    assert 'wrong.json' in said
+    assert not output.exists()
+    path.unlink()
+    gone = run(verb, *log, '-o', output, *more, path).refused()
+    assert 'wrong.json: cannot be read (no such file' in gone

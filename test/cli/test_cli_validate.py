@@ -133,19 +133,6 @@ def test_the_exponent_is_the_models(run, logs, model, tmp_path):
     assert 'different inputs' in said or 'beyond what the curve' in said
 
 
-@pytest.mark.parametrize(
-    ('content', 'part'),
-    [(None, 'cannot be read'), ('{', 'holds no JSON'), ('{"format": "x"}', 'no flow char')],
-)
-def test_an_unreadable_model_is_refused(run, logs, tmp_path, content, part):
-    path = tmp_path / 'model.json'
-    if content is not None:
-        path.write_text(content)
-    said = run('validate', logs / 'plant.csv', '--model', path, '-o', tmp_path / 'o').refused()
-    assert part in said
-    assert 'model.json' in said
-
-
 def test_a_log_without_segments_is_refused_with_what_would_help(run, model, tmp_path):
     assert run('simulate', '-o', tmp_path / 'a.csv', '--days', '0.02').status == 0
     said = run('validate', tmp_path / 'a.csv', '--model', model(), '-o', tmp_path / 'o').refused()

@@ -10,11 +10,12 @@ import sys
 import numpy as np
 import pandas as pd
 import pytest
+from extended_file import write_extended
 
 import valveflow_ros as vf
 from valveflow_ros.errors import DataError, InputError, RecordingError, UsageError
-from valveflow_ros.logs import write_table
-from valveflow_ros.records import SIGNALS
+from valveflow_ros.logs import write_samples, write_table
+from valveflow_ros.records import SIGNALS, SampleTable, Signal
 
 needs_jit = pytest.mark.skipif(
     os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
@@ -260,9 +261,8 @@ class TestMonitor:
     @pytest.fixture(scope='class')
     @classmethod
     def told(cls):
-        drifting = vf.simulate(1.0, 5, effects=['output_offset_drift:b_mw=40']).log
-        given = {**QUICK, 'refit_segments': 10}
-        return vf.monitor(drifting, diagnose=False, parameters=given)
+        drifting = vf.simulate(1.2, 5, effects=['output_offset_drift:b_mw=30']).log
+        return vf.monitor(drifting, parameters={**QUICK, 'refit_segments': 40})
 
     def test_curves_alarms_and_predictions(self, told):
         content = told.to_json()
@@ -276,10 +276,11 @@ class TestMonitor:
             assert told.start_ns < alarm['raised'] <= told.end_ns
             assert alarm['cleared'] is None or alarm['cleared'] >= alarm['raised']
             assert alarm['sentence'].endswith('.')
-        assert content['diagnoses'] == []
+        assert [d['causes'] for d in content['diagnoses']] == [['output_offset_drift']]
+        assert content['reference'] is None
         columns = told.predictions()
         assert len({len(column) for column in columns.values()}) == 1
-        assert len(columns['time_ns']) == 86400
+        assert len(columns['time_ns']) == 1.2 * 86400
         assert np.isfinite(columns['residual_mw']).any()
 
     def test_report_and_picture(self, told, tmp_path):
@@ -304,6 +305,19 @@ class TestMonitor:
         ids = [e.characteristic.model_id for e in events if type(e).__name__ == 'CurveAdopted']
         assert [c.model_id for _, c in told.curves] == ids != []
 
+    def test_a_model_and_a_reference_go_with_it(self, log, identified, tmp_path):
+        model = write_extended(tmp_path / 'model.json', output_offset_drift={'b_mw': 8.0})
+        given = {**QUICK, 'refit_segments': 8}
+        told = vf.monitor(
+            log, diagnose=False, parameters=given, model=model,
+            reference=identified.characteristic,
+        )  # fmt: skip
+        model_id = identified.characteristic.model_id
+        assert told.to_json()['reference'] == {'set': told.start_ns, 'model_id': model_id}
+        assert len(told.curves) > 1
+        for _, curve in told.curves:
+            assert [h.name for h in curve.held] == ['output_offset_drift']
+
     def test_a_log_without_power_is_refused(self, simulation):
         frame = simulation.to_dataframe().head(5000).assign(generated_power_mw=np.nan)
         with pytest.raises(DataError, match='generated_power has no usable value'):
@@ -323,3 +337,26 @@ def test_a_simulation_is_written_with_its_truth(tmp_path):
         vf.simulate(-1.0)
     with pytest.raises(InputError, match="Did you mean 'gain_drift'"):
         vf.simulate(1.0, effects=['gain_drif'])
+
+
+def recording(path, parameters):
+    table = vf.simulate(0.01, 1).data.table
+    values = table.values.copy()
+    values[:, Signal.MAIN_STEAM_PRESSURE] *= 10.0
+    sent = SampleTable(table.time_ns, values, table.quality)
+    attached = {'parameters.json': json.dumps(parameters).encode()}
+    write_samples(sent, path, attachments=attached)
+    return vf.open_log(path)
+
+
+def test_the_units_are_those_the_monitor_was_told(tmp_path):
+    log = recording(tmp_path / 'a.mcap', {'main_steam_pressure_unit': 'bar'})
+    assert log.units[Signal.MAIN_STEAM_PRESSURE] == 'bar'
+    mine = log.readings.value[log.readings.signal == Signal.MAIN_STEAM_PRESSURE]
+    assert 5.0 < mine.min() < mine.max() < 20.0
+
+
+def test_words_that_are_no_units_are_not_believed(tmp_path):
+    for k, parameters in enumerate(({'main_steam_pressure_unit': 'ell'}, {}, [1])):
+        log = recording(tmp_path / f'x_{k}' / 'a.mcap', parameters)
+        assert log.units[Signal.MAIN_STEAM_PRESSURE] == 'MPa'

@@ -19,7 +19,7 @@ from valveflow_ros.errors import DataError, InputError, UsageError
 
 if TYPE_CHECKING:
     from valveflow_ros.interface.mapping import LogMapping
-    from valveflow_ros.interface.table_import import Imported, Ordered, Spool, TableImport
+    from valveflow_ros.interface.table_import import TableImport
     from valveflow_ros.logs.tables.refusal import RefusedError, Remedy
 
 _DESCRIPTION = """\
@@ -91,25 +91,22 @@ def _imported(options: Namespace, mapping: LogMapping, console: Console) -> Outc
     console(0.05, 'looking at the table')
     table = TableImport(options.table, mapping, console)
     console(0.1, 'reading')
-    place = None
+    place, last = None, 'Nothing was written (--dry-run).'
     if options.dry_run:
-        imported, _ = table.read(None)
+        table.read(None)
     else:
         spool = Spool(options.output.absolute().parent)
         try:
-            imported, ordered = table.read(spool)
+            table.read(spool)
             console(0.6, 'writing')
-            place = _written(options, table, spool, imported, ordered)
+            place = str(_written(options, table))
         finally:
             spool.close()
-    last = 'Nothing was written (--dry-run).' if place is None else f'Wrote {place}.'
-    text = '\n'.join([*_understood(imported, table.is_long), last])
-    return Outcome(text, {'log': None if place is None else str(place), **imported.summary()})
+        last = f'Wrote {place}.'
+    return Outcome('\n'.join([*_understood(table), last]), {'log': place, **table.summary()})
 
 
-def _written(
-    options: Namespace, table: TableImport, spool: Spool, imported: Imported, ordered: Ordered
-) -> Path:
+def _written(options: Namespace, table: TableImport) -> Path:
     from valveflow_ros.interface.files import TABLES, is_empty, write_log
     from valveflow_ros.logs.mcap.importing import write_readings
     from valveflow_ros.records import SampleTable
@@ -117,8 +114,8 @@ def _written(
     path: Path = options.output
     if path.suffix.lower() not in TABLES:
         return write_readings(
-            table.readings(spool, ordered), table.signals, path,
-            attachments={'import.json': imported.as_json().encode()},
+            table.readings(), table.signals, path,
+            attachments={'import.json': table.as_json().encode()},
             overwrite=options.overwrite or is_empty(path),
         ).path  # fmt: skip
     if table.is_long:
@@ -126,25 +123,24 @@ def _written(
             f'{options.table}: each of its signals has times of its own, which a table cannot '
             'hold; write an .mcap file.'
         )
-    rows = SampleTable.concatenate(list(table.tables(spool, ordered)))
-    return write_log(rows, path, options.overwrite)
+    return write_log(SampleTable.concatenate(list(table.tables())), path, options.overwrite)
 
 
-def _understood(imported: Imported, long: bool) -> list[str]:
+def _understood(table: TableImport) -> list[str]:
     """Return what a person should check before trusting the log."""
     from valveflow_ros.report.words import count, counted, duration, moment, plain
 
-    first, last = imported.span_ns
+    first, last = table.span_ns
+    sources, gaps = table.sources(), table.gaps
+    every = duration(table.period_s)
     # In a long table a row is one value of one signal.
-    read = counted(imported.rows_read, 'value' if long else 'row')
-    step = f'one of each signal every {duration(imported.period_s)}' if long else (
-        f'one every {duration(imported.period_s)}'
-    )  # fmt: skip
-    zone = imported.time_zone
+    read = counted(table.rows_read, 'value' if table.is_long else 'row')
+    step = f'one of each signal every {every}' if table.is_long else f'one every {every}'
+    zone = table.time_zone
     if 'name no zone' in zone:
         zone += '; if they are local, add --time-zone, such as --time-zone Europe/Berlin'
     rows = []
-    for s in imported.sources:
+    for s in sources:
         if s.constant:
             rows.append(['(constant)', s.topic, 'as you said', '', plain(s.low), s.unit, ''])
             continue
@@ -154,27 +150,27 @@ def _understood(imported: Imported, long: bool) -> list[str]:
         rows.append([s.column, s.topic, s.ground or '', taken, span, s.unit, lost])
     lines = [
         f'Read {read}, {step}, {moment(first)} to {moment(last)}.',
-        f'Times: {imported.time_words}; zone: {zone}.',
+        f'Times: {table.time_words}; zone: {zone}.',
         columns(rows, _HEAD),
     ]
-    lines += [source.air for source in imported.sources if source.air]
-    for source in imported.sources:
+    lines += [source.air for source in sources if source.air]
+    for source in sources:
         told = [f"{count(n)} '{word}'" for word, n in source.words.items()]
         told += [f'{count(source.empty)} empty'] if source.empty and source.words else []
         if told:
             lines.append(f'Not numbers in {source.column}: {", ".join(told)}.')
-    if imported.ignored:
-        lines.append(f'Not used: {", ".join(imported.ignored)}.')
-    if imported.duplicates:
-        were = 'was' if imported.duplicates == 1 else 'were'
+    if table.ignored:
+        lines.append(f'Not used: {", ".join(table.ignored)}.')
+    if table.duplicates:
+        were = 'was' if table.duplicates == 1 else 'were'
         lines.append(
-            f'{counted(imported.duplicates, "row")} had a time that stood there before and '
+            f'{counted(table.duplicates, "row")} had a time that stood there before and '
             f'{were} left out; the first of each was kept.'
         )
-    if imported.gaps:
-        longest = imported.gaps[0]
+    if gaps:
+        longest = gaps[0]
         lines.append(
-            f'{counted(len(imported.gaps), "gap")}, the longest {duration(longest.seconds)} '
+            f'{counted(len(gaps), "gap")}, the longest {duration(longest.seconds)} '
             f'from {moment(longest.start_ns)}.'
         )
     return lines

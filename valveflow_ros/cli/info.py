@@ -157,7 +157,7 @@ def _summary(path: Path) -> str:
         with Source.open(path) as source:
             summary = read_summary(source) if source.size >= _LARGE_BYTES else None
     except RecordingError:
-        # Whoever reads the file will say what is wrong with it.
+        # Reading the file will show what is wrong with it.
         return ''
     if summary is None or not summary.messages:
         return ''

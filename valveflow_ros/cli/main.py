@@ -261,7 +261,7 @@ def _guarded(words: list[str], console: Console, stop: Stop) -> int:
     except KeyboardInterrupt:
         return _stopped(console, stop)
     except BrokenPipeError:
-        # Whoever read the output has gone; there is nobody to tell.
+        # The reader of the output has gone; nobody is left to tell.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except MemoryError:
         console.fail('There is not enough memory for this log; use a shorter part of it.')

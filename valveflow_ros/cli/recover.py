@@ -29,7 +29,7 @@ def arguments(parser: ArgumentParser) -> None:
 def run(options: Namespace, console: Console) -> Outcome:
     """Recover and say what was kept."""
     from valveflow_ros.interface.files import check_output
-    from valveflow_ros.logs import recover
+    from valveflow_ros.logs.mcap.recover import recover
     from valveflow_ros.report.words import count, counted
 
     check_output(options.output, ('.mcap',), source=options.broken)

@@ -150,21 +150,21 @@ def compare(
     else:
         first, second = log, _not_empty(as_log(test, progress))
         names = first.name, second.name
-    learn = _see(first, names[0], given, progress, progress.part(0.0, 0.4))
+    learn, settings, notes = _see(first, names[0], given, progress, progress.part(0.0, 0.4))
     # A discrete model runs at the step it was learnt at.
-    given['sample_period'] = learn.settings.real('sample_period')
-    judged = _see(second, names[1], given, progress, progress.part(0.2, 0.4))
+    given['sample_period'] = settings.real('sample_period')
+    judged, other, more = _see(second, names[1], given, progress, progress.part(0.2, 0.4))
     progress(0.4, 'curve of special segments')
-    characteristic = learn.observed.fit(lambda _, what: progress(0.4, what))
+    characteristic = learn.fit(lambda _, what: progress(0.4, what))
     result = comparison.compare(
-        samples_of(learn.observed.task.contents, learn.settings), characteristic,
-        other_data(judged.observed.task.contents, judged.settings), truth, progress,
+        samples_of(learn.task.contents, settings), characteristic,
+        other_data(judged.task.contents, other), truth, progress,
     )  # fmt: skip
-    notes = tuple(dict.fromkeys((*learn.notes, *judged.notes, *characteristic.notes)))
+    notes = tuple(dict.fromkeys((*notes, *more, *characteristic.notes)))
     return ComparisonResult(
         Compared(
-            log.name, second.name, test is None, result, learn.observed.task.contents,
-            judged.observed.task.contents, notes,
+            log.name, second.name, test is None, result, learn.task.contents,
+            judged.task.contents, notes,
         )
     )  # fmt: skip
 
@@ -198,16 +198,16 @@ def validate(
     RecordingError, InputError, DataError
         The log cannot be read or holds nothing to judge by.
     """
-    loaded = check_models(model, against, parameters or {})
+    curve, second, given = check_models(model, against, parameters or {})
     log = _not_empty(as_log(log, progress))
-    extended, curve = None, loaded.model
+    extended = None
     if isinstance(curve, ExtendedModel):
         extended, curve = curve, curve.characteristic()
-    seen = _see(log, log.name, loaded.given, progress, progress, extended)
+    observed, settings, notes = _see(log, log.name, given, progress, progress, extended)
+    contents = observed.task.contents
     progress(0.7, 'judging')
-    tolerance = tolerance_mw or seen.settings.real('alarm_floor')
-    other = other_data(seen.observed.task.contents, seen.settings)
-    result = validation.validate(curve, other, tolerance, loaded.against)
+    tolerance = tolerance_mw or settings.real('alarm_floor')
+    result = validation.validate(curve, other_data(contents, settings), tolerance, second)
     if result.outside_share > OUTSIDE_FLAG:
         progress.warn(
             f'{percent(result.outside_share, 2)} of the special samples lie beyond the ends of '
@@ -221,29 +221,17 @@ def validate(
             'extended_model.json beside it as --model.'
         )
         progress.warn(held)
-    second = '' if against is None else _name(against, model)
-    return ValidationResult(
-        Validated(
-            log.name, _name(model, against), second, result, seen.observed.task.contents,
-            seen.notes, held,
-        )
-    )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class CheckedModels:
-    """The curves to hold against a log, and the parameters with their pressure exponent."""
-
-    model: Model
-    against: Characteristic | None
-    given: dict[str, Any]
+    names = _name(model, against), '' if against is None else _name(against, model)
+    return ValidationResult(Validated(log.name, *names, result, contents, notes, held))
 
 
 def check_models(
     model: Model | str | Path, against: Characteristic | str | Path | None,
     parameters: Mapping[str, Any],
-) -> CheckedModels:  # fmt: skip
+) -> tuple[Model, Characteristic | None, dict[str, Any]]:  # fmt: skip
     """Read the curves of a validation and refuse what does not go together.
+
+    The parameters are returned with the pressure exponent of the model.
 
     Raises
     ------
@@ -263,7 +251,7 @@ def check_models(
             'freed of its causes: validate each by itself and compare their errors.'
         )
     name = 'The model' if first is model else model
-    return CheckedModels(first, second, with_exponent(first, parameters, name))
+    return first, second, with_exponent(first, parameters, name)
 
 
 def _name(model: Model | str | Path, other: Model | str | Path | None) -> str:
@@ -275,20 +263,14 @@ def _name(model: Model | str | Path, other: Model | str | Path | None) -> str:
     return str(file) if alike or file != Path(model) else file.name
 
 
-@dataclass(frozen=True, slots=True)
-class _Seen:
-    """A log, or a part of one, after the engine saw it, and sentences about how it was read."""
-
-    settings: Settings
-    observed: Observed
-    notes: tuple[str, ...]
-
-
 def _see(
     log: Log, name: str, given: Mapping[str, Any], progress: Progress,
     shown: Callable[[float, str], None], model: ExtendedModel | None = None,
-) -> _Seen:  # fmt: skip
-    """Run the engine over a log; an error says of which log it speaks."""
+) -> tuple[Observed, Settings, tuple[str, ...]]:  # fmt: skip
+    """Run the engine over a log; return what it saw, its settings, and notes on the reading.
+
+    An error says of which log it speaks.
+    """
     settings, notes = settings_of(log, given, progress, constants=False)
     try:
         observed = observe_log(log, settings, progress, model, shown)
@@ -299,7 +281,7 @@ def _see(
         back = f'{name}: the clock went back; where it stayed, what it had passed is out.'
         progress.warn(back)
         told = (*told, back)
-    return _Seen(settings, observed, told)
+    return observed, settings, told
 
 
 def _not_empty(log: Log) -> Log:

@@ -127,12 +127,7 @@ def is_empty(path: Path) -> bool:
 
 
 def check_readable(path: Path, what: str) -> None:
-    """Refuse a file that is not there; ``what`` says what cannot be done.
-
-    Raises
-    ------
-    RecordingError
-    """
+    """Raise `RecordingError` for a file that is not there; ``what`` says what cannot be done."""
     try:
         path.stat()
     except OSError as error:
@@ -142,12 +137,7 @@ def check_readable(path: Path, what: str) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Refuse a file that could not be written.
-
-    Raises
-    ------
-    RecordingError
-    """
+    """Raise `RecordingError` for a file that could not be written."""
     folder = path.absolute().parent
     if path.is_dir():
         raise RecordingError(path, 'is a folder; name a file')
@@ -159,13 +149,7 @@ def check_writable(path: Path) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse what cannot become a folder of results.
-
-    Raises
-    ------
-    RecordingError
-        It is a file, or may not be written into.
-    """
+    """Raise `RecordingError` for what cannot become a folder of results."""
     place = folder
     while not place.exists() and place != place.parent:
         place = place.parent
@@ -202,12 +186,7 @@ def check_output(
 
 
 def check_log(path: Path, *, source: Path | None = None, overwrite: bool = False) -> None:
-    """Refuse a log that cannot be written; a name without a suffix is a folder.
-
-    Raises
-    ------
-    RecordingError
-    """
+    """Refuse a log as `check_output` does; a name without a suffix is a folder."""
     if path.suffix:
         check_output(path, ('.mcap', *TABLES), source=source, overwrite=overwrite)
     elif path.exists() and (not path.is_dir() or any(path.iterdir())):

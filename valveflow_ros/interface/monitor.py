@@ -5,17 +5,21 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from valveflow_ros import __version__
 from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.diagnosis.corrector import corrector_of
+from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.from_window import diagnose_window
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.files import Result
 from valveflow_ros.interface.logs import as_log
+from valveflow_ros.interface.models import load_characteristic, load_extended, with_exponent
 from valveflow_ros.interface.observation import aligned_blocks, check_signals
 from valveflow_ros.interface.settings import settings_for
 from valveflow_ros.logs import LogContents
@@ -26,6 +30,7 @@ from valveflow_ros.monitoring.events import (
     Event,
     JournalEntry,
     JournalKind,
+    ReferenceSet,
 )
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_aligned
@@ -152,9 +157,21 @@ class MonitorResult(Result):
                 }
                 for at, d in self.diagnoses
             ],
-            'reference': None,
+            'reference': self._reference_json(),
         }
         return {'monitor.json': json.dumps(content, indent=2, allow_nan=False) + '\n'}
+
+    def _reference_json(self) -> dict[str, Any] | None:
+        references = [e.characteristic for e in self.events if isinstance(e, ReferenceSet)]
+        times = [
+            e.time_ns
+            for e in self.events
+            if isinstance(e, JournalEntry) and e.kind == JournalKind.SET_REFERENCE
+        ]
+        if not references:
+            return None
+        # One that is set before the first row has no time of its own.
+        return {'set': max(times[-1], self.start_ns), 'model_id': references[-1].model_id}
 
     def _alarms_json(self) -> list[dict[str, Any]]:
         """Return one entry for each time that an alarm rose."""
@@ -178,6 +195,8 @@ def monitor(
     log: Any,
     *,
     parameters: Mapping[str, Any] | None = None,
+    model: ExtendedModel | str | Path | None = None,
+    reference: Characteristic | str | Path | None = None,
     diagnose: bool = True,
     progress: Progress = SILENT,
 ) -> MonitorResult:
@@ -189,6 +208,11 @@ def monitor(
         What `open_log` returned, or anything it opens.
     parameters : mapping, optional
         Parameters of the monitor by name. What follows from the step of the data is adapted.
+    model : ExtendedModel or path, optional
+        An ``extended_model.json`` whose causes are taken out of the rows first, as the
+        parameter ``model_file`` of the node names one.
+    reference : Characteristic or path, optional
+        Every curve is judged against it, as ``reference_file`` of the node.
     diagnose : bool
         Also compute the diagnoses that the monitor asks for; each takes as long as `diagnose`.
     progress : Progress
@@ -200,14 +224,23 @@ def monitor(
     RecordingError, InputError
         A file cannot be read, or a parameter is wrong.
     """
-    log = as_log(log, progress)
     given = {**({} if diagnose else _NO_DIAGNOSIS), **(parameters or {})}
+    model = model or given.get('model_file') or None
+    if model is not None:
+        name = 'The model' if isinstance(model, ExtendedModel) else model
+        model = model if isinstance(model, ExtendedModel) else load_extended(model)
+        given = with_exponent(model, given, name)
+    reference = reference or given.get('reference_file') or None
+    if reference is not None and not isinstance(reference, Characteristic):
+        reference = load_characteristic(reference)
+    log = as_log(log, progress)
     # The window stays as long as that of a live monitor, however long the log is.
     settings, notes = settings_for(log.steps(), 0.0, given, live=True)
     for sentence in notes:
         progress.say(sentence)
-    aligner, engine = Aligner(settings), Monitor(settings)
-    events: list[Event] = []
+    corrector = None if model is None else corrector_of(model, settings.real('sample_period'))
+    aligner, engine = Aligner(settings), Monitor(settings, corrector)
+    events: list[Event] = [] if reference is None else engine.set_reference(reference)
     tables: list[SampleTable] = []
     for aligned in aligned_blocks(aligner, log.readings, progress, 'monitoring'):
         tables.append(aligned.table)

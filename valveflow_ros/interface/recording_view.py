@@ -158,7 +158,7 @@ class LogWatch:
 
     @property
     def finished(self) -> bool:
-        """Tell whether nothing more will come."""
+        """Return whether nothing more will come."""
         return self._follower.finished
 
     def read(self) -> Iterator[None]:

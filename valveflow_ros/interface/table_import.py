@@ -1,11 +1,13 @@
-"""Read a historian's table once, judge it, and give it out in the order of time."""
+"""Read a historian's table once, judge it, and give it out in the order of time.
+
+The rows wait on disk meanwhile, so that a table of years needs no more memory than its times.
+"""
 
 from __future__ import annotations
 
 import json
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -44,6 +46,8 @@ from valveflow_ros.report.data import Gap, gaps
 from valveflow_ros.signals.units import convert
 
 _SAMPLE = 500_000  # so many values are enough to judge a unit by
+_ROWS = 200_000  # in memory at a time
+_BY_COLUMN = {info.column: info for info in SIGNALS}
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,79 +74,11 @@ class SignalSource:
     air: str = ''
 
 
-@dataclass(frozen=True, slots=True)
-class Imported:
-    """A table that was understood.
-
-    Attributes
-    ----------
-    sources : list of SignalSource
-        In the order of `Signal`.
-    rows_read, rows, duplicates : int
-        Rows of the file with a readable time, those used, and those left out
-        for having one that stood there before.
-    period_s : float
-        Median step.
-    span_ns : tuple of int
-        First and last time.
-    gaps : list of Gap
-        The longest first.
-    ignored : tuple of str
-        Columns that were not used.
-    notes : tuple of str
-        Sentences of the reader.
-    time_zone : str
-        The zone the times were taken to be in.
-    time_words : str
-        How the times are written.
-    """
-
-    path: Path
-    sources: list[SignalSource]
-    rows_read: int
-    rows: int
-    duplicates: int
-    period_s: float
-    span_ns: tuple[int, int]
-    gaps: list[Gap]
-    ignored: tuple[str, ...]
-    notes: tuple[str, ...]
-    time_zone: str
-    time_words: str = ''
-
-    def summary(self) -> dict[str, Any]:
-        """Return everything, for a program."""
-        return {
-            'source': str(self.path),
-            'rows': self.rows,
-            'rows_read': self.rows_read,
-            'duplicates': self.duplicates,
-            'period_s': self.period_s,
-            'start_ns': self.span_ns[0],
-            'end_ns': self.span_ns[1],
-            'time_zone': self.time_zone,
-            'gaps': len(self.gaps),
-            'signals': [asdict(source) for source in self.sources],
-            'ignored': list(self.ignored),
-            'notes': list(self.notes),
-        }
-
-    def as_json(self) -> str:
-        """Return the summary as the text that goes into the log; the file's name only."""
-        content = {**self.summary(), 'source': self.path.name}
-        finite = [
-            {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in s.items()}
-            for s in content['signals']
-        ]
-        return json.dumps({**content, 'signals': finite}, indent=2, allow_nan=False)
-
-
-class Tally:
+class _Statistics:
     """Range and a sample of a column that passes by in blocks."""
 
     def __init__(self) -> None:
         self.low = self.high = float('nan')
-        self.known = 0
         self.missing = 0
         self._parts: list[FloatArray] = []
         self._stride = 1
@@ -150,7 +86,6 @@ class Tally:
     def add(self, values: FloatArray) -> None:
         """Count a block, values as they stand in the file."""
         finite = values[np.isfinite(values)]
-        self.known += len(finite)
         self.missing += len(values) - len(finite)
         if not len(finite):
             return
@@ -163,88 +98,7 @@ class Tally:
 
     def sample(self) -> FloatArray:
         """Return values that stand for all, the lowest and the highest among them."""
-        ends = [np.array([self.low, self.high])] if self.known else []
-        return np.concatenate([*self._parts, *ends]) if self._parts else np.empty(0)
-
-
-@dataclass(frozen=True, slots=True)
-class Ordered:
-    """In which order the rows of a file are to be taken.
-
-    Attributes
-    ----------
-    time_ns : int64 (n,)
-        In the order of the file.
-    order : int64 (m,) or None
-        Rows to be taken; ``None``: all, as they stand.
-    duplicates : int
-        Rows left out for having a time that stood there before.
-    sorted_how : str
-        A sentence, if the rows had to be sorted.
-    """
-
-    time_ns: IntArray
-    order: IntArray | None
-    duplicates: int = 0
-    sorted_how: str = ''
-
-    @classmethod
-    def of(cls, time_ns: IntArray, long: bool) -> Ordered:
-        """Sort the times; of a table with a row a value no time is one too many."""
-        steps = np.diff(time_ns)
-        order, how = None, ''
-        if (steps < 0).any():
-            newest_first = bool((steps <= 0).all())
-            how = '' if long else order_note(newest_first)
-            order = np.arange(len(time_ns))
-            if newest_first:
-                order = order[::-1]
-            order = order[np.argsort(time_ns[order], kind='stable')]
-            steps = np.diff(time_ns[order])
-        again = 0 if long else int((steps == 0).sum())
-        if again:
-            order = np.arange(len(time_ns)) if order is None else order
-            order = order[np.r_[True, steps != 0]]
-        return cls(time_ns, order, again, how)
-
-    @property
-    def rows_read(self) -> int:
-        """Return how many rows have a time."""
-        return len(self.time_ns)
-
-    @property
-    def rows(self) -> int:
-        """Return how many rows are taken."""
-        return len(self.time_ns) if self.order is None else len(self.order)
-
-    @property
-    def span_ns(self) -> tuple[int, int]:
-        """Return the first and the last time."""
-        return int(self.time_ns.min()), int(self.time_ns.max())
-
-    @property
-    def period_s(self) -> float:
-        """Return the median step between different times, 0 if there is none."""
-        steps = np.diff(self.distinct())
-        return float(np.median(steps)) / 1e9 if len(steps) else 0.0
-
-    def distinct(self) -> IntArray:
-        """Return the different times in their order."""
-        times = self.time_ns if self.order is None else self.time_ns[self.order]
-        return times[np.r_[True, np.diff(times) > 0]]
-
-    def blocks(self, size: int) -> Iterator[tuple[IntArray, slice | IntArray]]:
-        """Yield times and rows in the order of time."""
-        for start in range(0, self.rows, size):
-            if self.order is None:
-                part = slice(start, min(start + size, self.rows))
-                yield self.time_ns[part], part
-            else:
-                rows = self.order[start : start + size]
-                yield self.time_ns[rows], rows
-
-
-Array = NDArray[Any]
+        return np.concatenate([*self._parts, np.array([self.low, self.high])])
 
 
 class Spool:
@@ -260,7 +114,7 @@ class Spool:
         self._folder = folder
         self._files: dict[str, tuple[IO[bytes], np.dtype[Any]]] = {}
 
-    def append(self, name: str, values: Array) -> None:
+    def append(self, name: str, values: NDArray[Any]) -> None:
         """Add values to the end of a column.
 
         Raises
@@ -268,55 +122,31 @@ class Spool:
         RecordingError
             If the disk is full.
         """
-        if name not in self._files:
-            self._files[name] = (self._file(), values.dtype)
-        file, dtype = self._files[name]
-        with _said(self._folder):
+        try:
+            if name not in self._files:
+                file: IO[bytes] = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115 - `close` ends it
+                self._files[name] = file, values.dtype
+            file, dtype = self._files[name]
             file.write(np.ascontiguousarray(values, dtype).data.cast('B'))
+            file.flush()
+        except OSError as error:
+            problem = f'has no room for the work ({reason(error)})'
+            raise RecordingError(self._folder, problem) from None
 
-    def holds(self, name: str) -> bool:
-        """Tell whether there is such a column."""
+    def __contains__(self, name: str) -> bool:
+        """Return whether there is such a column."""
         return name in self._files
 
-    def take(self, name: str, rows: slice | IntArray) -> Array:
+    def take(self, name: str, rows: slice | IntArray) -> NDArray[Any]:
         """Return some rows of a column: a stretch, or any rows in any order."""
         file, dtype = self._files[name]
-        if isinstance(rows, slice):
-            return self._stretch(file, dtype, rows.start, rows.stop)
-        low, high = int(rows.min()), int(rows.max()) + 1
-        if high - low <= 4 * len(rows):
-            return self._stretch(file, dtype, low, high)[rows - low]
-        file.flush()
-        everything: Array = np.memmap(file, dtype, 'r')
-        return np.array(everything[rows])
+        column: NDArray[Any] = np.memmap(file, dtype, 'r')
+        return np.array(column[rows])
 
     def close(self) -> None:
         """Give the space back."""
         for file, _ in self._files.values():
             file.close()
-
-    def _file(self) -> IO[bytes]:
-        # It lives as long as this object; `close` ends it.
-        with _said(self._folder):
-            return tempfile.TemporaryFile(dir=self._folder)
-
-    def _stretch(self, file: IO[bytes], dtype: np.dtype[Any], start: int, stop: int) -> Array:
-        with _said(self._folder):
-            file.seek(start * dtype.itemsize)
-            raw = file.read((stop - start) * dtype.itemsize)
-        return np.frombuffer(raw, dtype)
-
-
-@contextmanager
-def _said(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise RecordingError(folder, f'has no room for the work ({reason(error)})') from None
-
-
-_ROWS = 200_000  # in memory at a time
-_BY_COLUMN = {info.column: info for info in SIGNALS}
 
 
 class TableImport:
@@ -334,6 +164,26 @@ class TableImport:
         Refuse also a column that the person named without its unit, where its values speak
         against the usual one; otherwise that is a warning.
 
+    Attributes
+    ----------
+    rows_read, rows, duplicates : int
+        Rows of the file with a readable time, those used, and those left out
+        for having one that stood there before.
+    period_s : float
+        Median step.
+    span_ns : tuple of int
+        First and last time.
+    gaps : list of Gap
+        The longest first.
+    ignored : tuple of str
+        Columns that were not used.
+    notes : tuple of str
+        Sentences of the reader.
+    time_zone, time_words : str
+        The zone the times were taken to be in, and how they are written.
+    is_long : bool
+        The table has a row for each value.
+
     Raises
     ------
     RecordingError, InputError, DataError
@@ -345,34 +195,41 @@ class TableImport:
     ) -> None:
         if path.suffix.lower() not in TABLE_SUFFIXES:
             raise RecordingError(path, 'is no .csv, .xlsx or .parquet table')
-        self._progress = progress
-        self._mapping = mapping
-        self._strict = strict
+        self._progress, self._mapping, self._strict = progress, mapping, strict
         self._reader = mapping.opened(
             lambda names: TableReader(path, names, list(mapping.constants), mapping.table)
         )
         self._constants = mapping.constant_signals
         check_constants(self._constants)
+        names = self._reader.names
         told = {_BY_COLUMN[n].signal: unit for n, unit in self._reader.units.items()}
-        self._units = {
-            name: mapping.unit_of(_BY_COLUMN[name].signal, told) for name in self._reader.names
-        }
-        self._used = [
-            name for name in self._reader.names if _BY_COLUMN[name].signal not in self._constants
-        ]
-        self._warn_of_constants()
+        self._units = {name: mapping.unit_of(_BY_COLUMN[name].signal, told) for name in names}
+        self._used = [n for n in names if _BY_COLUMN[n].signal not in self._constants]
+        self._spool: Spool | None = None
+        self._statistics = {name: _Statistics() for name in self._used}
+        self._time_ns: IntArray = np.empty(0, np.int64)
+        # Rows to be taken, in the order of time; None: all, as they stand.
+        self._order: IntArray | None = None
+        unused = (names[n] for n in names if n not in self._used)
+        self.ignored = (*self._reader.ignored, *unused)
+        self.rows_read = self.rows = self.duplicates = 0
+        self.period_s, self.span_ns = 0.0, (0, 0)
+        self.gaps: list[Gap] = []
+        self.notes: tuple[str, ...] = ()
+        self.time_zone, self.time_words = '', ''
+        self.is_long = self._reader.long is not None
+        for name in (n for n in names if n not in self._used):
+            progress.warn(
+                f"{_BY_COLUMN[name].topic} stands in the table as '{names[name]}' too; the "
+                'constant is used instead.'
+            )
 
     @property
     def signals(self) -> list[Signal]:
         """Return the signals there will be readings of."""
         return sorted({*(_BY_COLUMN[name].signal for name in self._used), *self._constants})
 
-    @property
-    def is_long(self) -> bool:
-        """Tell whether the table has a row for each value."""
-        return self._reader.long is not None
-
-    def read(self, spool: Spool | None) -> tuple[Imported, Ordered]:
+    def read(self, spool: Spool | None) -> None:
         """Read the whole table into the spool (or only look at it) and judge it.
 
         Raises
@@ -381,82 +238,146 @@ class TableImport:
             As the constructor; or no row is usable, or the values of a column
             speak against what it was taken for.
         """
+        reader = self._reader
         times: list[IntArray] = []
-        tallies = {name: Tally() for name in self._used}
         uncertain = 0
-        for block in self._reader.blocks():
+        for block in reader.blocks():
             times.append(block.time_ns)
-            self._progress(0.1 + 0.5 * self._reader.share, 'reading')
+            self._progress(0.1 + 0.5 * reader.share, 'reading')
             for name in self._used:
-                there = block.present.get(name)
-                column = block.columns[name]
-                tallies[name].add(column if there is None else column[there])
-                uncertain += _uncertain(block, name)
+                there = block.present.get(name, slice(None))
+                self._statistics[name].add(block.columns[name][there])
+                if name in block.quality:
+                    uncertain += int((block.quality[name][there] == Quality.UNCERTAIN).sum())
             if spool is not None:
                 self._keep(block, spool)
+        self._spool = spool
         refused: list[RefusedError] = []
+        notes: list[str] = []
         try:
-            notes = self._reader.notes()
+            notes = reader.notes()
         except RefusedError as error:
             refused.append(error)
-            notes = []
-        ordered = Ordered.of(np.concatenate(times), self.is_long)
-        if ordered.sorted_how:
-            notes.append(ordered.sorted_how)
-        airs = (
-            air_note(_BY_COLUMN[name].signal, self._units[name], self._reader.names[name])
-            for name in self._used
-        )
-        notes += [note for note in airs if note]
+        self._time_ns = np.concatenate(times)
+        notes += self._sort()
+        for name in self._used:
+            notes.append(air_note(_BY_COLUMN[name].signal, self._units[name], reader.names[name]))
+        notes = [note for note in notes if note]
         for note in notes:
             self._progress.say(note)
-        if not any(tally.known for tally in tallies.values()):
-            path = self._reader.path
-            raise DataError(f'{path}: there is no number in any of the columns used.')
-        self._judge(tallies, refused)
+        if all(np.isnan(found.low) for found in self._statistics.values()):
+            raise DataError(f'{reader.path}: there is no number in any of the columns used.')
+        self._judge(refused)
         if uncertain:
             self._progress.warn(
                 f'{uncertain} values are marked uncertain; a plain recording has no place for '
                 'that mark, they stand there as good.'
             )
-        return self._told(tallies, ordered, notes), ordered
+        self.notes = (*reader.understood(), *notes)
+        self.time_zone, self.time_words = reader.time_zone, reader.time_words
 
-    def tables(self, spool: Spool, ordered: Ordered) -> Iterator[SampleTable]:
+    def tables(self) -> Iterator[SampleTable]:
         """Yield the rows in the order of time, in the engine's units."""
-        for time_ns, rows in ordered.blocks(_ROWS):
-            columns, quality = self._columns(spool, rows)
+        for time_ns, _, columns, quality in self._blocks():
             for signal, value in self._constants.items():
                 columns[signal] = np.full(len(time_ns), value)
             yield SampleTable.from_columns(time_ns, columns, quality)
 
-    def readings(self, spool: Spool, ordered: Ordered) -> Iterator[Readings]:
+    def readings(self) -> Iterator[Readings]:
         """Yield the values one by one in the order of time, in the engine's units."""
         if not self.is_long:
-            yield from map(table_to_readings, self.tables(spool, ordered))
+            yield from map(table_to_readings, self.tables())
             return
-        names = self._used
-        for time_ns, rows in ordered.blocks(_ROWS):
-            columns, quality = self._columns(spool, rows)
+        assert self._spool is not None
+        signals = np.array([_BY_COLUMN[name].signal for name in self._used], np.int8)
+        for time_ns, rows, columns, quality in self._blocks():
             table = SampleTable.from_columns(time_ns, columns, quality)
-            there = np.column_stack([spool.take(f'{name}?', rows) for name in names])
-            row, column = np.nonzero(there)
-            signal = np.array([_BY_COLUMN[name].signal for name in names], np.int8)[column]
+            there = [self._spool.take(f'{name}?', rows) for name in self._used]
+            row, column = np.nonzero(np.column_stack(there))
+            signal = signals[column]
             readings = Readings(
                 time_ns[row], signal, table.values[row, signal], table.quality[row, signal]
             )
             yield with_constants(readings, self._constants)
 
-    def _columns(
-        self, spool: Spool, rows: slice | IntArray
-    ) -> tuple[dict[Signal, FloatArray], dict[Signal, ByteArray]]:
-        columns: dict[Signal, FloatArray] = {}
-        quality: dict[Signal, ByteArray] = {}
-        for name in self._used:
-            signal = _BY_COLUMN[name].signal
-            columns[signal] = convert(signal, self._units[name], spool.take(name, rows))
-            if spool.holds(f'{name}!'):
-                quality[signal] = spool.take(f'{name}!', rows)
-        return columns, quality
+    def sources(self) -> list[SignalSource]:
+        """Return where each signal comes from, in the order of `Signal`."""
+        sources = []
+        reader = self._reader
+        for info in SIGNALS:
+            name, unit = info.column, info.unit
+            if info.signal in self._constants:
+                value = self._constants[info.signal]
+                sources.append(SignalSource(info.topic, '', unit, unit, value, value, 0, True))
+            elif name in self._used:
+                found, written, theirs = (
+                    self._statistics[name],
+                    self._units[name],
+                    reader.names[name],
+                )
+                ends = np.array([found.low, found.high])
+                low, high = np.sort(convert(info.signal, written, ends))
+                sources.append(
+                    SignalSource(
+                        info.topic, theirs, written, unit, float(low), float(high),
+                        found.missing, False, dict(reader.words[name].most_common(8)),
+                        reader.empty[name], reader.grounds.get(name, ''),
+                        air_note(info.signal, written, theirs),
+                    )
+                )  # fmt: skip
+        return sources
+
+    def summary(self) -> dict[str, Any]:
+        """Return everything that was understood, for a program."""
+        start_ns, end_ns = self.span_ns
+        return {
+            'source': str(self._reader.path),
+            'rows': self.rows,
+            'rows_read': self.rows_read,
+            'duplicates': self.duplicates,
+            'period_s': self.period_s,
+            'start_ns': start_ns,
+            'end_ns': end_ns,
+            'time_zone': self.time_zone,
+            'gaps': len(self.gaps),
+            'signals': [asdict(source) for source in self.sources()],
+            'ignored': list(self.ignored),
+            'notes': list(self.notes),
+        }
+
+    def as_json(self) -> str:
+        """Return the summary as the text that goes into the log; the file's name only."""
+        content = {**self.summary(), 'source': self._reader.path.name}
+        finite = [
+            {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in s.items()}
+            for s in content['signals']
+        ]
+        return json.dumps({**content, 'signals': finite}, indent=2, allow_nan=False)
+
+    def _sort(self) -> list[str]:
+        """Bring the rows into the order of time; in a long table no time is one too many."""
+        time_ns, order = self._time_ns, None
+        steps = np.diff(time_ns)
+        notes = []
+        if (steps < 0).any():
+            newest_first = bool((steps <= 0).all())
+            notes = [] if self.is_long else [order_note(newest_first)]
+            order = np.arange(len(time_ns))[:: -1 if newest_first else 1]
+            order = order[np.argsort(time_ns[order], kind='stable')]
+            steps = np.diff(time_ns[order])
+        if not self.is_long and (steps == 0).any():
+            self.duplicates = int((steps == 0).sum())
+            order = np.arange(len(time_ns)) if order is None else order
+            order = order[np.r_[True, steps != 0]]
+        self._order = order
+        ordered = time_ns if order is None else time_ns[order]
+        distinct = ordered[np.r_[True, np.diff(ordered) > 0]]
+        steps = np.diff(distinct)
+        self.rows_read, self.rows = len(time_ns), len(ordered)
+        self.period_s = float(np.median(steps)) / 1e9 if len(steps) else 0.0
+        self.span_ns = int(distinct[0]), int(distinct[-1])
+        self.gaps = gaps(distinct, max(1, round(self.period_s * 1e9)))
+        return notes
 
     def _keep(self, block: RawBlock, spool: Spool) -> None:
         for name in self._used:
@@ -466,24 +387,36 @@ class TableImport:
             if name in block.present:
                 spool.append(f'{name}?', block.present[name])
 
-    def _warn_of_constants(self) -> None:
-        for name, theirs in self._reader.names.items():
-            if _BY_COLUMN[name].signal in self._constants:
-                self._progress.warn(
-                    f"{_BY_COLUMN[name].topic} stands in the table as '{theirs}' too; the "
-                    'constant is used instead.'
-                )
+    def _blocks(
+        self,
+    ) -> Iterator[
+        tuple[IntArray, slice | IntArray, dict[Signal, FloatArray], dict[Signal, ByteArray]]
+    ]:
+        """Yield times, places in the file, columns and qualities, block by block."""
+        spool = self._spool
+        assert spool is not None
+        for start in range(0, self.rows, _ROWS):
+            part = slice(start, min(start + _ROWS, self.rows))
+            rows = part if self._order is None else self._order[part]
+            columns: dict[Signal, FloatArray] = {}
+            quality: dict[Signal, ByteArray] = {}
+            for name in self._used:
+                signal = _BY_COLUMN[name].signal
+                columns[signal] = convert(signal, self._units[name], spool.take(name, rows))
+                if f'{name}!' in spool:
+                    quality[signal] = spool.take(f'{name}!', rows)
+            yield self._time_ns[rows], rows, columns, quality
 
-    def _judge(self, tallies: dict[str, Tally], refused: list[RefusedError]) -> None:
+    def _judge(self, refused: list[RefusedError]) -> None:
         """Refuse what was guessed wrongly, and warn of the rest; raises `RefusedError`."""
-        settings, doubts = Settings(), {}
-        for name, tally in tallies.items():
-            signal = _BY_COLUMN[name].signal
-            found = doubt(signal, tally.sample(), self._units[name], settings)
-            if found is not None:
-                doubts[name] = found
-        guessed = {_BY_COLUMN[name].signal for name in self._reader.grounds}
-        names = {_BY_COLUMN[name].signal: theirs for name, theirs in self._reader.names.items()}
+        settings, reader = Settings(), self._reader
+        judged = (
+            doubt(_BY_COLUMN[name].signal, found.sample(), self._units[name], settings)
+            for name, found in self._statistics.items()
+        )
+        doubts = [found for found in judged if found is not None]
+        guessed = {_BY_COLUMN[name].signal for name in reader.grounds}
+        names = {_BY_COLUMN[name].signal: theirs for name, theirs in reader.names.items()}
         said = {c.name for c in self._mapping.columns.values() if c.unit}
         unsaid = {signal for signal in names if SIGNALS[signal].topic not in said}
         for strict, grounds in ((False, guessed), (True, unsaid)):
@@ -491,63 +424,13 @@ class TableImport:
             if strict and not (self._strict or refused):
                 break
             try:
-                refuse_guesses(self._reader.path, doubts.values(), grounds, names)
+                refuse_guesses(reader.path, doubts, grounds, names)
             except RefusedError as error:
-                refused[:] = [one for one in refused if not one.last] + [error]
+                refused = [one for one in refused if not one.last] + [error]
         if refused:
             # What was understood until then is of use to who has to correct it.
-            for sentence in self._reader.understood():
+            for sentence in reader.understood():
                 self._progress.say(sentence)
-            raise joined(self._reader.path, refused)
-        for name, found in doubts.items():
-            self._progress.warn(found.advice(self._reader.names[name]))
-
-    def _told(self, tallies: dict[str, Tally], ordered: Ordered, notes: list[str]) -> Imported:
-        reader = self._reader
-        period_s = ordered.period_s
-        unused = [reader.names[n] for n in reader.names if n not in self._used]
-        return Imported(
-            reader.path, self._sources(tallies), ordered.rows_read, ordered.rows,
-            ordered.duplicates, period_s, ordered.span_ns,
-            gaps(ordered.distinct(), max(1, round(period_s * 1e9))),
-            (*reader.ignored, *unused), (*reader.understood(), *notes),
-            reader.time_zone, reader.time_words,
-        )  # fmt: skip
-
-    def _sources(self, tallies: dict[str, Tally]) -> list[SignalSource]:
-        sources = []
-        for info in SIGNALS:
-            if info.signal in self._constants:
-                value = self._constants[info.signal]
-                sources.append(
-                    SignalSource(info.topic, '', info.unit, info.unit, value, value, 0, True)
-                )
-            elif info.column in self._used:
-                tally, unit = tallies[info.column], self._units[info.column]
-                low, high = np.sort(convert(info.signal, unit, np.array([tally.low, tally.high])))
-                sources.append(
-                    SignalSource(
-                        info.topic,
-                        self._reader.names[info.column],
-                        unit,
-                        info.unit,
-                        float(low),
-                        float(high),
-                        tally.missing,
-                        False,
-                        dict(self._reader.words[info.column].most_common(8)),
-                        self._reader.empty[info.column],
-                        self._reader.grounds.get(info.column, ''),
-                        air_note(info.signal, unit, self._reader.names[info.column]),
-                    )
-                )
-        return sources
-
-
-def _uncertain(block: RawBlock, name: str) -> int:
-    codes: Any = block.quality.get(name)
-    if codes is None:
-        return 0
-    there = block.present.get(name)
-    return int(((codes == Quality.UNCERTAIN) if there is None else
-                ((codes == Quality.UNCERTAIN) & there)).sum())  # fmt: skip
+            raise joined(reader.path, refused)
+        for found in doubts:
+            self._progress.warn(found.advice(names[found.signal]))

@@ -5,14 +5,11 @@ from __future__ import annotations
 import io
 import re
 import time
-from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from valveflow_ros.cli import command
-from valveflow_ros.cli.command import _PARTS, share_of_time
 from valveflow_ros.report.terminal.progress import Progress, in_words
 
 
@@ -128,44 +125,3 @@ def test_a_stream_without_blocks_gets_a_bar_it_can_show(shown, monkeypatch):
 ])  # fmt: skip
 def test_lengths_of_time(seconds, words):
     assert in_words(seconds) == words
-
-
-@pytest.mark.parametrize('verb', sorted(_PARTS))
-def test_the_share_of_the_time_goes_forward_from_nothing_to_all(verb):
-    shares = []
-    for name, told_from, told_to, _ in _PARTS[verb]:
-        shares += [share_of_time(verb, told, name) for told in (told_from, told_to)]
-    assert shares[0] == 0.0
-    assert shares == sorted(shares)
-    assert all(0.0 <= share <= 1.0 for share in shares)
-    # What is not in the table stays as it is told.
-    assert share_of_time(verb, 0.3, 'something else') == share_of_time('no verb', 0.3, '') == 0.3
-
-
-def test_the_parts_of_the_time_are_those_a_verb_tells(
-    run, logs, identified, tmp_path, monkeypatch
-):
-    """Every part that a verb tells is in its table, and the bar moves on with each."""
-    told: list[tuple[float, str]] = []
-    monkeypatch.setattr(
-        command.Console, '__call__', lambda self, share, what: told.append((share, what))
-    )
-    words = ['validate', logs / 'plant.csv', '-o', tmp_path / 'o', '--model', identified]
-    assert run(*words).status == 0
-    shares = [share_of_time('validate', share, what) for share, what in told]
-    assert len(shares) > 4
-    assert shares == sorted(shares)
-    for _, what in told:
-        assert any(what.startswith(name) for name, *_ in _PARTS['validate']), what
-
-
-def test_every_part_of_the_time_is_told_somewhere():
-    """Also those of the verbs that take too long to be run here."""
-    root = Path(command.__file__).parents[1]
-    rooms = ('cli', 'interface', 'fit', 'monitoring', 'segments', 'baselines', 'diagnosis')
-    text = ''.join(p.read_text() for room in rooms for p in root.glob(f'{room}/*.py')
-                   if p.name != 'command.py')  # fmt: skip
-    for parts in _PARTS.values():
-        for name, *_ in parts:
-            # A sentence with a number in it is told from its beginning on.
-            assert f"'{name}" in text or f"'{name.rsplit(' ', 1)[0]}" in text, name
