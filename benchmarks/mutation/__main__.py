@@ -44,11 +44,7 @@ _RECOVER = (
     'test/logs/test_logs_edges.py',
     'test/logs/test_logs_recover.py',
 )
-_STATE = (
-    'test/ros/test_ros_state_rules.py',
-    'test/ros/test_ros_state_folder.py',
-    'test/ros/test_ros_keeper.py',
-)
+_STATE = ('test/ros/test_ros_state.py',)
 TESTS: Mapping[str, tuple[str, ...]] = {
     'valveflow_ros/logs/mcap/recorder.py': _RECORDER,
     'valveflow_ros/logs/mcap/recorder_loop.py': _RECORDER,

@@ -32,10 +32,10 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import SIGNALS, SampleTable, Signal
-from valveflow_ros.ros.conversions import from_time
+from valveflow_ros.ros.decoding import from_time
 from valveflow_ros.ros.demo import ros_arguments
-from valveflow_ros.ros.outputs import float64_bytes
-from valveflow_ros.ros.simulator_steps import effects_of
+from valveflow_ros.ros.encoding import float64_bytes
+from valveflow_ros.ros.simulator_main import effects_of
 from valveflow_ros.ros.verify import verify
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
@@ -329,7 +329,7 @@ def test_ending_during_a_refit_finishes_the_file_at_once(
     listener.until(lambda: listener.value('fit', 'Samples taken') == str(samples), 'the samples')
     (worker,) = [
         child for child in psutil.Process(monitor.pid).children()
-        if any('worker_child' in word for word in child.cmdline())
+        if any('valveflow_ros.ros.worker' in word for word in child.cmdline())
     ]  # fmt: skip
     # However fast the machine is, this refit is under way when the monitor has to end.
     worker.suspend()

@@ -19,8 +19,8 @@ from valveflow_ros.cli.main import main
 from valveflow_ros.logs import open_log
 from valveflow_ros.plant.simulator import DEFAULT_START_NS
 from valveflow_ros.records import NS_PER_S, SIGNALS
-from valveflow_ros.ros.conversions import to_time
 from valveflow_ros.ros.demo import ros_arguments
+from valveflow_ros.ros.encoding import to_time
 from valveflow_ros.ros.verify import verify
 
 STATE = {'valve_opening': 50.0, 'main_steam_pressure': 13.0, 'main_steam_temperature': 538.0,

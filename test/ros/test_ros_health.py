@@ -15,11 +15,11 @@ from std_msgs.msg import Float32, Float64
 
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Signal
+from valveflow_ros.ros.decoding import INPUTS, PLANT_SAMPLE
 from valveflow_ros.ros.demo import ros_arguments
-from valveflow_ros.ros.diagnostics import Changes, Item, Level, array
-from valveflow_ros.ros.inputs import INPUTS, PLANT_SAMPLE
-from valveflow_ros.ros.node.input_health import InputHealth, Publishers
-from valveflow_ros.ros.node.intake import Tally
+from valveflow_ros.ros.node.diagnostics import Changes, Item, Level, diagnostics_message
+from valveflow_ros.ros.node.health import InputHealth, Publishers
+from valveflow_ros.ros.node.intake import TopicStatistics
 from valveflow_ros.signals.align import REASONS
 
 TOPICS = {topic.name: f'/plant/{topic.name}' for topic in INPUTS}
@@ -31,14 +31,14 @@ class Scene:
 
     def __init__(self, **settings: object) -> None:
         self.health = InputHealth(Settings(settings), TOPICS)
-        self.tallies = {name: Tally() for name in TOPICS}
+        self.statistics = {name: TopicStatistics() for name in TOPICS}
         self.counts = {info.topic: dict.fromkeys(REASONS, 0) for info in SIGNALS}
         self.publishers = {info.topic: Publishers(1) for info in SIGNALS}
         for info in SIGNALS:
             self.hear(info.topic)
 
     def hear(self, name: str, at: float = NOW, period: float = 1.0) -> None:
-        tally = self.tallies[name]
+        tally = self.statistics[name]
         for k in range(5, -1, -1):
             tally.note_arrival(1, at - k * period)
             tally.note_number(tally.received + 1)
@@ -51,7 +51,7 @@ class Scene:
         newest_ns: int = 0,
     ) -> Item:
         items = self.health.items(
-            self.tallies, self.counts, self.publishers, at, listening, newest_ns
+            self.statistics, self.counts, self.publishers, at, listening, newest_ns
         )
         (found,) = [item for item in items if item.name == f'input {topic}']
         return found
@@ -141,7 +141,7 @@ def test_a_wrong_type_is_named_whatever_else_is_true() -> None:
 
 def test_silence_from_the_start() -> None:
     scene = Scene()
-    scene.tallies = {name: Tally() for name in TOPICS}
+    scene.statistics = {name: TopicStatistics() for name in TOPICS}
     scene.publishers = {}
     scene.says(Level.OK, 'Waiting for /plant/valve_opening', listening=1.0)
     scene.says(Level.STALE, 'Nobody publishes /plant/valve_opening')
@@ -154,14 +154,14 @@ def test_silence_from_the_start() -> None:
 
 def test_silence_after_speech() -> None:
     scene = Scene()
-    scene.tallies['valve_opening'] = Tally()
+    scene.statistics['valve_opening'] = TopicStatistics()
     scene.hear('valve_opening', NOW - 3.0)
     scene.says(Level.STALE, '/plant/valve_opening has been silent for 3.5 s')
 
 
 def test_a_stamped_sample_speaks_for_all_its_signals() -> None:
     scene = Scene()
-    scene.tallies = {name: Tally() for name in TOPICS}
+    scene.statistics = {name: TopicStatistics() for name in TOPICS}
     scene.hear(PLANT_SAMPLE)
     scene.publishers = {PLANT_SAMPLE: Publishers(1)}
     for info in SIGNALS:
@@ -171,7 +171,7 @@ def test_a_stamped_sample_speaks_for_all_its_signals() -> None:
 
 def test_a_stamped_sample_of_the_wrong_type_is_seen_before_it_is_heard() -> None:
     scene = Scene()
-    scene.tallies = {name: Tally() for name in TOPICS}
+    scene.statistics = {name: TopicStatistics() for name in TOPICS}
     scene.publishers = {PLANT_SAMPLE: Publishers(0, ('std_msgs/msg/String',))}
     scene.says(Level.ERROR, '/plant/plant_sample is published as std_msgs/msg/String')
 
@@ -217,7 +217,7 @@ def test_an_input_of_which_nothing_can_be_used_is_as_good_as_silent() -> None:
 
 def test_losses_are_said_once_and_counted_on() -> None:
     scene = Scene()
-    scene.tallies['valve_opening'].lost = 3
+    scene.statistics['valve_opening'].lost = 3
     scene.says(Level.WARN, '3 messages of /plant/valve_opening were lost')
     scene.says(Level.OK, 'Hz')
     assert scene.item().values['Messages lost on the way'] == 3
@@ -270,10 +270,10 @@ def test_other_rejections_are_told_by_reason(reason: str, words: str) -> None:
 
 def test_a_topic_without_any_time_points_to_the_clock() -> None:
     scene = Scene()
-    scene.tallies['valve_opening'].without_time = scene.tallies['valve_opening'].received
+    scene.statistics['valve_opening'].without_time = scene.statistics['valve_opening'].received
     scene.says(Level.ERROR, 'is /clock published?')
-    scene.tallies['valve_opening'].without_time = 0
-    scene.tallies['valve_opening'].waiting = scene.tallies['valve_opening'].received
+    scene.statistics['valve_opening'].without_time = 0
+    scene.statistics['valve_opening'].waiting = scene.statistics['valve_opening'].received
     scene.says(Level.ERROR, 'is /clock published?')
 
 
@@ -282,7 +282,7 @@ def test_the_message_follows_rep_107() -> None:
         Item('input valve_opening', Level.OK, 'Fine.', {'Rate (Hz)': 1.0, 'Age (s)': None}),
         Item('recorder', Level.ERROR, 'Broken.', {'On': False}),
     ]
-    message = array(items, 'HV101', 5 * 10**9)
+    message = diagnostics_message(items, 'HV101', 5 * 10**9)
     assert message.header.stamp.sec == 5
     first, second = message.status
     assert first.name == 'valveflow: HV101 input valve_opening'

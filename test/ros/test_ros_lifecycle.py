@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 
 from valveflow_ros.logs import open_log
 from valveflow_ros.parameters import TABLE
-from valveflow_ros.ros import simulator_steps
+from valveflow_ros.ros import simulator_main
 from valveflow_ros.ros.node import monitor_node
 from valveflow_ros.ros.node.monitor_node import MonitorNode
 
@@ -168,7 +168,7 @@ def test_help_is_a_page_and_starts_nothing(name: str, tmp_path: Path) -> None:
     )  # fmt: skip
     assert asked.returncode == 0, asked.stderr
     assert asked.stdout.startswith('usage: ')
-    table = {'monitor_main': TABLE, 'simulator_main': simulator_steps.TABLE}.get(name, ())
+    table = {'monitor_main': TABLE, 'simulator_main': simulator_main.TABLE}.get(name, ())
     for row in table:
         assert row.name in asked.stdout
         assert row.sentence in asked.stdout

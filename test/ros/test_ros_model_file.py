@@ -23,18 +23,18 @@ HELD = {'backlash': {'w_percent': 0.5}, 'gain_drift': {'g': 0.05}, 'clock': {'d_
 
 
 def test_a_model_is_read_from_its_file(tmp_path: Path) -> None:
-    assert given_files.extended_of(Settings()) is None
-    assert given_files.ready(None, Settings()) is None
-    assert given_files.attached(None) == {}
+    assert given_files.given_model(Settings()) is None
+    assert given_files.corrector_for(None, Settings()) is None
+    assert given_files.model_attachment(None) == {}
     path = write_extended(tmp_path / 'extended_model.json', **HELD)
     settings = Settings({'model_file': str(path)})
-    given = given_files.extended_of(settings)
+    given = given_files.given_model(settings)
     assert given is not None
     assert model_to_json(given) == extended_json(**HELD)
-    corrector = given_files.ready(given, settings)
+    corrector = given_files.corrector_for(given, settings)
     assert corrector is not None
     assert [h.name for h in corrector.held] == list(HELD)
-    kept = given_files.attached(given)[given_files.ATTACHMENT]
+    kept = given_files.model_attachment(given)[given_files.ATTACHMENT]
     assert json.loads(kept) == extended_json(**HELD)
 
 
@@ -57,7 +57,7 @@ def test_a_bad_file_is_refused_with_a_sentence(
     if text is not None:
         path.write_text(text, encoding='utf-8', errors='surrogateescape')
     with pytest.raises(ParameterError) as caught:
-        given_files.extended_of(Settings({'model_file': str(path)}))
+        given_files.given_model(Settings({'model_file': str(path)}))
     assert said in str(caught.value)
     assert str(caught.value).startswith("Parameter 'model_file' names")
 

@@ -33,9 +33,10 @@ from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import JournalReplayer, feed_rows
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
-from valveflow_ros.ros import conversions
+from valveflow_ros.ros import encoding
+from valveflow_ros.ros.decoding import from_time, journal_entry
 from valveflow_ros.ros.demo import ros_arguments
-from valveflow_ros.ros.node.given_files import reference_of
+from valveflow_ros.ros.node.given_files import given_reference
 from valveflow_ros.ros.node.health import reference_item
 from valveflow_ros.ros.outputs import Outputs
 from valveflow_ros.ros.verify import verify
@@ -63,19 +64,19 @@ def lifted(curve: Characteristic, by_mw: float) -> Characteristic:
 
 
 def test_without_a_reference_nothing_is_said_of_a_shift(curve: Characteristic) -> None:
-    message = conversions.characteristic(curve, CurveStatus.FRESH, '', 'u')
+    message = encoding.curve_message(curve, CurveStatus.FRESH, '', 'u')
     assert message.reference_model_id == message.shift_sentence == ''
     assert list(message.shift_mw) == list(message.shift_confidence) == []
-    assert conversions.from_time(message.shift_since) == 0
+    assert from_time(message.shift_since) == 0
 
 
 def test_the_reference_itself_has_not_moved(curve: Characteristic) -> None:
-    message = conversions.characteristic(curve, CurveStatus.FRESH, '', 'u', curve.model_id)
+    message = encoding.curve_message(curve, CurveStatus.FRESH, '', 'u', curve.model_id)
     assert list(message.shift_mw) == list(message.shift_confidence) == [0.0] * len(curve.pieces)
-    other = conversions.characteristic(curve, CurveStatus.FRESH, '', 'u', 'another')
+    other = encoding.curve_message(curve, CurveStatus.FRESH, '', 'u', 'another')
     assert all(math.isnan(v) for v in [*other.shift_mw, *other.shift_confidence])
     assert len(other.shift_mw) == len(curve.pieces)
-    none = conversions.characteristic(None, CurveStatus.UNKNOWN, 'why', 'u', 'another')
+    none = encoding.curve_message(None, CurveStatus.UNKNOWN, 'why', 'u', 'another')
     assert (none.reference_model_id, list(none.shift_mw)) == ('another', [])
 
 
@@ -85,13 +86,13 @@ def test_a_judgement_stands_in_the_message(curve: Characteristic) -> None:
         since_ns=DEFAULT_START_NS, since_low_ns=DEFAULT_START_NS - 1,
         since_high_ns=DEFAULT_START_NS + 1,
     )  # fmt: skip
-    message = conversions.characteristic(curve, CurveStatus.FRESH, '', 'u', 'lifted', shift)
+    message = encoding.curve_message(curve, CurveStatus.FRESH, '', 'u', 'lifted', shift)
     assert list(message.shift_mw) == pytest.approx([-5.0] * len(curve.pieces))
     assert list(message.shift_confidence) == [p.confidence for p in shift.pieces]
     assert message.shift_sentence == shift.sentence
-    assert conversions.from_time(message.shift_since) == DEFAULT_START_NS
-    assert conversions.from_time(message.shift_since_low) == DEFAULT_START_NS - 1
-    assert conversions.from_time(message.shift_since_high) == DEFAULT_START_NS + 1
+    assert from_time(message.shift_since) == DEFAULT_START_NS
+    assert from_time(message.shift_since_low) == DEFAULT_START_NS - 1
+    assert from_time(message.shift_since_high) == DEFAULT_START_NS + 1
 
 
 def test_outputs_follow_the_events(curve: Characteristic) -> None:
@@ -123,7 +124,7 @@ def test_a_run_with_references_is_repeated_byte_for_byte(curve: Characteristic) 
     live = [o for call in calls for o in first.of(call)]
     # Through messages and back, as a recording keeps the journal.
     journal = [
-        conversions.journal_entry(conversions.journal(e, 'u'))
+        journal_entry(encoding.encode(encoding.journal_message(e, 'u')))
         for e in events
         if isinstance(e, JournalEntry)
     ]
@@ -157,10 +158,10 @@ def test_health_says_how_the_curve_stands_to_its_reference(curve: Characteristic
 
 
 def test_a_reference_is_read_from_its_file(curve: Characteristic, tmp_path: Path) -> None:
-    assert reference_of(Settings()) is None
+    assert given_reference(Settings()) is None
     path = tmp_path / 'characteristic.json'
     path.write_text(json.dumps(to_json(curve)), encoding='utf-8')
-    read = reference_of(Settings({'reference_file': str(path)}))
+    read = given_reference(Settings({'reference_file': str(path)}))
     assert read is not None
     assert to_json(read) == to_json(curve)
 
@@ -181,7 +182,7 @@ def test_a_bad_file_is_refused_with_a_sentence(
     if text is not None:
         path.write_text(text, encoding='utf-8', errors='surrogateescape')
     with pytest.raises(ParameterError) as caught:
-        reference_of(Settings({'reference_file': str(path)}))
+        given_reference(Settings({'reference_file': str(path)}))
     assert said in str(caught.value)
     assert str(caught.value).startswith("Parameter 'reference_file' names")
 
@@ -191,7 +192,7 @@ def test_a_file_for_another_exponent_is_refused(curve: Characteristic, tmp_path:
     path.write_text(json.dumps(to_json(curve)), encoding='utf-8')
     settings = Settings({'reference_file': str(path), 'pressure_exponent': 1.0})
     with pytest.raises(ParameterError, match=r'the pressure exponent 1\.125'):
-        reference_of(settings)
+        given_reference(settings)
 
 
 # --- the node ---------------------------------------------------------------------------------

@@ -21,10 +21,10 @@ from valveflow_msgs.msg import Alarm, FlowCharacteristic
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import open_log
 from valveflow_ros.plant.simulator import simulate
+from valveflow_ros.ros.decoding import PLANT_SAMPLE
 from valveflow_ros.ros.demo import ros_arguments
-from valveflow_ros.ros.inputs import PLANT_SAMPLE
-from valveflow_ros.ros.playing import Player
-from valveflow_ros.ros.simulator_steps import effects_of, stamped_steps
+from valveflow_ros.ros.player import Player
+from valveflow_ros.ros.simulator_main import effects_of, stamped_steps
 from valveflow_ros.ros.verify import verify
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]

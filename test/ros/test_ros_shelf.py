@@ -22,7 +22,7 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import NS_PER_S
 from valveflow_ros.ros.demo import ros_arguments
-from valveflow_ros.ros.diagnostics import Item, Level
+from valveflow_ros.ros.node.diagnostics import Item, Level
 from valveflow_ros.ros.node.health import alarm_item
 from valveflow_ros.ros.verify import verify
 

@@ -25,7 +25,7 @@ from ros_helpers import Processes, wait_until
 from valveflow_ros.logs import Recorder, RecorderSettings, RecorderState, RecorderStatus
 from valveflow_ros.logs.mcap.recorder_loop import Ledger
 from valveflow_ros.logs.part_file import PartFile
-from valveflow_ros.ros.node.monitor_loop import Watchdog, recorder_lives
+from valveflow_ros.ros.node.monitor_node import Watchdog, recorder_lives
 
 ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).resolve().parent

@@ -15,7 +15,7 @@ from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_rows
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
-from valveflow_ros.ros.diagnostics import Item, Level
+from valveflow_ros.ros.node.diagnostics import Item, Level
 from valveflow_ros.ros.node.health import fit_item, reference_item
 
 SETTINGS = Settings({'refit_period': 3600.0, 'refit_segments': 0, 'alarm_limit': 500.0})

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.serialization import deserialize_message
-from valveflow_msgs.msg import JournalEntry as JournalMessage
 
 from valveflow_ros.diagnosis import result
 from valveflow_ros.errors import DataError, RecordingError, ValveflowError, counted
@@ -28,12 +27,11 @@ from valveflow_ros.monitoring.offline import JournalReplayer
 from valveflow_ros.monitoring.rows import Corrector
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import Readings
-from valveflow_ros.ros import conversions
-from valveflow_ros.ros.inputs import Decoder, Row
+from valveflow_ros.ros.decoding import Decoder, Row, journal_entry
 from valveflow_ros.ros.node import given_files
 from valveflow_ros.ros.node.recording import PARAMETERS, TOPICS
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
-from valveflow_ros.ros.worker.worker import DiagnosisWorker
+from valveflow_ros.ros.worker import DiagnosisWorker
 from valveflow_ros.signals.align import Aligner
 
 # Small, so that what is said before a decision that cannot be repeated is compared first.
@@ -131,16 +129,16 @@ def _replayed(
     progress: Progress,
 ) -> Iterator[Output]:
     """Yield what the engine says to the recorded inputs and decisions."""
-    speaker = Outputs(settings.text('unit_tag'))
+    outputs_of_replay = Outputs(settings.text('unit_tag'))
     # A recording of an earlier version has no topics that came later.
     kept = set(outputs.values())
     journal = list(_journal(log, outputs))
     if journal and _began_elsewhere(log, journal[0], inputs, outputs):
         problem = 'goes on from an earlier recording and cannot be verified without it'
         raise RecordingError(log.path, problem)
-    yield from (output for output in speaker.first() if output.name in kept)
-    monitor = Monitor(settings, _corrector(log, settings))
-    replayer = JournalReplayer(monitor, journal, diagnosed_elsewhere)
+    yield from (output for output in outputs_of_replay.latched() if output.name in kept)
+    monitor = Monitor(settings, corrector_of_run(log, settings))
+    replayer = JournalReplayer(monitor, journal, diagnose_in_process)
     aligner, decoder = Aligner(settings), Decoder(settings)
     messages = _messages(log, inputs)
     total = sum(log.topics[topic].count for topic in inputs if topic in log.topics)
@@ -151,13 +149,13 @@ def _replayed(
             for row in decoder.recorded(inputs[m.topic], m.data, m.publish_time_ns)
         ]  # fmt: skip
         # Restarts of the clock stand in the journal, so the rows alone are enough here.
-        said = speaker.of(_fed(replayer, aligner, rows))
+        said = outputs_of_replay.of(_fed(replayer, aligner, rows))
         yield from (output for output in said if output.name in kept)
         result.rows = monitor.rows
         progress(result.inputs / max(1, total))
 
 
-def _corrector(log: LogContents, settings: Settings) -> Corrector | None:
+def corrector_of_run(log: LogContents, settings: Settings) -> Corrector | None:
     """Return what took causes out of the rows in the run.
 
     Raises
@@ -165,11 +163,11 @@ def _corrector(log: LogContents, settings: Settings) -> Corrector | None:
     RecordingError
         The model is not in the recording, or cannot be used.
     """
-    if not settings.text(given_files.PARAMETER):
+    if not settings.text(given_files.MODEL_FILE):
         return None
     try:
         given = result.model_from_json(json.loads(log.attachments[given_files.ATTACHMENT]))
-        return given_files.ready(given, settings)
+        return given_files.corrector_for(given, settings)
     except KeyError:
         problem = f"lacks the attachment '{given_files.ATTACHMENT}' that its run was made with"
         raise RecordingError(log.path, problem) from None
@@ -178,7 +176,7 @@ def _corrector(log: LogContents, settings: Settings) -> Corrector | None:
         raise RecordingError(log.path, problem) from None
 
 
-def diagnosed_elsewhere(task: DiagnosisTask) -> str:
+def diagnose_in_process(task: DiagnosisTask) -> str:
     """Compute a diagnosis in a process like the one of the run, on which its last bits depend.
 
     Raises
@@ -209,9 +207,8 @@ def _journal(log: LogContents, outputs: dict[str, str]) -> Iterator[JournalEntry
     topics = [topic for topic, name in outputs.items() if name == 'journal']
     for message in _messages(log, topics):
         try:
-            yield conversions.journal_entry(deserialize_message(message.data, JournalMessage))
-        except Exception as error:
-            # rclpy raises whatever the middleware's C++ gave it.
+            yield journal_entry(message.data)
+        except ValueError as error:
             problem = f'holds a line of the journal that cannot be read ({error})'
             raise RecordingError(log.path, problem) from error
 

@@ -14,12 +14,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from valveflow_msgs.msg import Prediction
 
-from valveflow_ros.ros.inputs import INPUT_BY_NAME, header_time_ns
-from valveflow_ros.ros.outputs import clock_bytes
-from valveflow_ros.ros.polled_subscription import Taker
-
-# Do not send faster than the monitor takes: follow its predictions.
-
+from valveflow_ros.ros.decoding import INPUT_BY_NAME, header_time_ns
+from valveflow_ros.ros.encoding import clock_bytes
+from valveflow_ros.ros.polled_subscription import PolledSubscription
 
 _PREDICTION = 'valveflow_msgs/msg/Prediction'
 # Between two processes on one machine the middleware's queue holds 512 messages of all topics.
@@ -32,7 +29,7 @@ _BLIND_STEPS_PER_S = 1000.0
 _LOOK_S = 1.0
 
 
-class Flow:
+class FlowControl:
     """Holds a sender back while too much of what it sent is unanswered.
 
     What is sent in one go beyond what the middleware's queues hold is lost. The
@@ -45,7 +42,7 @@ class Flow:
     messages : int
         How many messages a sample takes.
     stop : callable
-        Tells whether to give up waiting.
+        Returns True to give up waiting.
 
     Notes
     -----
@@ -59,7 +56,7 @@ class Flow:
         self._node = node
         self._window = max(_LEAST_STEPS, _MOST_UNDER_WAY // messages)
         self._stop = stop
-        self._takers: list[Taker] = []
+        self._subscriptions: list[PolledSubscription] = []
         self._under_way: deque[int] = deque()
         self._newest_ns = 0
         self._stuck = 0
@@ -68,16 +65,18 @@ class Flow:
 
     @property
     def following(self) -> bool:
-        """Tell whether there is a prediction to follow."""
-        return bool(self._takers) and self._stuck < _STUCK_MOST
+        """Return True if there is a prediction to follow."""
+        return bool(self._subscriptions) and self._stuck < _STUCK_MOST
 
     def look_around(self) -> list[str]:
         """Find predictions to follow; return their topics."""
-        known = {taker.topic for taker in self._takers}
+        known = {subscription.topic for subscription in self._subscriptions}
         for topic, types in self._node.get_topic_names_and_types():
             if _PREDICTION in types and topic not in known:
-                self._takers.append(Taker(self._node, Prediction, topic, reliable=True))
-        return [taker.topic for taker in self._takers]
+                self._subscriptions.append(
+                    PolledSubscription(self._node, Prediction, topic, reliable=True)
+                )
+        return [subscription.topic for subscription in self._subscriptions]
 
     def sent(self, time_ns: int) -> None:
         """Note that the sample of a time was sent."""
@@ -91,7 +90,7 @@ class Flow:
         unlimited : bool
             Nothing else holds the sender back.
         """
-        if not self._takers and time.monotonic() - self._looked_s > _LOOK_S:
+        if not self._subscriptions and time.monotonic() - self._looked_s > _LOOK_S:
             self._looked_s = time.monotonic()
             self.look_around()
         if not self.following:
@@ -113,10 +112,10 @@ class Flow:
                 time.sleep(_FLOW_NAP_S)
 
     def _answered(self) -> bool:
-        """Take predictions; tell whether one speaks of something under way."""
-        for taker in self._takers:
-            for taken in taker.take():
-                self._newest_ns = max(self._newest_ns, header_time_ns(taken.data))
+        """Take predictions; return True if one answers something under way."""
+        for subscription in self._subscriptions:
+            for message in subscription.take():
+                self._newest_ns = max(self._newest_ns, header_time_ns(message.data))
         before = len(self._under_way)
         while self._under_way and self._under_way[0] <= self._newest_ns:
             self._under_way.popleft()
@@ -155,7 +154,7 @@ class Player:
     use_clock : bool
         Publish /clock before each step.
     stop : callable
-        Tells whether to stop.
+        Returns True to stop.
     """
 
     def __init__(
@@ -175,7 +174,7 @@ class Player:
             for name in names
         }
         self._clock = node.create_publisher(Clock, '/clock', qos) if use_clock else None
-        self._flow = Flow(node, len(self.publishers) + use_clock, stop)
+        self._flow = FlowControl(node, len(self.publishers) + use_clock, stop)
         self.sent: dict[str, int] = dict.fromkeys(self.publishers, 0)
 
     def wait_for_listeners(self, patience_s: float) -> list[str]:
