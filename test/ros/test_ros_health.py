@@ -122,7 +122,6 @@ def test_stamps_that_are_not_believed_are_told_by_how_far_they_are_off(
     off_s: float, words: str
 ) -> None:
     scene = Scene()
-    scene.health.by_host = False
     newest_ns = time.time_ns()
     scene.health.note('valve_opening', [(newest_ns + round(off_s * NS_PER_S), 0, 50.0, 0)])
     scene.counts['valve_opening']['time_outlier'] = 4

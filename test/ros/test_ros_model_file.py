@@ -100,7 +100,7 @@ def test_the_node_takes_causes_out_and_its_recording_repeats(
     log = open_log(folder)
     assert json.loads(log.attachments[given_files.ATTACHMENT]) == extended_json(**HELD)
     # Rows as measured would have another u from the first one on.
-    monkeypatch.setattr(verifying, '_corrector', lambda *_: None)
+    monkeypatch.setattr(verifying, 'corrector_of_run', lambda *_: None)
     assert 'Prediction number 1 differs' in verifying.verify(folder).difference
 
 
@@ -108,8 +108,8 @@ def test_a_recording_without_its_model_is_not_verified(tmp_path: Path) -> None:
     log = SimpleNamespace(path=tmp_path, attachments={})
     settings = Settings({'model_file': 'gone.json'})
     with pytest.raises(RecordingError, match='lacks the attachment'):
-        verifying._corrector(log, settings)  # type: ignore[arg-type]
+        verifying.corrector_of_run(log, settings)  # type: ignore[arg-type]
     log.attachments = {given_files.ATTACHMENT: b'{}'}
     with pytest.raises(RecordingError, match='an extended model that cannot be used'):
-        verifying._corrector(log, settings)  # type: ignore[arg-type]
-    assert verifying._corrector(log, Settings()) is None  # type: ignore[arg-type]
+        verifying.corrector_of_run(log, settings)  # type: ignore[arg-type]
+    assert verifying.corrector_of_run(log, Settings()) is None  # type: ignore[arg-type]

@@ -104,16 +104,12 @@ class Process:
     def __init__(
         self, name: str, module: str, parameters: Mapping[str, object], folder: Path
     ) -> None:
-        self.name = name
-        self.log = folder / f'{name}.log'
+        self.name, self.log = name, folder / f'{name}.log'
+        command = [sys.executable, '-m', f'valveflow_ros.ros.{module}', *ros_arguments(parameters)]
         with self.log.open('wb') as out:
+            # Ctrl-C comes to the demo alone, which then ends the others in order.
             self._process = subprocess.Popen(
-                [sys.executable, '-m', module, *ros_arguments(parameters)],
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=subprocess.STDOUT,
-                # Ctrl-C comes to the demo alone, which then ends the others in order.
-                start_new_session=True,
+                command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True
             )
 
     @property
@@ -194,26 +190,22 @@ class Story:
 
     def on_alarm(self, message: Alarm) -> None:
         """Tell that an alarm came, or came again, and how the first one went on."""
-        time_ns = from_time(message.header.stamp)
-        if message.state == Alarm.UNACKNOWLEDGED:
+        time_ns, state = from_time(message.header.stamp), message.state
+        goes_on = len(self._raised_ns) == 1 and message.previous_state != Alarm.SUPPRESSED
+        if state == Alarm.UNACKNOWLEDGED:
             self.reached(time_ns)
             # One that could not be judged for a while and stands again is not a new one.
-            if message.occurrence != self._occurrences.get(message.name):
-                self._occurrences[message.name] = message.occurrence
-                self._raised_ns.append(time_ns)
-                times = len(self._raised_ns)
-                nth = {2: 'second', 3: 'third'}.get(times, f'{times}th')
-                self._tell(
-                    time_ns,
-                    f'ALARM {message.name}: {message.sentence}' if times == 1 else
-                    f'the alarm comes again, the {nth} time',
-                )  # fmt: skip
-        elif (
-            message.state in _STATES
-            and message.previous_state != Alarm.SUPPRESSED
-            and len(self._raised_ns) == 1
-        ):
-            self._tell(time_ns, _STATES[message.state])
+            if message.occurrence == self._occurrences.get(message.name):
+                return
+            self._occurrences[message.name] = message.occurrence
+            self._raised_ns.append(time_ns)
+            times = len(self._raised_ns)
+            nth = {2: 'second', 3: 'third'}.get(times, f'{times}th')
+            again = f'the alarm comes again, the {nth} time'
+            told = f'ALARM {message.name}: {message.sentence}' if times == 1 else again
+            self._tell(time_ns, told)
+        elif goes_on and state in _STATES:
+            self._tell(time_ns, _STATES[state])
 
     def on_diagnosis(self, message: Diagnosis) -> None:
         """Tell of a diagnosis."""
@@ -353,19 +345,17 @@ def run(options: argparse.Namespace, stop: StopFlag) -> int:
 def _introduce(options: argparse.Namespace, fault_ns: int) -> None:
     rate = options.rate
     speed = f'{rate:g} times real time' if rate else 'as fast as the monitor takes them'
-    tell(
+    starting = f'Starting the monitor. {SENTENCE}' if is_first_run() else 'Starting the monitor.'
+    for line in (
         f"{counted(options.days, 'day')} of the paper's unit (seed {options.seed}), from "
-        f'{moment(DEFAULT_START_NS)} UTC on, {speed}.'
-    )
-    tell(
+        f'{moment(DEFAULT_START_NS)} UTC on, {speed}.',
         f'Hidden in it: from {moment(fault_ns)} on one of the valves gives up to '
-        f'{-_FAULT_MW:g} MW less, whenever the load needs that valve. The monitor is not told.'
-    )
-    tell(
+        f'{-_FAULT_MW:g} MW less, whenever the load needs that valve. The monitor is not told.',
         'To look on from another terminal (after: source env.sh): '
-        f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]} valveflow watch'
-    )
-    tell(f'Starting the monitor. {SENTENCE}' if is_first_run() else 'Starting the monitor.')
+        f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]} valveflow watch',
+        starting,
+    ):
+        tell(line)
 
 
 def _start(options: argparse.Namespace, folder: Path) -> tuple[Process, Process]:
@@ -385,8 +375,8 @@ def _start(options: argparse.Namespace, folder: Path) -> tuple[Process, Process]
         'unit_tag': 'demo', 'effects': f'"{fault}"', 'wait': 600.0,
     }  # fmt: skip
     return (
-        Process('monitor', 'valveflow_ros.ros.monitor_main', monitor, folder),
-        Process('plant', 'valveflow_ros.ros.simulator_main', plant, folder),
+        Process('monitor', 'monitor_main', monitor, folder),
+        Process('plant', 'simulator_main', plant, folder),
     )
 
 
@@ -444,13 +434,16 @@ def _conclude(watch: Watch, story: Story, folder: Path, fault_ns: int) -> int:
             )
     table = result / 'identify' / 'characteristic.json'
     pieces = len(json.loads(table.read_text())['pieces']) if table.exists() else 0
-    tell(f'Recording  {", ".join(map(str, sorted(recording.glob("*.mcap"))))}')
     report = result / 'identify' / 'report.html'
-    tell(f'Report     {report} ({pieces} pieces over the whole run, fault included)')
-    tell(f'Diagnosis  {result / "diagnose" / "report.html"}')
-    tell('Replay it to another monitor (after: source env.sh):')
-    tell(f'  python -m valveflow_ros.ros.replay_main {recording} --rate 600')
-    tell('  python -m valveflow_ros.ros.monitor_main --ros-args -p use_sim_time:=true')
+    for line in (
+        f'Recording  {", ".join(map(str, sorted(recording.glob("*.mcap"))))}',
+        f'Report     {report} ({pieces} pieces over the whole run, fault included)',
+        f'Diagnosis  {result / "diagnose" / "report.html"}',
+        'Replay it to another monitor (after: source env.sh):',
+        f'  python -m valveflow_ros.ros.replay_main {recording} --rate 600',
+        '  python -m valveflow_ros.ros.monitor_main --ros-args -p use_sim_time:=true',
+    ):
+        tell(line)
     if ok and story.alarms_of_fault and watch.acknowledged and found == [_FAULT]:
         return 0
     tell('Not all of it came out: a run of three days (the default) is enough for that.')

@@ -62,7 +62,7 @@ OUTPUTS: Mapping[str, OutputTopic] = {
 
 
 # What a running monitor can be asked to do, each a `std_srvs/Trigger` of the node.
-SERVICES = (
+SERVICES: tuple[str, ...] = (
     'refit',
     'acknowledge_alarms',
     'shelve_alarms',

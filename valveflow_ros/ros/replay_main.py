@@ -6,7 +6,9 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+from operator import itemgetter
 
 import rclpy
 from rclpy.node import Node
@@ -107,39 +109,29 @@ def steps_of(log: LogContents) -> tuple[list[str], Iterator[Step]]:
         messages = _recorded_messages(log, topics)
     if not names:
         raise DataError(f'{log.path}: there is nothing to play, no input of the monitor is in it.')
-    return names, _in_steps(messages)
+    # Messages that follow each other and belong to one instant are one step.
+    steps = (
+        Step(time_ns, [(name, data) for _, name, data in group])
+        for time_ns, group in groupby(messages, key=itemgetter(0))
+    )
+    return names, steps
 
 
 def _recorded_messages(
     log: LogContents, topics: dict[str, str]
 ) -> Iterator[tuple[int, str, bytes]]:
     for message in log.iter_messages(list(topics)):
-        name = topics[message.topic]
-        time_ns = message.publish_time_ns
+        name, time_ns = topics[message.topic], message.publish_time_ns
         if name == PLANT_SAMPLE:
             time_ns = header_time_ns(message.data)
         yield time_ns, name, message.data
 
 
 def _table_messages(log: LogContents) -> Iterator[tuple[int, str, bytes]]:
-    readings = log.readings
-    for time_ns, signal, value in zip(
-        readings.time_ns.tolist(), readings.signal.tolist(), readings.value.tolist(), strict=True
-    ):
+    r = log.readings
+    columns = (r.time_ns.tolist(), r.signal.tolist(), r.value.tolist())
+    for time_ns, signal, value in zip(*columns, strict=True):
         yield time_ns, SIGNALS[signal].topic, float64_bytes(value)
-
-
-def _in_steps(messages: Iterable[tuple[int, str, bytes]]) -> Iterator[Step]:
-    """Group messages that follow each other and belong to one instant."""
-    step: Step | None = None
-    for time_ns, name, data in messages:
-        if step is None or step.time_ns != time_ns:
-            if step is not None:
-                yield step
-            step = Step(time_ns, [])
-        step.messages.append((name, data))
-    if step is not None:
-        yield step
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -185,12 +177,13 @@ def _verify(path: str) -> int:
 
 def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     stop = StopFlag().install()
-    log = open_log(options.log)
-    names, steps = steps_of(log)
     start_ros(arguments)
-    node = Node('replay')
-    say = node.get_logger()
+    node: Node | None = None
     try:
+        log = open_log(options.log)
+        names, steps = steps_of(log)
+        node = Node('replay')
+        say = node.get_logger()
         for warning in log.warnings:
             say.warning(warning)
         player = Player(node, names, options.rate, not options.no_clock, lambda: bool(stop))
@@ -208,7 +201,8 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
         return 0
     finally:
         stop.last()
-        node.destroy_node()
+        if node is not None:
+            node.destroy_node()
         rclpy.try_shutdown()
 
 

@@ -211,7 +211,7 @@ class _Held(NamedTuple):
 
 
 class Source(Protocol):
-    """Something messages can be taken from."""
+    """Something that messages can be taken from."""
 
     def take(self, most: int = DEPTH) -> list[RawMessage]:
         """Return what has arrived."""

@@ -93,15 +93,15 @@ class Watchdog:
 
     def ready(self, status: str) -> None:
         """Tell that the start is done."""
-        self._send('READY=1', status, 'WATCHDOG=1')
+        self._send(f'READY=1\nSTATUS={_one_line(status)}\nWATCHDOG=1')
 
     def status(self, status: str) -> None:
         """Tell in a sentence what the process is doing."""
-        self._send('', status)
+        self._send(f'STATUS={_one_line(status)}')
 
     def stopping(self, status: str) -> None:
         """Tell that the end has begun."""
-        self._send('STOPPING=1', status)
+        self._send(f'STOPPING=1\nSTATUS={_one_line(status)}')
 
     def completed(self, recorder: Callable[[], RecorderStatus | None]) -> None:
         """Ping, if it is time, after a cycle that came to its end.
@@ -130,12 +130,9 @@ class Watchdog:
             if self._usec:
                 self._send(f'WATCHDOG_USEC={self._usec}\nWATCHDOG=1')
 
-    def _send(self, state: str, status: str = '', more: str = '') -> bool:
+    def _send(self, text: str) -> bool:
         if not self._address:
             return False
-        # A line break in a sentence would begin another assignment.
-        status = f'STATUS={" ".join(status.split())}' if status else ''
-        text = '\n'.join(filter(None, (state, status, more)))
         # A manager that does not take a datagram at once must not hold up the loop.
         kind = socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK
         try:
@@ -144,6 +141,11 @@ class Watchdog:
         except OSError:
             return False
         return True
+
+
+def _one_line(text: str) -> str:
+    """Return a text without line breaks, as each would begin another assignment."""
+    return ' '.join(text.split())
 
 
 def recorder_lives(status: RecorderStatus | None, stall_s: float) -> bool:
@@ -207,7 +209,7 @@ class MonitorNode(LifecycleNode):
         self.add_on_set_parameters_callback(self._check)
         self.add_post_set_parameters_callback(self._apply)
         self._health = self.create_publisher(DiagnosticArray, DIAGNOSTICS, 10)
-        self._services = [
+        self._trigger_services = [
             self.create_service(Trigger, f'~/{name}', functools.partial(self._serve, name))
             for name in SERVICES
         ]
