@@ -2,8 +2,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
@@ -13,12 +16,25 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_helpers import Processes, wait_until
 from std_msgs.msg import Float32, Float64
 
+from valveflow_ros.curve.characteristic import Characteristic, Support
+from valveflow_ros.curve.shift import judge_shift
+from valveflow_ros.fit.result import NOT_REFINED
+from valveflow_ros.monitoring.alarms import Judged, ResidualAlarm
+from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.monitoring.offline import feed_rows
 from valveflow_ros.parameters import Settings
+from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import NS_PER_S, SIGNALS, Signal
 from valveflow_ros.ros.decoding import INPUTS, PLANT_SAMPLE
 from valveflow_ros.ros.demo import ros_arguments
 from valveflow_ros.ros.node.diagnostics import Changes, Item, Level, diagnostics_message
-from valveflow_ros.ros.node.health import InputHealth, Publishers
+from valveflow_ros.ros.node.health import (
+    InputHealth,
+    Publishers,
+    alarm_item,
+    fit_item,
+    reference_item,
+)
 from valveflow_ros.ros.node.intake import TopicStatistics
 from valveflow_ros.signals.align import REASONS
 
@@ -318,6 +334,100 @@ def test_a_failure_gets_into_the_log_however_short_it_is_and_not_again_and_again
         assert changes.pick([well], second) == []
         assert changes.pick([dead], second + 1.0) == []
     assert changes.pick([well], 40.0) == [well]
+
+
+# The curve, its reference and its alarms
+
+WORK = Settings({'refit_period': 3600.0, 'refit_segments': 0, 'alarm_limit': 500.0})
+WORKER: Any = SimpleNamespace(failures_in_a_row=0, busy_s=None, starts=1)
+STRAIGHT = f'{NOT_REFINED}one straight piece, without dynamics.'
+ALONE = 'Piece 1 (u 1000 to 1400) rests on no special sample.'
+
+
+@pytest.fixture(scope='module')
+def monitor() -> Monitor:
+    made = Monitor(WORK)
+    feed_rows(made, simulate(0.3, 7).table)
+    return made
+
+
+def said_of(monitor: Monitor, notes: tuple[str, ...], identifiable: bool = True) -> Item:
+    """Return what is said of the running curve with other notes."""
+    curve = monitor.characteristic
+    assert curve is not None
+    support = (Support(1, 1, 100, (1200.0,), identifiable),)
+    source = replace(curve.source, temperature_flag=False)
+    other = replace(curve, notes=notes, support=support, source=source)
+    seen: Any = SimpleNamespace(
+        characteristic=other, noise=monitor.noise, status=monitor.status, rows=monitor.rows,
+        segments=1, special_samples=100, last_ns=monitor.last_ns, cause='',
+    )  # fmt: skip
+    item = fit_item(seen, WORKER, 1.0)
+    assert item.values['Notes'] == ' '.join(notes)
+    return item
+
+
+def test_a_weak_curve_says_so(monitor: Monitor) -> None:
+    assert said_of(monitor, ()).level == Level.OK
+    assert said_of(monitor, ('Manual step test: 19 of 19 levels count.',)).level == Level.OK
+    for notes, identifiable in (((STRAIGHT,), True), ((ALONE,), False)):
+        item = said_of(monitor, notes, identifiable)
+        assert (item.level, item.sentence) == (Level.WARN, notes[0])
+    both = said_of(monitor, ('Read so.', STRAIGHT, ALONE), identifiable=False)
+    assert (both.level, both.sentence) == (Level.WARN, f'{STRAIGHT} Weak points in all: 2.')
+
+
+def lifted(curve: Characteristic, by_mw: float) -> Characteristic:
+    pieces = tuple(replace(p, intercept=p.intercept + by_mw) for p in curve.pieces)
+    return replace(curve, pieces=pieces, model_id='lifted')
+
+
+def test_an_alarm_whose_range_left_the_window_says_so(monitor: Monitor) -> None:
+    curve = monitor.characteristic
+    assert curve is not None
+    monitor.set_reference(curve)
+    keeper, alarm = monitor.reference, monitor.reference.alarm
+    keeper.shift = judge_shift(curve, lifted(curve, 9.0))
+    alarm.judge(keeper.shift, 1, WORK)
+    assert reference_item(monitor).sentence == keeper.shift.sentence
+    knot = curve.pieces[-1].u_from
+    keeper.shift = judge_shift(curve, replace(curve, pieces=curve.pieces[-1:]))
+    assert alarm.judge(keeper.shift, 2, WORK) == []
+    item = reference_item(monitor)
+    assert item.level == Level.ERROR
+    assert item.sentence.startswith('The alarm stands: what moved, u ')
+    assert f'to {knot:.0f}, is not judged unmoved yet' in item.sentence
+
+
+NERVOUS = {'alarm_on_delay': 0.0, 'alarm_off_delay': 0.0, 'alarm_suppress_time': 60.0}
+
+
+def after(values: list[float], shelved: bool = False) -> Item:
+    """Return what diagnostics say after a second of each value."""
+    alarm = ResidualAlarm(Settings(NERVOUS))
+    time_ns = np.arange(1, len(values) + 1) * NS_PER_S
+    column = np.array(values)
+    alarm.feed(time_ns, column, column, 'm')
+    if shelved:
+        assert alarm.shelve(int(time_ns[-1]), 'm')[0]
+    monitor: Any = SimpleNamespace(alarm=alarm, judged=Judged(0, values[-1], values[-1]))
+    return alarm_item(monitor)
+
+
+def test_diagnostics_tell_the_state_that_no_announcement_told() -> None:
+    item = after([2.0, 0.0] * 5 + [2.0])
+    assert (item.level, item.values['State']) == (Level.ERROR, 'unacknowledged')
+    assert (item.values['Occurrences'], item.values['Announcements held back']) == (6, 4)
+
+
+def test_diagnostics_tell_of_shelf_and_suppression() -> None:
+    item = after([2.0], shelved=True)
+    assert (item.level, item.values['State']) == (Level.WARN, 'shelved')
+    assert item.values['Shelved until (s since 1970)'] == 1 + 28800
+    blind = after([0.0] + [float('nan')] * 70)
+    assert (blind.level, blind.values['State']) == (Level.WARN, 'suppressed')
+    assert 'no alarm can come' in blind.sentence
+    assert after([0.0]).level == Level.OK
 
 
 class Listener:

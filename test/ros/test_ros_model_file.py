@@ -8,14 +8,14 @@ from types import SimpleNamespace
 
 import pytest
 from extended_file import extended_json, write_extended
-from ros_helpers import PATIENCE_S, Processes, wait_until
+from listener import start_monitor, start_plant
+from ros_helpers import Processes, wait_until
 
 from valveflow_ros.diagnosis.result import model_to_json
 from valveflow_ros.errors import ParameterError, RecordingError
 from valveflow_ros.logs import open_log
 from valveflow_ros.parameters import Settings
 from valveflow_ros.ros import verify as verifying
-from valveflow_ros.ros.demo import ros_arguments
 from valveflow_ros.ros.node import given_files
 from valveflow_ros.ros.node.session import Session
 
@@ -75,17 +75,10 @@ def test_the_node_takes_causes_out_and_its_recording_repeats(
     processes: Processes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = write_extended(tmp_path / 'extended_model.json', **HELD)
-    parameters = {
-        'record_directory': f'"{tmp_path / "recordings"}"', 'unit_tag': '"unit"',
-        'input_reliability': 'reliable', 'refit_period': 3600.0, 'refit_segments': 0,
-        'model_file': f'"{model}"', 'use_sim_time': True,
-    }  # fmt: skip
-    monitor = processes.start('valveflow_ros.ros.monitor_main', *ros_arguments(parameters))
-    plant = processes.start(
-        'valveflow_ros.ros.simulator_main',
-        *ros_arguments({'seed': 7, 'rate': 0.0, 'wait': PATIENCE_S, 'days': 0.02,
-                        'use_clock': True}),
-    )  # fmt: skip
+    monitor = start_monitor(
+        processes, tmp_path / 'recordings', model_file=str(model), use_sim_time=True
+    )
+    plant = start_plant(processes, days=0.02, use_clock=True)
     wait_until(lambda: plant.poll() is not None, 'the end of the plant')
     monitor.terminate()
     assert monitor.wait(10.0) == 0, processes.output(monitor)

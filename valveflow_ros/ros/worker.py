@@ -338,11 +338,9 @@ class Worker:
         elif self._warming_since_s is not None:
             # It may be compiling. What waits behind it has not begun.
             if now_s - self._warming_since_s > _LONGEST_WARM_UP_S:
-                self._end()
                 sentence = f'The {self.word} process could not be made ready and was ended.'
                 self._failed(sentence, outcomes)
         elif self.busy_s is not None and self.busy_s > self._timeout_s:
-            self._end()
             sentence = (
                 f'The {self.word} took longer than {self._timeout_s:g} s and was ended '
                 f'(parameter {self.parameter}).'
@@ -363,7 +361,6 @@ class Worker:
                 result = result_from_bytes(data)
             except DataError:
                 if self._process.poll() is None:
-                    self._end()
                     sentence = f'The {self.word} process gave an answer that cannot be read.'
                     self._failed(sentence, outcomes)
                 return
@@ -405,6 +402,7 @@ class Worker:
         release_memory()
 
     def _failed(self, sentence: str, outcomes: list[Outcome]) -> None:
+        self._end()
         self.failures_in_a_row += 1
         self._start_at_s = self._clock() + self._pause_s
         self._pause_s = min(2.0 * self._pause_s, _LONGEST_PAUSE_S)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from rclpy.node import Node
@@ -28,62 +28,7 @@ from valveflow_ros.ros.worker import DiagnosisWorker, FitWorker
 from valveflow_ros.signals.align import REASONS
 from valveflow_ros.signals.units import unit_of
 
-_NONE = -(2**63)
-
-
-class StampHealth:
-    """Remembers the stamps of each signal from one look to the next.
-
-    Parameters
-    ----------
-    clock_jump_s : float
-        By how much a stamp may be off.
-    by_host : bool
-        Whether this machine's clock tells the time of the plant; false with a /clock.
-    """
-
-    def __init__(self, clock_jump_s: float, by_host: bool = True) -> None:
-        self._jump_ns = round(clock_jump_s * NS_PER_S)
-        self._by_host = by_host
-        # By the signals' numbers: this is done for every message.
-        self._last_ns = [0] * len(SIGNALS)
-        self._lead_ns = [_NONE] * len(SIGNALS)
-
-    def note(self, rows: Iterable[Row], host_ns: int) -> None:
-        """Take the readings of a message and what this machine's clock shows."""
-        for time_ns, number, _, _ in rows:
-            self._last_ns[number] = time_ns
-            lead_ns = time_ns - host_ns
-            if lead_ns > self._lead_ns[number]:
-                self._lead_ns[number] = lead_ns
-
-    def look(self, number: int) -> tuple[str, str]:
-        """Return what is wrong with the stamps since the last look, and what is only odd.
-
-        A stamp that is behind may be that of a recording which is played; none can be ahead.
-        Both are empty where this machine's clock agrees.
-        """
-        lead_ns, self._lead_ns[number] = self._lead_ns[number], _NONE
-        if not self._by_host or lead_ns == _NONE or abs(lead_ns) <= self._jump_ns:
-            return '', ''
-        if lead_ns < 0:
-            off = duration(-lead_ns / NS_PER_S)
-            return '', f"stamps are {off} behind this machine's clock"
-        most = duration(lead_ns / NS_PER_S)
-        return (
-            f"Stamps are up to {most} ahead of this machine's clock; set both by one server.",
-            '',
-        )
-
-    def far(self, number: int, newest_ns: int) -> str:
-        """Return how far the last stamp is from the newest that counts; empty if it is near."""
-        off_ns = self._last_ns[number] - newest_ns
-        if abs(off_ns) <= self._jump_ns:
-            return ''
-        off = duration(abs(off_ns) / NS_PER_S)
-        if off_ns > 0:
-            return f'The last stamp is {off} ahead of the newest one used.'
-        return f'The last stamp is {off} behind the newest one used.'
+_NO_LEAD = -(2**63)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +86,11 @@ class InputHealth:
         self._topics = topics
         # Looked up once; they are not live.
         self._ranges = [plausible_range(info.signal, settings) for info in SIGNALS]
-        self._stamps = StampHealth(settings.real('clock_jump'), by_host)
+        self._jump_ns = round(settings.real('clock_jump') * NS_PER_S)
+        self._by_host = by_host
+        # Stamps by the signals' numbers: this is done for every message.
+        self._last_ns = [0] * len(SIGNALS)
+        self._lead_ns = [_NO_LEAD] * len(SIGNALS)
         self._impossible: dict[str, tuple[str, float]] = {}
         self._counted: dict[tuple[str, str], int] = {}
         self._used: dict[str, tuple[int, float]] = {}
@@ -149,8 +98,10 @@ class InputHealth:
 
     def note(self, name: str, rows: Sequence[Row]) -> None:
         """Remember the stamps, and the last impossible value of each signal, to name it."""
-        self._stamps.note(rows, time.time_ns())
-        for _, number, value, _ in rows:
+        host_ns = time.time_ns()
+        for time_ns, number, value, _ in rows:
+            self._last_ns[number] = time_ns
+            self._lead_ns[number] = max(self._lead_ns[number], time_ns - host_ns)
             low, high = self._ranges[number]
             if not low <= value <= high and math.isfinite(value):
                 self._impossible[SIGNALS[number].topic] = (name, value)
@@ -236,7 +187,7 @@ class InputHealth:
         topic = self._topics[name]
         rejected = self._new(info.topic, 'rejected', sum(counts[r] for r in _REJECTED))
         lost = self._new(info.topic, 'lost', received.lost)
-        ahead, behind = self._stamps.look(info.signal)
+        ahead, behind = self._stamps(info.signal)
         if seen.wrong_types:
             return _wrong_type(topic, seen)
         if received.stale(now_s):
@@ -287,9 +238,12 @@ class InputHealth:
         """Return why readings were rejected: the last impossible value, or the reasons so far."""
         found = self._impossible.pop(info.topic, None)
         if found is None:
-            far = self._stamps.far(info.signal, self._newest_ns)
-            if self._new(info.topic, 'time_outlier', counts['time_outlier']) and far:
-                return far
+            off_ns = self._last_ns[info.signal] - self._newest_ns
+            outliers = self._new(info.topic, 'time_outlier', counts['time_outlier'])
+            if outliers and abs(off_ns) > self._jump_ns:
+                off = duration(abs(off_ns) / NS_PER_S)
+                side = 'ahead of' if off_ns > 0 else 'behind'
+                return f'The last stamp is {off} {side} the newest one used.'
             reasons = [f'{r.replace("_", " ")} {counts[r]}' for r in _REJECTED if counts[r]]
             return f'So far: {", ".join(reasons)}.'
         name, value = found
@@ -305,6 +259,19 @@ class InputHealth:
         if fitting:
             text += f' Is {info.topic}_unit {" or ".join(fitting)} rather than {named}?'
         return text
+
+    def _stamps(self, number: int) -> tuple[str, str]:
+        """Return what is wrong with the stamps since the last look, and what is only odd.
+
+        A stamp that is behind may be that of a recording which is played; none can be ahead.
+        """
+        lead_ns, self._lead_ns[number] = self._lead_ns[number], _NO_LEAD
+        if not self._by_host or lead_ns == _NO_LEAD or abs(lead_ns) <= self._jump_ns:
+            return '', ''
+        off = duration(abs(lead_ns) / NS_PER_S)
+        if lead_ns < 0:
+            return '', f"stamps are {off} behind this machine's clock"
+        return f"Stamps are up to {off} ahead of this machine's clock; set both by one server.", ''
 
     def _new(self, topic: str, what: str, count: int) -> int:
         """Return by how much a count has grown since the last look."""

@@ -38,13 +38,7 @@ def tag_of(settings: Settings) -> str:
 
 
 def expand_home(name: str) -> Path:
-    """Return a folder a parameter names, ``~`` replaced.
-
-    Raises
-    ------
-    RecordingError
-        There is no such user.
-    """
+    """Return a folder with ``~`` replaced; raises `RecordingError` if that user is not there."""
     try:
         return Path(name).expanduser()
     except RuntimeError:
@@ -52,13 +46,7 @@ def expand_home(name: str) -> Path:
 
 
 def new_folder(settings: Settings, at_s: float) -> Path:
-    """Make and return a folder that no other run records into.
-
-    Raises
-    ------
-    RecordingError
-        It cannot be made.
-    """
+    """Make a folder that no other run records into; raises `RecordingError` if it cannot be."""
     parent = expand_home(settings.text('record_directory') or DEFAULT_FOLDER)
     stem = time.strftime('valveflow_%Y%m%dT%H%M%SZ', time.gmtime(at_s)) + f'_{tag_of(settings)}'
     try:

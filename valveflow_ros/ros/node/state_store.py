@@ -73,7 +73,14 @@ class StateFolder:
             make_folder(folder)
             self._lock = _locked(folder / LOCK)
         except BlockingIOError:
-            raise InUseError(folder, _in_use(folder / LOCK)) from None
+            owner = ''
+            with contextlib.suppress(OSError, ValueError):
+                owner = f' (process {int((folder / LOCK).read_text()[:20])})'
+            problem = (
+                f'another monitor{owner} keeps its state there; stop it, or give this one a '
+                'state_directory or unit_tag of its own'
+            )
+            raise InUseError(folder, problem) from None
         except (OSError, ValueError) as error:
             raise RecordingError(folder, f'cannot be used ({_reason(error)})') from None
         # What a killed process left half written; if it cannot be removed, it does no harm.
@@ -90,9 +97,8 @@ class StateFolder:
             It is there and cannot be read.
         """
         path = self.path if path is None else path
-        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         try:
-            with os.fdopen(os.open(path, flags), 'rb') as file:
+            with os.fdopen(_private(path, os.O_RDONLY | os.O_NONBLOCK), 'rb') as file:
                 if os.fstat(file.fileno()).st_size > _MAX_BYTES:
                     raise RecordingError(path, 'is too large to be a saved state')
                 return file.read()
@@ -379,14 +385,9 @@ def _fitting(data: bytes | None, settings: Settings) -> State | None:
     return saved
 
 
-def _private(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, FILE_MODE)
-
-
 def _locked(path: Path) -> int:
-    """Return a descriptor that holds the lock; the kernel lets go when the process ends."""
-    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-    descriptor = os.open(path, flags, FILE_MODE)
+    """Return a descriptor that holds the lock; the kernel releases it when the process ends."""
+    descriptor = _private(path, os.O_RDWR | os.O_CREAT)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         os.fchmod(descriptor, FILE_MODE)
@@ -398,15 +399,8 @@ def _locked(path: Path) -> int:
     return descriptor
 
 
-def _in_use(lock: Path) -> str:
-    """Say who holds it."""
-    owner = ''
-    with contextlib.suppress(OSError, ValueError):
-        owner = f' (process {int(lock.read_text()[:20])})'
-    return (
-        f'another monitor{owner} keeps its state there; stop it, or give this one a '
-        'state_directory or unit_tag of its own'
-    )
+def _private(path: str | Path, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, FILE_MODE)
 
 
 def _reason(error: OSError | ValueError) -> str:
