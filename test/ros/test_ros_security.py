@@ -28,7 +28,7 @@ from valveflow_ros.ros.domain import InsecureError, check_security
 from valveflow_ros.ros.node.given_files import given_model, given_reference
 from valveflow_ros.ros.node.monitor_node import MonitorNode
 from valveflow_ros.ros.node.recording import Recording, new_folder
-from valveflow_ros.ros.node.state_store import LOCK, STATE, StateFolder
+from valveflow_ros.ros.node.state_store import LOCK
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).resolve().parents[2]
@@ -385,25 +385,6 @@ def test_a_planted_link_is_not_followed(tmp_path: Path) -> None:
     recorder.close(10.0)
     assert (elsewhere / 'victim').read_text() == 'untouched'
     assert [path.name for path in elsewhere.iterdir()] == ['victim']
-
-
-def test_a_planted_state_is_not_followed(tmp_path: Path) -> None:
-    victim, folder = tmp_path / 'victim', tmp_path / 'state'
-    victim.write_text('untouched')
-    folder.mkdir()
-    (folder / LOCK).symlink_to(victim)
-    with pytest.raises(RecordingError, match='cannot be used'):
-        StateFolder(folder)
-    (folder / LOCK).unlink()
-    (folder / STATE).symlink_to(victim)
-    state = StateFolder(folder)
-    with pytest.raises(RecordingError, match='cannot be read'):
-        state.read()
-    state.write(b'mine')
-    assert state.read() == b'mine'
-    state.close()
-    assert victim.read_text() == 'untouched'
-    assert {stat.S_IMODE(path.lstat().st_mode) for path in folder.iterdir()} == {0o600}
 
 
 @pytest.mark.parametrize('umask', [0o000, 0o022, 0o077])

@@ -242,8 +242,9 @@ class InputHealth:
             outliers = self._new(info.topic, 'time_outlier', counts['time_outlier'])
             if outliers and abs(off_ns) > self._jump_ns:
                 off = duration(abs(off_ns) / NS_PER_S)
-                side = 'ahead of' if off_ns > 0 else 'behind'
-                return f'The last stamp is {off} {side} the newest one used.'
+                if off_ns > 0:
+                    return f'The last stamp is {off} ahead of the newest one used.'
+                return f'The last stamp is {off} behind the newest one used.'
             reasons = [f'{r.replace("_", " ")} {counts[r]}' for r in _REJECTED if counts[r]]
             return f'So far: {", ".join(reasons)}.'
         name, value = found
