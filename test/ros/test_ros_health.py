@@ -54,10 +54,10 @@ class Scene:
             self.hear(info.topic)
 
     def hear(self, name: str, at: float = NOW, period: float = 1.0) -> None:
-        tally = self.statistics[name]
+        found = self.statistics[name]
         for k in range(5, -1, -1):
-            tally.note_arrival(1, at - k * period)
-            tally.note_number(tally.received + 1)
+            found.note_arrival(1, at - k * period)
+            found.note_number(found.received + 1)
 
     def item(
         self,
@@ -386,13 +386,13 @@ def test_an_alarm_whose_range_left_the_window_says_so(monitor: Monitor) -> None:
     curve = monitor.characteristic
     assert curve is not None
     monitor.set_reference(curve)
-    keeper, alarm = monitor.reference, monitor.reference.alarm
-    keeper.shift = judge_shift(curve, lifted(curve, 9.0))
-    alarm.judge(keeper.shift, 1, WORK)
-    assert reference_item(monitor).sentence == keeper.shift.sentence
+    reference, alarm = monitor.reference, monitor.reference.alarm
+    reference.shift = judge_shift(curve, lifted(curve, 9.0))
+    alarm.judge(reference.shift, 1, WORK)
+    assert reference_item(monitor).sentence == reference.shift.sentence
     knot = curve.pieces[-1].u_from
-    keeper.shift = judge_shift(curve, replace(curve, pieces=curve.pieces[-1:]))
-    assert alarm.judge(keeper.shift, 2, WORK) == []
+    reference.shift = judge_shift(curve, replace(curve, pieces=curve.pieces[-1:]))
+    assert alarm.judge(reference.shift, 2, WORK) == []
     item = reference_item(monitor)
     assert item.level == Level.ERROR
     assert item.sentence.startswith('The alarm stands: what moved, u ')

@@ -225,8 +225,8 @@ def test_what_is_sent_before_the_first_clock_waits_for_it_and_stands_before_its_
     assert [a.data for a in found[:4]] == [float64_bytes(k) for k in range(4)]
     assert [a.time_ns for a in found] == [*(shown - (10 - k) * NS_PER_S for k in range(4)), shown]
     assert [a.log_ns for a in found] == sorted(a.log_ns for a in found)
-    tally = intake.statistics['valve_opening']
-    assert (tally.waiting, tally.before_clock, tally.without_time) == (0, 4, 0)
+    statistics = intake.statistics['valve_opening']
+    assert (statistics.waiting, statistics.before_clock, statistics.without_time) == (0, 4, 0)
     assert len(intake.rows(found)) == 5
 
 
@@ -362,16 +362,16 @@ def test_the_clock_track_stays_bounded() -> None:
 
 
 def test_gaps_in_the_publishers_numbers_are_losses() -> None:
-    tally = TopicStatistics()
+    statistics = TopicStatistics()
     for number in (1, 2, 5, 6, 10):
-        tally.note_number(number)
-    assert (tally.received, tally.lost, tally.missed_at_start) == (5, 5, 0)
+        statistics.note_number(number)
+    assert (statistics.received, statistics.lost, statistics.missed_at_start) == (5, 5, 0)
 
 
 def test_numbers_before_the_first_are_no_losses() -> None:
-    tally = TopicStatistics()
-    tally.note_number(8)
-    assert (tally.lost, tally.missed_at_start) == (0, 7)
+    statistics = TopicStatistics()
+    statistics.note_number(8)
+    assert (statistics.lost, statistics.missed_at_start) == (0, 7)
 
 
 @settings(max_examples=200, deadline=None)
@@ -384,13 +384,13 @@ def test_two_publishers_never_invent_a_loss(
 ) -> None:
     """Nothing is lost; whoever sends, at whatever rate, in whatever bursts."""
     rng = np.random.default_rng(seed)
-    tally, numbers = TopicStatistics(), [first, second]
+    statistics, numbers = TopicStatistics(), [first, second]
     for _ in range(seconds):
         for who in (rng.random(int(rng.integers(0, 30))) < share).astype(int):
-            tally.note_number(numbers[who])
+            statistics.note_number(numbers[who])
             numbers[who] += 1
-        tally.note_publishers(2)
-        assert tally.lost == 0
+        statistics.note_publishers(2)
+        assert statistics.lost == 0
 
 
 @settings(max_examples=200, deadline=None)
@@ -399,65 +399,65 @@ def test_losses_are_counted_again_when_one_publisher_is_left(
     alone: int, both: int, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    tally, numbers = TopicStatistics(), [1, 900]
+    statistics, numbers = TopicStatistics(), [1, 900]
     for _ in range(alone):
-        tally.note_number(numbers[0])
+        statistics.note_number(numbers[0])
         numbers[0] += 1 + int(rng.integers(0, 2))
-    before = tally.lost
-    tally.note_publishers(1)
+    before = statistics.lost
+    statistics.note_publishers(1)
     for who in rng.integers(0, 2, both):
-        tally.note_number(numbers[who])
+        statistics.note_number(numbers[who])
         numbers[who] += 1
-    tally.note_publishers(2)
-    assert tally.lost == before
-    tally.note_publishers(1)
-    tally.note_publishers(1)
-    tally.note_number(numbers[0])
-    assert tally.lost == before
-    tally.note_publishers(1)
-    tally.note_publishers(1)
-    tally.note_number(numbers[0] + 1)
-    tally.note_number(numbers[0] + 5)
-    assert tally.lost == before + 3
+    statistics.note_publishers(2)
+    assert statistics.lost == before
+    statistics.note_publishers(1)
+    statistics.note_publishers(1)
+    statistics.note_number(numbers[0])
+    assert statistics.lost == before
+    statistics.note_publishers(1)
+    statistics.note_publishers(1)
+    statistics.note_number(numbers[0] + 1)
+    statistics.note_number(numbers[0] + 5)
+    assert statistics.lost == before + 3
 
 
 def test_another_publisher_after_a_pause_or_for_a_moment_invents_no_loss() -> None:
-    tally = TopicStatistics()
+    statistics = TopicStatistics()
     for number in (1, 2, 3):
-        tally.note_number(number)
-    tally.note_publishers(0)
-    tally.note_publishers(1)
-    tally.note_number(40)
-    assert tally.lost == 0
+        statistics.note_number(number)
+    statistics.note_publishers(0)
+    statistics.note_publishers(1)
+    statistics.note_number(40)
+    assert statistics.lost == 0
     for number in (500, 41):
-        tally.note_number(number)
-    tally.note_publishers(1)
-    assert tally.lost == 0
+        statistics.note_number(number)
+    statistics.note_publishers(1)
+    assert statistics.lost == 0
 
 
 def test_a_restarted_publisher_is_one_irregularity() -> None:
-    tally = TopicStatistics()
+    statistics = TopicStatistics()
     for number in (5, 6, 7, 1, 2, 3):
-        tally.note_number(number)
-    assert (tally.irregular, tally.lost) == (1, 0)
-    tally.note_publishers(1)
-    tally.note_number(number + 9)
-    assert tally.lost == 0, 'it may be another one that goes'
-    tally.note_publishers(1)
-    tally.note_number(number + 19)
-    assert tally.lost == 9
+        statistics.note_number(number)
+    assert (statistics.irregular, statistics.lost) == (1, 0)
+    statistics.note_publishers(1)
+    statistics.note_number(number + 9)
+    assert statistics.lost == 0, 'it may be another one that goes'
+    statistics.note_publishers(1)
+    statistics.note_number(number + 19)
+    assert statistics.lost == 9
 
 
 @pytest.mark.parametrize(('period', 'limit'), [(0.01, 2.0), (1.0, 2.5), (30.0, 75.0)])
 def test_silence_is_told_by_the_topics_own_period(period: float, limit: float) -> None:
-    tally = TopicStatistics()
-    assert tally.age_s(0.0) is None
+    statistics = TopicStatistics()
+    assert statistics.age_s(0.0) is None
     for k in range(100):
-        tally.note_arrival(1, k * period)
+        statistics.note_arrival(1, k * period)
     last = 99 * period
-    assert tally.rate_hz() == pytest.approx(1.0 / period)
-    assert not tally.stale(last + 0.98 * limit)
-    assert tally.stale(last + 1.02 * limit)
+    assert statistics.rate_hz() == pytest.approx(1.0 / period)
+    assert not statistics.stale(last + 0.98 * limit)
+    assert statistics.stale(last + 1.02 * limit)
 
 
 def test_the_rate_does_not_depend_on_how_often_is_looked() -> None:

@@ -46,8 +46,8 @@ class Ears:
         self.heard: dict[str, list[RawMessage]] = {name: [] for name in self._subscriptions}
 
     def take(self) -> None:
-        for name, taker in self._subscriptions.items():
-            self.heard[name] += taker.take()
+        for name, subscription in self._subscriptions.items():
+            self.heard[name] += subscription.take()
 
     def until(self, process: Any) -> None:
         """Listen until a process has ended and nothing more comes."""

@@ -267,7 +267,6 @@ class Intake:
         self._held: list[_Held] = []
         self._waiting: deque[_Held] = deque()
         self.statistics = {name: TopicStatistics() for name in self._sources}
-        self.clock_statistics = TopicStatistics()
 
     def collect(self, now_s: float, now_ns: int, last: bool = False) -> list[Arrival]:
         """Return the arrivals of this look.
@@ -297,7 +296,7 @@ class Intake:
                 # More is waiting there, received after the last of these.
                 until_ns = min(until_ns, received_ns)
         if self._clock is not None:
-            self._follow_clock(self._clock, now_s)
+            self._follow_clock(self._clock)
             self._release(now_s, last)
         if not self._held:
             return []
@@ -352,11 +351,8 @@ class Intake:
             rows += found
         return rows
 
-    def _follow_clock(self, clock: Source, now_s: float) -> None:
-        found = clock.take(_MOST_CLOCKS)
-        self.clock_statistics.note_arrival(len(found), now_s)
-        for message in found:
-            self.clock_statistics.note_number(message.sequence)
+    def _follow_clock(self, clock: Source) -> None:
+        for message in clock.take(_MOST_CLOCKS):
             self._track.note(message.source_ns, header_time_ns(message.data))
 
     def _arrival(self, held: _Held) -> Arrival:

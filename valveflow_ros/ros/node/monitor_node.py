@@ -238,7 +238,6 @@ class MonitorNode(LifecycleNode):
     @_logged
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start the fit process, compile, open the recording."""
-        del state
         log = self.get_logger()
         with self._watchdog.patient(_LONGEST_START_S):
             try:
@@ -258,7 +257,6 @@ class MonitorNode(LifecycleNode):
     @_logged
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Subscribe to the inputs."""
-        del state
         session = self.session
         assert session is not None
         with self._watchdog.patient(_LONGEST_START_S):
@@ -275,7 +273,6 @@ class MonitorNode(LifecycleNode):
     @_logged
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Unsubscribe; the curve and the alarm stay."""
-        del state
         assert self.session is not None
         self.session.unsubscribe()
         return _SUCCESS
@@ -283,14 +280,12 @@ class MonitorNode(LifecycleNode):
     @_logged
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Finish the recording and forget everything."""
-        del state
         self.end_session()
         return _SUCCESS
 
     @_logged
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Finish the recording; the process ends afterwards."""
-        del state
         self.end_session()
         self.finalized = True
         return _SUCCESS

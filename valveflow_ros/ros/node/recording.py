@@ -254,10 +254,8 @@ class BackgroundRecovery:
                 self._reports.put((Level.WARN, str(error)))
                 continue
             for report in reports:
-                self._reports.put(
-                    (
-                        Level.OK,
-                        f'{report.out} was left unfinished by an earlier run and is whole now: '
-                        f'{report.messages} messages.',
-                    )
+                sentence = (
+                    f'{report.out} was left unfinished by an earlier run and is whole now: '
+                    f'{report.messages} messages.'
                 )
+                self._reports.put((Level.OK, sentence))
