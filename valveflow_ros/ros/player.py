@@ -1,4 +1,10 @@
-"""Publish samples in their own time, at any rate, with or without a clock."""
+"""Publish samples in their own time, at any rate, with or without a clock.
+
+What is sent in one go beyond what the middleware's queues hold is lost. The monitor answers each
+row with a prediction that carries the row's stamp, so what is unanswered is known, and a player
+waits while that is too much. Where nobody predicts, a player without a rate is limited to what an
+ordinary subscriber takes.
+"""
 
 from __future__ import annotations
 
@@ -19,118 +25,17 @@ from valveflow_ros.ros.encoding import clock_bytes
 from valveflow_ros.ros.polled_subscription import PolledSubscription
 
 _PREDICTION = 'valveflow_msgs/msg/Prediction'
+_DEPTH = 1000
 # Between two processes on one machine the middleware's queue holds 512 messages of all topics.
-_MOST_UNDER_WAY = 240
+_MAX_UNANSWERED = 240
 _LEAST_STEPS = 8
 _FLOW_NAP_S = 0.002
 _STUCK_S = 0.5
-_STUCK_MOST = 3
-_BLIND_STEPS_PER_S = 1000.0
+_MAX_STUCK = 3
+_UNLED_STEPS_PER_S = 1000.0
 _LOOK_S = 1.0
-
-
-class FlowControl:
-    """Holds a sender back while too much of what it sent is unanswered.
-
-    What is sent in one go beyond what the middleware's queues hold is lost. The
-    monitor answers each row with a prediction that carries the row's stamp, so
-    what is under way is known.
-
-    Parameters
-    ----------
-    node : Node
-    messages : int
-        How many messages a sample takes.
-    stop : callable
-        Returns True to give up waiting.
-
-    Notes
-    -----
-    Where nobody predicts, there is nothing to follow: `wait` then limits the
-    rate to what an ordinary subscriber takes.
-    """
-
-    def __init__(
-        self, node: Node, messages: int, stop: Callable[[], bool] = lambda: False
-    ) -> None:
-        self._node = node
-        self._window = max(_LEAST_STEPS, _MOST_UNDER_WAY // messages)
-        self._stop = stop
-        self._subscriptions: list[PolledSubscription] = []
-        self._under_way: deque[int] = deque()
-        self._newest_ns = 0
-        self._stuck = 0
-        self._blind_s = 0.0
-        self._looked_s = 0.0
-
-    @property
-    def following(self) -> bool:
-        """Return True if there is a prediction to follow."""
-        return bool(self._subscriptions) and self._stuck < _STUCK_MOST
-
-    def look_around(self) -> list[str]:
-        """Find predictions to follow; return their topics."""
-        known = {subscription.topic for subscription in self._subscriptions}
-        for topic, types in self._node.get_topic_names_and_types():
-            if _PREDICTION in types and topic not in known:
-                self._subscriptions.append(
-                    PolledSubscription(self._node, Prediction, topic, reliable=True)
-                )
-        return [subscription.topic for subscription in self._subscriptions]
-
-    def sent(self, time_ns: int) -> None:
-        """Note that the sample of a time was sent."""
-        self._under_way.append(time_ns)
-
-    def wait(self, unlimited: bool) -> None:
-        """Return when the next sample may be sent.
-
-        Parameters
-        ----------
-        unlimited : bool
-            Nothing else holds the sender back.
-        """
-        if not self._subscriptions and time.monotonic() - self._looked_s > _LOOK_S:
-            self._looked_s = time.monotonic()
-            self.look_around()
-        if not self.following:
-            self._under_way.clear()
-            if unlimited:
-                self._wait_blindly()
-            return
-        begun_s = time.monotonic()
-        while len(self._under_way) >= self._window and not self._stop():
-            if self._answered():
-                self._stuck = 0
-                begun_s = time.monotonic()
-            elif time.monotonic() - begun_s > _STUCK_S:
-                # It may be waiting for what we hold back; and if it has gone, so be it.
-                self._stuck += 1
-                for _ in range(self._window // 4):
-                    self._under_way.popleft()
-            else:
-                time.sleep(_FLOW_NAP_S)
-
-    def _answered(self) -> bool:
-        """Take predictions; return True if one answers something under way."""
-        for subscription in self._subscriptions:
-            for message in subscription.take():
-                self._newest_ns = max(self._newest_ns, header_time_ns(message.data))
-        before = len(self._under_way)
-        while self._under_way and self._under_way[0] <= self._newest_ns:
-            self._under_way.popleft()
-        return len(self._under_way) < before
-
-    def _wait_blindly(self) -> None:
-        now_s = time.monotonic()
-        self._blind_s = max(self._blind_s, now_s - 0.05) + 1.0 / _BLIND_STEPS_PER_S
-        if self._blind_s > now_s:
-            time.sleep(self._blind_s - now_s)
-
-
-_DEPTH = 1000
 _NAP_S = 0.05
-# The other side may learn of us a little later than we of it.
+# The other side may discover us a little later than we it.
 _SETTLE_S = 1.0
 
 
@@ -174,8 +79,13 @@ class Player:
             for name in names
         }
         self._clock = node.create_publisher(Clock, '/clock', qos) if use_clock else None
-        self._flow = FlowControl(node, len(self.publishers) + use_clock, stop)
         self.sent: dict[str, int] = dict.fromkeys(self.publishers, 0)
+        self._window = max(_LEAST_STEPS, _MAX_UNANSWERED // (len(self.publishers) + use_clock))
+        self._predictions: list[PolledSubscription] = []
+        self._unanswered: deque[int] = deque()
+        self._answered_ns = 0
+        self._stuck = 0
+        self._free_at_s = self._looked_s = 0.0
 
     def wait_for_listeners(self, patience_s: float) -> list[str]:
         """Wait until every input has a subscriber; return the topics that have none.
@@ -191,15 +101,16 @@ class Player:
             time.sleep(_NAP_S)
             missing = self._without_listener()
         if len(missing) < len(self.publishers):
-            self._sleep(_SETTLE_S)
+            self._sleep_until(time.monotonic() + _SETTLE_S)
         return missing
 
     def play(self, steps: Iterable[Step]) -> int:
         """Publish steps until they end or we are asked to stop; return how many."""
-        following = self._flow.look_around()
+        self._find_predictions()
         log = self._node.get_logger()
-        if following:
-            log.info(f'Sending no faster than {", ".join(following)} answers.')
+        if self._predictions:
+            topics = ', '.join(found.topic for found in self._predictions)
+            log.info(f'Sending no faster than {topics} answers.')
         elif self._rate == 0:
             log.info('Nobody predicts, so there is nobody to follow: 1000 samples a second.')
         done = 0
@@ -209,22 +120,19 @@ class Player:
                 first_ns = step.time_ns
             if self._rate > 0:
                 self._sleep_until(begun_s + (step.time_ns - first_ns) * 1e-9 / self._rate)
-            self._flow.wait(unlimited=self._rate == 0)
+            self._wait_for_answers()
             if self._stop():
                 break
-            self._publish(step)
+            if self._clock is not None:
+                self._clock.publish(clock_bytes(step.time_ns))
+            for name, data in step.messages:
+                self.publishers[name].publish(data)
+                self.sent[name] += 1
+            self._unanswered.append(step.time_ns)
             done += 1
         for publisher in self.publishers.values():
             publisher.wait_for_all_acked(Duration(seconds=_SETTLE_S))
         return done
-
-    def _publish(self, step: Step) -> None:
-        if self._clock is not None:
-            self._clock.publish(clock_bytes(step.time_ns))
-        for name, data in step.messages:
-            self.publishers[name].publish(data)
-            self.sent[name] += 1
-        self._flow.sent(step.time_ns)
 
     def _without_listener(self) -> list[str]:
         return [
@@ -237,5 +145,45 @@ class Player:
         while not self._stop() and (left := until_s - time.monotonic()) > 0:
             time.sleep(min(left, _NAP_S))
 
-    def _sleep(self, seconds: float) -> None:
-        self._sleep_until(time.monotonic() + seconds)
+    def _find_predictions(self) -> None:
+        known = {found.topic for found in self._predictions}
+        for topic, types in self._node.get_topic_names_and_types():
+            if _PREDICTION in types and topic not in known:
+                made = PolledSubscription(self._node, Prediction, topic, reliable=True)
+                self._predictions.append(made)
+
+    def _wait_for_answers(self) -> None:
+        """Return when the next step may be sent."""
+        now_s = time.monotonic()
+        if not self._predictions and now_s - self._looked_s > _LOOK_S:
+            self._looked_s = now_s
+            self._find_predictions()
+        if not self._predictions or self._stuck >= _MAX_STUCK:
+            self._unanswered.clear()
+            if self._rate == 0:
+                now_s = time.monotonic()
+                self._free_at_s = max(self._free_at_s, now_s - 0.05) + 1.0 / _UNLED_STEPS_PER_S
+                time.sleep(max(0.0, self._free_at_s - now_s))
+            return
+        begun_s = now_s
+        while len(self._unanswered) >= self._window and not self._stop():
+            if self._take_answers():
+                self._stuck = 0
+                begun_s = time.monotonic()
+            elif time.monotonic() - begun_s > _STUCK_S:
+                # It may be waiting for what we hold back; and if it has gone, so be it.
+                self._stuck += 1
+                for _ in range(self._window // 4):
+                    self._unanswered.popleft()
+            else:
+                time.sleep(_FLOW_NAP_S)
+
+    def _take_answers(self) -> bool:
+        """Take predictions; return True if one answers something unanswered."""
+        for predictions in self._predictions:
+            for message in predictions.take():
+                self._answered_ns = max(self._answered_ns, header_time_ns(message.data))
+        before = len(self._unanswered)
+        while self._unanswered and self._unanswered[0] <= self._answered_ns:
+            self._unanswered.popleft()
+        return len(self._unanswered) < before
