@@ -115,8 +115,7 @@ def outputs() -> str:
 
 def service_names() -> list[str]:
     """Return the services the node offers, without ``~/``."""
-    source = (_NODE / 'services.py').read_text()
-    return re.findall(r"'([a-z_]+)'", source)
+    return list(ast.literal_eval(_literal('outputs.py', 'SERVICES')))
 
 
 def services() -> str:

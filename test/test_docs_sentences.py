@@ -59,20 +59,18 @@ def test_every_quote_is_a_sentence_of_the_program(quote: str) -> None:
 
 def _spoken() -> Iterator[str]:
     """Yield the sentences that the health of the monitor says where something is not well."""
-    for name in ('input_health', 'health'):
-        tree = ast.parse((PACKAGE / 'ros' / 'node' / f'{name}.py').read_text())
-        for node in ast.walk(tree):
-            values: list[ast.expr] = []
-            if isinstance(node, ast.Call) and getattr(node.func, 'id', '') == 'Item':
-                values = node.args[1:3]
-            elif isinstance(node, ast.Tuple) and len(node.elts) == 2:
-                values = node.elts
-            if len(values) == 2 and ast.unparse(values[0]) in (
-                'Level.WARN', 'Level.ERROR', 'Level.STALE'
-            ):  # fmt: skip
-                text = _template(values[1])
-                if text and text.strip(GAP):
-                    yield text
+    for node in ast.walk(ast.parse((PACKAGE / 'ros' / 'node' / 'health.py').read_text())):
+        values: list[ast.expr] = []
+        if isinstance(node, ast.Call) and getattr(node.func, 'id', '') == 'Item':
+            values = node.args[1:3]
+        elif isinstance(node, ast.Tuple) and len(node.elts) == 2:
+            values = node.elts
+        if len(values) == 2 and ast.unparse(values[0]) in (
+            'Level.WARN', 'Level.ERROR', 'Level.STALE'
+        ):  # fmt: skip
+            text = _template(values[1])
+            if text and text.strip(GAP):
+                yield text
     tree = ast.parse((PACKAGE / 'fit' / 'task.py').read_text())
     for node in ast.walk(tree):
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):

@@ -21,11 +21,11 @@ from valveflow_msgs.msg import Alarm
 
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import NS_PER_S, SampleTable
+from valveflow_ros.ros.decoding import header_time_ns
 from valveflow_ros.ros.demo import ros_arguments
-from valveflow_ros.ros.inputs import header_time_ns
-from valveflow_ros.ros.playing import Player
-from valveflow_ros.ros.polled_subscription import Taker
-from valveflow_ros.ros.simulator_steps import stamped_steps
+from valveflow_ros.ros.player import Player
+from valveflow_ros.ros.polled_subscription import PolledSubscription
+from valveflow_ros.ros.simulator_main import stamped_steps
 
 NAME = '/valveflow_monitor'
 HISTORY_DAYS = 0.3
@@ -44,7 +44,7 @@ class Ears:
         self.looks = 0
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_health, 10)
         self._refit = self.node.create_client(Trigger, f'{NAME}/refit')
-        self.alarms = Taker(self.node, Alarm, f'{NAME}/alarms')
+        self.alarms = PolledSubscription(self.node, Alarm, f'{NAME}/alarms')
 
     def spin(self, seconds: float = 0.0) -> None:
         """Let a callback run, if one is due within the time."""

@@ -20,9 +20,9 @@ import numpy as np
 
 from valveflow_ros.monitoring.events import Event
 from valveflow_ros.records import N_SIGNALS, SIGNALS
-from valveflow_ros.ros.inputs import Row
+from valveflow_ros.ros.decoding import Row
 from valveflow_ros.ros.monitor_main import main as monitor
-from valveflow_ros.ros.node.live import LiveEngine
+from valveflow_ros.ros.node.engine import LiveEngine
 
 _BIN_NS = 100_000
 _BINS = 50_000

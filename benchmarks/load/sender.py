@@ -23,7 +23,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64
 
-from valveflow_ros.ros.outputs import float64_bytes
+from valveflow_ros.ros.encoding import float64_bytes
 
 DEPTH = 1000
 # One message in so many units of the last digits; a plant does not notice.

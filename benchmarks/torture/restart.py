@@ -22,10 +22,10 @@ from benchmarks.torture.trial import Options, Outcome
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.records import SampleTable
+from valveflow_ros.ros.decoding import PLANT_SAMPLE
 from valveflow_ros.ros.demo import ros_arguments
-from valveflow_ros.ros.inputs import PLANT_SAMPLE
-from valveflow_ros.ros.playing import Player
-from valveflow_ros.ros.simulator_steps import stamped_steps
+from valveflow_ros.ros.player import Player
+from valveflow_ros.ros.simulator_main import stamped_steps
 from valveflow_ros.ros.verify import verify
 
 KILLS = 100

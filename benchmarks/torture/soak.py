@@ -20,7 +20,7 @@ from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SampleTable
-from valveflow_ros.ros.worker.worker import give_back
+from valveflow_ros.ros.worker import release_memory
 
 DAYS = 365
 PERIOD_DAYS = 30
@@ -77,7 +77,7 @@ class _Walk:
             del fed
             if asked:
                 # As the node does when a task has its outcome.
-                give_back()
+                release_memory()
 
     def close(self) -> None:
         """End the other process."""

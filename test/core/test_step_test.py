@@ -129,7 +129,7 @@ def test_the_same_opening_visited_twice_is_one_level():
 
 
 @pytest.mark.parametrize('knees', [[], [1300.0], [1300.0, 1700.0]])
-def test_exact_levels_give_back_the_broken_line(knees):
+def test_exact_levels_release_memory_the_broken_line(knees):
     knots = np.array([1000.0, *knees, 2000.0])
     slopes = np.array([0.25, 0.1, 0.02])[: len(knots) - 1]
     values = np.concatenate([[150.0], 150.0 + np.cumsum(slopes * np.diff(knots))])

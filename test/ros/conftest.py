@@ -34,6 +34,16 @@ def context(ros_environment: dict[str, str]) -> Iterator[Any]:
 
 
 @pytest.fixture
+def listener(context: Any) -> Iterator[Any]:
+    """Give a node that hears the monitor."""
+    from listener import Listener
+
+    made = Listener(context)
+    yield made
+    made.close()
+
+
+@pytest.fixture
 def processes(ros_environment: dict[str, str], tmp_path: Path) -> Iterator[Processes]:
     """Give a way to start processes in the test's own domain."""
     made = Processes(ros_environment, tmp_path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -10,12 +11,12 @@ from dataclasses import replace
 from typing import Any
 
 from valveflow_ros.parameters import Settings
-from valveflow_ros.ros.node.warmup import made_up_curve
+from valveflow_ros.ros.node.engine import example_curve
 
 
 def good(task: Any) -> Any:
     """Return a curve at once."""
-    curve = made_up_curve(Settings())
+    curve = example_curve(Settings())
     source = replace(curve.source, window_end_ns=int(task.contents.time_ns[-1]))
     return replace(curve, source=source).with_id()
 
@@ -47,6 +48,16 @@ def prints(task: Any) -> Any:
     print('x' * 10_000, flush=True)
     os.write(1, b'y' * 10_000)
     return good(task)
+
+
+def writes_nonsense(task: Any) -> Any:
+    """Write what is no message into every socket there is; eight bytes are the task's name."""
+    sent = (task.request_ns << 1).to_bytes(8, 'big') + b'no message at all'
+    for name in os.listdir('/proc/self/fd'):
+        if os.path.realpath(f'/proc/self/fd/{name}').startswith('/proc') and int(name) > 2:
+            with contextlib.suppress(OSError):
+                os.write(int(name), sent)
+    time.sleep(3600.0)
 
 
 def nan(task: Any) -> Any:

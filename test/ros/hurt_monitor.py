@@ -17,7 +17,7 @@ from typing import Any
 from valveflow_ros.logs.part_file import PartFile
 from valveflow_ros.ros import monitor_main
 from valveflow_ros.ros.node.monitor_node import MonitorNode
-from valveflow_ros.ros.polled_subscription import Taker
+from valveflow_ros.ros.polled_subscription import PolledSubscription
 
 HOLD, HELD = Path('hold'), Path('held')
 # The interpreter's lock cannot be given back from outside, so this one ends by itself.
@@ -58,7 +58,7 @@ def keep_the_lock() -> None:
 
 if __name__ == '__main__':
     MonitorNode.step = held_at('loop', MonitorNode.step)  # type: ignore[method-assign]
-    Taker.take = held_at('poll', Taker.take)  # type: ignore[method-assign]
+    PolledSubscription.take = held_at('poll', PolledSubscription.take)  # type: ignore[method-assign]
     PartFile.write = held_at('writer', PartFile.write)  # type: ignore[method-assign]
     threading.Thread(target=keep_the_lock, daemon=True).start()
     sys.exit(monitor_main.main(sys.argv[1:]))

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from valveflow_ros.ros.demo_watch import Story, moment
+import pytest
+from valveflow_msgs.msg import Alarm, Diagnosis, DiagnosisCause, FlowCharacteristic
+
+from valveflow_ros.ros.demo import Story, moment
+from valveflow_ros.ros.encoding import header, to_time
 
 HOUR = 3600 * 10**9
 T0 = 1_700_006_400 * 10**9  # 2023-11-15 00:00 UTC
@@ -10,9 +14,30 @@ FAULT = T0 + 36 * HOUR
 KNEES = [1250.0, 1600.0, 1900.0]
 
 
-def told() -> tuple[Story, list[str]]:
-    lines: list[str] = []
-    return Story(FAULT, lines.append), lines
+def curve(at_ns: int, knees: list[float]) -> FlowCharacteristic:
+    return FlowCharacteristic(
+        status=FlowCharacteristic.FRESH, model_id=str(at_ns), window_end=to_time(at_ns),
+        breakpoints=[900.0, *knees, 2500.0], pieces=len(knees) + 1,
+    )  # fmt: skip
+
+
+def alarm(at_ns: int, occurrence: int, state: int = Alarm.UNACKNOWLEDGED) -> Alarm:
+    return Alarm(
+        header=header(at_ns, 'u'), name='residual', state=state, occurrence=occurrence,
+        sentence='The unit gives 4.4 MW less.',
+    )  # fmt: skip
+
+
+def diagnosis(at_ns: int, *names: str, sentence: str = '') -> Diagnosis:
+    return Diagnosis(
+        header=header(at_ns, 'u'), model_id='m', sentence=sentence,
+        verdict=Diagnosis.NAMED if names else Diagnosis.NOTHING,
+        causes=[DiagnosisCause(name=name) for name in names],
+    )  # fmt: skip
+
+
+def lines(capsys: pytest.CaptureFixture[str]) -> list[str]:
+    return capsys.readouterr().out.splitlines()
 
 
 def test_times_are_those_of_the_monitors_sentences() -> None:
@@ -20,51 +45,54 @@ def test_times_are_those_of_the_monitors_sentences() -> None:
     assert moment(FAULT + 59 * 10**9) == '2023-11-16 12:00'
 
 
-def test_one_fault_is_one_story() -> None:
-    story, lines = told()
+def test_one_fault_is_one_story(capsys: pytest.CaptureFixture[str]) -> None:
+    story = Story(FAULT)
     for k in range(1, 9):
-        story.curve(T0 + 4 * k * HOUR, [u + k for u in KNEES])
+        story.on_curve(curve(T0 + 4 * k * HOUR, [u + k for u in KNEES]))
     story.reached(FAULT - 1)
-    assert len(lines) == 1
+    told = lines(capsys)
+    assert told == ['2023-11-15 04:00  first curve: 4 pieces, knees at u = 1251, 1601, 1901']
     for k in range(5):
         at = FAULT + (1 + 6 * k) * HOUR
-        story.came(at, 'residual', k + 1, 'The unit gives 4.4 MW less.')
-        story.went_on(at + HOUR // 6, 'acknowledged')
+        story.on_alarm(alarm(at, k + 1))
+        story.on_alarm(alarm(at + HOUR // 6, k + 1, Alarm.ACKNOWLEDGED))
         # Out of the curve's range, and back in it: the same alarm.
-        story.came(at + HOUR, 'residual', k + 1, 'The unit gives 4.4 MW less.')
-        story.went_on(at + 2 * HOUR, 'cleared')
-        story.curve(at + 3 * HOUR, KNEES[:2])
-    assert lines[0] == '2023-11-15 04:00  first curve: 4 pieces, knees at u = 1251, 1601, 1901'
-    assert 'the fault begins; 8 curves so far, the last with 4 pieces' in lines[1]
-    assert 'ALARM residual: The unit gives 4.4 MW less.' in lines[2]
-    assert [line[18:] for line in lines[3:]] == [
-        'acknowledged', 'cleared', 'the alarm comes again, the second time',
-        'the alarm comes again, the third time', 'the alarm comes again, the 4th time',
-        'the alarm comes again, the 5th time',
+        story.on_alarm(alarm(at + HOUR, k + 1))
+        story.on_alarm(alarm(at + 2 * HOUR, k + 1, Alarm.NORMAL))
+        story.on_curve(curve(at + 3 * HOUR, KNEES[:2]))
+    told = lines(capsys)
+    assert 'the fault begins; 8 curves so far, the last with 4 pieces' in told[0]
+    assert 'ALARM residual: The unit gives 4.4 MW less.' in told[1]
+    assert [line[18:] for line in told[2:]] == [
+        'acknowledged, by the service acknowledge_alarms',
+        'the unit follows the curve again; the alarm is cleared',
+        'the alarm comes again, the second time', 'the alarm comes again, the third time',
+        'the alarm comes again, the 4th time', 'the alarm comes again, the 5th time',
     ]  # fmt: skip
-    assert lines == sorted(lines)
+    assert told == sorted(told)
     assert 'the alarm came 1.0 h later, and 5 times in all' in story.outcome()
 
 
-def test_a_diagnosis_is_told_in_full_once() -> None:
-    story, lines = told()
-    story.diagnosed(FAULT - HOUR, (), 'nothing found', '')
-    story.diagnosed(FAULT + 3 * HOUR, (), 'nothing found', 'The model explains the unit.')
-    story.diagnosed(FAULT + 9 * HOUR, ('curve_step',), '', 'The curve lacks part of its course.')
-    story.diagnosed(FAULT + 20 * HOUR, ('curve_step',), '', 'The curve lacks part of its course.')
-    assert [line[18:] for line in lines] == [
+def test_a_diagnosis_is_told_in_full_once(capsys: pytest.CaptureFixture[str]) -> None:
+    story = Story(FAULT)
+    story.on_diagnosis(Diagnosis())
+    story.on_diagnosis(diagnosis(FAULT - HOUR))
+    story.on_diagnosis(diagnosis(FAULT + 3 * HOUR, sentence='The model explains the unit.'))
+    for hours in (9, 20):
+        story.on_diagnosis(diagnosis(FAULT + hours * HOUR, 'curve_step', sentence='It bends.'))
+    assert [line[18:] for line in lines(capsys)] == [
         'diagnosis of the data until then: nothing found',
         '--- the fault begins; no curve so far ---',
         'diagnosis of the data until then: nothing found; 3 h of them are with the fault',
-        'diagnosis of the data until then: named curve_step. The curve lacks part of its course.',
+        'diagnosis of the data until then: named curve_step. It bends.',
         'diagnosis of the data until then: named curve_step, as before',
     ]
 
 
-def test_an_alarm_before_the_fault_is_not_its_alarm() -> None:
-    story, lines = told()
-    story.came(FAULT - HOUR, 'residual', 1, 'x')
+def test_an_alarm_before_the_fault_is_not_its_alarm(capsys: pytest.CaptureFixture[str]) -> None:
+    story = Story(FAULT)
+    story.on_alarm(alarm(FAULT - HOUR, 1))
     assert story.outcome() == 'The fault raised no alarm.'
-    story.came(FAULT + HOUR, 'residual', 2, 'x')
+    story.on_alarm(alarm(FAULT + HOUR, 2))
     assert story.outcome().endswith('the alarm came 1.0 h later.')
-    assert len(lines) == 3
+    assert len(lines(capsys)) == 3

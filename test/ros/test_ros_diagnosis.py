@@ -33,17 +33,15 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import NS_PER_S, Readings, table_to_readings
-from valveflow_ros.ros import conversions
-from valveflow_ros.ros.diagnostics import Level, line_of
+from valveflow_ros.ros import encoding
+from valveflow_ros.ros.node.diagnostics import Level, line_of
+from valveflow_ros.ros.node.engine import LiveEngine, example_curve, example_task
 from valveflow_ros.ros.node.health import diagnosis_item, model_item
-from valveflow_ros.ros.node.live import LiveEngine
 from valveflow_ros.ros.node.monitor_node import MonitorNode
-from valveflow_ros.ros.node.warmup import made_up_curve, made_up_task
 from valveflow_ros.ros.outputs import Output, Outputs
-from valveflow_ros.ros.simulator_steps import effects_of
-from valveflow_ros.ros.verify import diagnosed_elsewhere
-from valveflow_ros.ros.worker.worker import DiagnosisWorker
-from valveflow_ros.ros.worker.worker_child import answer
+from valveflow_ros.ros.simulator_main import effects_of
+from valveflow_ros.ros.verify import diagnose_in_process
+from valveflow_ros.ros.worker import DiagnosisWorker, compute
 from valveflow_ros.signals.align import Aligner
 
 pytestmark = pytest.mark.usefixtures('jobs_on_path')
@@ -54,7 +52,7 @@ SETTINGS = Settings(
 
 
 def task_of() -> DiagnosisTask:
-    contents, curve = made_up_task(Settings()).contents, made_up_curve(Settings())
+    contents, curve = example_task(Settings()).contents, example_curve(Settings())
     end_ns = int(contents.time_ns[-1])
     return DiagnosisTask(end_ns, contents, Settings(), curve.with_id(), end_ns)
 
@@ -100,7 +98,7 @@ def test_each_task_has_a_process_and_an_outcome(job: str, words: str) -> None:
     ],
 )
 def test_a_bad_result_is_a_sentence(job: str, words: str) -> None:
-    given = answer(getattr(hurt_jobs, job), TASK, 'diagnosis')
+    given = compute(getattr(hurt_jobs, job), TASK, 'diagnosis')
     believed = DiagnosisWorker(60.0)._believed(TASK, given)
     if words:
         assert isinstance(believed, str)
@@ -111,16 +109,17 @@ def test_a_bad_result_is_a_sentence(job: str, words: str) -> None:
 
 
 def test_no_result_is_unknown_and_says_why() -> None:
-    message = conversions.of(Diagnosed(TASK, '', 'Because.'), 'unit 1')
+    (told,) = Outputs('unit 1').of([Diagnosed(TASK, '', 'Because.')])
+    message = deserialize_message(told.data, Diagnosis)
     assert (message.verdict, message.sentence) == (Diagnosis.UNKNOWN, 'Because.')
     assert (message.model_id, message.header.frame_id) == (TASK.curve.model_id, 'unit 1')
     assert math.isnan(message.rmse_simulation)
     assert len(message.causes) == 0
-    (*_, first) = Outputs('u').first()
+    (*_, first) = Outputs('u').latched()
     assert first.name == 'diagnosis'
     before = deserialize_message(first.data, Diagnosis)
     assert (before.verdict, before.model_id) == (Diagnosis.UNKNOWN, '')
-    assert before.sentence == conversions.NOT_YET
+    assert before.sentence == encoding.NOT_YET
 
 
 @pytest.fixture(scope='module')
@@ -149,7 +148,7 @@ def run() -> tuple[Readings, list[list[Event]], LiveEngine, DiagnosisWorker]:
 
 def said(calls: list[list[Event]]) -> list[Output]:
     outputs = Outputs('u')
-    return [*outputs.first(), *(output for events in calls for output in outputs.of(events))]
+    return [*outputs.latched(), *(output for events in calls for output in outputs.of(events))]
 
 
 def test_the_night_and_a_hand_bring_a_diagnosis(
@@ -168,7 +167,7 @@ def test_the_night_and_a_hand_bring_a_diagnosis(
                 if o.name == 'diagnosis']  # fmt: skip
     assert len(messages) == len(found) + 1
     content = json.loads(found[-1].content)
-    assert messages[-1].verdict == conversions.VERDICTS[content['verdict']]
+    assert messages[-1].verdict == encoding.VERDICTS[content['verdict']]
     assert messages[-1].sentence == content['sentence']
     assert [c.name for c in messages[-1].causes] == [c['name'] for c in content['causes']]
     assert {'gain_step', 'curve_step'} & {c['name'] for c in content['causes']}
@@ -189,7 +188,7 @@ def test_replaying_the_journal_repeats_each_diagnosis_byte_for_byte(
     readings, calls, _, _ = run
     journal = [e for events in calls for e in events if isinstance(e, JournalEntry)]
     table = Aligner(SETTINGS).feed(readings).table
-    replayer = JournalReplayer(Monitor(SETTINGS), journal, diagnosed_elsewhere)
+    replayer = JournalReplayer(Monitor(SETTINGS), journal, diagnose_in_process)
     assert said([replayer.feed(table)]) == said(calls)
     entry = JournalEntry(0, JournalKind.DIAGNOSED, 5, 0, '', '')
     with pytest.raises(DataError, match='never asked for'):
@@ -219,9 +218,9 @@ def test_a_node_that_comes_late_hears_the_diagnosis(
         assert node.trigger_configure() == node.trigger_activate() == Transition.SUCCESS
         session = node.session
         assert session is not None
-        session.tell(session.engine.feed(rows_of(table_to_readings(log.table))))
+        session.publish(session.engine.feed(rows_of(table_to_readings(log.table))))
         wait_until(lambda: node.step() or session.engine.monitor.characteristic, 'the curve')
-        session.tell(session.engine.request_diagnosis())
+        session.publish(session.engine.request_diagnosis())
         wait_until(lambda: node.step() or session.engine.monitor.diagnosing.last, 'a diagnosis')
         listener = processes.start('late_listener', session.outputs['diagnosis'])
         wait_until(lambda: listener.poll() is not None, 'the end of the listener')

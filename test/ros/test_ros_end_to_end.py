@@ -12,18 +12,14 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
+from listener import MONITOR, Listener, start_monitor, start_plant
 from rcl_interfaces.srv import SetParameters
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
-from ros_helpers import PATIENCE_S, Processes, wait_until
+from ros_helpers import Processes
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from std_msgs.msg import Float64MultiArray
-from std_srvs.srv import Trigger
 from valveflow_msgs.msg import Alarm, Diagnosis, FlowCharacteristic, JournalEntry, Prediction
 
 from valveflow_ros.logs import LogContents, RecordingWriter, open_log
@@ -32,89 +28,16 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import SIGNALS, SampleTable, Signal
-from valveflow_ros.ros.conversions import from_time
-from valveflow_ros.ros.demo import ros_arguments
-from valveflow_ros.ros.outputs import float64_bytes
-from valveflow_ros.ros.simulator_steps import effects_of
+from valveflow_ros.ros.decoding import from_time
+from valveflow_ros.ros.encoding import float64_bytes
+from valveflow_ros.ros.simulator_main import effects_of
 from valveflow_ros.ros.verify import verify
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 DAYS, SEED = 0.3, 7
 FAULT = 'gain_step:g=-0.12,t0_days=0.25'
 FAULT_NS = DEFAULT_START_NS + round(0.25 * 86400e9)
-MONITOR = '/valveflow_monitor'
-LATCHED = QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 SENT = [Signal.VALVE_COMMAND, *(info.signal for info in SIGNALS if info.required)]
-
-
-class Listener:
-    """Hears what the monitor says, and talks to its services."""
-
-    def __init__(self, context: Any) -> None:
-        self.node = Node('listener', context=context)
-        self.executor = SingleThreadedExecutor(context=context)
-        self.executor.add_node(self.node)
-        self.alarms: list[Alarm] = []
-        self.curves: list[FlowCharacteristic] = []
-        self.health: list[DiagnosticArray] = []
-        subscribe = self.node.create_subscription
-        subscribe(Alarm, f'{MONITOR}/alarms', self.alarms.append, LATCHED)
-        subscribe(FlowCharacteristic, f'{MONITOR}/characteristic', self.curves.append, LATCHED)
-        subscribe(DiagnosticArray, '/diagnostics', self.health.append, 10)
-
-    def spin(self) -> None:
-        self.executor.spin_once(timeout_sec=0.02)
-
-    def until(self, condition: Any, what: str, patience_s: float = PATIENCE_S) -> Any:
-        return wait_until(lambda: self.spin() or condition(), what, patience_s)
-
-    def call(self, kind: Any, name: str, request: Any) -> Any:
-        client = self.node.create_client(kind, f'{MONITOR}/{name}')
-        self.until(client.service_is_ready, name)
-        future = client.call_async(request)
-        return self.until(lambda: future.done() and future.result(), name)
-
-    def trigger(self, name: str) -> Trigger.Response:
-        return self.call(Trigger, name, Trigger.Request())
-
-    def latched(self, kind: Any, name: str) -> Any:
-        """Come late to a latched topic."""
-        heard: list[Any] = []
-        self.node.create_subscription(kind, f'{MONITOR}/{name}', heard.append, LATCHED)
-        return self.until(lambda: heard and heard[0], name)
-
-    def value(self, item: str, key: str) -> str:
-        """Return a number of the newest health."""
-        for status in self.health[-1].status if self.health else []:
-            if status.name.endswith(item):
-                return {entry.key: entry.value for entry in status.values}.get(key, '')
-        return ''
-
-    def close(self) -> None:
-        self.executor.shutdown()
-        self.node.destroy_node()
-
-
-@pytest.fixture
-def listener(context: Any) -> Any:
-    made = Listener(context)
-    yield made
-    made.close()
-
-
-def start_monitor(processes: Processes, folder: Path, **more: object) -> Any:
-    parameters = {
-        'record_directory': folder, 'unit_tag': 'unit 1', 'input_reliability': 'reliable',
-        'refit_period': 3600.0, 'refit_segments': 0, **more,
-    }  # fmt: skip
-    # Quotes, so that a text with a blank or of digits stays a text.
-    given = {k: f'"{v}"' if isinstance(v, str) else v for k, v in parameters.items()}
-    return processes.start('valveflow_ros.ros.monitor_main', *ros_arguments(given))
-
-
-def start_plant(processes: Processes, **parameters: object) -> Any:
-    given = {'seed': SEED, 'rate': 0.0, 'wait': PATIENCE_S, **parameters}
-    return processes.start('valveflow_ros.ros.simulator_main', *ros_arguments(given))
 
 
 def test_a_run_from_the_plant_to_the_disk(
@@ -122,7 +45,11 @@ def test_a_run_from_the_plant_to_the_disk(
 ) -> None:
     # Never suppressed: however late the operator of this test is, the alarm still stands then.
     monitor = start_monitor(
-        processes, tmp_path / 'recordings', use_sim_time=True, alarm_suppress_time=86400.0
+        processes,
+        tmp_path / 'recordings',
+        unit_tag='unit 1',
+        use_sim_time=True,
+        alarm_suppress_time=86400.0,
     )
     plant = start_plant(processes, days=DAYS, use_clock=True, command=True, effects=f'"{FAULT}"')
     live_parameter_and_acknowledgement(listener, monitor)
@@ -329,7 +256,7 @@ def test_ending_during_a_refit_finishes_the_file_at_once(
     listener.until(lambda: listener.value('fit', 'Samples taken') == str(samples), 'the samples')
     (worker,) = [
         child for child in psutil.Process(monitor.pid).children()
-        if any('worker_child' in word for word in child.cmdline())
+        if any('valveflow_ros.ros.worker' in word for word in child.cmdline())
     ]  # fmt: skip
     # However fast the machine is, this refit is under way when the monitor has to end.
     worker.suspend()

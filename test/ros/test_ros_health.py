@@ -2,8 +2,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
@@ -13,13 +16,26 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_helpers import Processes, wait_until
 from std_msgs.msg import Float32, Float64
 
+from valveflow_ros.curve.characteristic import Characteristic, Support
+from valveflow_ros.curve.shift import judge_shift
+from valveflow_ros.fit.result import NOT_REFINED
+from valveflow_ros.monitoring.alarms import Judged, ResidualAlarm
+from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.monitoring.offline import feed_rows
 from valveflow_ros.parameters import Settings
+from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import NS_PER_S, SIGNALS, Signal
+from valveflow_ros.ros.decoding import INPUTS, PLANT_SAMPLE
 from valveflow_ros.ros.demo import ros_arguments
-from valveflow_ros.ros.diagnostics import Changes, Item, Level, array
-from valveflow_ros.ros.inputs import INPUTS, PLANT_SAMPLE
-from valveflow_ros.ros.node.input_health import InputHealth, Publishers
-from valveflow_ros.ros.node.intake import Tally
+from valveflow_ros.ros.node.diagnostics import Changes, Item, Level, diagnostics_message
+from valveflow_ros.ros.node.health import (
+    InputHealth,
+    Publishers,
+    alarm_item,
+    fit_item,
+    reference_item,
+)
+from valveflow_ros.ros.node.intake import TopicStatistics
 from valveflow_ros.signals.align import REASONS
 
 TOPICS = {topic.name: f'/plant/{topic.name}' for topic in INPUTS}
@@ -31,17 +47,17 @@ class Scene:
 
     def __init__(self, **settings: object) -> None:
         self.health = InputHealth(Settings(settings), TOPICS)
-        self.tallies = {name: Tally() for name in TOPICS}
+        self.statistics = {name: TopicStatistics() for name in TOPICS}
         self.counts = {info.topic: dict.fromkeys(REASONS, 0) for info in SIGNALS}
         self.publishers = {info.topic: Publishers(1) for info in SIGNALS}
         for info in SIGNALS:
             self.hear(info.topic)
 
     def hear(self, name: str, at: float = NOW, period: float = 1.0) -> None:
-        tally = self.tallies[name]
+        found = self.statistics[name]
         for k in range(5, -1, -1):
-            tally.note_arrival(1, at - k * period)
-            tally.note_number(tally.received + 1)
+            found.note_arrival(1, at - k * period)
+            found.note_number(found.received + 1)
 
     def item(
         self,
@@ -51,7 +67,7 @@ class Scene:
         newest_ns: int = 0,
     ) -> Item:
         items = self.health.items(
-            self.tallies, self.counts, self.publishers, at, listening, newest_ns
+            self.statistics, self.counts, self.publishers, at, listening, newest_ns
         )
         (found,) = [item for item in items if item.name == f'input {topic}']
         return found
@@ -122,7 +138,6 @@ def test_stamps_that_are_not_believed_are_told_by_how_far_they_are_off(
     off_s: float, words: str
 ) -> None:
     scene = Scene()
-    scene.health.by_host = False
     newest_ns = time.time_ns()
     scene.health.note('valve_opening', [(newest_ns + round(off_s * NS_PER_S), 0, 50.0, 0)])
     scene.counts['valve_opening']['time_outlier'] = 4
@@ -141,7 +156,7 @@ def test_a_wrong_type_is_named_whatever_else_is_true() -> None:
 
 def test_silence_from_the_start() -> None:
     scene = Scene()
-    scene.tallies = {name: Tally() for name in TOPICS}
+    scene.statistics = {name: TopicStatistics() for name in TOPICS}
     scene.publishers = {}
     scene.says(Level.OK, 'Waiting for /plant/valve_opening', listening=1.0)
     scene.says(Level.STALE, 'Nobody publishes /plant/valve_opening')
@@ -154,14 +169,14 @@ def test_silence_from_the_start() -> None:
 
 def test_silence_after_speech() -> None:
     scene = Scene()
-    scene.tallies['valve_opening'] = Tally()
+    scene.statistics['valve_opening'] = TopicStatistics()
     scene.hear('valve_opening', NOW - 3.0)
     scene.says(Level.STALE, '/plant/valve_opening has been silent for 3.5 s')
 
 
 def test_a_stamped_sample_speaks_for_all_its_signals() -> None:
     scene = Scene()
-    scene.tallies = {name: Tally() for name in TOPICS}
+    scene.statistics = {name: TopicStatistics() for name in TOPICS}
     scene.hear(PLANT_SAMPLE)
     scene.publishers = {PLANT_SAMPLE: Publishers(1)}
     for info in SIGNALS:
@@ -171,7 +186,7 @@ def test_a_stamped_sample_speaks_for_all_its_signals() -> None:
 
 def test_a_stamped_sample_of_the_wrong_type_is_seen_before_it_is_heard() -> None:
     scene = Scene()
-    scene.tallies = {name: Tally() for name in TOPICS}
+    scene.statistics = {name: TopicStatistics() for name in TOPICS}
     scene.publishers = {PLANT_SAMPLE: Publishers(0, ('std_msgs/msg/String',))}
     scene.says(Level.ERROR, '/plant/plant_sample is published as std_msgs/msg/String')
 
@@ -217,7 +232,7 @@ def test_an_input_of_which_nothing_can_be_used_is_as_good_as_silent() -> None:
 
 def test_losses_are_said_once_and_counted_on() -> None:
     scene = Scene()
-    scene.tallies['valve_opening'].lost = 3
+    scene.statistics['valve_opening'].lost = 3
     scene.says(Level.WARN, '3 messages of /plant/valve_opening were lost')
     scene.says(Level.OK, 'Hz')
     assert scene.item().values['Messages lost on the way'] == 3
@@ -270,10 +285,10 @@ def test_other_rejections_are_told_by_reason(reason: str, words: str) -> None:
 
 def test_a_topic_without_any_time_points_to_the_clock() -> None:
     scene = Scene()
-    scene.tallies['valve_opening'].without_time = scene.tallies['valve_opening'].received
+    scene.statistics['valve_opening'].without_time = scene.statistics['valve_opening'].received
     scene.says(Level.ERROR, 'is /clock published?')
-    scene.tallies['valve_opening'].without_time = 0
-    scene.tallies['valve_opening'].waiting = scene.tallies['valve_opening'].received
+    scene.statistics['valve_opening'].without_time = 0
+    scene.statistics['valve_opening'].waiting = scene.statistics['valve_opening'].received
     scene.says(Level.ERROR, 'is /clock published?')
 
 
@@ -282,7 +297,7 @@ def test_the_message_follows_rep_107() -> None:
         Item('input valve_opening', Level.OK, 'Fine.', {'Rate (Hz)': 1.0, 'Age (s)': None}),
         Item('recorder', Level.ERROR, 'Broken.', {'On': False}),
     ]
-    message = array(items, 'HV101', 5 * 10**9)
+    message = diagnostics_message(items, 'HV101', 5 * 10**9)
     assert message.header.stamp.sec == 5
     first, second = message.status
     assert first.name == 'valveflow: HV101 input valve_opening'
@@ -319,6 +334,100 @@ def test_a_failure_gets_into_the_log_however_short_it_is_and_not_again_and_again
         assert changes.pick([well], second) == []
         assert changes.pick([dead], second + 1.0) == []
     assert changes.pick([well], 40.0) == [well]
+
+
+# The curve, its reference and its alarms
+
+WORK = Settings({'refit_period': 3600.0, 'refit_segments': 0, 'alarm_limit': 500.0})
+WORKER: Any = SimpleNamespace(failures_in_a_row=0, busy_s=None, starts=1)
+STRAIGHT = f'{NOT_REFINED}one straight piece, without dynamics.'
+ALONE = 'Piece 1 (u 1000 to 1400) rests on no special sample.'
+
+
+@pytest.fixture(scope='module')
+def monitor() -> Monitor:
+    made = Monitor(WORK)
+    feed_rows(made, simulate(0.3, 7).table)
+    return made
+
+
+def said_of(monitor: Monitor, notes: tuple[str, ...], identifiable: bool = True) -> Item:
+    """Return what is said of the running curve with other notes."""
+    curve = monitor.characteristic
+    assert curve is not None
+    support = (Support(1, 1, 100, (1200.0,), identifiable),)
+    source = replace(curve.source, temperature_flag=False)
+    other = replace(curve, notes=notes, support=support, source=source)
+    seen: Any = SimpleNamespace(
+        characteristic=other, noise=monitor.noise, status=monitor.status, rows=monitor.rows,
+        segments=1, special_samples=100, last_ns=monitor.last_ns, cause='',
+    )  # fmt: skip
+    item = fit_item(seen, WORKER, 1.0)
+    assert item.values['Notes'] == ' '.join(notes)
+    return item
+
+
+def test_a_weak_curve_says_so(monitor: Monitor) -> None:
+    assert said_of(monitor, ()).level == Level.OK
+    assert said_of(monitor, ('Manual step test: 19 of 19 levels count.',)).level == Level.OK
+    for notes, identifiable in (((STRAIGHT,), True), ((ALONE,), False)):
+        item = said_of(monitor, notes, identifiable)
+        assert (item.level, item.sentence) == (Level.WARN, notes[0])
+    both = said_of(monitor, ('Read so.', STRAIGHT, ALONE), identifiable=False)
+    assert (both.level, both.sentence) == (Level.WARN, f'{STRAIGHT} Weak points in all: 2.')
+
+
+def lifted(curve: Characteristic, by_mw: float) -> Characteristic:
+    pieces = tuple(replace(p, intercept=p.intercept + by_mw) for p in curve.pieces)
+    return replace(curve, pieces=pieces, model_id='lifted')
+
+
+def test_an_alarm_whose_range_left_the_window_says_so(monitor: Monitor) -> None:
+    curve = monitor.characteristic
+    assert curve is not None
+    monitor.set_reference(curve)
+    reference, alarm = monitor.reference, monitor.reference.alarm
+    reference.shift = judge_shift(curve, lifted(curve, 9.0))
+    alarm.judge(reference.shift, 1, WORK)
+    assert reference_item(monitor).sentence == reference.shift.sentence
+    knot = curve.pieces[-1].u_from
+    reference.shift = judge_shift(curve, replace(curve, pieces=curve.pieces[-1:]))
+    assert alarm.judge(reference.shift, 2, WORK) == []
+    item = reference_item(monitor)
+    assert item.level == Level.ERROR
+    assert item.sentence.startswith('The alarm stands: what moved, u ')
+    assert f'to {knot:.0f}, is not judged unmoved yet' in item.sentence
+
+
+NERVOUS = {'alarm_on_delay': 0.0, 'alarm_off_delay': 0.0, 'alarm_suppress_time': 60.0}
+
+
+def after(values: list[float], shelved: bool = False) -> Item:
+    """Return what diagnostics say after a second of each value."""
+    alarm = ResidualAlarm(Settings(NERVOUS))
+    time_ns = np.arange(1, len(values) + 1) * NS_PER_S
+    column = np.array(values)
+    alarm.feed(time_ns, column, column, 'm')
+    if shelved:
+        assert alarm.shelve(int(time_ns[-1]), 'm')[0]
+    monitor: Any = SimpleNamespace(alarm=alarm, judged=Judged(0, values[-1], values[-1]))
+    return alarm_item(monitor)
+
+
+def test_diagnostics_tell_the_state_that_no_announcement_told() -> None:
+    item = after([2.0, 0.0] * 5 + [2.0])
+    assert (item.level, item.values['State']) == (Level.ERROR, 'unacknowledged')
+    assert (item.values['Occurrences'], item.values['Announcements held back']) == (6, 4)
+
+
+def test_diagnostics_tell_of_shelf_and_suppression() -> None:
+    item = after([2.0], shelved=True)
+    assert (item.level, item.values['State']) == (Level.WARN, 'shelved')
+    assert item.values['Shelved until (s since 1970)'] == 1 + 28800
+    blind = after([0.0] + [float('nan')] * 70)
+    assert (blind.level, blind.values['State']) == (Level.WARN, 'suppressed')
+    assert 'no alarm can come' in blind.sentence
+    assert after([0.0]).level == Level.OK
 
 
 class Listener:

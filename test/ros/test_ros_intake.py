@@ -10,19 +10,18 @@ from valveflow_msgs.msg import PlantSample
 
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
-from valveflow_ros.ros.conversions import encode, to_time
-from valveflow_ros.ros.inputs import INPUT_ORDER, PLANT_SAMPLE, Decoder, header_time_ns
+from valveflow_ros.ros.decoding import INPUT_ORDER, PLANT_SAMPLE, Decoder, header_time_ns
+from valveflow_ros.ros.encoding import clock_bytes, encode, float64_bytes, to_time
 from valveflow_ros.ros.node.intake import (
-    EARLY_S,
-    MOST_EARLY,
+    LONGEST_WAIT_S,
+    MAX_WAITING,
     Arrival,
     ClockTrack,
     Intake,
     LogClock,
-    Tally,
+    TopicStatistics,
 )
-from valveflow_ros.ros.outputs import clock_bytes, float64_bytes
-from valveflow_ros.ros.polled_subscription import DEPTH, Taken
+from valveflow_ros.ros.polled_subscription import DEPTH, RawMessage
 
 T0 = 1_700_000_000 * NS_PER_S
 NOW = T0 + NS_PER_S  # later than anything was received
@@ -32,12 +31,12 @@ class Queue:
     """A source that gives what was put in."""
 
     def __init__(self) -> None:
-        self.waiting: list[Taken] = []
+        self.waiting: list[RawMessage] = []
 
     def put(self, data: bytes, sent: int, received: int | None = None, number: int = 0) -> None:
-        self.waiting.append(Taken(data, sent, sent if received is None else received, number))
+        self.waiting.append(RawMessage(data, sent, sent if received is None else received, number))
 
-    def take(self, most: int = DEPTH) -> list[Taken]:
+    def take(self, most: int = DEPTH) -> list[RawMessage]:
         taken, self.waiting = self.waiting[:most], self.waiting[most:]
         return taken
 
@@ -217,7 +216,7 @@ def test_what_is_sent_before_the_first_clock_waits_for_it_and_stands_before_its_
     queues[PLANT_SAMPLE].put(encode(sample(T0 + 7, valve_opening=50.0)), T0 + 1)
     # What has a time of its own does not wait for a clock.
     assert [a.name for a in intake.collect(0.0, NOW) + intake.collect(4.0, NOW)] == [PLANT_SAMPLE]
-    assert intake.tallies['valve_opening'].waiting == 4
+    assert intake.statistics['valve_opening'].waiting == 4
     shown = 90 * NS_PER_S
     queues['generated_power'].put(float64_bytes(5.0), T0 + 11 * NS_PER_S)
     clock.put(clock_bytes(shown), T0 + 10 * NS_PER_S)
@@ -226,22 +225,22 @@ def test_what_is_sent_before_the_first_clock_waits_for_it_and_stands_before_its_
     assert [a.data for a in found[:4]] == [float64_bytes(k) for k in range(4)]
     assert [a.time_ns for a in found] == [*(shown - (10 - k) * NS_PER_S for k in range(4)), shown]
     assert [a.log_ns for a in found] == sorted(a.log_ns for a in found)
-    tally = intake.tallies['valve_opening']
-    assert (tally.waiting, tally.before_clock, tally.without_time) == (0, 4, 0)
+    statistics = intake.statistics['valve_opening']
+    assert (statistics.waiting, statistics.before_clock, statistics.without_time) == (0, 4, 0)
     assert len(intake.rows(found)) == 5
 
 
 def test_not_too_many_wait_for_a_clock_that_never_comes() -> None:
     queues, intake = intake_of(['valve_opening'], Queue())
     found = []
-    for k in range(MOST_EARLY + 2000):
+    for k in range(MAX_WAITING + 2000):
         queues['valve_opening'].put(float64_bytes(k), T0 + k)
         if k % 500 == 499:
             found += intake.collect(1e-6 * k, NOW)
     found += intake.collect(1.0, NOW)
-    assert intake.tallies['valve_opening'].waiting == MOST_EARLY
+    assert intake.statistics['valve_opening'].waiting == MAX_WAITING
     found += intake.collect(2.0, NOW, last=True)
-    assert [a.data for a in found] == [float64_bytes(k) for k in range(MOST_EARLY + 2000)]
+    assert [a.data for a in found] == [float64_bytes(k) for k in range(MAX_WAITING + 2000)]
     assert {a.time_ns for a in found} == {0}
 
 
@@ -251,10 +250,10 @@ def test_nothing_waits_long_for_a_clock_that_never_comes() -> None:
     for k in range(100):
         queues['valve_opening'].put(float64_bytes(k), T0 + k)
         found += intake.collect(float(k), NOW + k)
-        assert len(found) >= k - EARLY_S - 1.0
+        assert len(found) >= k - LONGEST_WAIT_S - 1.0
     assert [a.data for a in found] == [float64_bytes(k) for k in range(len(found))]
     assert intake.rows(found) == []
-    assert intake.tallies['valve_opening'].without_time == len(found)
+    assert intake.statistics['valve_opening'].without_time == len(found)
 
 
 def test_what_has_no_time_is_logged_counted_and_not_fed() -> None:
@@ -265,7 +264,7 @@ def test_what_has_no_time_is_logged_counted_and_not_fed() -> None:
     found = intake.collect(0.0, NOW, last=True)
     assert [arrival.time_ns for arrival in found] == [0, 0]
     assert intake.rows(found) == []
-    assert [intake.tallies[name].without_time for name in queues] == [1, 1]
+    assert [intake.statistics[name].without_time for name in queues] == [1, 1]
 
 
 @pytest.mark.parametrize(
@@ -280,7 +279,7 @@ def test_what_has_no_time_is_logged_counted_and_not_fed() -> None:
 def test_what_cannot_be_read_is_counted_and_not_fed(name: str, data: bytes) -> None:
     _, intake = intake_of([name])
     assert intake.rows([Arrival(name, data, T0, T0)]) == []
-    assert intake.tallies[name].malformed == 1
+    assert intake.statistics[name].malformed == 1
 
 
 def test_units_are_converted_at_the_door() -> None:
@@ -363,16 +362,16 @@ def test_the_clock_track_stays_bounded() -> None:
 
 
 def test_gaps_in_the_publishers_numbers_are_losses() -> None:
-    tally = Tally()
+    statistics = TopicStatistics()
     for number in (1, 2, 5, 6, 10):
-        tally.note_number(number)
-    assert (tally.received, tally.lost, tally.missed_at_start) == (5, 5, 0)
+        statistics.note_number(number)
+    assert (statistics.received, statistics.lost, statistics.missed_at_start) == (5, 5, 0)
 
 
 def test_numbers_before_the_first_are_no_losses() -> None:
-    tally = Tally()
-    tally.note_number(8)
-    assert (tally.lost, tally.missed_at_start) == (0, 7)
+    statistics = TopicStatistics()
+    statistics.note_number(8)
+    assert (statistics.lost, statistics.missed_at_start) == (0, 7)
 
 
 @settings(max_examples=200, deadline=None)
@@ -385,13 +384,13 @@ def test_two_publishers_never_invent_a_loss(
 ) -> None:
     """Nothing is lost; whoever sends, at whatever rate, in whatever bursts."""
     rng = np.random.default_rng(seed)
-    tally, numbers = Tally(), [first, second]
+    statistics, numbers = TopicStatistics(), [first, second]
     for _ in range(seconds):
         for who in (rng.random(int(rng.integers(0, 30))) < share).astype(int):
-            tally.note_number(numbers[who])
+            statistics.note_number(numbers[who])
             numbers[who] += 1
-        tally.note_publishers(2)
-        assert tally.lost == 0
+        statistics.note_publishers(2)
+        assert statistics.lost == 0
 
 
 @settings(max_examples=200, deadline=None)
@@ -400,69 +399,69 @@ def test_losses_are_counted_again_when_one_publisher_is_left(
     alone: int, both: int, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    tally, numbers = Tally(), [1, 900]
+    statistics, numbers = TopicStatistics(), [1, 900]
     for _ in range(alone):
-        tally.note_number(numbers[0])
+        statistics.note_number(numbers[0])
         numbers[0] += 1 + int(rng.integers(0, 2))
-    before = tally.lost
-    tally.note_publishers(1)
+    before = statistics.lost
+    statistics.note_publishers(1)
     for who in rng.integers(0, 2, both):
-        tally.note_number(numbers[who])
+        statistics.note_number(numbers[who])
         numbers[who] += 1
-    tally.note_publishers(2)
-    assert tally.lost == before
-    tally.note_publishers(1)
-    tally.note_publishers(1)
-    tally.note_number(numbers[0])
-    assert tally.lost == before
-    tally.note_publishers(1)
-    tally.note_publishers(1)
-    tally.note_number(numbers[0] + 1)
-    tally.note_number(numbers[0] + 5)
-    assert tally.lost == before + 3
+    statistics.note_publishers(2)
+    assert statistics.lost == before
+    statistics.note_publishers(1)
+    statistics.note_publishers(1)
+    statistics.note_number(numbers[0])
+    assert statistics.lost == before
+    statistics.note_publishers(1)
+    statistics.note_publishers(1)
+    statistics.note_number(numbers[0] + 1)
+    statistics.note_number(numbers[0] + 5)
+    assert statistics.lost == before + 3
 
 
 def test_another_publisher_after_a_pause_or_for_a_moment_invents_no_loss() -> None:
-    tally = Tally()
+    statistics = TopicStatistics()
     for number in (1, 2, 3):
-        tally.note_number(number)
-    tally.note_publishers(0)
-    tally.note_publishers(1)
-    tally.note_number(40)
-    assert tally.lost == 0
+        statistics.note_number(number)
+    statistics.note_publishers(0)
+    statistics.note_publishers(1)
+    statistics.note_number(40)
+    assert statistics.lost == 0
     for number in (500, 41):
-        tally.note_number(number)
-    tally.note_publishers(1)
-    assert tally.lost == 0
+        statistics.note_number(number)
+    statistics.note_publishers(1)
+    assert statistics.lost == 0
 
 
 def test_a_restarted_publisher_is_one_irregularity() -> None:
-    tally = Tally()
+    statistics = TopicStatistics()
     for number in (5, 6, 7, 1, 2, 3):
-        tally.note_number(number)
-    assert (tally.irregular, tally.lost) == (1, 0)
-    tally.note_publishers(1)
-    tally.note_number(number + 9)
-    assert tally.lost == 0, 'it may be another one that goes'
-    tally.note_publishers(1)
-    tally.note_number(number + 19)
-    assert tally.lost == 9
+        statistics.note_number(number)
+    assert (statistics.irregular, statistics.lost) == (1, 0)
+    statistics.note_publishers(1)
+    statistics.note_number(number + 9)
+    assert statistics.lost == 0, 'it may be another one that goes'
+    statistics.note_publishers(1)
+    statistics.note_number(number + 19)
+    assert statistics.lost == 9
 
 
 @pytest.mark.parametrize(('period', 'limit'), [(0.01, 2.0), (1.0, 2.5), (30.0, 75.0)])
 def test_silence_is_told_by_the_topics_own_period(period: float, limit: float) -> None:
-    tally = Tally()
-    assert tally.age_s(0.0) is None
+    statistics = TopicStatistics()
+    assert statistics.age_s(0.0) is None
     for k in range(100):
-        tally.note_arrival(1, k * period)
+        statistics.note_arrival(1, k * period)
     last = 99 * period
-    assert tally.rate_hz() == pytest.approx(1.0 / period)
-    assert not tally.stale(last + 0.98 * limit)
-    assert tally.stale(last + 1.02 * limit)
+    assert statistics.rate_hz() == pytest.approx(1.0 / period)
+    assert not statistics.stale(last + 0.98 * limit)
+    assert statistics.stale(last + 1.02 * limit)
 
 
 def test_the_rate_does_not_depend_on_how_often_is_looked() -> None:
-    every, rarely = Tally(), Tally()
+    every, rarely = TopicStatistics(), TopicStatistics()
     for k in range(1, 1001):
         every.note_arrival(1, 0.01 * k)
         if k % 10 == 0:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -17,13 +18,16 @@ from ros_helpers import wait_until
 from std_msgs.msg import Float32
 from std_srvs.srv import Trigger
 
+from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import open_log
-from valveflow_ros.parameters import TABLE
-from valveflow_ros.ros import simulator_steps
+from valveflow_ros.parameters import TABLE, Settings
+from valveflow_ros.ros import demo, replay_main, simulator_main, watch_main
 from valveflow_ros.ros.node import monitor_node
 from valveflow_ros.ros.node.monitor_node import MonitorNode
+from valveflow_ros.ros.node.recording import check_record_directory
 
 pytestmark = pytest.mark.ros
+_MODULES = ('monitor_main', 'simulator_main', 'replay_main', 'watch_main', 'demo')
 DONE = TransitionCallbackReturn.SUCCESS
 
 
@@ -168,8 +172,79 @@ def test_help_is_a_page_and_starts_nothing(name: str, tmp_path: Path) -> None:
     )  # fmt: skip
     assert asked.returncode == 0, asked.stderr
     assert asked.stdout.startswith('usage: ')
-    table = {'monitor_main': TABLE, 'simulator_main': simulator_steps.TABLE}.get(name, ())
+    table = {'monitor_main': TABLE, 'simulator_main': simulator_main.TABLE}.get(name, ())
     for row in table:
         assert row.name in asked.stdout
         assert row.sentence in asked.stdout
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('module', _MODULES)
+def test_help_that_nobody_reads_to_its_end_is_no_accident(module):
+    """As by ``monitor --help | head -1``: the pipe is closed before a letter is written."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    words = [sys.executable, '-m', f'valveflow_ros.ros.{module}', '--help']
+    with os.fdopen(writer, 'w') as closed:
+        ended = subprocess.run(
+            words, stdout=closed, stderr=subprocess.PIPE, text=True, timeout=120, check=False
+        )
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stderr == ''
+
+
+@pytest.mark.parametrize(
+    ('parser', 'words', 'said'),
+    [
+        (
+            replay_main.parser,
+            ['x.mcap', '--rate', 'fast'],
+            '--rate must be a number of seconds of the log',
+        ),
+        (replay_main.parser, ['x.mcap', '--wait', 'nan'], "such as --wait 60; 'nan' is not"),
+        (watch_main.parser, ['--interval', '0'], "from 0.1 to 3600, such as --interval 5; '0' is"),
+        (
+            demo.parser,
+            ['--output', 'd', '--days', '-1'],
+            '--days must be a number of days',
+        ),
+        (demo.parser, ['--output', 'd', '--seed', 'x'], "'x' is no whole number"),
+    ],
+)
+def test_what_is_no_number_is_refused_in_words(parser, words, said, capsys):
+    with pytest.raises(SystemExit) as ended:
+        parser().parse_args(words)
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+# A folder that cannot be recorded into is reported before the engine is loaded.
+
+
+def recorded_to(place: object, record: bool = True) -> Settings:
+    return Settings({'record_directory': str(place), 'record': record})
+
+
+def test_a_folder_that_will_do_is_left_as_it_is(tmp_path: Path) -> None:
+    check_record_directory(recorded_to(tmp_path))
+    check_record_directory(recorded_to(tmp_path / 'a' / 'b'))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_recorded_into_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / 'file').write_text('')
+    below = tmp_path / 'file' / 'records'
+    with pytest.raises(RecordingError, match='is not a folder; set record_directory'):
+        check_record_directory(recorded_to(below))
+    check_record_directory(recorded_to(below, record=False))
+    with pytest.raises(RecordingError, match='not there'):
+        check_record_directory(recorded_to('~nobody-of-this-name/records'))
+    if os.geteuid() != 0:
+        tmp_path.chmod(0o500)
+        with pytest.raises(RecordingError, match='may not be written into'):
+            check_record_directory(recorded_to(tmp_path / 'records'))
+    monkeypatch.setattr(os, 'access', lambda *_: False)
+    with pytest.raises(RecordingError, match='may not be written into; set record_directory'):
+        check_record_directory(recorded_to(tmp_path))

@@ -17,11 +17,11 @@ from valveflow_ros.monitoring.offline import JournalReplayer
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.records import NS_PER_S, Readings, table_to_readings
-from valveflow_ros.ros.inputs import Row
-from valveflow_ros.ros.node.live import LiveEngine
+from valveflow_ros.ros.decoding import Row
+from valveflow_ros.ros.node.engine import LiveEngine
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
-from valveflow_ros.ros.simulator_steps import effects_of
-from valveflow_ros.ros.worker.worker import Outcome
+from valveflow_ros.ros.simulator_main import effects_of
+from valveflow_ros.ros.worker import Outcome
 from valveflow_ros.signals.align import Aligner
 
 SETTINGS = Settings({'refit_period': 3600.0, 'refit_segments': 0, 'alarm_on_delay': 60.0})
@@ -76,7 +76,7 @@ def run(
 
 def said(calls: list[list[Event]]) -> list[Output]:
     outputs = Outputs('u')
-    found = list(outputs.first())
+    found = list(outputs.latched())
     for events in calls:
         found += outputs.of(events)
     return found
@@ -194,4 +194,4 @@ def test_nothing_in_nothing_out() -> None:
     with pytest.raises(DataError):
         engine.request_fit()
     with pytest.raises(DataError):
-        engine.acknowledge()
+        engine.monitor.acknowledge()

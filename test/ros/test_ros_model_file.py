@@ -8,14 +8,14 @@ from types import SimpleNamespace
 
 import pytest
 from extended_file import extended_json, write_extended
-from ros_helpers import PATIENCE_S, Processes, wait_until
+from listener import start_monitor, start_plant
+from ros_helpers import Processes, wait_until
 
 from valveflow_ros.diagnosis.result import model_to_json
 from valveflow_ros.errors import ParameterError, RecordingError
 from valveflow_ros.logs import open_log
 from valveflow_ros.parameters import Settings
 from valveflow_ros.ros import verify as verifying
-from valveflow_ros.ros.demo import ros_arguments
 from valveflow_ros.ros.node import given_files
 from valveflow_ros.ros.node.session import Session
 
@@ -23,18 +23,18 @@ HELD = {'backlash': {'w_percent': 0.5}, 'gain_drift': {'g': 0.05}, 'clock': {'d_
 
 
 def test_a_model_is_read_from_its_file(tmp_path: Path) -> None:
-    assert given_files.extended_of(Settings()) is None
-    assert given_files.ready(None, Settings()) is None
-    assert given_files.attached(None) == {}
+    assert given_files.given_model(Settings()) is None
+    assert given_files.corrector_for(None, Settings()) is None
+    assert given_files.model_attachment(None) == {}
     path = write_extended(tmp_path / 'extended_model.json', **HELD)
     settings = Settings({'model_file': str(path)})
-    given = given_files.extended_of(settings)
+    given = given_files.given_model(settings)
     assert given is not None
     assert model_to_json(given) == extended_json(**HELD)
-    corrector = given_files.ready(given, settings)
+    corrector = given_files.corrector_for(given, settings)
     assert corrector is not None
     assert [h.name for h in corrector.held] == list(HELD)
-    kept = given_files.attached(given)[given_files.ATTACHMENT]
+    kept = given_files.model_attachment(given)[given_files.ATTACHMENT]
     assert json.loads(kept) == extended_json(**HELD)
 
 
@@ -57,7 +57,7 @@ def test_a_bad_file_is_refused_with_a_sentence(
     if text is not None:
         path.write_text(text, encoding='utf-8', errors='surrogateescape')
     with pytest.raises(ParameterError) as caught:
-        given_files.extended_of(Settings({'model_file': str(path)}))
+        given_files.given_model(Settings({'model_file': str(path)}))
     assert said in str(caught.value)
     assert str(caught.value).startswith("Parameter 'model_file' names")
 
@@ -75,17 +75,10 @@ def test_the_node_takes_causes_out_and_its_recording_repeats(
     processes: Processes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = write_extended(tmp_path / 'extended_model.json', **HELD)
-    parameters = {
-        'record_directory': f'"{tmp_path / "recordings"}"', 'unit_tag': '"unit"',
-        'input_reliability': 'reliable', 'refit_period': 3600.0, 'refit_segments': 0,
-        'model_file': f'"{model}"', 'use_sim_time': True,
-    }  # fmt: skip
-    monitor = processes.start('valveflow_ros.ros.monitor_main', *ros_arguments(parameters))
-    plant = processes.start(
-        'valveflow_ros.ros.simulator_main',
-        *ros_arguments({'seed': 7, 'rate': 0.0, 'wait': PATIENCE_S, 'days': 0.02,
-                        'use_clock': True}),
-    )  # fmt: skip
+    monitor = start_monitor(
+        processes, tmp_path / 'recordings', model_file=str(model), use_sim_time=True
+    )
+    plant = start_plant(processes, days=0.02, use_clock=True)
     wait_until(lambda: plant.poll() is not None, 'the end of the plant')
     monitor.terminate()
     assert monitor.wait(10.0) == 0, processes.output(monitor)
@@ -100,7 +93,7 @@ def test_the_node_takes_causes_out_and_its_recording_repeats(
     log = open_log(folder)
     assert json.loads(log.attachments[given_files.ATTACHMENT]) == extended_json(**HELD)
     # Rows as measured would have another u from the first one on.
-    monkeypatch.setattr(verifying, '_corrector', lambda *_: None)
+    monkeypatch.setattr(verifying, 'corrector_of_run', lambda *_: None)
     assert 'Prediction number 1 differs' in verifying.verify(folder).difference
 
 
@@ -108,8 +101,8 @@ def test_a_recording_without_its_model_is_not_verified(tmp_path: Path) -> None:
     log = SimpleNamespace(path=tmp_path, attachments={})
     settings = Settings({'model_file': 'gone.json'})
     with pytest.raises(RecordingError, match='lacks the attachment'):
-        verifying._corrector(log, settings)  # type: ignore[arg-type]
+        verifying.corrector_of_run(log, settings)  # type: ignore[arg-type]
     log.attachments = {given_files.ATTACHMENT: b'{}'}
     with pytest.raises(RecordingError, match='an extended model that cannot be used'):
-        verifying._corrector(log, settings)  # type: ignore[arg-type]
-    assert verifying._corrector(log, Settings()) is None  # type: ignore[arg-type]
+        verifying.corrector_of_run(log, settings)  # type: ignore[arg-type]
+    assert verifying.corrector_of_run(log, Settings()) is None  # type: ignore[arg-type]

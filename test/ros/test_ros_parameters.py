@@ -16,7 +16,7 @@ from valveflow_ros.errors import ParameterError
 from valveflow_ros.parameters import TABLE, Parameter, Settings, as_yaml
 from valveflow_ros.ros import monitor_main
 from valveflow_ros.ros.declare import changed, declare, descriptor, unknown_overrides
-from valveflow_ros.ros.diagnostics import Level
+from valveflow_ros.ros.node.diagnostics import Level
 from valveflow_ros.ros.node.monitor_node import MonitorNode
 
 pytestmark = pytest.mark.ros
@@ -147,7 +147,7 @@ def test_misspelt_parameters_are_named(context: Any) -> None:
     node = MonitorNode(context=context, parameter_overrides=overrides)
     (sentence,) = unknown_overrides(node)
     assert sentence == "Parameter 'refit_periodd' does not exist, did you mean 'refit_period'."
-    (item,) = node.misspelt()
+    (item,) = node.unknown_parameters()
     assert (item.name, item.level) == ('parameters', Level.WARN)
     assert item.sentence == f'{sentence} Ignored.'
     node.destroy_node()

@@ -6,15 +6,11 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
-from ros_helpers import PATIENCE_S, Processes, wait_until
-from std_srvs.srv import Trigger
-from valveflow_msgs.msg import Alarm, FlowCharacteristic
+from listener import Listener, start_monitor, start_plant
+from ros_helpers import Processes, wait_until
+from valveflow_msgs.msg import Alarm
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
@@ -33,15 +29,13 @@ from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import JournalReplayer, feed_rows
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
-from valveflow_ros.ros import conversions
-from valveflow_ros.ros.demo import ros_arguments
-from valveflow_ros.ros.node.given_files import reference_of
+from valveflow_ros.ros import encoding
+from valveflow_ros.ros.decoding import from_time, journal_entry
+from valveflow_ros.ros.node.given_files import given_reference
 from valveflow_ros.ros.node.health import reference_item
 from valveflow_ros.ros.outputs import Outputs
 from valveflow_ros.ros.verify import verify
 
-MONITOR = '/valveflow_monitor'
-LATCHED = QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 SETTINGS = Settings({'refit_period': 3600.0, 'refit_segments': 0, 'alarm_limit': 500.0})
 TABLE = simulate(0.3, 7).table
 
@@ -63,19 +57,19 @@ def lifted(curve: Characteristic, by_mw: float) -> Characteristic:
 
 
 def test_without_a_reference_nothing_is_said_of_a_shift(curve: Characteristic) -> None:
-    message = conversions.characteristic(curve, CurveStatus.FRESH, '', 'u')
+    message = encoding.curve_message(curve, CurveStatus.FRESH, '', 'u')
     assert message.reference_model_id == message.shift_sentence == ''
     assert list(message.shift_mw) == list(message.shift_confidence) == []
-    assert conversions.from_time(message.shift_since) == 0
+    assert from_time(message.shift_since) == 0
 
 
 def test_the_reference_itself_has_not_moved(curve: Characteristic) -> None:
-    message = conversions.characteristic(curve, CurveStatus.FRESH, '', 'u', curve.model_id)
+    message = encoding.curve_message(curve, CurveStatus.FRESH, '', 'u', curve.model_id)
     assert list(message.shift_mw) == list(message.shift_confidence) == [0.0] * len(curve.pieces)
-    other = conversions.characteristic(curve, CurveStatus.FRESH, '', 'u', 'another')
+    other = encoding.curve_message(curve, CurveStatus.FRESH, '', 'u', 'another')
     assert all(math.isnan(v) for v in [*other.shift_mw, *other.shift_confidence])
     assert len(other.shift_mw) == len(curve.pieces)
-    none = conversions.characteristic(None, CurveStatus.UNKNOWN, 'why', 'u', 'another')
+    none = encoding.curve_message(None, CurveStatus.UNKNOWN, 'why', 'u', 'another')
     assert (none.reference_model_id, list(none.shift_mw)) == ('another', [])
 
 
@@ -85,13 +79,13 @@ def test_a_judgement_stands_in_the_message(curve: Characteristic) -> None:
         since_ns=DEFAULT_START_NS, since_low_ns=DEFAULT_START_NS - 1,
         since_high_ns=DEFAULT_START_NS + 1,
     )  # fmt: skip
-    message = conversions.characteristic(curve, CurveStatus.FRESH, '', 'u', 'lifted', shift)
+    message = encoding.curve_message(curve, CurveStatus.FRESH, '', 'u', 'lifted', shift)
     assert list(message.shift_mw) == pytest.approx([-5.0] * len(curve.pieces))
     assert list(message.shift_confidence) == [p.confidence for p in shift.pieces]
     assert message.shift_sentence == shift.sentence
-    assert conversions.from_time(message.shift_since) == DEFAULT_START_NS
-    assert conversions.from_time(message.shift_since_low) == DEFAULT_START_NS - 1
-    assert conversions.from_time(message.shift_since_high) == DEFAULT_START_NS + 1
+    assert from_time(message.shift_since) == DEFAULT_START_NS
+    assert from_time(message.shift_since_low) == DEFAULT_START_NS - 1
+    assert from_time(message.shift_since_high) == DEFAULT_START_NS + 1
 
 
 def test_outputs_follow_the_events(curve: Characteristic) -> None:
@@ -123,7 +117,7 @@ def test_a_run_with_references_is_repeated_byte_for_byte(curve: Characteristic) 
     live = [o for call in calls for o in first.of(call)]
     # Through messages and back, as a recording keeps the journal.
     journal = [
-        conversions.journal_entry(conversions.journal(e, 'u'))
+        journal_entry(encoding.encode(encoding.journal_message(e, 'u')))
         for e in events
         if isinstance(e, JournalEntry)
     ]
@@ -157,10 +151,10 @@ def test_health_says_how_the_curve_stands_to_its_reference(curve: Characteristic
 
 
 def test_a_reference_is_read_from_its_file(curve: Characteristic, tmp_path: Path) -> None:
-    assert reference_of(Settings()) is None
+    assert given_reference(Settings()) is None
     path = tmp_path / 'characteristic.json'
     path.write_text(json.dumps(to_json(curve)), encoding='utf-8')
-    read = reference_of(Settings({'reference_file': str(path)}))
+    read = given_reference(Settings({'reference_file': str(path)}))
     assert read is not None
     assert to_json(read) == to_json(curve)
 
@@ -181,7 +175,7 @@ def test_a_bad_file_is_refused_with_a_sentence(
     if text is not None:
         path.write_text(text, encoding='utf-8', errors='surrogateescape')
     with pytest.raises(ParameterError) as caught:
-        reference_of(Settings({'reference_file': str(path)}))
+        given_reference(Settings({'reference_file': str(path)}))
     assert said in str(caught.value)
     assert str(caught.value).startswith("Parameter 'reference_file' names")
 
@@ -191,51 +185,23 @@ def test_a_file_for_another_exponent_is_refused(curve: Characteristic, tmp_path:
     path.write_text(json.dumps(to_json(curve)), encoding='utf-8')
     settings = Settings({'reference_file': str(path), 'pressure_exponent': 1.0})
     with pytest.raises(ParameterError, match=r'the pressure exponent 1\.125'):
-        reference_of(settings)
+        given_reference(settings)
 
 
 # --- the node ---------------------------------------------------------------------------------
 
 
-class Listener:
-    """Hears curves and alarms, and calls services."""
-
-    def __init__(self, context: Any) -> None:
-        self.node = Node('reference_listener', context=context)
-        self.executor = SingleThreadedExecutor(context=context)
-        self.executor.add_node(self.node)
-        self.curves: list[FlowCharacteristic] = []
-        self.alarms: list[Alarm] = []
-        subscribe = self.node.create_subscription
-        subscribe(FlowCharacteristic, f'{MONITOR}/characteristic', self.curves.append, LATCHED)
-        subscribe(Alarm, f'{MONITOR}/alarms', self.alarms.append, LATCHED)
-
-    def until(self, condition: Any, what: str) -> Any:
-        return wait_until(
-            lambda: self.executor.spin_once(timeout_sec=0.02) or condition(), what, PATIENCE_S
-        )
-
-    def trigger(self, name: str) -> Any:
-        client = self.node.create_client(Trigger, f'{MONITOR}/{name}')
-        self.until(client.service_is_ready, name)
-        future = client.call_async(Trigger.Request())
-        return self.until(lambda: future.done() and future.result(), name)
-
-
 @pytest.mark.ros
 @pytest.mark.slow
 def test_the_node_judges_curves_and_its_recording_repeats(
-    processes: Processes, context: Any, curve: Characteristic, tmp_path: Path
+    processes: Processes, listener: Listener, curve: Characteristic, tmp_path: Path
 ) -> None:
     given = tmp_path / 'reference.json'
     given.write_text(json.dumps(to_json(lifted(curve, 12.0))), encoding='utf-8')
-    parameters = {
-        'record_directory': f'"{tmp_path / "recordings"}"', 'unit_tag': '"unit"',
-        'input_reliability': 'reliable', 'refit_period': 3600.0, 'refit_segments': 0,
-        'reference_file': f'"{given}"', 'alarm_limit': 500.0, 'use_sim_time': True,
-    }  # fmt: skip
-    monitor = processes.start('valveflow_ros.ros.monitor_main', *ros_arguments(parameters))
-    listener = Listener(context)
+    monitor = start_monitor(
+        processes, tmp_path / 'recordings', reference_file=str(given), alarm_limit=500.0,
+        use_sim_time=True,
+    )  # fmt: skip
     listener.until(
         lambda: listener.curves and listener.curves[-1].reference_model_id == 'lifted',
         'the reference that was given',
@@ -243,11 +209,7 @@ def test_the_node_judges_curves_and_its_recording_repeats(
     refused = listener.trigger('set_reference')
     assert not refused.success
     assert 'no curve that could become the reference' in refused.message
-    plant = processes.start(
-        'valveflow_ros.ros.simulator_main',
-        *ros_arguments({'seed': 7, 'rate': 0.0, 'wait': PATIENCE_S, 'days': 0.1,
-                        'use_clock': True}),
-    )  # fmt: skip
+    plant = start_plant(processes, days=0.1, use_clock=True)
     listener.until(lambda: plant.poll() is not None, 'the end of the plant')
     raised = listener.until(
         lambda: [a for a in listener.alarms if a.name == 'curve_shift'], 'the alarm on the shift'
@@ -274,16 +236,56 @@ def test_the_node_judges_curves_and_its_recording_repeats(
     assert result.compared['journal'] >= 5
 
 
+def states(listener: Listener) -> list[int]:
+    """Return how the alarm on a shift went."""
+    return [a.state for a in listener.alarms if a.name == 'curve_shift']
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+def test_an_alarm_is_put_aside_and_taken_back_and_the_recording_repeats(
+    processes: Processes, listener: Listener, curve: Characteristic, tmp_path: Path
+) -> None:
+    given = tmp_path / 'reference.json'
+    given.write_text(json.dumps(to_json(lifted(curve, 12.0))), encoding='utf-8')
+    monitor = start_monitor(
+        processes, tmp_path / 'recordings', reference_file=str(given), alarm_limit=500.0,
+        use_sim_time=True,
+    )  # fmt: skip
+    listener.until(lambda: listener.curves, 'the monitor')
+    refused = listener.trigger('shelve_alarms')
+    assert (refused.success, refused.message) == (False, 'There is no alarm to shelve.')
+    plant = start_plant(processes, days=0.1, use_clock=True)
+    listener.until(lambda: plant.poll() is not None and states(listener), 'the alarm')
+    (raised,) = (a for a in listener.alarms if a.name == 'curve_shift')
+    assert raised.first_out == 'curve_shift'
+    answer = listener.trigger('shelve_alarms')
+    assert (answer.success, 'put aside for 8 h' in answer.message) == (True, True)
+    listener.until(lambda: Alarm.SHELVED in states(listener), 'the shelf')
+    assert not listener.trigger('acknowledge_alarms').success
+    assert listener.trigger('unshelve_alarms').success
+    listener.until(
+        lambda: states(listener)[-2:] == [Alarm.SHELVED, Alarm.UNACKNOWLEDGED], 'its return'
+    )
+    again = listener.trigger('unshelve_alarms')
+    assert (again.success, again.message) == (False, 'There is no shelved alarm.')
+    monitor.terminate()
+    assert monitor.wait(20.0) == 0, processes.output(monitor)
+    (folder,) = (tmp_path / 'recordings').glob('valveflow_*')
+    result = verify(folder)
+    assert result.identical, result.difference
+    # Where the load leaves the young curve the residual cannot be judged: that is told as well.
+    assert states(listener) == [Alarm.UNACKNOWLEDGED, Alarm.SHELVED, Alarm.UNACKNOWLEDGED]
+    assert result.compared['alarms'] == len(listener.alarms)
+
+
 @pytest.mark.ros
 @pytest.mark.slow
 def test_a_bad_reference_keeps_the_node_from_starting(
     processes: Processes, tmp_path: Path
 ) -> None:
     gone = tmp_path / 'gone.json'
-    monitor = processes.start(
-        'valveflow_ros.ros.monitor_main',
-        *ros_arguments({'reference_file': f'"{gone}"', 'record': False}),
-    )
+    monitor = start_monitor(processes, tmp_path, reference_file=str(gone), record=False)
     said = "names '" + str(gone)
     wait_until(lambda: said in processes.output(monitor), 'the sentence')
     assert 'Traceback' not in processes.output(monitor)

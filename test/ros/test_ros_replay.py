@@ -16,12 +16,12 @@ from valveflow_ros.logs import open_log, write_samples, write_table
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import NS_PER_S, SIGNALS, SampleTable, Signal
 from valveflow_ros.ros import replay_main, simulator_main
-from valveflow_ros.ros.inputs import INPUT_BY_NAME, header_time_ns
+from valveflow_ros.ros.decoding import INPUT_BY_NAME, header_time_ns
+from valveflow_ros.ros.encoding import float64_bytes
 from valveflow_ros.ros.node.intake import ClockTrack
-from valveflow_ros.ros.outputs import float64_bytes
-from valveflow_ros.ros.polled_subscription import Taken, Taker
-from valveflow_ros.ros.replay_steps import steps_of
-from valveflow_ros.ros.simulator_steps import (
+from valveflow_ros.ros.polled_subscription import PolledSubscription, RawMessage
+from valveflow_ros.ros.replay_main import steps_of
+from valveflow_ros.ros.simulator_main import (
     check_together,
     effects_of,
     plain_steps,
@@ -39,15 +39,15 @@ class Ears:
     def __init__(self, context: Any, names: list[str]) -> None:
         self.node = Node('ears', context=context, namespace='plant')
         kinds: dict[str, Any] = {name: INPUT_BY_NAME[name].message_type for name in names}
-        self._takers = {
-            name: Taker(self.node, kind, name, reliable=True)
+        self._subscriptions = {
+            name: PolledSubscription(self.node, kind, name, reliable=True)
             for name, kind in [*kinds.items(), ('/clock', Clock)]
         }
-        self.heard: dict[str, list[Taken]] = {name: [] for name in self._takers}
+        self.heard: dict[str, list[RawMessage]] = {name: [] for name in self._subscriptions}
 
     def take(self) -> None:
-        for name, taker in self._takers.items():
-            self.heard[name] += taker.take()
+        for name, subscription in self._subscriptions.items():
+            self.heard[name] += subscription.take()
 
     def until(self, process: Any) -> None:
         """Listen until a process has ended and nothing more comes."""

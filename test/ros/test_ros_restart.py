@@ -10,43 +10,27 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
-from ros_helpers import Processes, wait_until
-from std_srvs.srv import Trigger
-from valveflow_msgs.msg import Alarm, FlowCharacteristic
+from listener import LATCHED, MONITOR, Listener, start_monitor
+from ros_helpers import Processes
+from valveflow_msgs.msg import Alarm
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import open_log
 from valveflow_ros.plant.simulator import simulate
-from valveflow_ros.ros.demo import ros_arguments
-from valveflow_ros.ros.inputs import PLANT_SAMPLE
-from valveflow_ros.ros.playing import Player
-from valveflow_ros.ros.simulator_steps import effects_of, stamped_steps
+from valveflow_ros.ros.decoding import PLANT_SAMPLE
+from valveflow_ros.ros.player import Player
+from valveflow_ros.ros.simulator_main import effects_of, stamped_steps
 from valveflow_ros.ros.verify import verify
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
-MONITOR = '/valveflow_monitor'
-LATCHED = QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LOG = simulate(0.3, 7, effects=effects_of(['gain_step:g=-0.12,t0_days=0.2'])).table
 
 
-class Plant:
+class Plant(Listener):
     """Publishes rows of a log and hears what the monitor says."""
 
     def __init__(self, context: Any) -> None:
-        self.node = Node('plant', context=context)
-        self.executor = SingleThreadedExecutor(context=context)
-        self.executor.add_node(self.node)
-        self.alarms: list[Alarm] = []
-        self.curves: list[FlowCharacteristic] = []
-        subscribe = self.node.create_subscription
-        subscribe(Alarm, f'{MONITOR}/alarms', self.alarms.append, LATCHED)
-        subscribe(FlowCharacteristic, f'{MONITOR}/characteristic', self.curves.append, LATCHED)
-        self.known = False
-        subscribe(DiagnosticArray, '/diagnostics', self._note, 10)
+        super().__init__(context, 'plant')
         self._player = Player(self.node, [PLANT_SAMPLE], 0.0, False, lambda: False)
 
     def listeners(self) -> set[bytes]:
@@ -54,36 +38,21 @@ class Plant:
         found = self.node.get_subscriptions_info_by_topic(PLANT_SAMPLE)
         return {bytes(each.endpoint_gid) for each in found}
 
-    def _note(self, health: DiagnosticArray) -> None:
-        """Note whether the monitor knows of us."""
-        told = [v.value for s in health.status for v in s.values if v.key == 'Publishers']
-        self.known = self.known or any(count != '0' for count in told)
+    def known(self) -> bool:
+        """Tell whether the monitor knows of us, by its newest health."""
+        return any(
+            v.value != '0' for h in self.health for s in h.status for v in s.values
+            if v.key == 'Publishers'
+        )  # fmt: skip
 
     def play(self, start: int, end: int) -> None:
         assert not self._player.wait_for_listeners(240.0)
         self._player.play(stamped_steps([LOG.part(start, end)], False, 'unit'))
 
-    def until(self, condition: Any, what: str, patience_s: float = 120.0) -> Any:
-        def look() -> Any:
-            self.executor.spin_once(timeout_sec=0.02)
-            return condition()
-
-        return wait_until(look, what, patience_s)
-
     def quiet(self, seconds: float) -> None:
         """Listen for a while."""
         until_s = time.monotonic() + seconds
         self.until(lambda: time.monotonic() > until_s, 'the end of a while')
-
-    def trigger(self, name: str) -> Trigger.Response:
-        client = self.node.create_client(Trigger, f'{MONITOR}/{name}')
-        self.until(client.service_is_ready, name)
-        future = client.call_async(Trigger.Request())
-        return self.until(lambda: future.done() and future.result(), name)
-
-    def close(self) -> None:
-        self.executor.shutdown()
-        self.node.destroy_node()
 
 
 @pytest.fixture
@@ -91,14 +60,6 @@ def plant(context: Any) -> Iterator[Plant]:
     made = Plant(context)
     yield made
     made.close()
-
-
-def start(processes: Processes, folder: Path, **more: object) -> Any:
-    given = {
-        'record_directory': folder, 'input_reliability': 'reliable', 'refit_period': 3600.0,
-        'refit_segments': 0, **more,
-    }  # fmt: skip
-    return processes.start('valveflow_ros.ros.monitor_main', *ros_arguments(given))
 
 
 def goes_on(processes: Processes, monitor: Any) -> bool:
@@ -109,7 +70,7 @@ def goes_on(processes: Processes, monitor: Any) -> bool:
 def test_killed_and_started_again_it_goes_on_with_curve_alarm_and_recording(
     processes: Processes, plant: Plant, tmp_path: Path
 ) -> None:
-    first = start(processes, tmp_path)
+    first = start_monitor(processes, tmp_path)
     plant.play(0, 21000)
     plant.until(
         lambda: plant.curves and plant.curves[-1].model_id
@@ -124,7 +85,7 @@ def test_killed_and_started_again_it_goes_on_with_curve_alarm_and_recording(
     before = len(plant.alarms)
 
     plant.curves.clear()
-    second = start(processes, tmp_path)
+    second = start_monitor(processes, tmp_path)
     begun = time.monotonic()
     found = plant.until(lambda: plant.curves and plant.curves[-1], 'the curve')
     print(f'curve again after {time.monotonic() - begun:.1f} s')
@@ -163,9 +124,9 @@ def test_killed_and_started_again_it_goes_on_with_curve_alarm_and_recording(
 def test_a_second_monitor_on_the_same_state_is_refused_and_the_first_goes_on(
     processes: Processes, plant: Plant, tmp_path: Path
 ) -> None:
-    first = start(processes, tmp_path)
+    first = start_monitor(processes, tmp_path)
     plant.until(lambda: plant.curves, 'the first monitor', 240.0)
-    second = start(processes, tmp_path)
+    second = start_monitor(processes, tmp_path)
     assert second.wait(120.0) == 1
     said = processes.output(second)
     assert f'another monitor (process {first.pid}) keeps its state there' in said
@@ -177,12 +138,12 @@ def test_a_second_monitor_on_the_same_state_is_refused_and_the_first_goes_on(
     known = plant.listeners()
     os.kill(first.pid, signal.SIGKILL)
     first.wait()
-    third = start(processes, tmp_path)
+    third = start_monitor(processes, tmp_path)
     plant.until(lambda: goes_on(processes, third), 'the sentence', 240.0)
     # The one that is gone would count as a listener too; and the new one has to know of us.
     plant.until(lambda: plant.listeners() - known, 'the new listener')
-    plant.known = False
-    plant.until(lambda: plant.known, 'the monitor knowing the plant')
+    plant.health.clear()
+    plant.until(plant.known, 'the monitor knowing the plant')
     plant.play(600, 700)
     plant.quiet(1.0)
     third.send_signal(signal.SIGTERM)

@@ -23,12 +23,12 @@ from ros_helpers import PATIENCE_S, Processes, wait_until
 from valveflow_ros.errors import ParameterError, RecordingError, ValveflowError
 from valveflow_ros.logs import Recorder, RecorderSettings, open_log
 from valveflow_ros.parameters import TABLE, Settings
-from valveflow_ros.ros import monitor_main, replay_main, secure_start, simulator_main
-from valveflow_ros.ros.node.given_files import extended_of, reference_of
+from valveflow_ros.ros import domain, monitor_main, replay_main, simulator_main
+from valveflow_ros.ros.domain import InsecureError, check_security
+from valveflow_ros.ros.node.given_files import given_model, given_reference
 from valveflow_ros.ros.node.monitor_node import MonitorNode
 from valveflow_ros.ros.node.recording import Recording, new_folder
-from valveflow_ros.ros.node.state_store import LOCK, STATE, StateFolder
-from valveflow_ros.ros.secure_start import InsecureError, check_security
+from valveflow_ros.ros.node.state_store import LOCK
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).resolve().parents[2]
@@ -263,14 +263,14 @@ def test_an_unknown_middleware_is_not_trusted_to_refuse(
     demanded: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     demanded(DEMANDS[-1][0])
-    monkeypatch.setattr(secure_start, 'get_rmw_implementation_identifier', lambda: 'rmw_new_cpp')
+    monkeypatch.setattr(domain, 'get_rmw_implementation_identifier', lambda: 'rmw_new_cpp')
     with pytest.raises(InsecureError, match='of rmw_new_cpp it is not known'):
         check_security([])
 
 
 # Paths
 
-READERS = [('reference_file', reference_of), ('model_file', extended_of)]
+READERS = [('reference_file', given_reference), ('model_file', given_model)]
 
 
 @pytest.mark.parametrize(('name', 'read'), READERS)
@@ -385,25 +385,6 @@ def test_a_planted_link_is_not_followed(tmp_path: Path) -> None:
     recorder.close(10.0)
     assert (elsewhere / 'victim').read_text() == 'untouched'
     assert [path.name for path in elsewhere.iterdir()] == ['victim']
-
-
-def test_a_planted_state_is_not_followed(tmp_path: Path) -> None:
-    victim, folder = tmp_path / 'victim', tmp_path / 'state'
-    victim.write_text('untouched')
-    folder.mkdir()
-    (folder / LOCK).symlink_to(victim)
-    with pytest.raises(RecordingError, match='cannot be used'):
-        StateFolder(folder)
-    (folder / LOCK).unlink()
-    (folder / STATE).symlink_to(victim)
-    state = StateFolder(folder)
-    with pytest.raises(RecordingError, match='cannot be read'):
-        state.read()
-    state.write(b'mine')
-    assert state.read() == b'mine'
-    state.close()
-    assert victim.read_text() == 'untouched'
-    assert {stat.S_IMODE(path.lstat().st_mode) for path in folder.iterdir()} == {0o600}
 
 
 @pytest.mark.parametrize('umask', [0o000, 0o022, 0o077])

@@ -18,8 +18,8 @@ from valveflow_msgs.msg import Alarm, Diagnosis, DiagnosisCause, FlowCharacteris
 
 from valveflow_ros.report.terminal.draw import screen
 from valveflow_ros.ros import watch_main
-from valveflow_ros.ros.diagnostics import Item, Level, array
-from valveflow_ros.ros.watch_node import WatchNode, fields_of
+from valveflow_ros.ros.node.diagnostics import Item, Level, diagnostics_message
+from valveflow_ros.ros.watch_main import WatchNode, fields_of
 
 pytestmark = pytest.mark.ros
 
@@ -56,7 +56,7 @@ class Speaker(Node):
 
     def go_on(self) -> None:
         """Say what comes again and again."""
-        self.health.publish(array(
+        self.health.publish(diagnostics_message(
             [Item('input valve_opening', Level.STALE, 'silent for 9 s.'),
              Item('recorder', Level.OK, 'Recording.')], 'U1', AT_S * 10**9,
         ))  # fmt: skip

@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 import weakref
 from collections.abc import Iterator
@@ -14,7 +13,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import hurt_jobs
-import numpy as np
 import psutil
 import pytest
 from ros_helpers import wait_until
@@ -25,23 +23,23 @@ from valveflow_ros.fit.fit import fit
 from valveflow_ros.fit.task import FitTask
 from valveflow_ros.monitoring.events import DiagnosisTask
 from valveflow_ros.parameters import Settings
-from valveflow_ros.ros.node.warmup import made_up_curve, made_up_task
-from valveflow_ros.ros.worker.protocol import (
-    FrameReader,
-    result_letter,
-    result_of,
-    send,
-    task_letter,
-    task_of,
+from valveflow_ros.ros import worker as worker_module
+from valveflow_ros.ros.node.engine import example_curve, example_task
+from valveflow_ros.ros.worker import (
+    FIT_JOB,
+    FitWorker,
+    Outcome,
+    result_from_bytes,
+    result_to_bytes,
+    task_from_bytes,
+    task_to_bytes,
 )
-from valveflow_ros.ros.worker.worker import FIT_JOB, FitWorker, Outcome
-from valveflow_ros.ros.worker.worker import worker as worker_module
 from valveflow_ros.segments.window import NO_ROWS
-from valveflow_ros.state import State
+from valveflow_ros.state import to_bytes
 
 pytestmark = pytest.mark.usefixtures('jobs_on_path')
-TASK = made_up_task(Settings())
-DIAGNOSIS = DiagnosisTask(5, TASK.contents, Settings(), made_up_curve(Settings()).with_id(), 6)
+TASK = example_task(Settings())
+DIAGNOSIS = DiagnosisTask(5, TASK.contents, Settings(), example_curve(Settings()).with_id(), 6)
 
 
 @contextmanager
@@ -187,7 +185,7 @@ def test_submitting_never_blocks_even_if_nobody_reads() -> None:
         outcome_of(made)
         assert made.pid is not None
         os.kill(made.pid, signal.SIGSTOP)
-        large = made_up_task(Settings())
+        large = example_task(Settings())
         for name in ('u', 'power_mw', 'temperature_degc'):
             # 24 MB of data: far more than a pipe holds.
             object.__setattr__(large.contents, name, getattr(large.contents, name).repeat(170))
@@ -216,12 +214,12 @@ import subprocess
 import sys
 import threading
 import time
-from valveflow_ros.ros.node.warmup import made_up_task
+from valveflow_ros.ros.node.engine import example_task
 from valveflow_ros.parameters import Settings
-from valveflow_ros.ros.worker.worker import FitWorker
+from valveflow_ros.ros.worker import FitWorker
 made = FitWorker(120.0, 'hurt_jobs:hangs')
 made.start()
-made.submit(made_up_task(Settings()))
+made.submit(example_task(Settings()))
 print(made.pid, flush=True)
 time.sleep(600.0)
 """
@@ -237,45 +235,28 @@ def test_the_process_ends_with_its_parent() -> None:
     )
 
 
-def test_frames_survive_any_cutting() -> None:
-    reader, writer = os.pipe()
-    large = np.random.default_rng(1).standard_normal((3, 100_000))
-    items = [{'a': [1.5, 'b', None]}, {'large': large, 'of': {'more': large[0]}}, {}]
-    os.set_blocking(reader, False)
-    frames = FrameReader(reader)
-    found: list[State] = []
-
-    def write() -> None:
-        for item in items:
-            send(writer, item)
-        os.close(writer)
-
-    # More than a pipe holds, so that it is written and read by turns.
-    thread = threading.Thread(target=write)
-    thread.start()
-    wait_until(lambda: found.extend(frames.ready()) or frames.ended, 'the end of the pipe')
-    thread.join()
-    os.close(reader)
-    assert len(found) == len(items)
-    assert (found[0], found[2]) == (items[0], items[2])
-    assert found[1]['large'].tobytes() == large.tobytes()
-    assert found[1]['of']['more'].tobytes() == large[0].tobytes()
+@pytest.mark.parametrize('sent', [b'x' * 100, b'\xff' * 8, b'\x05' + 7 * b'\x00' + b'abcde'])
+def test_a_process_that_writes_nonsense_costs_one_fit_and_is_replaced(sent: bytes) -> None:
+    with worker('writes_nonsense') as made:
+        made.submit(replace(TASK, request_ns=int.from_bytes(sent[:8], 'big') >> 1))
+        (outcome,) = wait_until(made.poll, 'the outcome')
+        assert outcome.result == 'The fit process gave an answer that cannot be read.'
+        assert (made.pid, made.failures_in_a_row) == (None, 1)
+        wait_until(lambda: made.poll() or made.pid, 'another process', 10.0)
 
 
-@pytest.mark.parametrize('raw', [b'x' * 100, b'\x05' + 7 * b'\x00' + b'abcde', b'\xff' * 8])
-def test_what_is_no_message_is_refused(raw: bytes) -> None:
-    reader, writer = os.pipe()
-    os.set_blocking(reader, False)
-    os.write(writer, raw)
+@pytest.mark.parametrize('cut', [b'', b'valveflow-state', b'x' * 200, result_to_bytes(None)[:-1]])
+def test_damaged_bytes_are_refused(cut: bytes) -> None:
+    for read in (task_from_bytes, result_from_bytes):
+        with pytest.raises(DataError):
+            read(cut)
+    half = to_bytes({'text': 'a diagnosis of no window'})
     with pytest.raises(DataError):
-        FrameReader(reader).ready()
-    os.close(writer)
-    os.close(reader)
+        result_from_bytes(half)
 
 
 def test_tasks_and_results_arrive_as_they_were_sent() -> None:
-    number, task = task_of(task_letter(7, TASK))
-    assert number == 7
+    task = task_from_bytes(task_to_bytes(TASK))
     assert isinstance(task, FitTask)
     assert dict(task.settings) == dict(TASK.settings)
     bare = {'contents': NO_ROWS, 'settings': TASK.settings}
@@ -283,10 +264,74 @@ def test_tasks_and_results_arrive_as_they_were_sent() -> None:
     for name in ('time_ns', 'u', 'power_mw', 'temperature_degc', 'spans'):
         assert getattr(task.contents, name).tobytes() == getattr(TASK.contents, name).tobytes()
     for result in (hurt_jobs.good(TASK), hurt_jobs.diagnosed(DIAGNOSIS), 'A sentence.', None):
-        assert repr(result_of(result_letter(3, result))) == repr((3, result))
-    _, again = task_of(task_letter(9, DIAGNOSIS))
+        assert repr(result_from_bytes(result_to_bytes(result))) == repr(result)
+    again = task_from_bytes(task_to_bytes(DIAGNOSIS))
     assert isinstance(again, DiagnosisTask)
     assert repr(replace(again, **bare)) == repr(replace(DIAGNOSIS, **bare))
+
+
+def test_a_task_behind_a_warm_up_is_computed_by_the_same_process() -> None:
+    with worker('good') as made:
+        first = made.pid
+        made.warm_up(TASK)
+        assert made.warming_up
+        made.submit(TASK)
+        (outcome,) = wait_until(made.poll, 'the outcome')
+        assert not made.warming_up
+        assert isinstance(outcome.result, Characteristic)
+        assert made.busy_s is None
+        # Whether its answer came before or after, it is nobody's.
+        time.sleep(0.3)
+        assert made.poll() == []
+        assert (made.pid, made.starts, made.failures_in_a_row) == (first, 1, 0)
+
+
+def test_death_in_a_warm_up_is_no_outcome_and_the_process_is_replaced() -> None:
+    with worker('dies') as made:
+        made.warm_up(TASK)
+        until_s = time.monotonic() + 60.0
+        while made.starts < 2 and time.monotonic() < until_s:
+            assert made.poll() == []
+            time.sleep(0.02)
+        assert made.starts == 2
+        # Who waits for its end is not kept waiting.
+        assert not made.warming_up
+        assert made.failures_in_a_row == 1
+
+
+def test_the_wait_for_a_warm_up_is_not_counted_as_the_tasks() -> None:
+    now = [0.0]
+    made = FitWorker(120.0, 'hurt_jobs:good', clock=lambda: now[0])
+    made.start()
+    try:
+        made.warm_up(TASK)
+        # So that its sender has the pipe.
+        time.sleep(0.2)
+        made.submit(TASK)
+        now[0] = 50.0
+        (outcome,) = wait_until(made.poll, 'the outcome')
+    finally:
+        made.close()
+    assert outcome.seconds == 0.0
+
+
+def test_what_waits_behind_a_warm_up_is_not_ended_for_taking_long() -> None:
+    """It may compile for minutes, once; but not for ever."""
+    now = [0.0]
+    made = FitWorker(120.0, 'hurt_jobs:hangs', clock=lambda: now[0])
+    made.start()
+    try:
+        made.warm_up(TASK)
+        made.submit(TASK)
+        now[0] = 500.0
+        assert made.poll() == []
+        assert (made.warming_up, made.starts) == (True, 1)
+        now[0] = 700.0
+        (outcome,) = made.poll()
+        assert outcome.result == 'The fit process could not be made ready and was ended.'
+        assert not made.warming_up
+    finally:
+        made.close()
 
 
 @pytest.mark.parametrize(('job', 'works'), [(FIT_JOB, True), ('nothing_of_the_kind', False)])
@@ -298,7 +343,9 @@ def test_memory_is_given_back_once_after_each_outcome_when_the_task_was_let_go(
     time_ns = TASK.contents.time_ns.copy()
     watched = weakref.ref(time_ns)
     task = replace(TASK, contents=replace(TASK.contents, time_ns=time_ns))
-    monkeypatch.setattr(worker_module, 'give_back', lambda: held.append(watched() is not None))
+    monkeypatch.setattr(
+        worker_module, 'release_memory', lambda: held.append(watched() is not None)
+    )
     with worker(job) as made:
         made.submit(task)
         del task, time_ns
@@ -314,12 +361,12 @@ def test_memory_is_given_back_once_after_each_outcome_when_the_task_was_let_go(
 def test_memory_is_given_back_by_what_the_c_library_has_or_not_at_all(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    worker_module.give_back()
+    worker_module.release_memory()
     asked: list[int] = []
     with_it = SimpleNamespace(malloc_trim=asked.append)
     monkeypatch.setattr(worker_module.ctypes, 'CDLL', lambda _name: with_it)
-    worker_module.give_back()
+    worker_module.release_memory()
     assert asked == [0]
     monkeypatch.setattr(worker_module.ctypes, 'CDLL', lambda _name: SimpleNamespace())
-    worker_module.give_back()
+    worker_module.release_memory()
     assert asked == [0]

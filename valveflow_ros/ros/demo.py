@@ -11,23 +11,47 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
-from valveflow_msgs.msg import FlowCharacteristic
+from rclpy.task import Future
+from std_srvs.srv import Trigger
+from valveflow_msgs.msg import Alarm, Diagnosis, FlowCharacteristic
 
 from valveflow_ros.errors import ValveflowError, counted
 from valveflow_ros.plant.simulator import DEFAULT_START_NS
 from valveflow_ros.plant.unit import UnitDescription
+from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.report.terminal.text import number, whole
-from valveflow_ros.ros.conversions import from_time
-from valveflow_ros.ros.demo_watch import Story, Watch, moment
-from valveflow_ros.ros.process import Parser, StopFlag, with_place
+from valveflow_ros.ros.decoding import from_time
+from valveflow_ros.ros.process import Parser, StopFlag, complain, with_place
 
-# The command line of the demo.
+_EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
+_HOUR_NS = 3600 * 10**9
+_FAULT, _FAULT_MW = 'curve_step', -12.0
+_FAULT_FROM = 0.5  # share of the run after which the fault begins
+_MONITOR = '/valveflow_monitor'
+_LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_BEFORE_ACKNOWLEDGING_S = 0.2
+_PATIENCE_S = 10.0
+_QUIET_LOOKS = 3
+_LONGEST_WAIT_S = 120.0
+_STATES = {
+    Alarm.NORMAL: 'the unit follows the curve again; the alarm is cleared',
+    Alarm.ACKNOWLEDGED: 'acknowledged, by the service acknowledge_alarms',
+    Alarm.RETURNED_UNACKNOWLEDGED: 'the alarm has gone by itself',
+}
+_VERDICTS = {
+    Diagnosis.NOTHING: 'nothing found',
+    Diagnosis.UNEXPLAINED: 'something that it cannot name',
+}
 
 
 def parser() -> argparse.ArgumentParser:
@@ -47,19 +71,11 @@ def parser() -> argparse.ArgumentParser:
         type=whole('a whole number', 0, None, '--seed 1'),
     )  # fmt: skip
     made.add_argument(
-        '--rate',
-        metavar='R',
+        '--rate', metavar='R', default=0.0,
         type=number('plant seconds in a second', 0, 1e6, '--rate 600'),
-        default=0.0,
         help='plant seconds in a second; 0: as fast as the monitor takes it (default: 0)',
-    )
+    )  # fmt: skip
     return made
-
-
-# The demo's processes: started with their output in files, and ended in order.
-
-
-_PATIENCE_S = 10.0
 
 
 def ros_arguments(parameters: Mapping[str, object]) -> list[str]:
@@ -71,52 +87,40 @@ def ros_arguments(parameters: Mapping[str, object]) -> list[str]:
     return words
 
 
-class Process:
-    """A module of ours as a process of its own.
+def tell(line: str) -> None:
+    """Print a line."""
+    print(line, flush=True)
 
-    Parameters
-    ----------
-    name : str
-        For sentences and the name of the log file.
-    module : str
-    arguments : list of str
-    folder : Path
-        Where the log file goes.
-    environment : mapping
-    """
+
+def moment(time_ns: int) -> str:
+    """Return a time as the monitor's own sentences write it."""
+    at = _EPOCH + timedelta(microseconds=time_ns // 1000)
+    return at.strftime('%Y-%m-%d %H:%M')
+
+
+class Process:
+    """A module of ours as a process of its own, with its output in the file ``name.log``."""
 
     def __init__(
-        self,
-        name: str,
-        module: str,
-        arguments: list[str],
-        folder: Path,
-        environment: Mapping[str, str],
+        self, name: str, module: str, parameters: Mapping[str, object], folder: Path
     ) -> None:
-        self.name = name
-        self.log = folder / f'{name}.log'
+        self.name, self.log = name, folder / f'{name}.log'
+        command = [sys.executable, '-m', f'valveflow_ros.ros.{module}', *ros_arguments(parameters)]
         with self.log.open('wb') as out:
+            # Ctrl-C comes to the demo alone, which then ends the others in order.
             self._process = subprocess.Popen(
-                [sys.executable, '-m', module, *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=subprocess.STDOUT,
-                env=dict(environment),
-                # Ctrl-C comes to the demo alone, which then ends the others in order.
-                start_new_session=True,
+                command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True
             )
 
     @property
     def status(self) -> int | None:
-        """Return the exit status, None while it runs."""
-        return self._process.poll()
-
-    def must_run(self) -> None:
-        """Raise `ValveflowError` with its last words if it has ended with an error."""
-        if self.status:
+        """Return the exit status, None while it runs; raise `ValveflowError` if it failed."""
+        status = self._process.poll()
+        if status:
             raise ValveflowError(
-                f'The process {self.name} ended with status {self.status}: {self.last_line()}'
+                f'The process {self.name} ended with status {status}: {self.last_line()}'
             )
+        return status
 
     def last_line(self) -> str:
         """Return the last line of its output."""
@@ -125,7 +129,7 @@ class Process:
 
     def end(self) -> int:
         """Ask it to end, wait, and return its exit status; doing it again changes nothing."""
-        if self.status is None:
+        if self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
             try:
                 self._process.wait(_PATIENCE_S)
@@ -136,237 +140,345 @@ class Process:
         return self._process.returncode
 
 
-_DAY_NS = 86400 * 10**9
-_FAULT = 'curve_step'
-_FAULT_MW = -12.0
-_FAULT_FROM = 0.5  # share of the run after which the fault begins
-_QUIET_LOOKS = 3
-_LONGEST_WAIT_S = 120.0
+class Story:
+    """Tells what is worth a line of what the monitor says.
 
-
-def tell(line: str) -> None:
-    """Say something to the person in front."""
-    print(line, flush=True)
-
-
-class Demo:
-    """One run of the demo.
+    A fault of one valve shows only while that valve is at work, so its alarm comes and goes with
+    the load, and a monitor learns a curve anew every few hours. The first of each is told in
+    full; of the others, that they came.
 
     Parameters
     ----------
-    options : argparse.Namespace
-    stop : StopFlag
+    fault_ns : int
+        When the hidden fault begins.
     """
 
-    def __init__(self, options: argparse.Namespace, stop: StopFlag) -> None:
-        self._options = options
-        self._stop = stop
-        self.folder: Path = options.output.resolve()
-        self.fault_ns = DEFAULT_START_NS + round(_FAULT_FROM * options.days * _DAY_NS)
-        self._story = Story(self.fault_ns, tell)
-        self._processes: list[Process] = []
+    def __init__(self, fault_ns: int) -> None:
+        self._fault_ns = fault_ns
+        self._fault_told = False
+        self._last_curve = ''
+        self._occurrences: dict[str, int] = {}
+        self._raised_ns: list[int] = []
+        self._named: list[str] = []
+        self.curves: list[FlowCharacteristic] = []
+        self.diagnoses: list[Diagnosis] = []
 
-    def run(self) -> int:
-        """Do everything; return the exit status."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-        watch = Watch(DEFAULT_START_NS, self._story)
-        executor = SingleThreadedExecutor()
-        executor.add_node(watch)
-        try:
-            self._introduce()
-            begun_s = time.monotonic()
-            monitor, plant = self._start()
-            self._follow(watch, executor, monitor, plant)
-            if self._stop:
-                return 130
-            self._close(monitor, watch, time.monotonic() - begun_s)
-            return self._conclude(watch)
-        finally:
-            for process in self._processes:
-                process.end()
-            executor.shutdown()
-            watch.destroy_node()
-            rclpy.try_shutdown()
+    @property
+    def alarms_of_fault(self) -> list[int]:
+        """Return when the alarm came after the fault had begun, each time."""
+        return [time_ns for time_ns in self._raised_ns if time_ns >= self._fault_ns]
 
-    def _introduce(self) -> None:
-        o = self._options
-        speed = f'{o.rate:g} times real time' if o.rate else 'as fast as the monitor takes them'
-        tell(
-            f"{counted(o.days, 'day')} of the paper's unit (seed {o.seed}), from "
-            f'{moment(DEFAULT_START_NS)} UTC on, {speed}.'
-        )
-        tell(
-            f'Hidden in it: from {moment(self.fault_ns)} on one of the valves gives up to '
-            f'{-_FAULT_MW:g} MW less, whenever the load needs that valve. The monitor is not told.'
-        )
-        domain = os.environ['ROS_DOMAIN_ID']
-        tell(
-            'To look on from another terminal (after: source env.sh): '
-            f'ROS_DOMAIN_ID={domain} valveflow watch'
-        )
-        tell(f'Starting the monitor. {SENTENCE}' if is_first_run() else 'Starting the monitor.')
+    def on_curve(self, message: FlowCharacteristic) -> None:
+        """Tell of the first curve, or of one with another number of pieces."""
+        time_ns = from_time(message.window_end)
+        if message.status != FlowCharacteristic.FRESH:
+            if message.cause and not self.curves:
+                self._tell(time_ns or DEFAULT_START_NS, message.cause)
+            return
+        if self.curves and self.curves[-1].model_id == message.model_id:
+            return
+        self.reached(time_ns)
+        knees = ', '.join(f'{u:.0f}' for u in message.breakpoints[1:-1])
+        before = self._last_curve.partition(',')[0]
+        pieces = counted(message.pieces, 'piece')
+        self._last_curve = f'{pieces}, {f"knees at u = {knees}" if knees else "no knee"}'
+        self.curves.append(message)
+        if len(self.curves) == 1:
+            self._tell(time_ns, f'first curve: {self._last_curve}')
+        elif not self._fault_told and before != pieces:
+            self._tell(time_ns, f'new curve: {self._last_curve}')
 
-    def _start(self) -> tuple[Process, Process]:
-        o = self._options
-        monitor = self._process(
-            'monitor',
-            'valveflow_ros.ros.monitor_main',
-            {
-                'unit_tag': 'demo',
-                'record_directory': self.folder / 'recordings',
-                # Shown anew each time.
-                'keep_state': False,
-                'refit_period': 14400.0,
-                'refit_segments': 0,
-                # Here a night is over before a diagnosis is.
-                'diagnosis_hour': -1,
-                # The plant does not wait for the disk; neither does a demo for a slow one.
-                'record_flush': 1.0,
-            },
-        )
-        fault = f'{_FAULT}:s_mw={_FAULT_MW:g},t0_days={_FAULT_FROM * o.days:.6g}'
-        plant = self._process(
-            'plant',
-            'valveflow_ros.ros.simulator_main',
-            {
-                'days': o.days,
-                'seed': o.seed,
-                'rate': float(o.rate),
-                'stamped': True,
-                'unit_tag': 'demo',
-                'effects': f'"{fault}"',
-                'wait': 600.0,
-            },
-        )
-        return monitor, plant
+    def on_alarm(self, message: Alarm) -> None:
+        """Tell that an alarm came, or came again, and how the first one went on."""
+        time_ns, state = from_time(message.header.stamp), message.state
+        goes_on = len(self._raised_ns) == 1 and message.previous_state != Alarm.SUPPRESSED
+        if state == Alarm.UNACKNOWLEDGED:
+            self.reached(time_ns)
+            # One that could not be judged for a while and stands again is not a new one.
+            if message.occurrence == self._occurrences.get(message.name):
+                return
+            self._occurrences[message.name] = message.occurrence
+            self._raised_ns.append(time_ns)
+            times = len(self._raised_ns)
+            nth = {2: 'second', 3: 'third'}.get(times, f'{times}th')
+            again = f'the alarm comes again, the {nth} time'
+            told = f'ALARM {message.name}: {message.sentence}' if times == 1 else again
+            self._tell(time_ns, told)
+        elif goes_on and state in _STATES:
+            self._tell(time_ns, _STATES[state])
 
-    def _process(self, name: str, module: str, parameters: dict[str, object]) -> Process:
-        process = Process(name, module, ros_arguments(parameters), self.folder, os.environ)
-        self._processes.append(process)
-        return process
+    def on_diagnosis(self, message: Diagnosis) -> None:
+        """Tell of a diagnosis."""
+        if message.verdict == Diagnosis.UNKNOWN and not message.model_id:
+            return
+        self.diagnoses.append(message)
+        until_ns = from_time(message.header.stamp)
+        self.reached(until_ns)
+        told = _VERDICTS.get(message.verdict, 'unknown')
+        names = [cause.name for cause in message.causes]
+        if names:
+            more = ', as before' if names == self._named else f'. {message.sentence}'
+            told, self._named = f'named {", ".join(names)}{more}', names
+        elif self._fault_told:
+            hours = (until_ns - self._fault_ns) / _HOUR_NS
+            told += f'; {hours:.0f} h of them are with the fault'
+        self._tell(until_ns, f'diagnosis of the data until then: {told}')
 
-    def _follow(
-        self, watch: Watch, executor: SingleThreadedExecutor, monitor: Process, plant: Process
-    ) -> None:
-        """Listen until the plant has ended, all of it was diagnosed, and nothing is left to do."""
-        quiet, seen, samples = 0, 0, -1
-        ended_s: float | None = None
-        while not self._stop and quiet < _QUIET_LOOKS:
-            executor.spin_once(timeout_sec=0.1)
-            watch.work()
-            monitor.must_run()
-            plant.must_run()
-            if monitor.status is not None:
-                raise ValveflowError(f'The monitor ended by itself: {monitor.last_line()}')
-            if plant.status is None:
-                continue
-            ended_s = ended_s or time.monotonic()
-            if time.monotonic() - ended_s > _LONGEST_WAIT_S:
-                raise ValveflowError(f'The monitor does not come to rest; see {monitor.log}.')
-            if watch.health_seen > seen:
-                seen = watch.health_seen
-                still = watch.samples == samples and not watch.busy
-                quiet = quiet + 1 if still else 0
-                samples = watch.samples
-            if quiet == _QUIET_LOOKS and not watch.asked:
-                watch.ask_for_diagnosis()
-                quiet = 0
+    def outcome(self) -> str:
+        """Return how the fault was met, in a sentence."""
+        told = self.alarms_of_fault
+        if not told:
+            return 'The fault raised no alarm.'
+        hours = (told[0] - self._fault_ns) / _HOUR_NS
+        text = f'The fault began {moment(self._fault_ns)}; the alarm came {hours:.1f} h later'
+        if len(told) > 1:
+            text += (
+                f', and {len(told)} times in all: the fault is that of one valve, and shows only '
+                'while that valve is at work'
+            )
+        return f'{text}.'
 
-    def _close(self, monitor: Process, watch: Watch, seconds: float) -> None:
+    def reached(self, time_ns: int) -> None:
+        """Tell that the fault begins, once the plant has come so far."""
+        if self._fault_told or time_ns < self._fault_ns:
+            return
+        self._fault_told = True
+        known = 'no curve so far'
+        if self.curves:
+            curves = counted(len(self.curves), 'curve')
+            known = f'{curves} so far, the last with {self._last_curve}'
+        self._tell(self._fault_ns, f'--- the fault begins; {known} ---')
+
+    def _tell(self, time_ns: int, words: str) -> None:
+        tell(f'{moment(time_ns)}  {words}')
+
+
+class Watch(Node):
+    """Listens to the monitor and acknowledges alarms."""
+
+    def __init__(self, story: Story) -> None:
+        super().__init__('valveflow_demo')
+        self._story = story
+        self._acknowledge_at_s: float | None = None
+        self.acknowledged = self.samples = self.health_seen = 0
+        self.busy = self.asked = False
+        for kind, topic, take in (
+            (FlowCharacteristic, 'characteristic', story.on_curve),
+            (Alarm, 'alarms', self._on_alarm),
+            (Diagnosis, 'diagnosis', story.on_diagnosis),
+        ):
+            self.create_subscription(kind, f'{_MONITOR}/{topic}', take, _LATCHED)
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._on_health, 10)
+        self._acknowledge = self.create_client(Trigger, f'{_MONITOR}/acknowledge_alarms')
+        self._diagnose = self.create_client(Trigger, f'{_MONITOR}/diagnose')
+
+    def work(self) -> None:
+        """Acknowledge an alarm that somebody has had time to read."""
+        if self._acknowledge_at_s is None or time.monotonic() < self._acknowledge_at_s:
+            return
+        if self._acknowledge.service_is_ready():
+            self._acknowledge_at_s = None
+            future = self._acknowledge.call_async(Trigger.Request())
+            future.add_done_callback(self._on_answer)
+
+    def ask_for_diagnosis(self) -> None:
+        """Have the monitor diagnose all that it has seen; the health says when it has done so."""
+        self.asked = True
+        self._diagnose.call_async(Trigger.Request())
+
+    def _on_alarm(self, message: Alarm) -> None:
+        self._story.on_alarm(message)
+        if message.state in (Alarm.UNACKNOWLEDGED, Alarm.RETURNED_UNACKNOWLEDGED):
+            self._acknowledge_at_s = time.monotonic() + _BEFORE_ACKNOWLEDGING_S
+
+    def _on_health(self, message: DiagnosticArray) -> None:
+        values = {
+            status.name.rpartition(' ')[2]: {item.key: item.value for item in status.values}
+            for status in message.status
+        }
+        if 'fit' in values:
+            self.samples = int(values['fit'].get('Samples taken', '0'))
+            self._story.reached(DEFAULT_START_NS + self.samples * NS_PER_S)
+        refitting = values.get('fit', {}).get('Refit under way for (s)', 'unknown') != 'unknown'
+        self.busy = refitting or values.get('diagnosis', {}).get('Running') == 'yes'
+        self.health_seen += 1
+
+    def _on_answer(self, future: Future) -> None:
+        response: Trigger.Response | None = future.result()
+        self.acknowledged += int(response is not None and response.success)
+
+
+def run(options: argparse.Namespace, stop: StopFlag) -> int:
+    """Run the demo; return the exit status."""
+    folder: Path = options.output.resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    fault_ns = DEFAULT_START_NS + round(_FAULT_FROM * options.days * 24 * _HOUR_NS)
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    story = Story(fault_ns)
+    watch = Watch(story)
+    executor = SingleThreadedExecutor()
+    executor.add_node(watch)
+    processes: list[Process] = []
+    try:
+        _introduce(options, fault_ns)
+        begun_s = time.monotonic()
+        monitor, plant = processes[:] = _start(options, folder)
+        _follow(watch, executor, monitor, plant, stop)
+        if stop:
+            return 130
         status = monitor.end()
         tell(
-            f'The plant has ended: {counted(watch.samples, "sample")} in {seconds:.0f} s; '
-            f'monitor closed with status {status}.'
+            f'The plant has ended: {counted(watch.samples, "sample")} in '
+            f'{time.monotonic() - begun_s:.0f} s; monitor closed with status {status}.'
         )
         if status != 0:
             raise ValveflowError(f'The monitor ended with status {status}: {monitor.last_line()}')
+        return _conclude(watch, story, folder, fault_ns)
+    finally:
+        for process in processes:
+            process.end()
+        executor.shutdown()
+        watch.destroy_node()
+        rclpy.try_shutdown()
 
-    def _conclude(self, watch: Watch) -> int:
-        found = (self.folder / 'recordings').glob('valveflow_*')
-        recording = max(found, key=lambda p: p.stat().st_mtime)
-        result = self.folder / 'result'
-        ok = self._run('replay --verify', 'ros.replay_main', str(recording), '--verify')
-        for verb in ('identify', 'diagnose'):
-            files = str(recording), '-o', str(result / verb)
-            ok &= self._run(f'valveflow {verb}', 'cli', verb, *files)
-        curve = self._last_clean(watch.curves)
-        if curve is None:
-            tell('No curve was found before the fault.')
-            return 1
-        self._compare(curve)
-        told = [time_ns for time_ns in self._story.raised if time_ns >= self.fault_ns]
-        tell(self._story.outcome())
-        named = self._named(watch)
-        self._point_out(recording, result)
-        if ok and told and watch.acknowledged and named:
-            return 0
-        tell('Not all of it came out: a run of three days (the default) is enough for that.')
+
+def _introduce(options: argparse.Namespace, fault_ns: int) -> None:
+    rate = options.rate
+    speed = f'{rate:g} times real time' if rate else 'as fast as the monitor takes them'
+    starting = f'Starting the monitor. {SENTENCE}' if is_first_run() else 'Starting the monitor.'
+    for line in (
+        f"{counted(options.days, 'day')} of the paper's unit (seed {options.seed}), from "
+        f'{moment(DEFAULT_START_NS)} UTC on, {speed}.',
+        f'Hidden in it: from {moment(fault_ns)} on one of the valves gives up to '
+        f'{-_FAULT_MW:g} MW less, whenever the load needs that valve. The monitor is not told.',
+        'To look on from another terminal (after: source env.sh): '
+        f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]} valveflow watch',
+        starting,
+    ):
+        tell(line)
+
+
+def _start(options: argparse.Namespace, folder: Path) -> tuple[Process, Process]:
+    monitor = {
+        'unit_tag': 'demo', 'record_directory': folder / 'recordings',
+        # Shown anew each time.
+        'keep_state': False,
+        'refit_period': 14400.0, 'refit_segments': 0,
+        # Here a night is over before a diagnosis is.
+        'diagnosis_hour': -1,
+        # The plant does not wait for the disk; neither does a demo for a slow one.
+        'record_flush': 1.0,
+    }  # fmt: skip
+    fault = f'{_FAULT}:s_mw={_FAULT_MW:g},t0_days={_FAULT_FROM * options.days:.6g}'
+    plant = {
+        'days': options.days, 'seed': options.seed, 'rate': float(options.rate), 'stamped': True,
+        'unit_tag': 'demo', 'effects': f'"{fault}"', 'wait': 600.0,
+    }  # fmt: skip
+    return (
+        Process('monitor', 'monitor_main', monitor, folder),
+        Process('plant', 'simulator_main', plant, folder),
+    )
+
+
+def _follow(
+    watch: Watch,
+    executor: SingleThreadedExecutor,
+    monitor: Process,
+    plant: Process,
+    stop: StopFlag,
+) -> None:
+    """Listen until the plant has ended, all of it was diagnosed, and nothing is left to do."""
+    quiet, seen, samples = 0, 0, -1
+    ended_s: float | None = None
+    while not stop and quiet < _QUIET_LOOKS:
+        executor.spin_once(timeout_sec=0.1)
+        watch.work()
+        if monitor.status is not None:
+            raise ValveflowError(f'The monitor ended by itself: {monitor.last_line()}')
+        if plant.status is None:
+            continue
+        ended_s = ended_s or time.monotonic()
+        if time.monotonic() - ended_s > _LONGEST_WAIT_S:
+            raise ValveflowError(f'The monitor does not come to rest; see {monitor.log}.')
+        if watch.health_seen > seen:
+            still = watch.samples == samples and not watch.busy
+            quiet = quiet + 1 if still else 0
+            seen, samples = watch.health_seen, watch.samples
+        if quiet == _QUIET_LOOKS and not watch.asked:
+            watch.ask_for_diagnosis()
+            quiet = 0
+
+
+def _conclude(watch: Watch, story: Story, folder: Path, fault_ns: int) -> int:
+    recording = max((folder / 'recordings').glob('valveflow_*'), key=lambda p: p.stat().st_mtime)
+    result = folder / 'result'
+    ok = _run('replay --verify', 'ros.replay_main', str(recording), '--verify')
+    for verb in ('identify', 'diagnose'):
+        ok &= _run(f'valveflow {verb}', 'cli', verb, str(recording), '-o', str(result / verb))
+    clean = [c for c in story.curves if from_time(c.window_end) <= fault_ns]
+    if not clean:
+        tell('No curve was found before the fault.')
         return 1
+    _compare(clean[-1])
+    tell(story.outcome())
+    last = story.diagnoses[-1] if story.diagnoses else None
+    found = [] if last is None else [cause.name for cause in last.causes]
+    tell(f'Hidden was {_FAULT}; the diagnosis named {", ".join(found) or "nothing"}.')
+    if last is not None:
+        tell(f'  {last.sentence}')
+        if last.rmse_extended < last.rmse_simulation:
+            tell(
+                f'  On time it had not seen, the error falls from {last.rmse_simulation:.2f} '
+                f'to {last.rmse_extended:.2f} MW with the cause in the model (noise: '
+                f'{last.rmse_noise_floor:.2f} MW).'
+            )
+    table = result / 'identify' / 'characteristic.json'
+    pieces = len(json.loads(table.read_text())['pieces']) if table.exists() else 0
+    report = result / 'identify' / 'report.html'
+    for line in (
+        f'Recording  {", ".join(map(str, sorted(recording.glob("*.mcap"))))}',
+        f'Report     {report} ({pieces} pieces over the whole run, fault included)',
+        f'Diagnosis  {result / "diagnose" / "report.html"}',
+        'Replay it to another monitor (after: source env.sh):',
+        f'  python -m valveflow_ros.ros.replay_main {recording} --rate 600',
+        '  python -m valveflow_ros.ros.monitor_main --ros-args -p use_sim_time:=true',
+    ):
+        tell(line)
+    if ok and story.alarms_of_fault and watch.acknowledged and found == [_FAULT]:
+        return 0
+    tell('Not all of it came out: a run of three days (the default) is enough for that.')
+    return 1
 
-    def _named(self, watch: Watch) -> bool:
-        """Tell what the last diagnosis named, and whether that is what was hidden."""
-        last = watch.diagnoses[-1] if watch.diagnoses else None
-        found = [] if last is None else [cause.name for cause in last.causes]
-        tell(f'Hidden was {_FAULT}; the diagnosis named {", ".join(found) or "nothing"}.')
-        if last is not None:
-            tell(f'  {last.sentence}')
-            if last.rmse_extended < last.rmse_simulation:
-                tell(
-                    f'  On time it had not seen, the error falls from {last.rmse_simulation:.2f} '
-                    f'to {last.rmse_extended:.2f} MW with the cause in the model (noise: '
-                    f'{last.rmse_noise_floor:.2f} MW).'
-                )
-        return found == [_FAULT]
 
-    def _run(self, what: str, module: str, *arguments: str) -> bool:
-        """Run a command of ours to its end; show its last line."""
-        tell(f'{what} ...')
-        done = subprocess.run(
-            [sys.executable, '-m', f'valveflow_ros.{module}', *arguments],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        lines = (done.stdout if done.returncode == 0 else done.stderr or done.stdout).strip()
-        tell(f'  {lines.splitlines()[-1] if lines else "done"}')
-        return done.returncode == 0
+def _run(what: str, module: str, *arguments: str) -> bool:
+    """Run a command of ours to its end; show its last line."""
+    tell(f'{what} ...')
+    command = [sys.executable, '-m', f'valveflow_ros.{module}', *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    lines = (done.stdout if done.returncode == 0 else done.stderr or done.stdout).strip()
+    tell(f'  {lines.splitlines()[-1] if lines else "done"}')
+    return done.returncode == 0
 
-    def _last_clean(self, curves: list[FlowCharacteristic]) -> FlowCharacteristic | None:
-        """Return the last curve fitted to data without the fault."""
-        clean = [c for c in curves if from_time(c.window_end) <= self.fault_ns]
-        return clean[-1] if clean else None
 
-    def _compare(self, found: FlowCharacteristic) -> None:
-        true = UnitDescription().curve
-        tell(
-            f'The last curve before the fault (data until {moment(from_time(found.window_end))}), '
-            'and the truth, which only the simulated plant knows:'
-        )
-        tell('  piece   slope, 95 % [MW per % MPa^(9/8)]     true     knee found (95 %)     true')
-        for k in range(max(found.pieces, len(true.slopes))):
-            line = f'  {k + 1:>5}   '
-            if k < found.pieces:
-                line += f'{found.slopes[k]:.4f} +- {1.96 * found.slope_stderr[k]:.4f}'
-            line = f'{line:<47}'
-            line += f'{true.slopes[k]:.4f}   ' if k < len(true.slopes) else '     -   '
-            if k < found.pieces - 1:
-                low, high = found.breakpoint_low[k], found.breakpoint_high[k]
-                line += f'{found.breakpoints[k + 1]:.0f} ({low:.0f} to {high:.0f})'
-            line = f'{line:<78}'
-            tell(line + (f'{true.knots[k + 1]:.0f}' if k < len(true.slopes) - 1 else ''))
-
-    def _point_out(self, recording: Path, result: Path) -> None:
-        files = sorted(recording.glob('*.mcap'))
-        table = result / 'identify' / 'characteristic.json'
-        pieces = len(json.loads(table.read_text())['pieces']) if table.exists() else 0
-        tell(f'Recording  {", ".join(map(str, files))}')
-        report = result / 'identify' / 'report.html'
-        tell(f'Report     {report} ({pieces} pieces over the whole run, fault included)')
-        tell(f'Diagnosis  {result / "diagnose" / "report.html"}')
-        tell('Replay it to another monitor (after: source env.sh):')
-        tell(f'  python -m valveflow_ros.ros.replay_main {recording} --rate 600')
-        tell('  python -m valveflow_ros.ros.monitor_main --ros-args -p use_sim_time:=true')
+def _compare(found: FlowCharacteristic) -> None:
+    """Tell the curve that was found beside the one of the simulated plant."""
+    true = UnitDescription().curve
+    tell(
+        f'The last curve before the fault (data until {moment(from_time(found.window_end))}), '
+        'and the truth, which only the simulated plant knows:'
+    )
+    tell('  piece   slope, 95 % [MW per % MPa^(9/8)]     true     knee found (95 %)     true')
+    for k in range(max(found.pieces, len(true.slopes))):
+        slope = knee = ''
+        if k < found.pieces:
+            slope = f'{found.slopes[k]:.4f} +- {1.96 * found.slope_stderr[k]:.4f}'
+        if k < found.pieces - 1:
+            low, high = found.breakpoint_low[k], found.breakpoint_high[k]
+            knee = f'{found.breakpoints[k + 1]:.0f} ({low:.0f} to {high:.0f})'
+        true_slope = f'{true.slopes[k]:.4f}   ' if k < len(true.slopes) else '     -   '
+        true_knee = f'{true.knots[k + 1]:.0f}' if k < len(true.slopes) - 1 else ''
+        line = f'{f"  {k + 1:>5}   {slope}":<47}{true_slope}{knee}'
+        tell(f'{line:<78}{true_knee}')
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -377,17 +489,13 @@ def main(args: Sequence[str] | None = None) -> int:
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     stop = StopFlag().install()
     try:
-        status = Demo(options, stop).run()
+        status = run(options, stop)
     except ValveflowError as error:
-        print(f'valveflow demo: {error}', file=sys.stderr)
-        return 1
+        return complain('demo', str(error))
     except OSError as error:
-        place = error.filename or options.output
-        print(f'valveflow demo: {place}: {error.strerror}', file=sys.stderr)
-        return 1
-    except Exception as error:  # noqa: BLE001 - a person is owed a sentence, not a trace
-        print(f'valveflow demo: failed unexpectedly: {with_place(error)}', file=sys.stderr)
-        return 1
+        return complain('demo', f'{error.filename or options.output}: {error.strerror}')
+    except Exception as error:  # noqa: BLE001 - a person gets a sentence, not a trace
+        return complain('demo', f'failed unexpectedly: {with_place(error)}')
     if stop:
         tell('Stopped; nothing is left running.')
     return status

@@ -1,4 +1,8 @@
-"""The executable `monitor`: its signals are its own before anything else is loaded."""
+"""The executable `monitor`: it handles its signals before anything else is loaded.
+
+Then it enters the ROS domain, and only then loads compiler and libraries: while that takes a
+second, the others in the domain discover this process.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +10,58 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
+from typing import Any
 
-from valveflow_ros.ros.process import StopFlag, Stopped
+from valveflow_ros.errors import ValveflowError
+from valveflow_ros.parameters import TABLE
+from valveflow_ros.ros.process import (
+    StopFlag,
+    Stopped,
+    complain,
+    show,
+    usage,
+    wants_help,
+    with_place,
+)
+
+_ABOUT = """usage: monitor [--ros-args ...]
+
+Watches valve opening, main steam pressure and temperature and generated power, and keeps the
+flow characteristic of the main steam valve. It runs until it is asked to end (Ctrl-C)."""
+_EXAMPLE = (
+    'ros2 run valveflow_ros monitor --ros-args -p unit_tag:=U1 -p main_steam_pressure_unit:=bar'
+)
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the monitor until it is asked to stop; return the exit status."""
     stop = StopFlag().install()
-    # Recordings, logs and compiled code are nobody else's business, whatever the shell allowed.
+    if wants_help(args):
+        show(usage(_ABOUT, _EXAMPLE, TABLE))
+        return 0
+    # Recordings, logs and compiled code are private, whatever the shell allowed.
     before = os.umask(0o077)
+    presence: Any = None
     try:
+        # A signal need not wait for what is loaded: nothing has begun yet.
         with stop.cutting():
-            begin = importlib.import_module('valveflow_ros.ros.monitor_begin')
-        return int(begin.run(stop, args))
+            domain = importlib.import_module('valveflow_ros.ros.domain')
+        domain.choose_transport()
+        domain.check_security(args)
+        presence = domain.Presence(args)
+        with stop.cutting():
+            node = importlib.import_module('valveflow_ros.ros.node.monitor_node')
+        return int(node.run(stop, presence))
     except Stopped:
         return 0
+    except ValveflowError as error:
+        return complain('monitor', str(error))
+    except Exception as error:  # noqa: BLE001 - a person gets a sentence, not a trace
+        return complain('monitor', f'The monitor failed unexpectedly: {with_place(error)}')
     finally:
+        if presence is not None:
+            stop.last()
+            presence.close()
         os.umask(before)
 
 

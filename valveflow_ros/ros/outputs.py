@@ -1,13 +1,11 @@
-"""What the monitor says, as bytes: a pure function of the engine's events.
+"""The output topics, and their messages as a pure function of the engine's events.
 
-The node publishes and records what comes out of here, and a verification
-compares it with what comes out when a recording is fed again.
+The node publishes and records them; a verification compares them with those of a replay.
 """
 
 from __future__ import annotations
 
-import functools
-import struct
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -31,59 +29,7 @@ from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.events import JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.prediction import PredictionBlock
-from valveflow_ros.records import NS_PER_S
-from valveflow_ros.ros import conversions
-from valveflow_ros.ros.conversions import LAST_NS, encode
-
-# Predictions as bytes, made without a message object.
-#
-# There is one for every sample, and with a plant running thousands of times
-# faster than real time a message object a row would be the monitor's largest
-# cost. What comes out equals `encoding.encode` of the message; a test holds the
-# two, and the order of the fields in Prediction.msg, together.
-
-
-_HEAD = b'\x00\x01\x00\x00'  # plain CDR, little endian
-
-
-@functools.lru_cache(maxsize=16)
-def _layout(tag_bytes: int, model_bytes: int) -> struct.Struct:
-    """Return the layout of a row's message for texts of these lengths, zero bytes included."""
-    size = 12 + tag_bytes + 1
-    before_model = -size % 4
-    size += before_model + 4 + model_bytes
-    before_numbers = -size % 8
-    return struct.Struct(f'<4siII{tag_bytes}sB{before_model}xI{model_bytes}s{before_numbers}x10d')
-
-
-def prediction_bytes(block: PredictionBlock, tag: str) -> Iterator[tuple[int, bytes]]:
-    """Yield the message of each row with the row's time in ns."""
-    frame, model = tag.encode() + b'\x00', block.model_id.encode() + b'\x00'
-    pack = _layout(len(frame), len(model)).pack
-    expected = block.measured_mw - block.residual_mw
-    columns = (
-        block.time_ns, block.state, block.u, block.measured_mw, block.static_mw,
-        block.dynamic_mw, block.residual_mw, block.average_mw, expected - block.width_mw,
-        expected + block.width_mw, block.evidence, block.shift_mw,
-    )  # fmt: skip
-    for row in zip(*(column.tolist() for column in columns), strict=True):
-        time_ns, state, *numbers = row
-        sec, nanosec = divmod(min(max(time_ns, 0), LAST_NS), NS_PER_S)
-        yield (
-            time_ns,
-            pack(
-                _HEAD,
-                sec,
-                nanosec,
-                len(frame),
-                frame,
-                state,
-                len(model),
-                model,
-                *numbers,
-            ),
-        )
-
+from valveflow_ros.ros import encoding
 
 NO_CURVE_YET = 'No curve yet: not enough special segments.'
 
@@ -113,6 +59,17 @@ OUTPUTS: Mapping[str, OutputTopic] = {
     'diagnosis': OutputTopic(Diagnosis, 'valveflow_msgs/msg/Diagnosis', True),
     'journal': OutputTopic(JournalEntry, 'valveflow_msgs/msg/JournalEntry', False),
 }
+
+
+# What a running monitor can be asked to do, each a `std_srvs/Trigger` of the node.
+SERVICES: tuple[str, ...] = (
+    'refit',
+    'acknowledge_alarms',
+    'shelve_alarms',
+    'unshelve_alarms',
+    'set_reference',
+    'diagnose',
+)
 
 
 class Output(NamedTuple):
@@ -147,10 +104,6 @@ class Outputs:
         self._diagnosed: engine.Diagnosed | None = None
         self._alarms: dict[str, AlarmChange] = {}
 
-    def first(self) -> Iterator[Output]:
-        """Return what stands there before anything has happened."""
-        return self.latched()
-
     def of(self, events: Sequence[engine.Event]) -> Iterator[Output]:
         """Yield the messages of the events of one call of the engine.
 
@@ -173,7 +126,7 @@ class Outputs:
     def _rows(self, block: PredictionBlock, changes: list[AlarmChange]) -> Iterator[Output]:
         left = iter(changes)
         change = next(left, None)
-        for time_ns, data in prediction_bytes(block, self._tag):
+        for time_ns, data in encoding.prediction_bytes(block, self._tag):
             yield Output('prediction', data, max(0, time_ns))
             while change is not None and change.time_ns <= time_ns:
                 yield from self._single(change)
@@ -182,11 +135,11 @@ class Outputs:
     def _single(self, event: engine.Event) -> Iterator[Output]:
         tag = self._tag
         if isinstance(event, engine.SegmentClosed):
-            message = conversions.segment(event.segment, tag)
+            message = encoding.segment_message(event.segment, tag)
             yield _output('segments', message, event.segment.end_ns)
         elif isinstance(event, AlarmChange):
             self._alarms[event.name] = event
-            yield _output('alarms', conversions.alarm(event, tag), event.time_ns)
+            yield _output('alarms', encoding.alarm_message(event, tag), event.time_ns)
         elif isinstance(event, engine.CurveAdopted):
             self.curve, self.status, self.cause = event.characteristic, CurveStatus.FRESH, ''
             self.shift = event.shift
@@ -196,9 +149,9 @@ class Outputs:
             yield from self._curve_messages()
         elif isinstance(event, engine.Diagnosed):
             self._diagnosed = event
-            yield self._diagnosis(event)
+            yield self._diagnosis()
         elif isinstance(event, engine.JournalEntry):
-            yield _output('journal', conversions.journal(event, tag), event.time_ns)
+            yield _output('journal', encoding.journal_message(event, tag), event.time_ns)
             if event.kind == JournalKind.RESUMED:
                 # Who listens to a process that was started again finds everything there.
                 self.shift = None
@@ -207,8 +160,8 @@ class Outputs:
             elif self._note(event):
                 yield from self._curve_messages()
 
-    def take_up(self, monitor: Monitor) -> None:
-        """Go on with what a monitor knows that was taken up where it was left."""
+    def restore(self, monitor: Monitor) -> None:
+        """Continue from what a restored monitor knows."""
         reference = monitor.reference.curve
         self.curve, self.status, self.cause = monitor.characteristic, monitor.status, monitor.cause
         self.reference_id = '' if reference is None else reference.model_id
@@ -219,22 +172,25 @@ class Outputs:
     def latched(self) -> Iterator[Output]:
         """Yield the messages that stand on the latched topics."""
         yield from self._curve_messages()
-        if self._diagnosed is None:
-            message = conversions.unknown(conversions.NOT_YET, self._tag)
-            yield _output('diagnosis', message, 0)
-        else:
-            yield self._diagnosis(self._diagnosed)
+        yield self._diagnosis()
 
     def _standing(self) -> Iterator[Output]:
         """Yield what was said last of the alarms that stand; nothing in it is new."""
         told = sorted(self._alarms.values(), key=lambda change: (change.time_ns, change.name))
         for change in told:
             if change.state != AlarmState.NORMAL:
-                yield _output('alarms', conversions.alarm(change, self._tag), change.time_ns)
+                yield _output('alarms', encoding.alarm_message(change, self._tag), change.time_ns)
 
-    def _diagnosis(self, event: engine.Diagnosed) -> Output:
-        message = conversions.of(event, self._tag)
-        return _output('diagnosis', message, event.task.window_end_ns)
+    def _diagnosis(self) -> Output:
+        event, tag = self._diagnosed, self._tag
+        if event is None:
+            return _output('diagnosis', encoding.no_diagnosis_message(encoding.NOT_YET, tag), 0)
+        task = event.task
+        if event.content:
+            message = encoding.diagnosis_message(json.loads(event.content), task, tag)
+        else:
+            message = encoding.no_diagnosis_message(event.reason, tag, task)
+        return _output('diagnosis', message, task.window_end_ns)
 
     def _note(self, entry: engine.JournalEntry) -> bool:
         """Take what an entry says about the curve; tell whether it says anything."""
@@ -250,7 +206,7 @@ class Outputs:
     def _curve_messages(self) -> Iterator[Output]:
         curve = self.curve
         time_ns = 0 if curve is None else curve.source.window_end_ns
-        message = conversions.characteristic(
+        message = encoding.curve_message(
             curve, self.status, self.cause, self._tag, self.reference_id, self.shift
         )
         yield _output('characteristic', message, time_ns)
@@ -261,28 +217,8 @@ class Outputs:
             ('breakpoints', knots, f'integrated input u at the ends of the pieces [{unit}]'),
             ('slopes', slopes, f'slope of each piece [MW / ({unit})]'),
         ):
-            yield _output(name, conversions.plain_array(values, label), time_ns)
+            yield _output(name, encoding.array_message(values, label), time_ns)
 
 
 def _output(name: str, message: Any, time_ns: int) -> Output:
-    return Output(name, encode(message), max(0, time_ns))
-
-
-# Small messages as the bytes that go over the wire, made without a message object.
-
-
-_LITTLE_ENDIAN = b'\x00\x01\x00\x00'
-_FLOAT64 = struct.Struct('<d')
-_TIME = struct.Struct('<iI')
-_LAST_S = (1 << 31) - 1
-
-
-def float64_bytes(value: float) -> bytes:
-    """Return a std_msgs/Float64."""
-    return _LITTLE_ENDIAN + _FLOAT64.pack(value)
-
-
-def clock_bytes(time_ns: int) -> bytes:
-    """Return a rosgraph_msgs/Clock; times before 1970 or after 2038 become the nearest one."""
-    seconds, nanoseconds = divmod(max(time_ns, 0), NS_PER_S)
-    return _LITTLE_ENDIAN + _TIME.pack(min(seconds, _LAST_S), nanoseconds)
+    return Output(name, encoding.encode(message), max(0, time_ns))

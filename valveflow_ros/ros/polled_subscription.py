@@ -1,10 +1,8 @@
-"""Take messages without the executor: the one place that leans on rclpy's inside.
+"""Subscriptions that are polled without the executor; the one place that uses rclpy's inside.
 
-An executor spends far more time on choosing callbacks than the messages are
-worth. Here the loop asks each subscription itself, for raw bytes together with
-the stamps and the sequence number the middleware delivers. Where this rclpy
-does not offer that, the executor calls back instead and the rest of the house
-notices nothing; a contract test tells which way is taken.
+An executor spends far more time on choosing callbacks than the messages are worth. Here the loop
+polls each subscription for raw bytes with the stamps and the sequence number that the middleware
+delivers. Where this rclpy does not offer that, the executor calls back instead.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ from rclpy.subscription import Subscription
 DEPTH = 1000
 
 
-class Taken(NamedTuple):
+class RawMessage(NamedTuple):
     """One message as the middleware delivered it; stamps in ns, 0 where it gave none."""
 
     data: bytes
@@ -35,7 +33,7 @@ class _PolledGroup(CallbackGroup):
     """Keeps the executor away from subscriptions, and lets their events through."""
 
     def can_execute(self, entity: Any) -> bool:
-        """Tell the executor that nothing is to be done for a subscription."""
+        """Return False for a subscription."""
         return not isinstance(entity, Subscription)
 
     def beginning_execution(self, entity: Any) -> bool:
@@ -43,16 +41,16 @@ class _PolledGroup(CallbackGroup):
         return self.can_execute(entity)
 
     def ending_execution(self, entity: Any) -> None:
-        """Forget nothing, for nothing was noted."""
+        """Do nothing: `can_execute` keeps no record."""
 
 
 def can_poll(subscription: Subscription) -> bool:
-    """Tell whether this rclpy lets a message be taken by hand."""
+    """Return True if this rclpy lets a message be taken by hand."""
     return callable(getattr(subscription.handle, 'take_message', None))
 
 
-class Taker:
-    """A subscription that is asked.
+class PolledSubscription:
+    """A subscription that is polled.
 
     Parameters
     ----------
@@ -65,7 +63,7 @@ class Taker:
     on_mismatch : callable
         Called with the topic when a publisher's quality of service does not match.
     polled : bool
-        False to let the executor call back even where asking is possible.
+        False to let the executor call back even where polling is possible.
     """
 
     def __init__(
@@ -80,7 +78,7 @@ class Taker:
     ) -> None:
         self._node = node
         self._type = message_type
-        self._waiting: deque[Taken] = deque(maxlen=DEPTH)
+        self._waiting: deque[RawMessage] = deque(maxlen=DEPTH)
         self._polled = polled
         self._make(topic, reliable, on_mismatch, _PolledGroup() if polled else None)
         if polled and not can_poll(self._subscription):
@@ -89,7 +87,7 @@ class Taker:
             self._make(topic, reliable, on_mismatch, None)
         self._handle = self._subscription.handle
         self._take_message = getattr(self._handle, 'take_message', None)
-        # Held as long as we ask, so that not every look has to.
+        # Held as long as we poll, so that not every look has to.
         self._handle.__enter__()
 
     @property
@@ -99,10 +97,10 @@ class Taker:
 
     @property
     def polled(self) -> bool:
-        """Tell whether messages are asked for rather than called back."""
+        """Return True if messages are polled rather than called back."""
         return self._polled
 
-    def take(self, most: int = DEPTH) -> list[Taken]:
+    def take(self, most: int = DEPTH) -> list[RawMessage]:
         """Return what has arrived, oldest first, at most ``most`` messages."""
         if not self._polled:
             return [self._waiting.popleft() for _ in range(min(most, len(self._waiting)))]
@@ -110,12 +108,12 @@ class Taker:
         found = self._take_message(self._type, True)
         if found is None:
             return []
-        taken = [_taken(*found)]
+        taken = [_raw_message(*found)]
         while len(taken) < most:
             found = self._take_message(self._type, True)
             if found is None:
                 break
-            taken.append(_taken(*found))
+            taken.append(_raw_message(*found))
         return taken
 
     def close(self) -> None:
@@ -145,11 +143,11 @@ class Taker:
         )
 
     def _call_back(self, data: bytes, info: dict[str, Any]) -> None:
-        self._waiting.append(_taken(data, info))
+        self._waiting.append(_raw_message(data, info))
 
 
-def _taken(data: bytes, info: dict[str, Any]) -> Taken:
-    return Taken(
+def _raw_message(data: bytes, info: dict[str, Any]) -> RawMessage:
+    return RawMessage(
         data,
         int(info['source_timestamp'] or 0),
         int(info['received_timestamp'] or 0),

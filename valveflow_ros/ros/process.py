@@ -1,4 +1,4 @@
-"""Signals become a flag: what runs is finished, then the process ends in order."""
+"""What the executables share: signals, errors in one line, and help."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _ASKED_TO_STOP = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Stopped(BaseException):
-    """A signal came where it may cut what runs."""
+    """A signal came where it may interrupt what runs."""
 
 
 class StopFlag:
-    """Set by SIGINT, SIGTERM or SIGHUP; asking twice changes nothing."""
+    """Set by SIGINT, SIGTERM or SIGHUP: what runs is finished, then the process ends in order."""
 
     def __init__(self) -> None:
         self._by: int | None = None
@@ -37,7 +37,7 @@ class StopFlag:
 
     @contextmanager
     def cutting(self) -> Iterator[None]:
-        """Let signals raise `Stopped` inside: for work that leaves nothing to be finished.
+        """Let signals raise `Stopped` inside, for work that leaves nothing to be finished.
 
         Raises
         ------
@@ -53,12 +53,12 @@ class StopFlag:
             self._cuts = False
 
     def last(self) -> None:
-        """Hear nothing more: the process ends already, and its last steps are not to be cut."""
+        """Ignore signals from now on: the process ends already, and its last steps must finish."""
         for number in _ASKED_TO_STOP:
             signal.signal(number, signal.SIG_IGN)
 
     def __bool__(self) -> bool:
-        """Tell whether to stop."""
+        """Return True if the process is to stop."""
         return self._by is not None
 
     @property
@@ -66,18 +66,11 @@ class StopFlag:
         """Return the name of the signal, empty before one came."""
         return '' if self._by is None else signal.Signals(self._by).name
 
-    def set(self) -> None:
-        """Ask to stop from inside."""
-        self._by = self._by or signal.SIGTERM
-
     def _note(self, number: int, _frame: FrameType | None) -> None:
         self._by = number
         if self._cuts:
             self._cuts = False
             raise Stopped
-
-
-# Foreign errors in one line: a person is owed a sentence, not a trace.
 
 
 _IN_C = re.compile(r',? at /\S+\.c(?:pp)?:\d+')
@@ -99,14 +92,14 @@ def with_place(error: BaseException) -> str:
     return f'{one_line(error)} ({type(error).__name__}{place})'
 
 
-# What the executables answer to ``--help``.
-
-
-_WIDTH = 28
+def complain(executable: str, sentence: str) -> int:
+    """Print a sentence on stderr; return the exit status 1."""
+    print(f'valveflow {executable}: {sentence}', file=sys.stderr)
+    return 1
 
 
 def wants_help(args: Sequence[str] | None) -> bool:
-    """Tell whether somebody asked what there is to give."""
+    """Return True if help was asked for."""
     given = sys.argv[1:] if args is None else args
     return any(word in ('-h', '--help') for word in given)
 
@@ -138,6 +131,6 @@ def usage(about: str, example: str, rows: Iterable[Parameter]) -> str:
     for row in rows:
         default = repr(row.default) if isinstance(row.default, str) else str(row.default).lower()
         unit = f' {row.unit}' if row.unit else ''
-        lines.append(f'  {row.name:{_WIDTH}} {default}{unit}')
-        lines.append(f'  {"":{_WIDTH}} {row.sentence}')
+        lines.append(f'  {row.name:28} {default}{unit}')
+        lines.append(f'  {"":28} {row.sentence}')
     return '\n'.join(lines)

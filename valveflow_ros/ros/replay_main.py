@@ -1,26 +1,30 @@
-"""The executable `replay`: a log on the input topics again, or proof that it repeats itself."""
+"""The executable `replay`: a log on the input topics again, or a comparison with its replay."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+from operator import itemgetter
 
 import rclpy
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from valveflow_ros.errors import ValveflowError, counted
-from valveflow_ros.logs import open_log
+from valveflow_ros.errors import DataError, ValveflowError, counted
+from valveflow_ros.logs import LogContents, open_log
+from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.terminal.progress import Progress
 from valveflow_ros.report.terminal.text import number
-from valveflow_ros.ros.domain import choose_transport
-from valveflow_ros.ros.playing import Player
-from valveflow_ros.ros.process import Parser, StopFlag, one_line, with_place
-from valveflow_ros.ros.replay_steps import steps_of
-from valveflow_ros.ros.secure_start import check_security
+from valveflow_ros.ros.decoding import INPUT_BY_NAME, PLANT_SAMPLE, header_time_ns
+from valveflow_ros.ros.domain import start_ros
+from valveflow_ros.ros.encoding import float64_bytes
+from valveflow_ros.ros.node.recording import TOPICS
+from valveflow_ros.ros.player import Player, Step
+from valveflow_ros.ros.process import Parser, StopFlag, complain, with_place
 from valveflow_ros.ros.verify import verify
 
 # As a shell tells of a process that Ctrl-C has ended.
@@ -65,6 +69,71 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
+def input_topics(log: LogContents) -> dict[str, str]:
+    """Return the topics of a recording to play, each with the input it stands for.
+
+    A recording of the monitor says itself which of its topics were inputs; in
+    any other one they go by their names.
+    """
+    try:
+        told = json.loads(log.attachments[TOPICS])['inputs']
+        known = {str(topic): str(name) for name, topic in told.items() if name in INPUT_BY_NAME}
+    except (KeyError, ValueError, TypeError, AttributeError):
+        known = {topic: SIGNALS[signal].topic for signal, topic in log.signals.items()}
+        for topic, info in log.topics.items():
+            if info.type == INPUT_BY_NAME[PLANT_SAMPLE].type_name:
+                known[topic] = PLANT_SAMPLE
+    return {
+        topic: name
+        for topic, name in known.items()
+        if topic in log.topics
+        and log.topics[topic].count
+        and log.topics[topic].type == INPUT_BY_NAME[name].type_name
+    }
+
+
+def steps_of(log: LogContents) -> tuple[list[str], Iterator[Step]]:
+    """Return the inputs that will be published, and the steps.
+
+    Raises
+    ------
+    DataError
+        There is nothing to play.
+    """
+    if not log.topics:
+        names = [SIGNALS[signal].topic for signal in sorted(log.signals)]
+        messages = _table_messages(log)
+    else:
+        topics = input_topics(log)
+        names = list(dict.fromkeys(topics.values()))
+        messages = _recorded_messages(log, topics)
+    if not names:
+        raise DataError(f'{log.path}: there is nothing to play, no input of the monitor is in it.')
+    # Messages that follow each other and belong to one instant are one step.
+    steps = (
+        Step(time_ns, [(name, data) for _, name, data in group])
+        for time_ns, group in groupby(messages, key=itemgetter(0))
+    )
+    return names, steps
+
+
+def _recorded_messages(
+    log: LogContents, topics: dict[str, str]
+) -> Iterator[tuple[int, str, bytes]]:
+    for message in log.iter_messages(list(topics)):
+        name, time_ns = topics[message.topic], message.publish_time_ns
+        if name == PLANT_SAMPLE:
+            time_ns = header_time_ns(message.data)
+        yield time_ns, name, message.data
+
+
+def _table_messages(log: LogContents) -> Iterator[tuple[int, str, bytes]]:
+    r = log.readings
+    columns = (r.time_ns.tolist(), r.signal.tolist(), r.value.tolist())
+    for time_ns, signal, value in zip(*columns, strict=True):
+        yield time_ns, SIGNALS[signal].topic, float64_bytes(value)
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Replay or verify; return the exit status."""
     arguments = list(sys.argv if args is None else ['replay', *args])
@@ -74,13 +143,12 @@ def main(args: Sequence[str] | None = None) -> int:
             return _verify(options.log)
         return _replay(options, arguments)
     except ValveflowError as error:
-        print(f'valveflow replay: {error}', file=sys.stderr)
+        return complain('replay', str(error))
     except KeyboardInterrupt:
         print('valveflow replay: stopped.', file=sys.stderr)
         return _STOPPED
     except Exception as error:  # noqa: BLE001 - a person is owed a sentence, not a trace
-        print(f'valveflow replay: failed unexpectedly: {with_place(error)}', file=sys.stderr)
-    return 1
+        return complain('replay', f'failed unexpectedly: {with_place(error)}')
 
 
 def _verify(path: str) -> int:
@@ -109,18 +177,13 @@ def _verify(path: str) -> int:
 
 def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     stop = StopFlag().install()
-    choose_transport()
-    check_security(arguments)
-    log = open_log(options.log)
-    names, steps = steps_of(log)
+    start_ros(arguments)
+    node: Node | None = None
     try:
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:  # noqa: BLE001 - rclpy raises what its C++ gave it
-        print(f'valveflow replay: ROS could not be started: {one_line(error)}', file=sys.stderr)
-        return 1
-    node = Node('replay')
-    say = node.get_logger()
-    try:
+        log = open_log(options.log)
+        names, steps = steps_of(log)
+        node = Node('replay')
+        say = node.get_logger()
         for warning in log.warnings:
             say.warning(warning)
         player = Player(node, names, options.rate, not options.no_clock, lambda: bool(stop))
@@ -138,7 +201,8 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
         return 0
     finally:
         stop.last()
-        node.destroy_node()
+        if node is not None:
+            node.destroy_node()
         rclpy.try_shutdown()
 
 

@@ -4,24 +4,126 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import datetime, timezone
 from typing import cast
 
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
+from valveflow_msgs.msg import PlantSample
 
 from valveflow_ros.errors import ParameterError, ValveflowError, counted
-from valveflow_ros.plant.simulator import simulate_parts
-from valveflow_ros.records import SIGNALS, SampleTable, Signal
-from valveflow_ros.ros import simulator_steps as steps
+from valveflow_ros.parameters import Parameter
+from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate_parts
+from valveflow_ros.plant.spec import EffectSpec
+from valveflow_ros.records import N_SIGNALS, NS_PER_S, SIGNALS, SampleTable, Signal
 from valveflow_ros.ros.declare import declare, unknown_overrides
-from valveflow_ros.ros.domain import choose_transport
-from valveflow_ros.ros.inputs import PLANT_SAMPLE
-from valveflow_ros.ros.playing import Player, Step
-from valveflow_ros.ros.process import StopFlag, one_line, show, usage, wants_help, with_place
-from valveflow_ros.ros.secure_start import check_security
+from valveflow_ros.ros.decoding import PLANT_SAMPLE
+from valveflow_ros.ros.domain import start_ros
+from valveflow_ros.ros.encoding import encode, float64_bytes, header
+from valveflow_ros.ros.player import Player, Step
+from valveflow_ros.ros.process import StopFlag, complain, show, usage, wants_help, with_place
+
+TABLE: tuple[Parameter, ...] = (
+    Parameter('days', 10.0, 'd', 'How long the plant is simulated.', 0.001, 400.0),
+    Parameter('seed', 1, '', 'Seed of every random number.', 0, 2**31 - 1),
+    Parameter('rate', 1.0, '', 'Simulated seconds in a second; 0: as fast as the monitor takes '
+              'them.', 0.0, 1e6),
+    Parameter('stamped', False, '', 'Publish one stamped plant_sample instead of plain values.'),
+    Parameter('use_clock', False, '', 'Publish the simulated time on /clock.'),
+    Parameter('command', False, '', 'Publish valve_command too.'),
+    Parameter('unit_tag', 'unit', '', 'Tag of the unit; frame_id of stamped samples.'),
+    Parameter('start', '', '', 'Time of the first sample, ISO 8601, UTC unless it says otherwise; '
+              'empty: now in real time, 2023-11-15 otherwise.'),
+    Parameter('wait', 180.0, 's', 'How long to wait for a subscriber.', 0.0, 86400.0),
+)  # fmt: skip
+
+
+def effects_of(texts: Iterable[str]) -> list[EffectSpec]:
+    """Read effects; a text may hold several, with semicolons between them.
+
+    Raises
+    ------
+    InputError
+        An effect is unknown or its parameters cannot be used.
+    """
+    return [
+        EffectSpec.parse(text)
+        for together in texts
+        for text in together.split(';')
+        if text.strip()
+    ]
+
+
+def start_ns_of(text: str, rate: float, now_ns: int) -> int:
+    """Return the time of the first sample.
+
+    Raises
+    ------
+    ParameterError
+        The text is no time.
+    """
+    if not text.strip():
+        return now_ns - now_ns % NS_PER_S if rate == 1.0 else DEFAULT_START_NS
+    try:
+        moment = datetime.fromisoformat(text.strip().replace('Z', '+00:00'))
+    except ValueError:
+        raise ParameterError(
+            'start', f"must be a time such as 2026-03-01T12:00:00Z, not '{text}'"
+        ) from None
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=timezone.utc)
+    return round(moment.timestamp()) * NS_PER_S
+
+
+def check_together(rate: float, stamped: bool, use_clock: bool) -> None:
+    """Refuse plain values in another time than the machine's, with nothing that says so.
+
+    Raises
+    ------
+    ParameterError
+        The samples' times would be lost.
+    """
+    if rate != 1.0 and not stamped and not use_clock:
+        raise ParameterError(
+            'rate',
+            f'is {rate:g}, and plain values carry no time: set use_clock (and use_sim_time at '
+            'the monitor), or stamped',
+        )
+
+
+def plain_steps(parts: Iterable[SampleTable], command: bool) -> Iterator[Step]:
+    """Yield a step of single values for each row."""
+    # The optional signal first, as everywhere.
+    signals = [Signal.VALVE_COMMAND] if command else []
+    signals += [info.signal for info in SIGNALS if info.required]
+    names = [SIGNALS[signal].topic for signal in signals]
+    for table in parts:
+        columns = [table.column(signal).tolist() for signal in signals]
+        for time_ns, *values in zip(table.time_ns.tolist(), *columns, strict=True):
+            yield Step(
+                time_ns,
+                [(name, float64_bytes(v)) for name, v in zip(names, values, strict=True)],
+            )
+
+
+def stamped_steps(parts: Iterable[SampleTable], command: bool, tag: str) -> Iterator[Step]:
+    """Yield a step with one stamped sample for each row."""
+    topics = [info.topic for info in SIGNALS]
+    for table in parts:
+        values, quality = table.values.copy(), table.quality.copy()
+        if not command:
+            values[:, Signal.VALVE_COMMAND] = float('nan')
+            quality[:, Signal.VALVE_COMMAND] = PlantSample.QUALITY_BAD
+        rows = zip(table.time_ns.tolist(), values.tolist(), quality.tolist(), strict=True)
+        for time_ns, row, codes in rows:
+            sample = PlantSample(header=header(time_ns, tag))
+            for k in range(N_SIGNALS):
+                setattr(sample, topics[k], row[k])
+                setattr(sample, f'{topics[k]}_quality', codes[k])
+            yield Step(time_ns, [(PLANT_SAMPLE, encode(sample))])
+
 
 _EFFECTS = ParameterDescriptor(
     description='What is wrong with the plant: texts of the form name or name:key=value,... as '
@@ -44,25 +146,21 @@ _EXAMPLE = (
 def main(args: Sequence[str] | None = None) -> int:
     """Simulate and publish; return the exit status."""
     if wants_help(args):
-        show(usage(_ABOUT, _EXAMPLE, steps.TABLE))
+        show(usage(_ABOUT, _EXAMPLE, TABLE))
         show(f'  {"effects":28} []\n  {"":28} {_EFFECTS.description}')
         return 0
     stop = StopFlag().install()
     try:
-        choose_transport()
-        check_security(args)
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        start_ros(args)
     except ValveflowError as error:
-        return _complain(str(error))
-    except Exception as error:  # noqa: BLE001 - rclpy raises what its C++ gave it
-        return _complain(f'ROS could not be started: {one_line(error)}')
+        return complain('plant_simulator', str(error))
     node = Node('plant_simulator')
     try:
         return _run(node, stop)
     except ValveflowError as error:
-        return _complain(str(error))
-    except Exception as error:  # noqa: BLE001 - a person is owed a sentence, not a trace
-        return _complain(f'failed unexpectedly: {with_place(error)}')
+        return complain('plant_simulator', str(error))
+    except Exception as error:  # noqa: BLE001 - a person gets a sentence, not a trace
+        return complain('plant_simulator', f'failed unexpectedly: {with_place(error)}')
     finally:
         stop.last()
         node.destroy_node()
@@ -70,40 +168,36 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _run(node: Node, stop: StopFlag) -> int:
-    values = declare(node, steps.TABLE)
+    values = declare(node, TABLE)
     days, seed = cast(float, values['days']), cast(int, values['seed'])
     rate, wait_s = cast(float, values['rate']), cast(float, values['wait'])
-    effects = steps.effects_of(_texts(node.declare_parameter('effects', [], _EFFECTS).value))
+    effects = effects_of(_texts(node.declare_parameter('effects', [], _EFFECTS).value))
     log = node.get_logger()
     for sentence in unknown_overrides(node, [*values, 'effects']):
         log.warning(f'{sentence} It is ignored.')
-    steps.check_together(rate, bool(values['stamped']), bool(values['use_clock']))
-    start_ns = steps.start_ns_of(str(values['start']), rate, time.time_ns())
+    check_together(rate, bool(values['stamped']), bool(values['use_clock']))
+    start_ns = start_ns_of(str(values['start']), rate, time.time_ns())
     parts = simulate_parts(days, seed, start_ns=start_ns, effects=effects)
-    names, made = _steps((part.table for part in parts), values)
+    tables = (part.table for part in parts)
+    command = bool(values['command'])
+    if values['stamped']:
+        names = [PLANT_SAMPLE]
+        steps = stamped_steps(tables, command, str(values['unit_tag']))
+    else:
+        names = [i.topic for i in SIGNALS if command or i.signal != Signal.VALVE_COMMAND]
+        steps = plain_steps(tables, command)
     player = Player(node, names, rate, bool(values['use_clock']), lambda: bool(stop))
     missing = player.wait_for_listeners(wait_s)
     if missing and wait_s > 0 and not stop:
         log.warning(f'Nobody listens to {", ".join(missing)}.')
     wrong = ', '.join(str(effect) for effect in effects) or 'nothing'
     log.info(f'{counted(days, "day")} of plant, seed {seed}; wrong with it: {wrong}.')
-    count = player.play(made)
+    count = player.play(steps)
     end = 'Stopped' if stop else 'Finished'
     log.info(
         f'{end} after {counted(count, "sample")}, {counted(sum(player.sent.values()), "message")}.'
     )
     return 0
-
-
-def _steps(
-    parts: Iterator[SampleTable], values: dict[str, object]
-) -> tuple[list[str], Iterator[Step]]:
-    """Return the inputs that will be published, and the steps."""
-    command = bool(values['command'])
-    if values['stamped']:
-        return [PLANT_SAMPLE], steps.stamped_steps(parts, command, str(values['unit_tag']))
-    names = [info.topic for info in SIGNALS if command or info.signal != Signal.VALVE_COMMAND]
-    return names, steps.plain_steps(parts, command)
 
 
 def _texts(given: object) -> list[str]:
@@ -116,11 +210,6 @@ def _texts(given: object) -> list[str]:
     if not all(isinstance(text, str) for text in texts):
         raise ParameterError('effects', f'must be a list of texts, not {given!r}')
     return texts
-
-
-def _complain(sentence: str) -> int:
-    print(f'valveflow plant_simulator: {sentence}', file=sys.stderr)
-    return 1
 
 
 if __name__ == '__main__':

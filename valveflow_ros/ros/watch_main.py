@@ -8,24 +8,127 @@ import json
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.signals import SignalHandlerOptions
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
 from std_srvs.srv import Trigger
+from valveflow_msgs.msg import Alarm, Diagnosis, FlowCharacteristic, Prediction
 
 from valveflow_ros.errors import ValveflowError
-from valveflow_ros.report.terminal.board import CURVE, HEALTH
+from valveflow_ros.report.terminal.board import (
+    ALARM,
+    CURVE,
+    DIAGNOSIS,
+    HEALTH,
+    KEPT,
+    PREDICTION,
+    Board,
+)
+from valveflow_ros.report.terminal.frame import Frame
 from valveflow_ros.report.terminal.screen import Screen
 from valveflow_ros.report.terminal.text import number
-from valveflow_ros.ros.domain import choose_transport
-from valveflow_ros.ros.process import Parser, one_line, with_place
-from valveflow_ros.ros.secure_start import check_security
-from valveflow_ros.ros.services import SERVICES
-from valveflow_ros.ros.watch_node import WatchNode
+from valveflow_ros.ros.domain import start_ros
+from valveflow_ros.ros.outputs import SERVICES
+from valveflow_ros.ros.process import Parser, complain, with_place
+
+_LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# A sample that is lost here is lost to the eye only.
+_STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+_CURVE_TOPIC = '/characteristic'
+
+
+class WatchNode(Node):
+    """Finds the monitor, subscribes, and keeps what a terminal view needs.
+
+    Parameters
+    ----------
+    monitor : str
+        Full name of the monitor's node; empty: the one there is.
+    """
+
+    def __init__(self, monitor: str = '') -> None:
+        super().__init__('valveflow_watch', enable_rosout=False)
+        self._wanted = '/' + monitor.strip('/') if monitor else ''
+        self.monitor = ''
+        self.several: tuple[str, ...] = ()
+        self._board = Board()
+        self._predictions: deque[Prediction] = deque(maxlen=KEPT)
+        self.heard: set[str] = set()
+
+    def look(self) -> None:
+        """Look for the monitor as long as it is not found."""
+        if self.monitor:
+            return
+        found = sorted(
+            topic.removesuffix(_CURVE_TOPIC)
+            for topic, kinds in self.get_topic_names_and_types()
+            if CURVE in kinds and topic.endswith(_CURVE_TOPIC) and self.count_publishers(topic)
+        )
+        self.several = tuple(found) if len(found) > 1 and not self._wanted else ()
+        if self._wanted in found or (len(found) == 1 and not self._wanted):
+            self._listen(self._wanted or found[0])
+
+    def frame(self) -> Frame:
+        """Return what is known now."""
+        while self._predictions:
+            self._board.take(PREDICTION, fields_of(self._predictions.popleft()))
+        return self._board.frame(self.monitor or 'ROS 2', self._note())
+
+    def _note(self) -> str:
+        if self.several:
+            return f'Several monitors run: {", ".join(self.several)}. Choose with --node NAME.'
+        if not self.monitor:
+            what = self._wanted or 'a monitor'
+            return (
+                f'Waiting for {what}. If one runs, compare ROS_DOMAIN_ID and '
+                'ROS_AUTOMATIC_DISCOVERY_RANGE here and there: they must be the same.'
+            )
+        if not self.count_publishers(self.monitor + _CURVE_TOPIC):
+            return 'The monitor has gone; this is what it said last.'
+        return '' if self.heard else 'The monitor was found; nothing has come from it yet.'
+
+    def _listen(self, monitor: str) -> None:
+        self.monitor = monitor
+        for name, kind, type_name in (
+            ('characteristic', FlowCharacteristic, CURVE),
+            ('alarms', Alarm, ALARM),
+            ('diagnosis', Diagnosis, DIAGNOSIS),
+        ):
+            self._subscribe(f'{monitor}/{name}', kind, type_name, _LATCHED)
+        self._subscribe('/diagnostics', DiagnosticArray, HEALTH, QoSProfile(depth=10))
+        self.create_subscription(Prediction, f'{monitor}/prediction', self._on_prediction, _STREAM)
+
+    def _subscribe(self, topic: str, kind: type, type_name: str, qos: QoSProfile) -> None:
+        def take(message: Any) -> None:
+            self.heard.add(type_name)
+            self._board.take(type_name, fields_of(message))
+
+        self.create_subscription(kind, topic, take, qos)
+
+    def _on_prediction(self, message: Prediction) -> None:
+        self.heard.add(PREDICTION)
+        self._predictions.append(message)
+
+
+def fields_of(message: Any) -> Mapping[str, Any]:
+    """Return a message as a mapping, messages within as mappings too."""
+    return {name: _plain(getattr(message, name)) for name in message.get_fields_and_field_types()}
+
+
+def _plain(value: Any) -> Any:
+    if hasattr(value, 'get_fields_and_field_types'):
+        return fields_of(value)
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value
+
 
 _LOOK_S = 0.5
 # For one picture: how long a monitor may take to be found, and then to say how it is.
@@ -74,17 +177,10 @@ def main(args: Sequence[str] | None = None) -> int:
     if options.ask and options.once:
         made.error('--ask and --once do not go together')
     try:
-        choose_transport()
-        check_security(arguments)
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    except ValveflowError as error:
-        return _complain(str(error))
-    except KeyboardInterrupt:
-        return 0
-    except Exception as error:  # noqa: BLE001 - rclpy raises what its C++ gave it
-        return _complain(f'ROS could not be started: {one_line(error)}')
-    try:
+        start_ros(arguments)
         return _run(options)
+    except ValveflowError as error:
+        return complain('watch', str(error))
     except KeyboardInterrupt:
         # How one stops looking.
         return 0
@@ -92,8 +188,8 @@ def main(args: Sequence[str] | None = None) -> int:
         # Whoever read the output has gone.
         sys.stdout = None  # type: ignore[assignment]
         return 0
-    except Exception as error:  # noqa: BLE001 - a person is owed a sentence, not a trace
-        return _complain(f'failed unexpectedly: {with_place(error)}')
+    except Exception as error:  # noqa: BLE001 - a person gets a sentence, not a trace
+        return complain('watch', f'failed unexpectedly: {with_place(error)}')
     finally:
         rclpy.try_shutdown()
 
@@ -134,7 +230,7 @@ def _find(node: WatchNode, executor: SingleThreadedExecutor) -> bool:
 
 def _ask(node: WatchNode, executor: SingleThreadedExecutor, service: str) -> int:
     if not _find(node, executor):
-        return _complain(node.frame().note)
+        return complain('watch', node.frame().note)
     client = node.create_client(Trigger, f'{node.monitor}/{service}')
     if client.wait_for_service(timeout_sec=_FIND_S):
         answer = client.call_async(Trigger.Request())
@@ -142,15 +238,15 @@ def _ask(node: WatchNode, executor: SingleThreadedExecutor, service: str) -> int
         if answer.done():
             response = answer.result()
             if not response.success:
-                return _complain(response.message)
+                return complain('watch', response.message)
             print(response.message, flush=True)
             return 0
-    return _complain(f'{node.monitor} does not answer; nothing is known to be done.')
+    return complain('watch', f'{node.monitor} does not answer; nothing is known to be done.')
 
 
 def _once(node: WatchNode, executor: SingleThreadedExecutor, as_json: bool) -> int:
     if not _find(node, executor):
-        return _complain(node.frame().note)
+        return complain('watch', node.frame().note)
     found_s = time.monotonic()
     # The health comes once a second, and what is latched at once.
     while not {CURVE, HEALTH} <= node.heard and time.monotonic() - found_s < _HEAR_S:
@@ -171,11 +267,6 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _complain(sentence: str) -> int:
-    print(f'valveflow watch: {sentence}', file=sys.stderr)
-    return 1
 
 
 if __name__ == '__main__':

@@ -1,9 +1,14 @@
-"""How the work goes: an item each for the fit, the alarm and the recorder."""
+"""The health of the inputs, the fit, the alarms, the diagnosis and the recorder: an item each."""
 
 from __future__ import annotations
 
 import json
 import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from rclpy.node import Node
 
 from valveflow_ros.errors import counted
 from valveflow_ros.fit.result import weaknesses
@@ -11,10 +16,287 @@ from valveflow_ros.logs import RecorderState
 from valveflow_ros.monitoring.alarm import Alarm, AlarmState
 from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.monitor import Monitor
-from valveflow_ros.ros.conversions import NOT_YET
-from valveflow_ros.ros.diagnostics import Item, Level
+from valveflow_ros.parameters import Settings
+from valveflow_ros.records import NS_PER_S, SIGNALS, SignalInfo
+from valveflow_ros.report.words import duration
+from valveflow_ros.ros.decoding import PLANT_SAMPLE, Row, plausible_range, plausible_units
+from valveflow_ros.ros.encoding import NOT_YET
+from valveflow_ros.ros.node.diagnostics import Item, Level
+from valveflow_ros.ros.node.intake import TopicStatistics
 from valveflow_ros.ros.node.recording import Recording
-from valveflow_ros.ros.worker.worker import DiagnosisWorker, FitWorker
+from valveflow_ros.ros.worker import DiagnosisWorker, FitWorker
+from valveflow_ros.signals.align import REASONS
+from valveflow_ros.signals.units import unit_of
+
+_NO_LEAD = -(2**63)
+
+
+@dataclass(frozen=True, slots=True)
+class Publishers:
+    """The publishers of one topic.
+
+    Attributes
+    ----------
+    right : int
+        Publishers of the type we listen for.
+    wrong_types : tuple of str
+        Other types somebody publishes on the same topic.
+    """
+
+    right: int = 0
+    wrong_types: tuple[str, ...] = ()
+
+
+def publishers(node: Node, topic: str, type_name: str) -> Publishers:
+    """Look up in the ROS graph who publishes a topic; a wrong type makes no noise of its own."""
+    found = node.get_publishers_info_by_topic(topic)
+    right = [info for info in found if info.topic_type == type_name]
+    wrong = sorted({info.topic_type for info in found} - {type_name})
+    return Publishers(len(right), tuple(wrong))
+
+
+_REJECTED = tuple(reason for reason in REASONS if reason not in ('accepted', 'late'))
+_PATIENCE_S = 5.0
+# Rejected for so long, an input is as good as silent.
+_BLIND_S = 10.0
+
+
+class InputHealth:
+    """Judges the inputs, from one look to the next.
+
+    Parameters
+    ----------
+    settings : Settings
+    topics : mapping of str to str
+        Contract name to full topic name.
+    by_host : bool
+        Whether this machine's clock tells the time of the plant; false with a /clock.
+
+    Attributes
+    ----------
+    mismatched : set of str
+        Contract names on which a publisher's quality of service did not match.
+    """
+
+    def __init__(
+        self, settings: Settings, topics: Mapping[str, str], *, by_host: bool = True
+    ) -> None:
+        self.settings = settings
+        self.mismatched: set[str] = set()
+        self._topics = topics
+        # Looked up once; they are not live.
+        self._ranges = [plausible_range(info.signal, settings) for info in SIGNALS]
+        self._jump_ns = round(settings.real('clock_jump') * NS_PER_S)
+        self._by_host = by_host
+        # Stamps by the signals' numbers: this is done for every message.
+        self._last_ns = [0] * len(SIGNALS)
+        self._lead_ns = [_NO_LEAD] * len(SIGNALS)
+        self._impossible: dict[str, tuple[str, float]] = {}
+        self._counted: dict[tuple[str, str], int] = {}
+        self._used: dict[str, tuple[int, float]] = {}
+        self._newest_ns = 0
+
+    def note(self, name: str, rows: Sequence[Row]) -> None:
+        """Remember the stamps, and the last impossible value of each signal, to name it."""
+        host_ns = time.time_ns()
+        for time_ns, number, value, _ in rows:
+            self._last_ns[number] = time_ns
+            self._lead_ns[number] = max(self._lead_ns[number], time_ns - host_ns)
+            low, high = self._ranges[number]
+            if not low <= value <= high and math.isfinite(value):
+                self._impossible[SIGNALS[number].topic] = (name, value)
+
+    def items(
+        self,
+        statistics: Mapping[str, TopicStatistics],
+        counts: Mapping[str, Mapping[str, int]],
+        publishers: Mapping[str, Publishers],
+        now_s: float,
+        listening_s: float,
+        newest_ns: int = 0,
+    ) -> list[Item]:
+        """Return an item for each signal.
+
+        Parameters
+        ----------
+        statistics : mapping
+            By the contract's names of the topics.
+        counts : mapping
+            What became of the readings, by signal and reason.
+        publishers : mapping
+            What the graph says, by the contract's names of the topics.
+        now_s, listening_s : float
+            Time by a clock that never goes back, and for how long we have listened.
+        newest_ns : int
+            The newest stamp that is used.
+        """
+        self._newest_ns = newest_ns
+        unknown = Publishers()
+        found: list[Item] = []
+        for info in SIGNALS:
+            name = _speaking(info.topic, statistics, publishers)
+            received, seen = statistics[name], publishers.get(name, unknown)
+            reasons = counts[info.topic]
+            if received.received:
+                level, sentence = self._judge(info, name, received, seen, reasons, now_s)
+            else:
+                level, sentence = self._judge_silent(info, name, seen, listening_s)
+            both = (info.topic, PLANT_SAMPLE)
+            twice = all(publishers.get(n, unknown).right and statistics[n].received for n in both)
+            if level <= Level.WARN and info.required and twice:
+                level = Level.WARN
+                mixed = f'{self._topics[info.topic]} and {self._topics[PLANT_SAMPLE]}'
+                sentence = f'{mixed} are both published; their values are mixed. Stop one of them.'
+            values = self._values(name, received, seen, reasons, now_s)
+            found.append(Item(f'input {info.topic}', level, sentence, values))
+        return found
+
+    def _values(
+        self,
+        name: str,
+        received: TopicStatistics,
+        seen: Publishers,
+        counts: Mapping[str, int],
+        now_s: float,
+    ) -> dict[str, object]:
+        values: dict[str, object] = {
+            'Topic': self._topics[name],
+            'Actual frequency (Hz)': received.rate_hz(),
+            'Age of the newest message (s)': received.age_s(now_s),
+            'Publishers': seen.right,
+            'Messages received': received.received,
+            'Messages lost on the way': received.lost,
+            'Messages sent before the first received': received.missed_at_start,
+            'Messages with irregular numbers': received.irregular,
+            'Messages that cannot be read': received.malformed,
+            'Messages without a time': received.without_time,
+            'Messages sent before the first /clock': received.before_clock,
+            'Messages that wait for the first /clock': received.waiting,
+        }
+        return values | {f'Readings {r.replace("_", " ")}': counts[r] for r in REASONS}
+
+    def _judge(
+        self,
+        info: SignalInfo,
+        name: str,
+        received: TopicStatistics,
+        seen: Publishers,
+        counts: Mapping[str, int],
+        now_s: float,
+    ) -> tuple[Level, str]:
+        topic = self._topics[name]
+        rejected = self._new(info.topic, 'rejected', sum(counts[r] for r in _REJECTED))
+        lost = self._new(info.topic, 'lost', received.lost)
+        ahead, behind = self._stamps(info.signal)
+        if seen.wrong_types:
+            return _wrong_type(topic, seen)
+        if received.stale(now_s):
+            return Level.STALE, f'{topic} has been silent for {received.age_s(now_s):.1f} s.'
+        if seen.right > 1:
+            return Level.WARN, (
+                f'{topic} has {seen.right} publishers; their values are mixed. Stop all but one.'
+            )
+        before, since_s = self._used.get(info.topic, (-1, now_s))
+        since_s = since_s if counts['accepted'] == before else now_s
+        self._used[info.topic] = (counts['accepted'], since_s)
+        if rejected:
+            why = self._why(info, counts)
+            if now_s - since_s > _BLIND_S:
+                blind_s = now_s - since_s
+                return Level.ERROR, f'Nothing usable has come for {blind_s:.0f} s. {why}'
+            return Level.WARN, f'{rejected} new readings were rejected. {why}'
+        if received.without_time + received.waiting == received.received:
+            return Level.ERROR, f'{topic} comes without a time; is /clock published?'
+        if ahead:
+            return Level.WARN, ahead
+        if lost:
+            return Level.WARN, f'{lost} messages of {topic} were lost on the way.'
+        hz = received.rate_hz()
+        rate = f'{hz:.0f} Hz' if hz >= 100.0 else f'{hz:.3g} Hz'
+        return Level.OK, f'{rate}; {behind}.' if behind else f'{rate}.'
+
+    def _judge_silent(
+        self, info: SignalInfo, name: str, seen: Publishers, listening_s: float
+    ) -> tuple[Level, str]:
+        topic = self._topics[name]
+        if seen.wrong_types:
+            return _wrong_type(topic, seen)
+        if name in self.mismatched:
+            return Level.ERROR, (
+                f'{topic} is published as best effort and asked for as reliable, so nothing '
+                'comes: set input_reliability to best_effort.'
+            )
+        if not info.required and not seen.right:
+            return Level.OK, f'{topic} is not sent; it is optional.'
+        if listening_s < _PATIENCE_S:
+            return Level.OK, f'Waiting for {topic}.'
+        if seen.right:
+            return Level.STALE, f'{topic} has a publisher, but nothing has come from it yet.'
+        return Level.STALE, f'Nobody publishes {topic}; remap it, or start the gateway.'
+
+    def _why(self, info: SignalInfo, counts: Mapping[str, int]) -> str:
+        """Return why readings were rejected: the last impossible value, or the reasons so far."""
+        found = self._impossible.pop(info.topic, None)
+        if found is None:
+            off_ns = self._last_ns[info.signal] - self._newest_ns
+            outliers = self._new(info.topic, 'time_outlier', counts['time_outlier'])
+            if outliers and abs(off_ns) > self._jump_ns:
+                off = duration(abs(off_ns) / NS_PER_S)
+                if off_ns > 0:
+                    return f'The last stamp is {off} ahead of the newest one used.'
+                return f'The last stamp is {off} behind the newest one used.'
+            reasons = [f'{r.replace("_", " ")} {counts[r]}' for r in _REJECTED if counts[r]]
+            return f'So far: {", ".join(reasons)}.'
+        name, value = found
+        low, high = plausible_range(info.signal, self.settings)
+        believed = f'believed: {low:g} to {high:g} {info.unit}'
+        if name == PLANT_SAMPLE:
+            return f'The last one, {value:g} {info.unit}, is impossible ({believed}).'
+        named = self.settings.text(f'{info.topic}_unit')
+        unit = unit_of(info.signal, named)
+        sent = (value - unit.offset) / unit.scale
+        text = f'The last one, {sent:g} {named}, is impossible ({believed}).'
+        fitting = [u for u in plausible_units(info.signal, self.settings, sent) if u != named]
+        if fitting:
+            text += f' Is {info.topic}_unit {" or ".join(fitting)} rather than {named}?'
+        return text
+
+    def _stamps(self, number: int) -> tuple[str, str]:
+        """Return what is wrong with the stamps since the last look, and what is only odd.
+
+        A stamp that is behind may be that of a recording which is played; none can be ahead.
+        """
+        lead_ns, self._lead_ns[number] = self._lead_ns[number], _NO_LEAD
+        if not self._by_host or lead_ns == _NO_LEAD or abs(lead_ns) <= self._jump_ns:
+            return '', ''
+        off = duration(abs(lead_ns) / NS_PER_S)
+        if lead_ns < 0:
+            return '', f"stamps are {off} behind this machine's clock"
+        return f"Stamps are up to {off} ahead of this machine's clock; set both by one server.", ''
+
+    def _new(self, topic: str, what: str, count: int) -> int:
+        """Return by how much a count has grown since the last look."""
+        last = self._counted.get((topic, what), 0)
+        self._counted[topic, what] = count
+        return max(0, count - last)
+
+
+def _wrong_type(topic: str, seen: Publishers) -> tuple[Level, str]:
+    kinds = ' and '.join(seen.wrong_types)
+    return Level.ERROR, f'{topic} is published as {kinds}, which the monitor cannot take.'
+
+
+def _speaking(
+    topic: str, statistics: Mapping[str, TopicStatistics], publishers: Mapping[str, Publishers]
+) -> str:
+    """Return the topic that feeds a signal: the one heard last, or the one that somebody has."""
+    own, stamped = statistics[topic].last_s, statistics[PLANT_SAMPLE].last_s
+    if own is None and stamped is None:
+        nobody = publishers.get(topic, Publishers()) == Publishers()
+        somebody = publishers.get(PLANT_SAMPLE, Publishers()) != Publishers()
+        return PLANT_SAMPLE if nobody and somebody else topic
+    return PLANT_SAMPLE if stamped is not None and (own is None or stamped > own) else topic
+
 
 # Somebody knows of it, or nothing can be known of it.
 _ASIDE = (AlarmState.SHELVED, AlarmState.SUPPRESSED)
@@ -23,11 +305,31 @@ _ASIDE = (AlarmState.SHELVED, AlarmState.SUPPRESSED)
 def fit_item(monitor: Monitor, worker: FitWorker, last_fit_s: float | None) -> Item:
     """Return how the curve is, and the process that fits it."""
     curve = monitor.characteristic
-    values = _fit_values(monitor, worker, last_fit_s)
+    noise = monitor.noise()
+    spread_k = age_s = None
+    if curve is not None:
+        spread_k = curve.source.temperature_spread_k
+        # The clock may have gone back behind what the curve was found from.
+        age_s = max(0.0, (monitor.last_ns - curve.source.window_end_ns) / 1e9)
+    values: dict[str, object] = {
+        'Status': monitor.status.name.lower(),
+        'Model': '' if curve is None else curve.model_id,
+        'Pieces': 0 if curve is None else len(curve.pieces),
+        'Age of the curve (s)': age_s,
+        'Special segments in the window': monitor.segments,
+        'Special samples in the window': monitor.special_samples,
+        'Samples taken': monitor.rows,
+        'Noise of the integrated input (% MPa^e)': noise.input,
+        'Noise of the power (MW)': noise.power_mw,
+        'Temperature spread (K)': math.nan if spread_k is None else spread_k,
+        'Refit under way for (s)': worker.busy_s,
+        'Last refit took (s)': last_fit_s,
+        'Fit process starts': worker.starts,
+        'Notes': '' if curve is None else ' '.join(curve.notes),
+    }
     if worker.failures_in_a_row:
-        sentence = (
-            f'{monitor.cause} {counted(worker.failures_in_a_row, "failure")} in a row.'.strip()
-        )
+        failures = counted(worker.failures_in_a_row, 'failure')
+        sentence = f'{monitor.cause} {failures} in a row.'.strip()
         return Item('fit', Level.ERROR, sentence, values)
     if curve is None:
         refused = monitor.status == CurveStatus.REFUSED
@@ -47,37 +349,6 @@ def fit_item(monitor: Monitor, worker: FitWorker, last_fit_s: float | None) -> I
         more = f' Weak points in all: {len(weak)}.' if len(weak) > 1 else ''
         return Item('fit', Level.WARN, weak[0] + more, values)
     return Item('fit', Level.OK, f'A curve of {counted(len(curve.pieces), "piece")}.', values)
-
-
-def _fit_values(
-    monitor: Monitor, worker: FitWorker, last_fit_s: float | None
-) -> dict[str, object]:
-    curve = monitor.characteristic
-    noise = monitor.noise()
-    return {
-        'Status': monitor.status.name.lower(),
-        'Model': '' if curve is None else curve.model_id,
-        'Pieces': 0 if curve is None else len(curve.pieces),
-        'Age of the curve (s)': None if curve is None else _age_s(monitor),
-        'Special segments in the window': monitor.segments,
-        'Special samples in the window': monitor.special_samples,
-        'Samples taken': monitor.rows,
-        'Noise of the integrated input (% MPa^e)': noise.input,
-        'Noise of the power (MW)': noise.power_mw,
-        'Temperature spread (K)': math.nan if curve is None else curve.source.temperature_spread_k,
-        'Refit under way for (s)': worker.busy_s,
-        'Last refit took (s)': last_fit_s,
-        'Fit process starts': worker.starts,
-        'Notes': '' if curve is None else ' '.join(curve.notes),
-    }
-
-
-def _age_s(monitor: Monitor) -> float:
-    curve = monitor.characteristic
-    if curve is None:
-        return math.nan
-    # The clock may have gone back behind what the curve was found from.
-    return max(0.0, (monitor.last_ns - curve.source.window_end_ns) / 1e9)
 
 
 def alarm_item(monitor: Monitor) -> Item:
@@ -118,28 +389,28 @@ def _count_values(alarm: Alarm) -> dict[str, object]:
 
 def reference_item(monitor: Monitor) -> Item:
     """Return how the curve stands to its reference."""
-    keeper = monitor.reference
-    if keeper.curve is None:
+    reference = monitor.reference
+    if reference.curve is None:
         return Item('reference', Level.OK, 'No reference was set (~/set_reference).')
-    shift = keeper.shift
+    shift = reference.shift
     values: dict[str, object] = {
-        'Reference': keeper.curve.model_id,
-        'Alarm': _words(keeper.alarm),
-        **_count_values(keeper.alarm),
+        'Reference': reference.curve.model_id,
+        'Alarm': _words(reference.alarm),
+        **_count_values(reference.alarm),
     }
     if shift is not None:
         sizes = [p.shift_mw for p in shift.pieces]
         values['Shift by piece (MW)'] = ', '.join(f'{size:+.2f}' for size in sizes)
         values['Shift since (s since 1970)'] = shift.since_ns // 10**9 or None
-    if keeper.problem:
-        return Item('reference', Level.WARN, keeper.problem, values)
-    level = Level.WARN if keeper.alarm.standing else Level.OK
-    if keeper.alarm.active and keeper.alarm.state not in _ASIDE:
+    if reference.problem:
+        return Item('reference', Level.WARN, reference.problem, values)
+    level = Level.WARN if reference.alarm.standing else Level.OK
+    if reference.alarm.active and reference.alarm.state not in _ASIDE:
         level = Level.ERROR
     # After a restart no curve was judged yet, and the alarm stands all the same.
     sentence = 'The next curve is judged against it.' if shift is None else shift.sentence
-    if keeper.alarm.active and (shift is None or not shift.moved):
-        spans = ' and '.join(f'u {a:.0f} to {b:.0f}' for a, b in keeper.alarm.ranges)
+    if reference.alarm.active and (shift is None or not shift.moved):
+        spans = ' and '.join(f'u {a:.0f} to {b:.0f}' for a, b in reference.alarm.ranges)
         moved = f'what moved, {spans}, is not judged unmoved yet' if spans else 'doubt is left'
         sentence = f'The alarm stands: {moved}. {sentence}'
     return Item('reference', level, sentence, values)
@@ -174,9 +445,6 @@ def recorder_item(recording: Recording) -> Item:
             values,
         )
     return Item('recorder', Level.OK, 'Recording.', values)
-
-
-# How well the model fits, and how the diagnoses go: an item each.
 
 
 def model_item(monitor: Monitor) -> Item:

@@ -1,4 +1,4 @@
-"""One look at all inputs: take, put in order, give each message its times."""
+"""The inputs: messages are taken, put in one order, and given the times they belong to."""
 
 from __future__ import annotations
 
@@ -8,13 +8,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-from rosgraph_msgs.msg import Clock
-
-from valveflow_ros.ros.inputs import INPUT_ORDER, PLANT_SAMPLE, Decoder, Row, header_time_ns
-from valveflow_ros.ros.polled_subscription import DEPTH, Taken
-
-# Which time a value belongs to, and which time a message is logged at.
-
+from valveflow_ros.ros.decoding import INPUT_ORDER, PLANT_SAMPLE, Decoder, Row, header_time_ns
+from valveflow_ros.ros.polled_subscription import DEPTH, RawMessage
 
 _CLOCKS_KEPT = 16384
 
@@ -41,7 +36,7 @@ class LogClock:
 
 
 class ClockTrack:
-    """Remembers /clock, to say what it showed when a value was published.
+    """Remembers /clock, to tell what it showed when a value was published.
 
     Both times used are the publisher's, so a value and the clock message sent
     just before it belong together however late either is taken.
@@ -84,17 +79,16 @@ class ClockTrack:
         return self._clock_ns[at - 1] if at else 0
 
 
-# Account of what arrived on one topic: how often, how lately, and what was lost on the way.
-
-
 _STALE_LEAST_S = 2.0
 _STALE_PERIODS = 2.5
 _MEMORY = 0.1  # weight of the newest interval in the mean period
 
 
 @dataclass(slots=True)
-class Tally:
-    """Counts and times of one topic; times by a clock that never goes back.
+class TopicStatistics:
+    """What arrived on one topic: how often, when last, and what was lost on the way.
+
+    Times are by a clock that never goes back.
 
     Attributes
     ----------
@@ -182,17 +176,15 @@ class Tally:
         return 1.0 / self.period_s if self.period_s else 0.0
 
     def stale(self, now_s: float) -> bool:
-        """Tell whether a topic that spoke has fallen silent."""
+        """Return True if messages came once and come no more."""
         age = self.age_s(now_s)
         return age is not None and age > max(_STALE_LEAST_S, _STALE_PERIODS * (self.period_s or 0))
 
 
-__all__ = ['Arrival', 'Clock', 'Intake']
-
 _MOST_CLOCKS = 16 * DEPTH
 # So many plain values wait for the first /clock, and so long: what waits is not on disk yet.
-MOST_EARLY = 16 * DEPTH
-EARLY_S = 5.0
+MAX_WAITING = 16 * DEPTH
+LONGEST_WAIT_S = 5.0
 _PATIENCE_S = 0.03
 _CLOCK_PATIENCE_S = 0.2
 # A message may get its receipt time a moment before it can be taken.
@@ -215,13 +207,13 @@ class _Held(NamedTuple):
     order: int
     taken_s: float
     name: str
-    taken: Taken
+    message: RawMessage
 
 
 class Source(Protocol):
-    """Something messages can be taken from."""
+    """Something that messages can be taken from."""
 
-    def take(self, most: int = DEPTH) -> list[Taken]:
+    def take(self, most: int = DEPTH) -> list[RawMessage]:
         """Return what has arrived."""
 
 
@@ -240,21 +232,19 @@ class Intake:
     clock : Source, optional
         /clock; if given, it gives every plain value its time.
     watch : callable
-        Is shown the readings of each message, with the topic's name.
+        Is called with the topic's name and the readings of each message.
 
     Notes
     -----
-    Topics are looked at one after the other, and while a plant runs faster than
-    real time a later one would be ahead of an earlier one by many samples. So a
-    look gives only what was received before it began, and keeps the rest for
-    the next one. With a /clock a value waits until a clock message is there that
-    was sent after it, so that none sent before it can still be on its way; if
-    none comes, it does not wait for long.
+    Topics are polled one after the other, and while a plant runs faster than real time a later
+    one would be ahead of an earlier one by many samples. So a look gives only what was received
+    before it began, and keeps the rest for the next one. With a /clock a value waits, not for
+    long, until a clock message is there that was sent after it.
 
-    What is sent before the very first clock message has no time yet. It waits for
-    that message, and is put before its time by as much as it was sent earlier. After
-    `EARLY_S`, or where more than `MOST_EARLY` wait, the oldest wait no longer and
-    are logged without a time, which is 0, and not fed.
+    What is sent before the very first clock message has no time yet. It waits for that message,
+    and gets a time that is earlier by as much as it was sent earlier. After `LONGEST_WAIT_S`, or
+    where more than `MAX_WAITING` wait, the oldest are logged without a time, which is 0, and not
+    fed.
     """
 
     def __init__(
@@ -275,9 +265,8 @@ class Intake:
         self._watch = watch
         self._track = ClockTrack()
         self._held: list[_Held] = []
-        self._early: deque[_Held] = deque()
-        self.tallies = {name: Tally() for name in self._sources}
-        self.clock_tally = Tally()
+        self._waiting: deque[_Held] = deque()
+        self.statistics = {name: TopicStatistics() for name in self._sources}
 
     def collect(self, now_s: float, now_ns: int, last: bool = False) -> list[Arrival]:
         """Return the arrivals of this look.
@@ -296,10 +285,10 @@ class Intake:
             found = source.take()
             if not found:
                 continue
-            tally = self.tallies[name]
-            tally.note_arrival(len(found), now_s)
+            statistics = self.statistics[name]
+            statistics.note_arrival(len(found), now_s)
             for taken in found:
-                tally.note_number(taken.sequence)
+                statistics.note_number(taken.sequence)
                 received_ns = taken.received_ns or now_ns
                 held = _Held(received_ns, INPUT_ORDER[name], now_s, name, taken)
                 self._hold(held)
@@ -307,8 +296,8 @@ class Intake:
                 # More is waiting there, received after the last of these.
                 until_ns = min(until_ns, received_ns)
         if self._clock is not None:
-            self._follow_clock(self._clock, now_s)
-            self._let_go(now_s, last)
+            self._follow_clock(self._clock)
+            self._release(now_s, last)
         if not self._held:
             return []
         # By topic within one receipt time; a topic's own messages stay in their order.
@@ -325,17 +314,17 @@ class Intake:
         if self._clock is None or self._track.newest_ns or held.name == PLANT_SAMPLE:
             self._held.append(held)
             return
-        self._early.append(held)
-        self.tallies[held.name].waiting += 1
+        self._waiting.append(held)
+        self.statistics[held.name].waiting += 1
 
-    def _let_go(self, now_s: float, last: bool) -> None:
+    def _release(self, now_s: float, last: bool) -> None:
         """End the wait for the first clock message: it has come, or they waited long enough."""
-        most = 0 if last or self._track.newest_ns else MOST_EARLY
-        while self._early and (
-            len(self._early) > most or now_s - self._early[0].taken_s > EARLY_S
+        most = 0 if last or self._track.newest_ns else MAX_WAITING
+        while self._waiting and (
+            len(self._waiting) > most or now_s - self._waiting[0].taken_s > LONGEST_WAIT_S
         ):
-            held = self._early.popleft()
-            self.tallies[held.name].waiting -= 1
+            held = self._waiting.popleft()
+            self.statistics[held.name].waiting -= 1
             self._held.append(held)
 
     def _due(self, held: _Held, until_ns: int, now_s: float) -> bool:
@@ -343,7 +332,7 @@ class Intake:
         if self._clock is None:
             # Should the machine's clock have been set back, nothing waits for it.
             return held.received_ns <= until_ns or waited_s > _PATIENCE_S
-        ready = held.received_ns <= until_ns and held.taken.source_ns < self._track.newest_ns
+        ready = held.received_ns <= until_ns and held.message.source_ns < self._track.newest_ns
         return ready or waited_s > _CLOCK_PATIENCE_S
 
     def rows(self, arrivals: list[Arrival]) -> list[Row]:
@@ -351,40 +340,37 @@ class Intake:
         rows: list[Row] = []
         for arrival in arrivals:
             if arrival.time_ns <= 0:
-                self.tallies[arrival.name].without_time += 1
+                self.statistics[arrival.name].without_time += 1
                 continue
             try:
                 found = self._decoder.rows(arrival.name, arrival.data, arrival.time_ns)
             except ValueError:
-                self.tallies[arrival.name].malformed += 1
+                self.statistics[arrival.name].malformed += 1
                 continue
             self._watch(arrival.name, found)
             rows += found
         return rows
 
-    def _follow_clock(self, clock: Source, now_s: float) -> None:
-        found = clock.take(_MOST_CLOCKS)
-        self.clock_tally.note_arrival(len(found), now_s)
-        for taken in found:
-            self.clock_tally.note_number(taken.sequence)
-            self._track.note(taken.source_ns, header_time_ns(taken.data))
+    def _follow_clock(self, clock: Source) -> None:
+        for message in clock.take(_MOST_CLOCKS):
+            self._track.note(message.source_ns, header_time_ns(message.data))
 
     def _arrival(self, held: _Held) -> Arrival:
-        received_ns, name, taken = held.received_ns, held.name, held.taken
+        received_ns, name, message = held.received_ns, held.name, held.message
         if self._clock is not None:
-            time_ns = self._clock_time(name, taken)
+            time_ns = self._clock_time(name, message)
         elif self._by_receipt:
             time_ns = received_ns
         else:
-            time_ns = taken.source_ns or received_ns
-        time_ns = max(0, self._decoder.time_ns(name, taken.data, time_ns))
-        return Arrival(name, taken.data, self._log_clock.stamp(received_ns), time_ns)
+            time_ns = message.source_ns or received_ns
+        time_ns = max(0, self._decoder.time_ns(name, message.data, time_ns))
+        return Arrival(name, message.data, self._log_clock.stamp(received_ns), time_ns)
 
-    def _clock_time(self, name: str, taken: Taken) -> int:
+    def _clock_time(self, name: str, message: RawMessage) -> int:
         """Return what the clock showed when a message was sent, 0 while that is not known."""
-        lead_ns = self._track.lead_ns(taken.source_ns)
+        lead_ns = self._track.lead_ns(message.source_ns)
         if not lead_ns:
-            return self._track.at(taken.source_ns)
+            return self._track.at(message.source_ns)
         if name != PLANT_SAMPLE:
-            self.tallies[name].before_clock += 1
+            self.statistics[name].before_clock += 1
         return max(0, self._track.first_ns - lead_ns)

@@ -1,38 +1,165 @@
-"""The node: lifecycle, parameters and services, wired to a session."""
+"""The node: lifecycle, parameters and services wired to a session, its loop and its watchdog."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import gc
+import os
+import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from valveflow_ros.errors import ParameterError, ValveflowError, counted
+from valveflow_ros.logs import RecorderState, RecorderStatus
 from valveflow_ros.parameters import Settings
 from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.ros import declare
-from valveflow_ros.ros.conversions import encode
-from valveflow_ros.ros.diagnostics import Changes, Item, Level, array
+from valveflow_ros.ros.domain import Presence
+from valveflow_ros.ros.encoding import encode
+from valveflow_ros.ros.node.diagnostics import Changes, Item, Level, diagnostics_message
+from valveflow_ros.ros.node.recording import check_record_directory
 from valveflow_ros.ros.node.session import DIAGNOSTICS, Session
-from valveflow_ros.ros.process import with_place
-from valveflow_ros.ros.record_place import check_record_place
-from valveflow_ros.ros.services import SERVICES
+from valveflow_ros.ros.outputs import SERVICES
+from valveflow_ros.ros.process import StopFlag, with_place
 
 _SUCCESS = TransitionCallbackReturn.SUCCESS
 _LOOK_AROUND_S = 5.0
 _NOT_RUNNING = 'The monitor is not active; activate it first.'
-
+# A look costs the same for one message as for ten, and a plant is in no hurry. Where much comes,
+# as from a replay, the next look follows at once.
+_PERIOD_S = 0.02
+_MUCH = 50
+# Services may wait that long; a look of the executor costs as much as forty messages.
+_SPIN_EVERY_S = 0.1
+# The compiler works when a configuration runs for the first time, and an activation may feed what
+# an earlier run recorded.
+_LONGEST_START_S = 600.0
+# A recorder that has been at one step for longer is not counted on.
+_STALL_S = 1.0
 
 _Transition = Callable[['MonitorNode', LifecycleState], TransitionCallbackReturn]
 
 
-def _spoken(transition: _Transition) -> _Transition:
+class Watchdog:
+    """Tells systemd how the process is, by the notify protocol, sd_notify(3).
+
+    Where `NOTIFY_SOCKET` is not set nothing is ever sent. Pings are sent at twice the rate that
+    `WATCHDOG_USEC` asks for, and only by `completed`: whoever calls it has just finished a cycle.
+
+    Parameters
+    ----------
+    environ : mapping, optional
+        Where the names of the protocol are looked up; the process's own by default.
+    clock : callable
+        Seconds by a clock that never goes back.
+
+    Attributes
+    ----------
+    period_s : float
+        Time between pings, 0 if none are asked for.
+    stall_s : float
+        How long a recorder may be at one step and still count as alive.
+    """
+
+    def __init__(
+        self,
+        environ: Mapping[str, str] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        environ = os.environ if environ is None else environ
+        self._clock = clock
+        name = environ.get('NOTIFY_SOCKET', '')
+        # An @ stands for the abstract namespace.
+        abstract = name.startswith('@') and len(name) > 1
+        self._address = os.fsencode(f'\0{name[1:]}' if abstract else name)
+        usec = environ.get('WATCHDOG_USEC', '')
+        valid = usec.isascii() and usec.isdigit() and len(usec) < 19
+        own = environ.get('WATCHDOG_PID', '') in ('', str(os.getpid()))
+        if not (abstract or name.startswith('/')):
+            self._address = b''
+        self._usec = int(usec) if valid and own and self._address else 0
+        self.period_s = self._usec / 2e6
+        self.stall_s = min(_STALL_S, self.period_s)
+        self._next_s = 0.0
+
+    def ready(self, status: str) -> None:
+        """Tell that the start is done."""
+        self._send(f'READY=1\nSTATUS={_one_line(status)}\nWATCHDOG=1')
+
+    def status(self, status: str) -> None:
+        """Tell in a sentence what the process is doing."""
+        self._send(f'STATUS={_one_line(status)}')
+
+    def stopping(self, status: str) -> None:
+        """Tell that the end has begun."""
+        self._send(f'STOPPING=1\nSTATUS={_one_line(status)}')
+
+    def completed(self, recorder: Callable[[], RecorderStatus | None]) -> None:
+        """Ping, if it is time, after a cycle that came to its end.
+
+        Parameters
+        ----------
+        recorder : callable
+            Returns the status of the recorder, None where none is to be at work. It is asked
+            only when a ping is due, and none is sent while the recorder is stuck.
+        """
+        now_s = self._clock()
+        if not self._usec or now_s < self._next_s:
+            return
+        # What the manager did not take is sent again after the next cycle.
+        if recorder_lives(recorder(), self.stall_s) and self._send('WATCHDOG=1'):
+            self._next_s = now_s + self.period_s
+
+    @contextlib.contextmanager
+    def patient(self, limit_s: float) -> Iterator[None]:
+        """Give one piece of work more time than a cycle has; afterwards the old limit holds."""
+        if self._usec:
+            self._send(f'WATCHDOG_USEC={max(self._usec, round(limit_s * 1e6))}\nWATCHDOG=1')
+        try:
+            yield
+        finally:
+            if self._usec:
+                self._send(f'WATCHDOG_USEC={self._usec}\nWATCHDOG=1')
+
+    def _send(self, text: str) -> bool:
+        if not self._address:
+            return False
+        # A manager that does not take a datagram at once must not hold up the loop.
+        kind = socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK
+        try:
+            with socket.socket(socket.AF_UNIX, kind) as channel:
+                channel.sendto(text.encode(), self._address)
+        except OSError:
+            return False
+        return True
+
+
+def _one_line(text: str) -> str:
+    """Return a text without line breaks, as each would begin another assignment."""
+    return ' '.join(text.split())
+
+
+def recorder_lives(status: RecorderStatus | None, stall_s: float) -> bool:
+    """Return False if only a new process can help the recorder.
+
+    One that keeps trying on a full disk is alive. One whose thread has ended, or has not come
+    back from a step for longer than ``stall_s``, is not.
+    """
+    if status is None:
+        return True
+    return status.state != RecorderState.STOPPED and status.stalled_s <= stall_s
+
+
+def _logged(transition: _Transition) -> _Transition:
     """Log what goes wrong in a transition; rclpy alone would swallow it."""
 
     @functools.wraps(transition)
@@ -41,7 +168,7 @@ def _spoken(transition: _Transition) -> _Transition:
             return transition(node, state)
         except ValveflowError as error:
             node.get_logger().error(str(error))
-        except Exception as error:  # noqa: BLE001 - whatever it is, it is to be heard
+        except Exception as error:  # noqa: BLE001 - whatever it is, it must be logged
             node.get_logger().error(f'The monitor failed unexpectedly: {with_place(error)}')
         return TransitionCallbackReturn.FAILURE
 
@@ -54,7 +181,8 @@ class MonitorNode(LifecycleNode):
     Parameters
     ----------
     stop : callable
-        Tells whether the process was asked to end.
+        Returns True if the process was asked to end.
+    watchdog : Watchdog, optional
 
     Raises
     ------
@@ -62,96 +190,102 @@ class MonitorNode(LifecycleNode):
         The parameters given at the start cannot be used.
     """
 
-    def __init__(self, stop: Callable[[], bool] = lambda: False, **options: Any) -> None:
+    def __init__(
+        self,
+        stop: Callable[[], bool] = lambda: False,
+        watchdog: Watchdog | None = None,
+        **options: Any,
+    ) -> None:
         super().__init__('valveflow_monitor', **options)
         self._stop = stop
+        self._watchdog = watchdog or Watchdog({})
         self.session: Session | None = None
         self.finalized = False
         self._next_diagnostics_s = 0.0
         self._changes = Changes()
-        self._look_around_s, self._alike = 0.0, 1
+        self._look_around_s, self._same_name = 0.0, 1
         self.settings = Settings(declare.declare(self))
         self._ignored = declare.unknown_overrides(self)
-        self.add_on_set_parameters_callback(self._judge)
-        self.add_post_set_parameters_callback(self._take)
+        self.add_on_set_parameters_callback(self._check)
+        self.add_post_set_parameters_callback(self._apply)
         self._health = self.create_publisher(DiagnosticArray, DIAGNOSTICS, 10)
-        works = (
-            self._refit, self._acknowledge, self._shelve, self._unshelve, self._set_reference,
-            self._diagnose,
-        )  # fmt: skip
-        self._offered = [
-            self.create_service(Trigger, f'~/{name}', self._service(work))
-            for name, work in zip(SERVICES, works, strict=True)
+        self._trigger_services = [
+            self.create_service(Trigger, f'~/{name}', functools.partial(self._serve, name))
+            for name in SERVICES
         ]
 
     # Parameters
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set parameters; refuse with the table's own sentence."""
-        result = self._judge(parameter_list)
+        result = self._check(parameter_list)
         return super().set_parameters_atomically(parameter_list) if result.successful else result
 
-    def _judge(self, wanted: list[Parameter]) -> SetParametersResult:
+    def _check(self, wanted: list[Parameter]) -> SetParametersResult:
         try:
             declare.changed(self.settings, wanted)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def _take(self, wanted: list[Parameter]) -> None:
+    def _apply(self, wanted: list[Parameter]) -> None:
         self.settings = declare.changed(self.settings, wanted)
         if self.session is not None:
             self.session.reconfigure(self.settings)
 
     # Lifecycle
 
-    @_spoken
+    @_logged
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start the fit process, compile, open the recording."""
-        del state
         log = self.get_logger()
-        try:
-            check_record_place(self.settings)
-        except ValveflowError as error:
-            # Known before the long work, for whoever watches the start; the unit is watched all
-            # the same.
-            log.warning(str(error))
-        begun_s = time.monotonic()
-        log.info(SENTENCE if is_first_run() else 'Loading the engine.')
-        self.session = session = Session(self, self.settings, self._stop, self._log)
-        log.info(f'Ready after {time.monotonic() - begun_s:.1f} s of loading and compiling.')
-        if session.recording.problem:
-            log.warning(session.recording.problem)
+        with self._watchdog.patient(_LONGEST_START_S):
+            try:
+                check_record_directory(self.settings)
+            except ValveflowError as error:
+                # Known before the long work, for whoever watches the start; the unit is watched
+                # all the same.
+                log.warning(str(error))
+            begun_s = time.monotonic()
+            log.info(SENTENCE if is_first_run() else 'Loading the engine.')
+            self.session = session = Session(self, self.settings, self._stop, self._log)
+            log.info(f'Ready after {time.monotonic() - begun_s:.1f} s of loading and compiling.')
+            if session.recording.problem:
+                log.warning(session.recording.problem)
         return _SUCCESS
 
-    @_spoken
+    @_logged
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Listen."""
-        del state
-        assert self.session is not None
-        self.session.listen()
-        self.get_logger().info(self._introduction(self.session))
+        """Subscribe to the inputs."""
+        session = self.session
+        assert session is not None
+        with self._watchdog.patient(_LONGEST_START_S):
+            session.subscribe()
+        folder = session.recording.folder
+        self.get_logger().info(
+            f'{self.settings.text("unit_tag")}: listening to {", ".join(session.inputs.values())} '
+            f'({self.settings.text("input_reliability")}), publishing below '
+            f'{self.get_fully_qualified_name()}/; '
+            f'{f"recording to {folder}" if session.recording.on else "not recording"}.'
+        )
         return _SUCCESS
 
-    @_spoken
+    @_logged
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop listening; the curve and the alarm stay."""
-        del state
+        """Unsubscribe; the curve and the alarm stay."""
         assert self.session is not None
-        self.session.hush()
+        self.session.unsubscribe()
         return _SUCCESS
 
-    @_spoken
+    @_logged
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Finish the recording and forget everything."""
-        del state
         self.end_session()
         return _SUCCESS
 
-    @_spoken
+    @_logged
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Finish the recording; the process ends afterwards."""
-        del state
         self.end_session()
         self.finalized = True
         return _SUCCESS
@@ -169,16 +303,6 @@ class MonitorNode(LifecycleNode):
         if status is not None and session.recording.problem:
             self.get_logger().error(session.recording.problem)
 
-    def _introduction(self, session: Session) -> str:
-        settings = self.settings
-        folder = session.recording.folder
-        return (
-            f'{settings.text("unit_tag")}: listening to {", ".join(session.inputs.values())} '
-            f'({settings.text("input_reliability")}), publishing below '
-            f'{self.get_fully_qualified_name()}/; '
-            f'{f"recording to {folder}" if session.recording.on else "not recording"}.'
-        )
-
     # What the loop calls
 
     def step(self) -> int:
@@ -187,17 +311,21 @@ class MonitorNode(LifecycleNode):
         now_s = time.monotonic()
         if now_s >= self._next_diagnostics_s:
             self._next_diagnostics_s = now_s + self.settings.real('diagnostics_period')
-            self._say_health(now_s)
+            self._publish_health(now_s)
         return found
 
-    def _say_health(self, now_s: float) -> None:
+    def recorder_status(self) -> RecorderStatus | None:
+        """Return the status of the recorder, None where none is at work."""
+        return None if self.session is None else self.session.recording.status()
+
+    def _publish_health(self, now_s: float) -> None:
         session = self.session
         if session is None:
             items = [Item('fit', Level.STALE, 'The monitor is not configured.')]
         else:
-            items = [*session.items(), *self.misspelt(), *self.namesakes(now_s)]
+            items = [*session.items(), *self.unknown_parameters(), *self.same_name(now_s)]
         now_ns = time.time_ns()
-        data = encode(array(items, self.settings.text('unit_tag'), now_ns))
+        data = encode(diagnostics_message(items, self.settings.text('unit_tag'), now_ns))
         self._health.publish(data)
         if session is not None:
             session.record(DIAGNOSTICS, data, now_ns)
@@ -209,28 +337,28 @@ class MonitorNode(LifecycleNode):
         for (level, sentence), names in alike.items():
             self._log(level, f'{", ".join(names)}: {sentence}')
 
-    def misspelt(self) -> list[Item]:
-        """Return an item if a parameter was given that there is not, else nothing."""
+    def unknown_parameters(self) -> list[Item]:
+        """Return an item if a parameter was given that does not exist, else nothing."""
         if not self._ignored:
             return []
         # It stands in the health too: whoever set it takes it to be in force.
         sentence = f'{" ".join(self._ignored)} Ignored.'
         return [Item('parameters', Level.WARN, sentence, {'Ignored': len(self._ignored)})]
 
-    def namesakes(self, now_s: float) -> list[Item]:
+    def same_name(self, now_s: float) -> list[Item]:
         """Return an item if another node of the domain bears this one's name, else nothing."""
         if now_s >= self._look_around_s:
             self._look_around_s = now_s + _LOOK_AROUND_S
             own = (self.get_name(), self.get_namespace())
-            self._alike = sum(found == own for found in self.get_node_names_and_namespaces())
-        if self._alike < 2:
+            self._same_name = sum(found == own for found in self.get_node_names_and_namespaces())
+        if self._same_name < 2:
             return []
         sentence = (
-            f'{self._alike} nodes are called {self.get_fully_qualified_name()}: topics are mixed, '
-            'and a service or a parameter reaches all of them. Give each a namespace or a '
+            f'{self._same_name} nodes are called {self.get_fully_qualified_name()}: topics are '
+            'mixed, and a service or a parameter reaches all of them. Give each a namespace or a '
             'ROS_DOMAIN_ID of its own.'
         )
-        return [Item('name', Level.ERROR, sentence, {'Nodes of this name': self._alike})]
+        return [Item('name', Level.ERROR, sentence, {'Nodes of this name': self._same_name})]
 
     def _log(self, level: Level, text: str) -> None:
         # One call each: rclpy ties a severity to the place it is called from.
@@ -243,50 +371,83 @@ class MonitorNode(LifecycleNode):
 
     # Services
 
-    def _service(self, work: Callable[[Session], str]) -> Callable[..., Trigger.Response]:
-        """Return a service that does some work and always answers with a sentence."""
-
-        def serve(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            response.success = False
-            session = self.session
-            if session is None or not session.listening:
-                response.message = _NOT_RUNNING
-                return response
-            try:
-                response.message = work(session)
-                response.success = True
-            except ValveflowError as error:
-                response.message = str(error)
+    def _serve(
+        self, name: str, _request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        """Do what a service asks for; the answer is always a sentence."""
+        response.success = False
+        session = self.session
+        if session is None or not session.listening:
+            response.message = _NOT_RUNNING
             return response
+        try:
+            response.message = self._answer(name, session)
+            response.success = True
+        except ValveflowError as error:
+            response.message = str(error)
+        return response
 
-        return serve
-
-    def _refit(self, session: Session) -> str:
-        session.tell(session.engine.request_fit())
-        return 'A refit was started; the curve follows on ~/characteristic.'
-
-    def _acknowledge(self, session: Session) -> str:
-        session.tell(session.engine.acknowledge())
-        return 'The alarm is acknowledged.'
-
-    def _shelve(self, session: Session) -> str:
-        session.tell(session.engine.shelve())
-        hours = self.settings.real('alarm_shelve_time') / 3600.0
-        return (
-            f'The standing alarms are put aside for {hours:g} h; then they come back by '
-            'themselves if their cause is still there. New alarms are not hidden.'
-        )
-
-    def _unshelve(self, session: Session) -> str:
-        session.tell(session.engine.unshelve())
-        return 'The alarms are no longer put aside.'
-
-    def _set_reference(self, session: Session) -> str:
-        session.tell(session.engine.set_reference())
-        curve = session.engine.monitor.reference.curve
+    def _answer(self, name: str, session: Session) -> str:
+        monitor, engine = session.engine.monitor, session.engine
+        if name == 'refit':
+            session.publish(engine.request_fit())
+            return 'A refit was started; the curve follows on ~/characteristic.'
+        if name == 'diagnose':
+            session.publish(engine.request_diagnosis())
+            return 'A diagnosis was started; the result follows on ~/diagnosis.'
+        if name == 'acknowledge_alarms':
+            session.publish(monitor.acknowledge())
+            return 'The alarm is acknowledged.'
+        if name == 'shelve_alarms':
+            session.publish(monitor.shelve())
+            hours = self.settings.real('alarm_shelve_time') / 3600.0
+            return (
+                f'The standing alarms are put aside for {hours:g} h; then they come back by '
+                'themselves if their cause is still there. New alarms are not hidden.'
+            )
+        if name == 'unshelve_alarms':
+            session.publish(monitor.unshelve())
+            return 'The alarms are no longer put aside.'
+        session.publish(monitor.set_reference())
+        curve = monitor.reference.curve
         assert curve is not None
         return f'Curve {curve.model_id} is the reference that later ones are judged against.'
 
-    def _diagnose(self, session: Session) -> str:
-        session.tell(session.engine.request_diagnosis())
-        return 'A diagnosis was started; the result follows on ~/diagnosis.'
+
+def run(stop: StopFlag, presence: Presence) -> int:
+    """Watch until the process is asked to stop; return the exit status."""
+    if stop:
+        return 0
+    watchdog = Watchdog()
+    node = MonitorNode(lambda: bool(stop), watchdog, context=presence.settle())
+    presence.end()
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    try:
+        watchdog.status('Loading and compiling.')
+        if node.settings.flag('autostart'):
+            for transition in (node.trigger_configure, node.trigger_activate):
+                if transition() != _SUCCESS:
+                    return 0 if stop else 1
+        watchdog.ready('Listening.' if node.session else 'Waits to be configured.')
+        # What is there now stays: the collector need not go through the compiler's objects again
+        # and again.
+        gc.collect()
+        gc.freeze()
+        spin_s = 0.0
+        while not stop and not node.finalized and node.context.ok():
+            begun_s = time.monotonic()
+            found = node.step()
+            if begun_s >= spin_s:
+                spin_s = begun_s + _SPIN_EVERY_S
+                executor.spin_once(timeout_sec=0)
+            # Taken, fed, handed to the recorder: only a whole cycle counts.
+            watchdog.completed(node.recorder_status)
+            if found < _MUCH:
+                time.sleep(max(0.0, begun_s + _PERIOD_S - time.monotonic()))
+        return 0
+    finally:
+        watchdog.stopping('Finishing the recording.')
+        node.end_session()
+        executor.shutdown(timeout_sec=0.5)
+        node.destroy_node()

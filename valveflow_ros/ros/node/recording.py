@@ -1,8 +1,9 @@
-"""The recording of a run: where it lies, what it holds, and that it never disturbs the run."""
+"""The recording of a run: where it is, what it holds, and that it never disturbs the run."""
 
 from __future__ import annotations
 
 import json
+import os
 import queue
 import re
 import threading
@@ -22,7 +23,7 @@ from valveflow_ros.logs import (
 )
 from valveflow_ros.logs.part_file import PART_SUFFIX, make_folder
 from valveflow_ros.parameters import Settings
-from valveflow_ros.ros.diagnostics import Level
+from valveflow_ros.ros.node.diagnostics import Level
 
 DEFAULT_FOLDER = 'valveflow_recordings'
 PARAMETERS = 'parameters.json'
@@ -36,14 +37,8 @@ def tag_of(settings: Settings) -> str:
     return re.sub(r'[^A-Za-z0-9_-]+', '-', settings.text('unit_tag'))[:60] or 'unit'
 
 
-def at_home(name: str) -> Path:
-    """Return a folder a parameter names, ``~`` replaced.
-
-    Raises
-    ------
-    RecordingError
-        There is no such user.
-    """
+def expand_home(name: str) -> Path:
+    """Return a folder with ``~`` replaced; raises `RecordingError` if that user is not there."""
     try:
         return Path(name).expanduser()
     except RuntimeError:
@@ -51,14 +46,8 @@ def at_home(name: str) -> Path:
 
 
 def new_folder(settings: Settings, at_s: float) -> Path:
-    """Make and return a folder that no other run records into.
-
-    Raises
-    ------
-    RecordingError
-        It cannot be made.
-    """
-    parent = at_home(settings.text('record_directory') or DEFAULT_FOLDER)
+    """Make a folder that no other run records into; raises `RecordingError` if it cannot be."""
+    parent = expand_home(settings.text('record_directory') or DEFAULT_FOLDER)
     stem = time.strftime('valveflow_%Y%m%dT%H%M%SZ', time.gmtime(at_s)) + f'_{tag_of(settings)}'
     try:
         make_folder(parent)
@@ -73,6 +62,29 @@ def new_folder(settings: Settings, at_s: float) -> Path:
         reason = (error.strerror or str(error)).lower()
         raise RecordingError(parent, f'cannot be made ({reason})') from None
     raise RecordingError(parent, f"holds {_MOST_NAMES} folders called '{stem}' already")
+
+
+def check_record_directory(settings: Settings) -> None:
+    """Refuse a ``record_directory`` that cannot be made or written into; make nothing.
+
+    Raises
+    ------
+    RecordingError
+        With the reason, and what to do.
+    """
+    if not settings.flag('record'):
+        return
+    folder = expand_home(settings.text('record_directory') or DEFAULT_FOLDER)
+    advice = 'set record_directory to a folder this user may write into, or record to false'
+    place = folder.absolute()
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    if not place.is_dir():
+        raise RecordingError(folder, f"cannot be made: '{place}' is not a folder; {advice}")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise RecordingError(
+            folder, f"cannot be made: '{place}' may not be written into; {advice}"
+        )
 
 
 class Recording:
@@ -135,12 +147,12 @@ class Recording:
 
     @property
     def on(self) -> bool:
-        """Tell whether there is a recorder at work."""
+        """Return True if there is a recorder at work."""
         return self._recorder is not None
 
     @property
     def whole(self) -> bool:
-        """Tell whether everything handed in is on disk or on its way there."""
+        """Return True if everything handed in is on disk or on its way there."""
         status = self.status()
         if status is None or status.state != RecorderState.RECORDING:
             return False
@@ -168,11 +180,11 @@ class Recording:
             self._give_up(str(error))
 
     def status(self) -> RecorderStatus | None:
-        """Return the recorder's account, None without one."""
+        """Return the recorder's status, None without one."""
         return None if self._recorder is None else self._recorder.status()
 
     def settled(self) -> Callable[[], bool]:
-        """Return what tells whether all messages handed in up to now are on disk or lost."""
+        """Return what tells whether all messages up to now are on disk or lost."""
         recorder = self._recorder
         if recorder is None:
             return lambda: True
@@ -204,16 +216,13 @@ def _json(content: Mapping[str, Any]) -> bytes:
     return json.dumps(content, indent=2, sort_keys=True).encode()
 
 
-# Finishes in the background what runs that died left unfinished.
-
-
-class Leftovers:
-    """Looks once through this unit's other recordings; a living recorder's files stay.
+class BackgroundRecovery:
+    """Recovers this unit's unfinished recordings once, in a thread; a live recorder's files stay.
 
     Parameters
     ----------
     own : Path
-        The recording at hand, which is seen to by its own recorder.
+        The recording of this run.
     tag : str
         The unit's part of the folders' names; those of other units are theirs.
     """
@@ -221,14 +230,14 @@ class Leftovers:
     def __init__(self, own: Path, tag: str) -> None:
         self._own = own
         self._mine = re.compile(rf'valveflow_\d{{8}}T\d{{6}}Z_{re.escape(tag)}(_\d+)?')
-        self._news: queue.SimpleQueue[tuple[Level, str]] = queue.SimpleQueue()
-        threading.Thread(target=self._run, name='leftovers', daemon=True).start()
+        self._reports: queue.SimpleQueue[tuple[Level, str]] = queue.SimpleQueue()
+        threading.Thread(target=self._run, name='recovery', daemon=True).start()
 
-    def news(self) -> list[tuple[Level, str]]:
-        """Return what there is to say since the last time, each with how grave it is."""
+    def reports(self) -> list[tuple[Level, str]]:
+        """Return what was recovered since the last call, each with its level."""
         found: list[tuple[Level, str]] = []
-        while not self._news.empty():
-            found.append(self._news.get())
+        while not self._reports.empty():
+            found.append(self._reports.get())
         return found
 
     def _run(self) -> None:
@@ -242,13 +251,11 @@ class Leftovers:
             try:
                 reports = recover_leftovers(folder)
             except ValveflowError as error:
-                self._news.put((Level.WARN, str(error)))
+                self._reports.put((Level.WARN, str(error)))
                 continue
             for report in reports:
-                self._news.put(
-                    (
-                        Level.OK,
-                        f'{report.out} was left unfinished by an earlier run and is whole now: '
-                        f'{report.messages} messages.',
-                    )
+                sentence = (
+                    f'{report.out} was left unfinished by an earlier run and is whole now: '
+                    f'{report.messages} messages.'
                 )
+                self._reports.put((Level.OK, sentence))

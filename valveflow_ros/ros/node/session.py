@@ -1,4 +1,4 @@
-"""One run of the monitor, from configure to clean-up: inputs, engine, outputs, recording."""
+"""One run of the monitor from configure to clean-up: inputs, engine, outputs, recording."""
 
 from __future__ import annotations
 
@@ -10,26 +10,25 @@ from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 
 from valveflow_ros.logs import RecorderStatus
 from valveflow_ros.monitoring.events import Event
 from valveflow_ros.parameters import Settings
-from valveflow_ros.ros.diagnostics import Item, Level, line_of
-from valveflow_ros.ros.inputs import INPUTS, Decoder
-from valveflow_ros.ros.node import given_files, health, input_health
-from valveflow_ros.ros.node.given_files import reference_of
-from valveflow_ros.ros.node.input_health import InputHealth
-from valveflow_ros.ros.node.intake import Clock, Intake, LogClock
-from valveflow_ros.ros.node.live import LiveEngine
-from valveflow_ros.ros.node.recording import Recording
-from valveflow_ros.ros.node.restart import Continuity
-from valveflow_ros.ros.node.warmup import warm_up
+from valveflow_ros.ros.decoding import INPUTS, Decoder
+from valveflow_ros.ros.node import given_files, health
+from valveflow_ros.ros.node.diagnostics import Item, Level, line_of
+from valveflow_ros.ros.node.engine import LiveEngine, warm_up
+from valveflow_ros.ros.node.intake import Intake, LogClock
+from valveflow_ros.ros.node.recording import BackgroundRecovery, Recording, tag_of
+from valveflow_ros.ros.node.restart import Restart
+from valveflow_ros.ros.node.state_store import StateStore
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs, OutputTopic
-from valveflow_ros.ros.polled_subscription import Taker
-from valveflow_ros.ros.worker.worker import DiagnosisWorker, FitWorker
+from valveflow_ros.ros.polled_subscription import PolledSubscription
+from valveflow_ros.ros.worker import DiagnosisWorker, FitWorker
 
 DIAGNOSTICS = '/diagnostics'
-# A look costs a fraction of a millisecond.
+# A look at the graph costs a fraction of a millisecond.
 _GRAPH_S = 0.5
 _DEPTH = 1000
 
@@ -42,9 +41,16 @@ class Session:
     node : Node
     settings : Settings
     stop : callable
-        Tells whether to give up waiting.
+        Returns True to give up waiting.
     log : callable
-        Takes how grave something is and a sentence.
+        Takes a level and a sentence.
+
+    Attributes
+    ----------
+    engine : LiveEngine
+    recording : Recording
+    inputs, outputs : dict of str to str
+        Full topic names by the names of the contract.
     """
 
     def __init__(
@@ -57,61 +63,55 @@ class Session:
         self._node = node
         self._log = log
         self._settings = settings
-        self._reference = reference_of(settings)
-        self._extended = given_files.extended_of(settings)
+        self._reference = given_files.given_reference(settings)
+        self._model = given_files.given_model(settings)
         self.inputs = {topic.name: node.resolve_topic_name(topic.name) for topic in INPUTS}
         self.outputs = {name: node.resolve_topic_name(f'~/{name}') for name in OUTPUTS}
-        self._continuity = Continuity(settings, self.inputs, self.outputs, log)
-        self.worker = FitWorker(settings.real('refit_timeout'))
-        self.worker.start()
-        self.diagnosis_worker = DiagnosisWorker(settings.real('diagnosis_timeout'))
-        self._outputs = Outputs(settings.text('unit_tag'))
+        self._store = StateStore(settings)
+        self._restart = Restart(settings, self._store, self.inputs, self.outputs, log)
+        self._fit_worker = FitWorker(settings.real('refit_timeout'))
+        self._fit_worker.start()
+        self._diagnosis_worker = DiagnosisWorker(settings.real('diagnosis_timeout'))
+        self._messages = Outputs(settings.text('unit_tag'))
+        self._recovery: BackgroundRecovery | None = None
         try:
             # Each event costs the executor time at every look, and nobody listens to these.
             silent = PublisherEventCallbacks(use_default_callbacks=False)
-            self._publishers = {
+            self._publishers: dict[str, Publisher] = {
                 name: node.create_publisher(
                     topic.message_type, f'~/{name}', _qos(topic), event_callbacks=silent
                 )
                 for name, topic in OUTPUTS.items()
             }
-            self.engine = self._made_engine()
-            warm_up(settings, self.worker, stop, wait=not self._continuity.goes_on)
-            self._log_clock = LogClock(self._continuity.log_ns)
+            self.engine = self._restart.engine(self._make_engine)
+            if self._restart.continues:
+                # The curve of the earlier run is there at once.
+                self._messages.restore(self.engine.monitor)
+                for output in self._messages.latched():
+                    self._publishers[output.name].publish(output.data)
+            warm_up(settings, self._fit_worker, stop, wait=not self._restart.continues)
+            self._log_clock = LogClock(self._restart.log_ns)
             self.recording = self._open_recording()
         except BaseException:
-            self.worker.close()
-            self._continuity.close()
+            self._fit_worker.close()
+            self._store.close()
             raise
-        self._takers: list[Taker] = []
+        self._subscriptions: list[PolledSubscription] = []
         self._intake: Intake | None = None
         by_host = not node.get_parameter('use_sim_time').value
-        self._health = InputHealth(settings, self.inputs, by_host=by_host)
-        self._seen: dict[str, input_health.Publishers] = {}
+        self._health = health.InputHealth(settings, self.inputs, by_host=by_host)
+        self._publishers_seen: dict[str, health.Publishers] = {}
         self._looked_s = self._listening_since_s = 0.0
+        # Before the tail of an earlier run is fed, a state would leave it out for good.
         self._begun = False
-
-    def _made_engine(self) -> LiveEngine:
-        """Return the engine; where it goes on from an earlier run its curve is there at once."""
-
-        def make(settings: Settings) -> LiveEngine:
-            corrector = given_files.ready(self._extended, settings)
-            return LiveEngine(settings, self.worker, self.diagnosis_worker, corrector)
-
-        engine = self._continuity.engine(make)
-        if self._continuity.goes_on:
-            self._outputs.take_up(engine.monitor)
-            for output in self._outputs.latched():
-                self._publishers[output.name].publish(output.data)
-        return engine
 
     @property
     def listening(self) -> bool:
-        """Tell whether inputs are taken."""
+        """Return True while inputs are taken."""
         return self._intake is not None
 
-    def listen(self) -> None:
-        """Subscribe."""
+    def subscribe(self) -> None:
+        """Subscribe to the inputs; the first time, continue where an earlier run ended."""
         node, settings = self._node, self._settings
         reliable = settings.text('input_reliability') == 'reliable'
         names = {topic: name for name, topic in self.inputs.items()}
@@ -119,15 +119,17 @@ class Session:
         def mismatch(topic: str) -> None:
             self._health.mismatched.add(names.get(topic, topic))
 
-        def taker(message_type: type, topic: str) -> Taker:
-            made = Taker(node, message_type, topic, reliable=reliable, on_mismatch=mismatch)
-            self._takers.append(made)
+        def subscription(message_type: type, topic: str) -> PolledSubscription:
+            made = PolledSubscription(
+                node, message_type, topic, reliable=reliable, on_mismatch=mismatch
+            )
+            self._subscriptions.append(made)
             return made
 
-        sources = {topic.name: taker(topic.message_type, topic.name) for topic in INPUTS}
+        sources = {topic.name: subscription(topic.message_type, topic.name) for topic in INPUTS}
         clock = None
         if node.get_parameter('use_sim_time').value:
-            clock = taker(Clock, '/clock')
+            clock = subscription(Clock, '/clock')
         intake = Intake(
             sources, Decoder(settings), self._log_clock, settings.text('stamp_source'), clock,
             self._health.note,
@@ -138,32 +140,23 @@ class Session:
         self._intake = intake
         self._listening_since_s = time.monotonic()
 
-    def _begin(self) -> None:
-        """Say what stands there at the start, or go on where an earlier run ended."""
-        self._say(self._continuity.begin(self._settings, self.engine, self._outputs))
-        self._continuity.look_after(self.recording)
-        if self._extended is not None:
-            names = ', '.join(h.name for h in self._extended.held) or 'nothing'
-            self._log(Level.OK, f'Taken out of the rows, by model_file: {names}.')
-        kept = self.engine.monitor.reference.curve
-        given = self._reference
-        if given is not None and (kept is None or kept.model_id != given.model_id):
-            self.tell(self.engine.set_reference(given))
-
-    def hush(self) -> None:
-        """Unsubscribe, after taking what is there."""
+    def unsubscribe(self) -> None:
+        """Take what has arrived, then unsubscribe."""
         if self._intake is None:
             return
         self.step(last=True)
-        for taker in self._takers:
-            taker.close()
-        self._takers.clear()
+        for subscription in self._subscriptions:
+            subscription.close()
+        self._subscriptions.clear()
         self._intake = None
 
     def step(self, last: bool = False) -> int:
         """Take, record and feed what has arrived; return how many messages that was."""
-        self.tell(self.engine.poll())
-        self._continuity.step(self._settings, self.engine, self._log_clock.last_ns, self.recording)
+        self.publish(self.engine.poll())
+        for level, sentence in self._recovery.reports() if self._recovery else ():
+            self._log(level, sentence)
+        if self._store.due and self._begun:
+            self._save_state()
         if self._intake is None:
             return 0
         arrivals = self._intake.collect(time.monotonic(), time.time_ns(), last)
@@ -171,87 +164,113 @@ class Session:
             self.recording.write(
                 self.inputs[arrival.name], arrival.data, arrival.log_ns, arrival.time_ns
             )
-        self.tell(self.engine.feed(self._intake.rows(arrivals)))
+        self.publish(self.engine.feed(self._intake.rows(arrivals)))
         return len(arrivals)
 
-    def tell(self, events: Sequence[Event]) -> None:
-        """Publish and record what a call of the engine brought."""
+    def publish(self, events: Sequence[Event]) -> None:
+        """Log, publish and record the events of a call of the engine."""
         for event in events:
             line = line_of(event)
             if line is not None:
                 self._log(*line)
-        self._continuity.note(events)
-        self._say(self._outputs.of(events))
+        self._store.note(events)
+        self._send(self._messages.of(events))
 
     def reconfigure(self, settings: Settings) -> None:
         """Take settings of which only live ones differ."""
         self._settings = self._health.settings = settings
-        self.tell(self.engine.reconfigure(settings))
+        self.publish(self.engine.monitor.reconfigure(settings))
 
     def items(self) -> list[Item]:
-        """Return how everything is."""
+        """Return the health of everything."""
         now_s = time.monotonic()
-        monitor = self.engine.monitor
+        engine, monitor = self.engine, self.engine.monitor
         items: list[Item] = []
         if self._intake is not None:
+            statistics = self._intake.statistics
             if now_s - self._looked_s >= _GRAPH_S:
                 self._looked_s = now_s
-                types = {topic.name: topic.type_name for topic in INPUTS}
-                wanted = {name: (topic, types[name]) for name, topic in self.inputs.items()}
-                self._seen = input_health.publishers(self._node, wanted)
-                for name, seen in self._seen.items():
-                    self._intake.tallies[name].note_publishers(seen.right)
+                for topic in INPUTS:
+                    full_name = self.inputs[topic.name]
+                    seen = health.publishers(self._node, full_name, topic.type_name)
+                    self._publishers_seen[topic.name] = seen
+                    statistics[topic.name].note_publishers(seen.right)
             items += self._health.items(
-                self._intake.tallies, self.engine.aligner.counts(), self._seen,
-                now_s, now_s - self._listening_since_s, self.engine.aligner.newest_ns,
+                statistics, engine.aligner.counts(), self._publishers_seen,
+                now_s, now_s - self._listening_since_s, engine.aligner.newest_ns,
             )  # fmt: skip
-        items.append(health.fit_item(monitor, self.worker, self.engine.last_fit_s))
-        items.append(health.alarm_item(monitor))
-        items.append(health.reference_item(monitor))
-        items.append(health.model_item(monitor))
-        items.append(
-            health.diagnosis_item(monitor, self.diagnosis_worker, self.engine.last_diagnosis_s)
-        )
-        items.append(health.recorder_item(self.recording))
-        items.append(self._continuity.item())
-        return items
+        return [
+            *items,
+            health.fit_item(monitor, self._fit_worker, engine.last_fit_s),
+            health.alarm_item(monitor),
+            health.reference_item(monitor),
+            health.model_item(monitor),
+            health.diagnosis_item(monitor, self._diagnosis_worker, engine.last_diagnosis_s),
+            health.recorder_item(self.recording),
+            self._store.item(),
+        ]
 
     def record(self, topic: str, data: bytes, time_ns: int) -> None:
-        """Record a message that no engine event stands behind."""
+        """Record a message; one that belongs to no time of the plant gets that of the log."""
         log_ns = self._log_clock.stamp(time.time_ns())
-        # What is said before the first row belongs to no time of the plant; a viewer that goes by
-        # this time would else begin in 1970.
+        # A viewer that goes by this time would else begin in 1970.
         self.recording.write(topic, data, log_ns, time_ns or log_ns)
 
     def close(self) -> RecorderStatus | None:
         """End everything; the recording is a finished file afterwards."""
-        self.hush()
-        self.worker.close()
-        self.diagnosis_worker.close()
+        self.unsubscribe()
+        self._fit_worker.close()
+        self._diagnosis_worker.close()
         # Where not all is recorded, nothing else tells what happened since it was saved last.
-        if not self.recording.whole:
-            self._continuity.save(
-                self._settings, self.engine, self._log_clock.last_ns, self.recording
-            )
+        if not self.recording.whole and self._begun:
+            self._save_state()
         status = self.recording.close()
-        self._continuity.close()
+        self._store.close()
         for publisher in self._publishers.values():
             self._node.destroy_publisher(publisher)
         return status
 
-    def _say(self, outputs: Iterable[Output]) -> None:
+    def _begin(self) -> None:
+        """Publish what stands at the start, or continue where an earlier run ended."""
+        monitor, given = self.engine.monitor, self._reference
+        self._send(self._restart.begin(self._settings, self.engine, self._messages))
+        if self.recording.folder is not None:
+            self._recovery = BackgroundRecovery(self.recording.folder, tag_of(self._settings))
+        if self._model is not None:
+            names = ', '.join(h.name for h in self._model.held) or 'nothing'
+            self._log(Level.OK, f'Taken out of the rows, by model_file: {names}.')
+        kept = monitor.reference.curve
+        if given is not None and (kept is None or kept.model_id != given.model_id):
+            self.publish(monitor.set_reference(given))
+
+    def _make_engine(self, settings: Settings) -> LiveEngine:
+        corrector = given_files.corrector_for(self._model, settings)
+        return LiveEngine(settings, self._fit_worker, self._diagnosis_worker, corrector)
+
+    def _save_state(self) -> None:
+        recording = self.recording
+        folder = recording.folder if recording.on else None
+        state = {
+            'settings': dict(self._settings),
+            'engine': self.engine.snapshot(),
+            # Of the newest message that went into it.
+            'log_ns': self._log_clock.last_ns,
+            'topics': {**self.inputs, **self.outputs},
+            'began': recording.began,
+            'recording': None if folder is None else str(folder.resolve()),
+        }
+        self._store.write(state, recording.settled())
+
+    def _send(self, outputs: Iterable[Output]) -> None:
         for output in outputs:
-            publisher: Publisher = self._publishers[output.name]
-            publisher.publish(output.data)
+            self._publishers[output.name].publish(output.data)
             self.record(self.outputs[output.name], output.data, output.time_ns)
 
     def _open_recording(self) -> Recording:
         topics: dict[str, Any] = {'inputs': self.inputs, 'outputs': self.outputs}
-        model = given_files.attached(self._extended)
-        recording = Recording(
-            self._settings, topics, time.time(), model, self._continuity.folder,
-            self._continuity.began,
-        )  # fmt: skip
+        attachments = given_files.model_attachment(self._model)
+        folder, began = self._restart.folder, self._restart.began
+        recording = Recording(self._settings, topics, time.time(), attachments, folder, began)
         reliable = self._settings.text('input_reliability') == 'reliable'
         for topic in INPUTS:
             recording.offer(
@@ -261,14 +280,13 @@ class Session:
             recording.offer(
                 self.outputs[name], output.type_name, reliable=True, latched=output.latched
             )
-        recording.offer(
-            DIAGNOSTICS, 'diagnostic_msgs/msg/DiagnosticArray', reliable=True, latched=False
-        )
+        health_type = 'diagnostic_msgs/msg/DiagnosticArray'
+        recording.offer(DIAGNOSTICS, health_type, reliable=True, latched=False)
         return recording
 
 
 def _qos(topic: OutputTopic) -> QoSProfile:
-    """Return what outputs are offered with: reliable, and kept for who comes late if latched."""
+    """Return what outputs are offered with: reliable, and kept for late subscribers if latched."""
     kept = DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE
     return QoSProfile(
         depth=topic.kept if topic.latched else _DEPTH,

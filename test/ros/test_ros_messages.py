@@ -31,10 +31,10 @@ from valveflow_ros.monitoring.prediction import PredictionBlock, PredictionState
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, Quality, SegmentKind
 from valveflow_ros.records import SpecialSegment as SegmentRecord
-from valveflow_ros.ros import conversions
-from valveflow_ros.ros.conversions import encode
-from valveflow_ros.ros.node.warmup import made_up_curve
-from valveflow_ros.ros.outputs import clock_bytes, float64_bytes, prediction_bytes
+from valveflow_ros.ros import encoding
+from valveflow_ros.ros.decoding import from_time, journal_entry
+from valveflow_ros.ros.encoding import clock_bytes, encode, float64_bytes, prediction_bytes
+from valveflow_ros.ros.node.engine import example_curve
 
 times = st.integers(0, (1 << 31) * NS_PER_S - 1)
 texts = st.text(st.characters(exclude_characters='\x00', exclude_categories=['Cs']), max_size=20)
@@ -47,13 +47,13 @@ def bits(value: float) -> bytes:
 
 @given(times)
 def test_times_survive_the_way_there_and_back(time_ns: int) -> None:
-    assert conversions.from_time(conversions.to_time(time_ns)) == time_ns
+    assert from_time(encoding.to_time(time_ns)) == time_ns
 
 
 @pytest.mark.parametrize('time_ns', [-1, -(10**18), 2**62, (1 << 31) * NS_PER_S])
 def test_times_that_a_stamp_cannot_hold_become_the_nearest_one(time_ns: int) -> None:
     nearest = 0 if time_ns < 0 else (1 << 31) * NS_PER_S - 1
-    assert conversions.from_time(conversions.to_time(time_ns)) == nearest
+    assert from_time(encoding.to_time(time_ns)) == nearest
 
 
 @given(times, st.sampled_from(JournalKind), times, st.integers(0, 2**63), texts, texts, texts)
@@ -61,9 +61,9 @@ def test_the_journal_survives_the_way_through_bytes(
     time_ns: int, kind: JournalKind, request_ns: int, rows: int, model: str, text: str, tag: str
 ) -> None:
     entry = JournalEntry(time_ns, kind, request_ns, rows, model, text)
-    data = encode(conversions.journal(entry, tag))
+    data = encode(encoding.journal_message(entry, tag))
     message = deserialize_message(data, JournalMessage)
-    assert conversions.journal_entry(message) == entry
+    assert journal_entry(data) == entry
     assert message.header.frame_id == tag
 
 
@@ -93,11 +93,11 @@ def test_every_field_of_a_segment_is_carried_over() -> None:
         7, SegmentKind.SLOPE, 10**18 + 1, 10**18 + 5, 300, 1.5, 2.5, 0.25, 0.125, 100.0, 110.0,
         0.5, 538.25,
     )  # fmt: skip
-    message = conversions.segment(record, 'unit 1')
+    message = encoding.segment_message(record, 'unit 1')
     assert message.header.frame_id == 'unit 1'
-    assert conversions.from_time(message.header.stamp) == record.end_ns
-    assert conversions.from_time(message.start) == record.start_ns
-    assert conversions.from_time(message.end) == record.end_ns
+    assert from_time(message.header.stamp) == record.end_ns
+    assert from_time(message.start) == record.start_ns
+    assert from_time(message.end) == record.end_ns
     for name in (
         'number', 'kind', 'samples', 'u_start', 'u_end', 'u_rate_per_s', 'u_rms',
         'power_start_mw', 'power_end_mw', 'power_rms_mw', 'temperature_mean_degc',
@@ -110,9 +110,9 @@ def test_every_field_of_an_alarm_is_carried_over() -> None:
         10**18, 'residual', AlarmState.ACKNOWLEDGED, AlarmState.UNACKNOWLEDGED, Priority.HIGH,
         5.5, 4.5, 'MW', 'A sentence.', 3, 10**17, 'abc',
     )  # fmt: skip
-    message = conversions.alarm(change, 'u')
-    assert conversions.from_time(message.header.stamp) == change.time_ns
-    assert conversions.from_time(message.raised) == change.raised_ns
+    message = encoding.alarm_message(change, 'u')
+    assert from_time(message.header.stamp) == change.time_ns
+    assert from_time(message.raised) == change.raised_ns
     assert (message.state, message.previous_state) == (change.state, change.previous)
     for name in (
         'name', 'priority', 'value', 'limit', 'unit', 'sentence', 'occurrence', 'model_id',
@@ -121,8 +121,8 @@ def test_every_field_of_an_alarm_is_carried_over() -> None:
 
 
 def test_the_curve_is_drawn_by_arrays_that_fit_each_other() -> None:
-    curve = made_up_curve(Settings()).with_id()
-    message = conversions.characteristic(curve, CurveStatus.FRESH, '', 'u')
+    curve = example_curve(Settings()).with_id()
+    message = encoding.curve_message(curve, CurveStatus.FRESH, '', 'u')
     j = len(curve.pieces)
     assert message.pieces == j
     assert list(message.breakpoints) == curve.breakpoints.tolist()
@@ -139,7 +139,7 @@ def test_the_curve_is_drawn_by_arrays_that_fit_each_other() -> None:
 
 
 def test_without_a_curve_the_message_says_why_and_gives_no_numbers() -> None:
-    message = conversions.characteristic(None, CurveStatus.REFUSED, 'Too little.', 'u')
+    message = encoding.curve_message(None, CurveStatus.REFUSED, 'Too little.', 'u')
     assert (message.status, message.cause) == (FlowCharacteristic.REFUSED, 'Too little.')
     assert not message.breakpoints
     assert not message.slopes
@@ -158,7 +158,7 @@ def test_predictions_made_by_hand_are_what_the_encoder_makes(
     ((found_ns, data),) = prediction_bytes(block, tag)
     message = deserialize_message(data, Prediction)
     assert found_ns == time_ns
-    assert conversions.from_time(message.header.stamp) == time_ns
+    assert from_time(message.header.stamp) == time_ns
     assert (message.header.frame_id, message.model_id, message.state) == (tag, model, state)
     names = (
         'integrated_input', 'measured_mw', 'static_mw', 'dynamic_mw', 'residual_mw', 'average_mw',
@@ -175,7 +175,7 @@ def test_predictions_made_by_hand_are_what_the_encoder_makes(
 
 MESSAGES = [
     Alarm(name='residual', sentence='äöü', unit='MW', value=math.nan, occurrence=7),
-    Clock(clock=conversions.to_time(5 * NS_PER_S + 7)),
+    Clock(clock=encoding.to_time(5 * NS_PER_S + 7)),
     Diagnosis(
         causes=[DiagnosisCause(name='backlash', parameter_names=['a', 'bcd'],
                                parameter_values=[1.0, 2.0], parameter_units=['', '%'])],
@@ -188,8 +188,8 @@ MESSAGES = [
     ]),
     Float64(data=-0.0),
     Float64MultiArray(data=[1.0, 2.0]),
-    conversions.plain_array([1.0, 2.0, 3.0], 'label'),
-    conversions.characteristic(made_up_curve(Settings()), CurveStatus.STALE, 'Why.', 'tag'),
+    encoding.array_message([1.0, 2.0, 3.0], 'label'),
+    encoding.curve_message(example_curve(Settings()), CurveStatus.STALE, 'Why.', 'tag'),
     FlowCharacteristic(),
     JournalMessage(samples=2**63, text='t'),
     MultiArrayDimension(label='l', size=1, stride=2),
@@ -233,12 +233,12 @@ def test_float64_bytes(value: float) -> None:
 
 @given(times)
 def test_clock_bytes(time_ns: int) -> None:
-    assert clock_bytes(time_ns) == encode(Clock(clock=conversions.to_time(time_ns)))
+    assert clock_bytes(time_ns) == encode(Clock(clock=encoding.to_time(time_ns)))
 
 
 @given(arrays.arrays(np.float64, st.integers(0, 50)))
 def test_plain_arrays_say_how_long_they_are(values: np.ndarray) -> None:
-    message = conversions.plain_array(values, 'what')
+    message = encoding.array_message(values, 'what')
     assert bits(0.0).join(map(bits, message.data)) == bits(0.0).join(map(bits, values.tolist()))
     (dimension,) = message.layout.dim
     assert (dimension.label, dimension.size, dimension.stride) == (

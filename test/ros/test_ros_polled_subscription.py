@@ -10,45 +10,44 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_helpers import wait_until
 from std_msgs.msg import Float64
 
-from valveflow_ros.ros.conversions import encode
-from valveflow_ros.ros.outputs import float64_bytes
-from valveflow_ros.ros.polled_subscription import DEPTH, Taken, Taker, can_poll
+from valveflow_ros.ros.encoding import encode, float64_bytes
+from valveflow_ros.ros.polled_subscription import DEPTH, PolledSubscription, RawMessage, can_poll
 
 pytestmark = pytest.mark.ros
 
 
 @pytest.fixture
 def node(context: Any) -> Any:
-    made = Node('taking', context=context)
+    made = Node('polling', context=context)
     yield made
     made.destroy_node()
 
 
-def publisher_for(node: Node, taker: Taker, reliable: bool = True) -> Any:
+def publisher_for(node: Node, source: PolledSubscription, reliable: bool = True) -> Any:
     kind = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
     profile = QoSProfile(depth=DEPTH, reliability=kind)
-    return node.create_publisher(Float64, taker.topic, profile)
+    return node.create_publisher(Float64, source.topic, profile)
 
 
-def matched(node: Node, taker: Taker) -> Any:
-    publisher = publisher_for(node, taker)
+def matched(node: Node, source: PolledSubscription) -> Any:
+    publisher = publisher_for(node, source)
     wait_until(lambda: publisher.get_subscription_count() == 1, 'the match')
     # Both sides have matched once a value has come through.
-    wait_until(lambda: publisher.publish(Float64(data=-1.0)) or taker.take(), 'the first value')
+    wait_until(lambda: publisher.publish(Float64(data=-1.0)) or source.take(), 'the first value')
     time.sleep(0.05)
-    taker.take()
+    source.take()
     return publisher
 
 
 def collect(
-    taker: Taker, count: int, executor: SingleThreadedExecutor | None = None
-) -> list[Taken]:
-    found: list[Taken] = []
+    source: PolledSubscription, count: int, executor: SingleThreadedExecutor | None = None
+) -> list[RawMessage]:
+    found: list[RawMessage] = []
 
     def enough() -> bool:
         if executor is not None:
             executor.spin_once(timeout_sec=0.01)
-        found.extend(taker.take())
+        found.extend(source.take())
         return len(found) >= count
 
     wait_until(enough, f'{count} messages', 20.0)
@@ -58,25 +57,25 @@ def collect(
 def test_this_rclpy_lets_messages_be_taken_by_hand(node: Node) -> None:
     # If this fails after an update of rclpy, the executor takes over (see the next tests);
     # it costs about eight times the processor time, so better find the new way.
-    taker = Taker(node, Float64, 'value')
-    assert can_poll(taker._subscription)
-    assert taker.polled
+    source = PolledSubscription(node, Float64, 'value')
+    assert can_poll(source._subscription)
+    assert source.polled
 
 
 @pytest.mark.parametrize('polled', [True, False])
 def test_bytes_stamps_and_numbers_come_in_order(node: Node, polled: bool) -> None:
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
-    taker = Taker(node, Float64, 'value', reliable=True, polled=polled)
-    publisher = publisher_for(node, taker)
+    source = PolledSubscription(node, Float64, 'value', reliable=True, polled=polled)
+    publisher = publisher_for(node, source)
     wait_until(lambda: publisher.get_subscription_count() == 1, 'the match')
     before_ns = time.time_ns()
     values = [0.5 * k for k in range(100)]
     for value in values:
         publisher.publish(Float64(data=value))
-    found = collect(taker, len(values), executor)
+    found = collect(source, len(values), executor)
     after_ns = time.time_ns()
-    assert taker.polled == polled
+    assert source.polled == polled
     assert [taken.data for taken in found] == [float64_bytes(value) for value in values]
     numbers = [taken.sequence for taken in found]
     assert numbers == list(range(numbers[0], numbers[0] + len(values)))
@@ -88,32 +87,32 @@ def test_bytes_stamps_and_numbers_come_in_order(node: Node, polled: bool) -> Non
 def test_the_executor_leaves_messages_to_who_takes_them(node: Node) -> None:
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
-    taker = Taker(node, Float64, 'value')
-    publisher = matched(node, taker)
+    source = PolledSubscription(node, Float64, 'value')
+    publisher = matched(node, source)
     for k in range(20):
         publisher.publish(Float64(data=float(k)))
     for _ in range(50):
         executor.spin_once(timeout_sec=0.0)
-    assert len(collect(taker, 20)) == 20
+    assert len(collect(source, 20)) == 20
     executor.shutdown()
 
 
 def test_a_look_takes_no_more_than_asked_for(node: Node) -> None:
-    taker = Taker(node, Float64, 'value')
-    publisher = matched(node, taker)
+    source = PolledSubscription(node, Float64, 'value')
+    publisher = matched(node, source)
     for k in range(30):
         publisher.publish(Float64(data=float(k)))
-    found: list[Taken] = []
-    wait_until(lambda: found.extend(taker.take(7)) or len(found) >= 7, 'seven')
+    found: list[RawMessage] = []
+    wait_until(lambda: found.extend(source.take(7)) or len(found) >= 7, 'seven')
     assert len(found) <= 13
-    assert len(found) + len(collect(taker, 30 - len(found))) == 30
+    assert len(found) + len(collect(source, 30 - len(found))) == 30
 
 
 def test_best_effort_and_reliable_publishers_are_both_heard(node: Node) -> None:
-    taker = Taker(node, Float64, 'value')
+    source = PolledSubscription(node, Float64, 'value')
     for reliable in (True, False):
-        publisher = publisher_for(node, taker, reliable)
-        wait_until(lambda p=publisher: p.publish(Float64()) or taker.take(), 'a value', 20.0)
+        publisher = publisher_for(node, source, reliable)
+        wait_until(lambda p=publisher: p.publish(Float64()) or source.take(), 'a value', 20.0)
         node.destroy_publisher(publisher)
 
 
@@ -121,24 +120,24 @@ def test_a_publisher_that_does_not_match_is_told(node: Node) -> None:
     heard: list[str] = []
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
-    taker = Taker(node, Float64, 'value', reliable=True, on_mismatch=heard.append)
-    publisher_for(node, taker, reliable=False)
+    source = PolledSubscription(node, Float64, 'value', reliable=True, on_mismatch=heard.append)
+    publisher_for(node, source, reliable=False)
     wait_until(lambda: executor.spin_once(timeout_sec=0.05) or heard, 'the mismatch', 20.0)
     assert set(heard) == {'/value'}
     executor.shutdown()
 
 
 def test_after_closing_nobody_listens(node: Node) -> None:
-    taker = Taker(node, Float64, 'value')
-    publisher = matched(node, taker)
-    taker.close()
+    source = PolledSubscription(node, Float64, 'value')
+    publisher = matched(node, source)
+    source.close()
     wait_until(lambda: publisher.get_subscription_count() == 0, 'the end', 20.0)
 
 
 def test_names_are_resolved_and_remapped(context: Any) -> None:
     options = ['--ros-args', '-r', 'value:=/plant/other']
     node = Node('remapped', context=context, namespace='unit1', cli_args=options)
-    assert Taker(node, Float64, 'value').topic == '/plant/other'
-    assert Taker(node, Float64, 'second').topic == '/unit1/second'
+    assert PolledSubscription(node, Float64, 'value').topic == '/plant/other'
+    assert PolledSubscription(node, Float64, 'second').topic == '/unit1/second'
     assert encode(Float64()) == float64_bytes(0.0)
     node.destroy_node()

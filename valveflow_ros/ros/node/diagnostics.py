@@ -1,4 +1,4 @@
-"""Health items and the messages they become (REP 107)."""
+"""Health items, the diagnostics message they become (REP 107), and lines of the log."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from valveflow_ros.monitoring.events import (
     JournalKind,
     ReferenceSet,
 )
-from valveflow_ros.ros.conversions import to_time
+from valveflow_ros.ros.encoding import header
 
 
 class Level(enum.IntEnum):
@@ -45,12 +45,9 @@ class Item:
     values: dict[str, object] = field(default_factory=dict)
 
 
-def array(items: Iterable[Item], tag: str, now_ns: int) -> DiagnosticArray:
-    """Return the message that says all items."""
-    message = DiagnosticArray()
-    message.header.stamp = to_time(now_ns)
-    message.header.frame_id = tag
-    message.status = [
+def diagnostics_message(items: Iterable[Item], tag: str, now_ns: int) -> DiagnosticArray:
+    """Return all items as a message."""
+    status = [
         DiagnosticStatus(
             level=bytes([item.level]),
             name=f'valveflow: {tag} {item.name}',
@@ -60,7 +57,7 @@ def array(items: Iterable[Item], tag: str, now_ns: int) -> DiagnosticArray:
         )
         for item in items
     ]
-    return message
+    return DiagnosticArray(header=header(now_ns, tag), status=status)
 
 
 def _text(value: object) -> str:
@@ -101,14 +98,11 @@ class Changes:
         return picked
 
 
-# What is worth a line in the log: alarms, new curves, diagnoses, refusals.
-
-
 _STANDING = (AlarmState.UNACKNOWLEDGED, AlarmState.RETURNED_UNACKNOWLEDGED)
 
 
 def line_of(event: Event) -> tuple[Level, str] | None:
-    """Return how grave an event is and a sentence about it; None for the many others."""
+    """Return the line of the log for an event; None for the many that are not worth one."""
     if isinstance(event, AlarmChange):
         words = event.state.name.lower().replace('_', ' ')
         level = Level.WARN if event.state in _STANDING else Level.OK
@@ -125,18 +119,12 @@ def line_of(event: Event) -> tuple[Level, str] | None:
     if isinstance(event, ReferenceSet):
         return Level.OK, f'the reference is now curve {event.characteristic.model_id}'
     if isinstance(event, Diagnosed):
-        return _diagnosis_line(event)
-    if isinstance(event, JournalEntry):
-        return _journal_line(event)
-    return None
-
-
-def _diagnosis_line(event: Diagnosed) -> tuple[Level, str]:
-    if not event.content:
-        return Level.WARN, f'no diagnosis: {event.reason}'
-    content = json.loads(event.content)
-    level = Level.OK if content['verdict'] == 'nothing' else Level.WARN
-    return level, f'diagnosis: {content["sentence"]}'
+        if not event.content:
+            return Level.WARN, f'no diagnosis: {event.reason}'
+        content = json.loads(event.content)
+        level = Level.OK if content['verdict'] == 'nothing' else Level.WARN
+        return level, f'diagnosis: {content["sentence"]}'
+    return _journal_line(event) if isinstance(event, JournalEntry) else None
 
 
 def _journal_line(event: JournalEntry) -> tuple[Level, str] | None:

@@ -1,4 +1,4 @@
-"""What comes in: the topics, and how their bytes become readings in the engine's units."""
+"""Messages as the engine's records: readings from input topics, lines of the journal."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from builtin_interfaces.msg import Time
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import Float64
+from valveflow_msgs.msg import JournalEntry as JournalMessage
 from valveflow_msgs.msg import PlantSample
 
+from valveflow_ros.monitoring.events import JournalEntry, JournalKind
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
 from valveflow_ros.signals.units import UNITS, Unit, unit_of
@@ -59,6 +62,34 @@ def header_time_ns(data: bytes) -> int:
         return 0
     seconds, nanoseconds = layout.unpack_from(data, _HEAD)
     return int(seconds) * NS_PER_S + int(nanoseconds)
+
+
+def from_time(stamp: Time) -> int:
+    """Return a stamp in ns since the epoch."""
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+
+
+def journal_entry(data: bytes) -> JournalEntry:
+    """Return a line of the journal as the engine's record.
+
+    Raises
+    ------
+    ValueError
+        The bytes are no line of a journal.
+    """
+    try:
+        message = deserialize_message(data, JournalMessage)
+        return JournalEntry(
+            time_ns=from_time(message.header.stamp),
+            kind=JournalKind(message.kind),
+            request_ns=from_time(message.request),
+            rows=int(message.samples),
+            model_id=message.model_id,
+            text=message.text,
+        )
+    except Exception as error:
+        # rclpy raises whatever the middleware's C++ gave it.
+        raise ValueError(str(error)) from error
 
 
 class Decoder:

@@ -1,0 +1,799 @@
+"""What is kept between runs: one owner, whole or not at all, used only where it fits."""
+
+from __future__ import annotations
+
+import errno
+import gc
+import hashlib
+import io
+import json
+import os
+import shutil
+import signal
+import stat
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as limits
+from hypothesis import strategies as st
+
+from valveflow_ros.errors import DataError, RecordingError
+from valveflow_ros.logs import LoggedMessage
+from valveflow_ros.monitoring.events import CurveAdopted
+from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.parameters import Settings
+from valveflow_ros.ros.node import restart, state_store
+from valveflow_ros.ros.node.diagnostics import Level
+from valveflow_ros.ros.node.engine import example_curve
+from valveflow_ros.ros.node.restart import Restart
+from valveflow_ros.ros.node.state_store import (
+    ASIDE,
+    LOCK,
+    STATE,
+    InUseError,
+    StateFolder,
+    StateStore,
+    state_folder,
+)
+from valveflow_ros.ros.outputs import Output
+from valveflow_ros.signals.align import Aligner
+from valveflow_ros.state import (
+    FORMAT,
+    VERSION,
+    ArrayMemory,
+    copies,
+    from_bytes,
+    put_back,
+    to_bytes,
+)
+
+CURVE = example_curve(Settings()).with_id()
+STATE_A = {'numbers': np.arange(3.0), 'log_ns': 5}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[StateFolder]:
+    made = StateFolder(tmp_path / 'state')
+    yield made
+    made.close()
+
+
+def settings(folder: Path, **more: object) -> Settings:
+    return Settings({'record_directory': str(folder), **more})
+
+
+def written(folder: Path, state: dict[str, Any] = STATE_A, **more: object) -> None:
+    given = settings(folder, **more)
+    store = StateStore(given)
+    store.write({'settings': dict(given), **state}, lambda: True)
+    store.close()
+
+
+# States as bytes
+
+arrays = st.builds(
+    lambda kind, shape: (np.arange(np.prod(shape, dtype=int)) % 2).reshape(shape).astype(kind),
+    st.sampled_from(['f8', 'i8', 'u1', '?', 'f4']),
+    st.lists(st.integers(0, 3), max_size=3).map(tuple),
+)
+plain = st.one_of(
+    st.none(), st.booleans(), st.integers(-(2**70), 2**70), st.floats(allow_nan=False), st.text(),
+    arrays,
+)  # fmt: skip
+values = st.recursive(
+    plain,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+)
+states = st.dictionaries(st.text(), values, max_size=5)
+
+
+def same(one: Any, other: Any) -> bool:
+    """Tell whether two values are equal to the type of each number."""
+    if isinstance(one, np.ndarray):
+        fits = isinstance(other, np.ndarray) and one.dtype == other.dtype
+        return fits and one.shape == other.shape and bool(np.array_equal(one, other))
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[k], other[k]) for k in one)
+    if isinstance(one, list):
+        return len(one) == len(other) and all(map(same, one, other))
+    return type(one) is type(other) and one == other
+
+
+@given(states)
+@limits(max_examples=60)
+def test_every_state_comes_back_as_it_was_and_equal_ones_are_equal_bytes(
+    state: dict[str, Any],
+) -> None:
+    data = to_bytes(state)
+    found = from_bytes(data)
+    assert same(state, found)
+    assert to_bytes(found) == data
+
+
+@given(st.dictionaries(st.text(), st.integers() | st.lists(st.integers()), max_size=3))
+@limits(max_examples=20)
+def test_whole_is_what_its_first_line_says(state: dict[str, Any]) -> None:
+    """The slow truth: format, version and SHA-256 of all that follows the line."""
+    line, content = to_bytes(state).split(b'\n', 1)
+    # What stands on disks already.
+    assert line.startswith(b'valveflow-state 1 ')
+    digest = hashlib.sha256(content).hexdigest().encode()
+    assert line == FORMAT + b' ' + str(VERSION).encode() + b' ' + digest
+
+
+def signed(content: bytes, version: int = VERSION, name: bytes = FORMAT) -> bytes:
+    digest = hashlib.sha256(content).hexdigest().encode()
+    return name + b' %d ' % version + digest + b'\n' + content
+
+
+def archived(**more: Any) -> bytes:
+    archive = io.BytesIO()
+    np.savez(archive, **more)
+    return archive.getvalue()
+
+
+def tree(value: Any) -> Any:
+    return np.frombuffer(json.dumps(value).encode(), dtype=np.uint8)
+
+
+class Trap:
+    """Would be executed by whoever unpickles it."""
+
+    def __reduce__(self) -> tuple[Callable[[str], None], tuple[str]]:
+        return os.mkdir, ('executed',)
+
+
+def test_nothing_in_a_state_is_executed_however_well_it_is_signed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    trap = np.array([Trap()], dtype=object)
+    for content in (
+        archived(tree=tree({'x': {'$array': 0}}), a0=trap),
+        archived(tree=trap),
+    ):
+        with pytest.raises(DataError, match='cannot be read'):
+            from_bytes(signed(content))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ('data', 'sentence'),
+    [
+        (b'', 'is none, or its beginning is damaged'),
+        (b'\n', 'is none, or its beginning is damaged'),
+        (signed(b'', name=b'other-state'), 'is none, or its beginning is damaged'),
+        (FORMAT + b' 1 abc\n', 'is none, or its beginning is damaged'),
+        (FORMAT + b' 1 ' + b'0' * 64 + b' more\n', 'is none, or its beginning is damaged'),
+        (FORMAT + b' 1 ' + b'0' * 64 + b'\nwhatever', 'its checksum is another one'),
+        (signed(b'', version=2), 'has version 2, this program reads 1'),
+        (signed(b'', version=0), 'has version 0, this program reads 1'),
+        (FORMAT + b' ' + b'9' * 50 + b' ' + b'0' * 64 + b'\n', f'version {"9" * 20}, this'),
+        (FORMAT + b' \xff ' + b'0' * 64 + b'\n', 'version \ufffd, this'),
+        (signed(b''), r'cannot be read \('),
+        (signed(b'no archive'), r'cannot be read \('),
+        (signed(archived(other=tree({}))), r'cannot be read \(KeyError\)'),
+        (signed(archived(tree=np.zeros(3, dtype=np.uint8))), r'cannot be read \('),
+        *(
+            (signed(archived(tree=tree(v))), 'The saved state is none')
+            for v in ([1], 'x', 5, None)
+        ),
+    ],
+)
+def test_what_is_no_state_is_a_sentence(data: bytes, sentence: str) -> None:
+    with pytest.raises(DataError, match=sentence):
+        from_bytes(data)
+
+
+def test_what_only_looks_like_a_place_of_an_array_is_a_table() -> None:
+    for state in ({'x': {'$array': 0, 'y': 1}}, {'x': {'a': {'b': {}}}}):
+        assert from_bytes(to_bytes(state)) == state
+
+
+def test_what_is_remembered_is_a_copy_both_ways() -> None:
+    class Two(ArrayMemory):
+        def __init__(self) -> None:
+            self.one, self.two = np.zeros(2), np.zeros((2, 2), dtype=np.int64)
+
+        def _memory(self) -> dict[str, Any]:
+            return {'one': self.one, 'two': self.two}
+
+    first, second = Two(), Two()
+    first.one += 1.0
+    kept = first.snapshot()
+    first.one += 1.0
+    assert kept['one'].tolist() == [1.0, 1.0]
+    array = second.one
+    second.restore({**kept, 'more': 'is not asked for'})
+    assert array is second.one
+    assert array.tolist() == [1.0, 1.0]
+    second.one += 5.0
+    assert kept['one'].tolist() == [1.0, 1.0]
+    assert ArrayMemory().snapshot() == {}
+    ArrayMemory().restore({})
+    assert copies({}) == {}
+    with pytest.raises(DataError, match=r"lacks 'one'"):
+        second.restore({})
+    with pytest.raises(DataError, match=r"'one' as float32 \(2,\), float64 \(2,\) is wanted"):
+        put_back({'one': np.zeros(2)}, {'one': np.zeros(2, dtype=np.float32)})
+
+
+def test_every_single_cut_and_many_flips_are_noticed() -> None:
+    data = to_bytes({'a': [1, 2.5, None, 'text'], 'b': np.arange(5), 'c': {'d': np.eye(2)}})
+    assert to_bytes(from_bytes(data)) == data
+    for end in range(len(data)):
+        with pytest.raises(DataError):
+            from_bytes(data[:end])
+    chance = np.random.default_rng(3)
+    for _ in range(500):
+        place, bit = int(chance.integers(len(data))), int(chance.integers(8))
+        with pytest.raises(DataError):
+            from_bytes(data[:place] + bytes([data[place] ^ 1 << bit]) + data[place + 1 :])
+
+
+def test_arrays_and_numbers_of_numpy_come_back_as_they_were() -> None:
+    state = {
+        'array': np.arange(6.0).reshape(2, 3), 'number': np.float64(1.5), 'whole': np.int64(7),
+        'true': np.bool_(True), 'list': [np.zeros(0), {'deep': np.ones(2, dtype=np.uint8)}],
+        'tuple': (1, 2), 'nan': float('nan'),
+    }  # fmt: skip
+    found = from_bytes(to_bytes(state))
+    np.testing.assert_array_equal(found['array'], state['array'])
+    assert (found['number'], found['whole'], found['true']) == (1.5, 7, True)
+    assert found['list'][0].shape == (0,)
+    assert found['list'][1]['deep'].dtype == np.uint8
+    assert found['tuple'] == [1, 2]
+    assert np.isnan(found['nan'])
+
+
+def test_a_state_that_names_an_array_it_does_not_hold_is_a_sentence() -> None:
+    with pytest.raises(DataError, match=r'cannot be read \(KeyError\)'):
+        from_bytes(to_bytes({'$array': 5}))
+
+
+@pytest.mark.parametrize('given', [5, None, [1.0, 2.0], np.zeros(3), np.zeros(2, dtype=np.int64)])
+def test_what_does_not_fit_an_array_changes_nothing(given: Any) -> None:
+    arrays = {'first': np.ones(2), 'second': np.ones(2)}
+    with pytest.raises(DataError, match="'second'"):
+        put_back(arrays, {'first': np.zeros(2), 'second': given})
+    np.testing.assert_array_equal(arrays['first'], [1.0, 1.0])
+
+
+# The folder
+
+
+def test_of_two_states_that_do_not_fit_the_larger_one_is_kept_aside(folder: StateFolder) -> None:
+    """In whatever order they came; a tie keeps the one that is there."""
+    folder.set_aside()
+    assert not folder.aside.exists()
+    largest = b''
+    for data in (b'22', b'4444', b'333', b'aaaa', b'55555', b''):
+        folder.write(data)
+        folder.set_aside()
+        largest = data if len(data) > len(largest) else largest
+        assert folder.read(folder.aside) == largest
+    assert folder.read() == b''
+
+
+def test_the_names_on_the_disk_are_those_that_an_earlier_run_wrote(folder: StateFolder) -> None:
+    folder.write(b'x')
+    folder.set_aside()
+    folder.write(b'y')
+    folder.write_curve(CURVE)
+    names = {'lock', 'monitor.state', 'monitor.state.unused', f'curve_{CURVE.model_id}.json'}
+    assert {p.name for p in folder.folder.iterdir()} == names
+
+
+def test_taking_back_twice_changes_nothing(folder: StateFolder) -> None:
+    folder.write(b'mended')
+    folder.aside.write_bytes(b'before')
+    for _ in range(2):
+        now, aside = folder.read(), folder.read(folder.aside)
+        folder.swap_aside()
+        assert (folder.read(), folder.read(folder.aside)) == (aside, now)
+    folder.path.unlink()
+    folder.swap_aside()
+    assert (folder.read(), folder.read(folder.aside)) == (b'before', None)
+    assert {p.name for p in folder.folder.iterdir()} == {LOCK, STATE}
+
+
+@pytest.mark.parametrize('mask', [0o000, 0o022, 0o077])
+def test_all_that_is_kept_is_its_owners(tmp_path: Path, mask: int) -> None:
+    before = os.umask(mask)
+    try:
+        folder = StateFolder(tmp_path / 'deep' / 'state')
+        folder.write(b'x')
+        folder.write_curve(CURVE)
+        folder.close()
+    finally:
+        os.umask(before)
+    modes = {p.name: stat.S_IMODE(p.stat().st_mode) for p in folder.folder.iterdir()}
+    assert set(modes.values()) == {0o600}
+    assert set(modes) == {LOCK, STATE, f'curve_{CURVE.model_id}.json'}
+    assert stat.S_IMODE(folder.folder.stat().st_mode) == 0o700
+
+
+def test_the_last_curves_stay_and_each_is_found_by_its_name(folder: StateFolder) -> None:
+    curves = []
+    for k in range(9):
+        curve = replace(CURVE, notes=(f'number {k}',)).with_id()
+        curves.append(curve)
+        folder.write_curve(curve)
+        path = folder.folder / f'curve_{curve.model_id}.json'
+        # Whatever the clock of a disk can tell apart.
+        os.utime(path, ns=(10**9 * (k + 1), 10**9 * (k + 1)))
+        kept = list(folder.folder.glob('curve_*.json'))
+        assert {p.name for p in kept} == {f'curve_{c.model_id}.json' for c in curves[-5:]}
+        assert repr(folder.curve(curve.model_id)) == repr(curve)
+    assert not list(folder.folder.glob('.*.tmp'))
+
+
+@pytest.mark.parametrize('content', ['[' * 100_000, '', '{}', 'null', '\udcff', '{"format": 1'])
+def test_a_file_that_is_no_curve_or_another_one_is_one_sentence(
+    folder: StateFolder, content: str
+) -> None:
+    folder.write_curve(CURVE)
+    path = folder.folder / 'curve_abc.json'
+    shutil.copy(folder.folder / f'curve_{CURVE.model_id}.json', path)
+    with pytest.raises(DataError, match='Curve abc was not saved'):
+        folder.curve('abc')
+    path.write_text(content, encoding='utf-8', errors='surrogateescape')
+    with pytest.raises(DataError, match='Curve abc was not saved'):
+        folder.curve('abc')
+
+
+def test_a_lock_names_its_owner_and_nothing_of_the_one_before(tmp_path: Path) -> None:
+    (tmp_path / LOCK).write_text('1234567890123456789\nand a lot more of the one before\n')
+    folder = StateFolder(tmp_path)
+    assert (tmp_path / LOCK).read_text() == f'{os.getpid()}\n'
+    with pytest.raises(InUseError, match=rf'another monitor \(process {os.getpid()}\) keeps'):
+        StateFolder(tmp_path)
+    for unknown in ('', 'nobody\n'):
+        (tmp_path / LOCK).write_text(unknown)
+        with pytest.raises(InUseError, match='another monitor keeps its state there'):
+            StateFolder(tmp_path)
+    folder.close()
+
+
+def test_being_refused_keeps_no_descriptor(tmp_path: Path) -> None:
+    folder = StateFolder(tmp_path)
+    # What earlier tests left to the collector may go at any moment.
+    gc.collect()
+    before = len(os.listdir('/proc/self/fd'))
+    for _ in range(3):
+        with pytest.raises(InUseError):
+            StateFolder(tmp_path)
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(RecordingError, match=r'cannot be used \(not a directory\)'):
+        StateFolder(tmp_path / 'file' / 'state')
+    with pytest.raises(RecordingError, match=r'cannot be used \(embedded null byte\)'):
+        StateFolder(tmp_path / 'nul\0')
+    assert folder.read() is None
+    folder.write(b'x')
+    assert folder.read() == b'x'
+    assert len(os.listdir('/proc/self/fd')) == before
+    folder.close()
+
+
+def test_nothing_is_locked_or_written_through_a_link(tmp_path: Path) -> None:
+    victim = tmp_path / 'victim'
+    victim.write_text('not ours')
+    state = tmp_path / 'state'
+    state.mkdir()
+    (state / LOCK).symlink_to(victim)
+    with pytest.raises(RecordingError, match=r'cannot be used \(too many levels of symbolic'):
+        StateFolder(state)
+    (state / LOCK).unlink()
+    folder = StateFolder(state)
+    (state / f'.curve_{CURVE.model_id}.json.tmp').symlink_to(victim)
+    folder.write_curve(CURVE)
+    with pytest.raises(DataError, match='was not saved'):
+        folder.curve(CURVE.model_id)
+    assert victim.read_text() == 'not ours'
+    folder.close()
+
+
+def test_a_file_that_is_too_large_is_not_even_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = StateFolder(tmp_path)
+    monkeypatch.setattr(state_store, '_MAX_BYTES', 3)
+    folder.write(b'123')
+    assert folder.read() == b'123'
+    folder.write(b'1234')
+    with pytest.raises(RecordingError, match='too large to be a saved state'):
+        folder.read()
+    folder.close()
+
+
+def test_a_state_in_the_place_of_something_else_is_a_sentence(tmp_path: Path) -> None:
+    folder = StateFolder(tmp_path)
+    (tmp_path / 'elsewhere').write_bytes(b'somebody else keeps this')
+    (tmp_path / STATE).symlink_to(tmp_path / 'elsewhere')
+    with pytest.raises(RecordingError, match='cannot be read'):
+        folder.read()
+    # A new one takes the place of the link, not of what it points to.
+    folder.write(b'mine')
+    assert (folder.read(), (tmp_path / 'elsewhere').read_bytes()) == (
+        b'mine',
+        b'somebody else keeps this',
+    )
+    folder.close()
+
+
+def test_closing_twice_lets_nobody_elses_descriptor_go(tmp_path: Path) -> None:
+    folder = StateFolder(tmp_path)
+    folder.close()
+    other = os.open(tmp_path / 'lock', os.O_RDONLY)
+    folder.close()
+    os.fstat(other)
+    os.close(other)
+    again = StateFolder(tmp_path)
+    with pytest.raises(InUseError):
+        StateFolder(tmp_path)
+    again.close()
+
+
+def test_a_curve_that_cannot_be_kept_is_in_the_state_that_follows(tmp_path: Path) -> None:
+    folder = StateFolder(tmp_path / 'state')
+    shutil.rmtree(tmp_path / 'state')
+    folder.write_curve(CURVE)
+    folder.close()
+    assert not (tmp_path / 'state').exists()
+
+
+def test_what_a_killed_writer_left_goes_at_the_next_start(tmp_path: Path) -> None:
+    StateFolder(tmp_path).close()
+    (tmp_path / '.monitor.state.1.2.tmp').write_bytes(b'half')
+    (tmp_path / 'monitor.state').write_bytes(b'whole')
+    folder = StateFolder(tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ['lock', 'monitor.state']
+    folder.close()
+
+
+# Loaded once; each line it reads begins a writer of its own and tells its number.
+_WRITES = """
+import itertools, os, sys
+import numpy as np
+from pathlib import Path
+from valveflow_ros.state import to_bytes
+from valveflow_ros.ros.node.state_store import StateFolder
+for line in iter(sys.stdin.readline, ''):
+    child = os.fork()
+    if child:
+        os.waitpid(child, 0)
+        os.write(1, b'ended\\n')
+        continue
+    folder = StateFolder(Path(line[:-1]))
+    os.write(1, b'%d\\n' % os.getpid())
+    for k in itertools.count(1):
+        folder.write(to_bytes({'number': k, 'rows': np.full(200_000, k)}))
+        os.write(1, b'%d\\n' % k)
+"""
+
+
+def test_killed_at_any_moment_it_is_the_old_or_the_new_state(tmp_path: Path) -> None:
+    chance = np.random.default_rng(1)
+    with subprocess.Popen(
+        [sys.executable, '-c', _WRITES], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as nursery:
+        assert nursery.stdin is not None
+        assert nursery.stdout is not None
+        for _ in range(8):
+            nursery.stdin.write(f'{tmp_path}\n')
+            nursery.stdin.flush()
+            writer, first = int(nursery.stdout.readline()), int(nursery.stdout.readline())
+            time.sleep(float(chance.uniform(0.0, 0.15)))
+            os.kill(writer, signal.SIGKILL)
+            told = [first, *map(int, iter(nursery.stdout.readline, 'ended\n'))]
+            folder = StateFolder(tmp_path)
+            state = from_bytes(folder.read() or b'')
+            folder.close()
+            assert state['number'] in (told[-1], told[-1] + 1)
+            assert (state['rows'] == state['number']).all()
+            assert not list(tmp_path.glob('.*.tmp'))
+        nursery.stdin.close()
+
+
+# The store
+
+
+def test_what_is_written_is_found_again_with_the_rights_of_its_owner(tmp_path: Path) -> None:
+    written(tmp_path)
+    found = StateStore(settings(tmp_path))
+    assert found.saved is not None
+    assert found.saved['log_ns'] == 5
+    np.testing.assert_array_equal(found.saved['numbers'], STATE_A['numbers'])
+    folder = state_folder(settings(tmp_path))
+    assert folder is not None
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert {p.stat().st_mode & 0o777 for p in folder.iterdir()} == {0o600}
+    found.close()
+
+
+def test_only_one_at_a_time_and_the_next_as_soon_as_it_is_gone(tmp_path: Path) -> None:
+    first = StateStore(settings(tmp_path))
+    with pytest.raises(RecordingError, match=rf'another monitor \(process {os.getpid()}\)'):
+        StateStore(settings(tmp_path))
+    StateStore(settings(tmp_path, unit_tag='another')).close()
+    StateStore(settings(tmp_path, state_directory=str(tmp_path / 'own'))).close()
+    for none in ({'keep_state': False}, {'record': False}):
+        store = StateStore(settings(tmp_path, **none))
+        assert not store.on
+        store.close()
+    first.close()
+    StateStore(settings(tmp_path)).close()
+
+
+@pytest.mark.parametrize(
+    ('more', 'words'),
+    [
+        ({'sample_period': 2.0}, 'It was made with another sample_period.'),
+        ({'block': 20.0, 'window_days': 5.0}, 'It was made with another window_days and block.'),
+        ({'alarm_limit': 3.0, 'refit_period': 60.0}, ''),
+        ({'record_keep': 5, 'refit_timeout': 50.0}, ''),
+    ],
+)
+def test_a_state_of_other_parameters_is_used_only_where_they_do_not_matter(
+    tmp_path: Path, more: dict[str, float], words: str
+) -> None:
+    written(tmp_path)
+    store = StateStore(settings(tmp_path, **more))
+    assert (store.saved is None) == bool(words)
+    assert words in store.sentence
+    # It waits for a run that it fits.
+    assert not store.lost
+    store.close()
+
+
+def test_a_mistyped_parameter_costs_no_state(tmp_path: Path) -> None:
+    written(tmp_path)
+    for _ in range(2):
+        store = StateStore(settings(tmp_path, window_days=5.0))
+        assert store.saved is None
+        assert 'a run that it fits takes it up again' in store.sentence
+        store.close()
+        # A young state takes its place at once.
+        written(tmp_path, {'numbers': np.arange(1.0)}, window_days=5.0)
+        mended = StateStore(settings(tmp_path))
+        assert mended.sentence == ''
+        assert mended.saved is not None
+        np.testing.assert_array_equal(mended.saved['numbers'], STATE_A['numbers'])
+        mended.close()
+        # The other one is not lost either.
+        again = StateStore(settings(tmp_path, window_days=5.0))
+        assert again.saved is not None
+        assert len(again.saved['numbers']) == 1
+        again.close()
+        written(tmp_path)
+        (tmp_path / 'state_unit' / ASIDE).unlink()
+
+
+@pytest.mark.parametrize('given', ['/proc/nothing', '~nobody_of_that_name/x'])
+def test_where_nothing_can_be_saved_the_monitor_goes_on_and_says_so(given: str) -> None:
+    store = StateStore(Settings({'state_directory': given}))
+    assert not store.on
+    assert store.problem.startswith('The state cannot be saved. ')
+    assert not store.due
+    store.close()
+
+
+@pytest.mark.parametrize('how', ['cut', 'flipped', 'empty', 'junk', 'newer', 'folder', 'pipe'])
+def test_a_state_that_is_not_whole_is_a_sentence_and_never_an_exception(
+    tmp_path: Path, how: str
+) -> None:
+    written(tmp_path)
+    path = tmp_path / 'state_unit' / STATE
+    data = path.read_bytes()
+    path.unlink()
+    if how == 'folder':
+        path.mkdir()
+    elif how == 'pipe':
+        os.mkfifo(path)
+    else:
+        half = len(data) // 2
+        path.write_bytes(
+            {
+                'cut': data[:-1],
+                'flipped': data[:half] + bytes([data[half] ^ 1]) + data[half + 1 :],
+                'empty': b'',
+                'junk': b'x' * 1000,
+                'newer': data.replace(b'state 1 ', b'state 2 ', 1),
+            }[how]
+        )
+    store = StateStore(settings(tmp_path))
+    assert store.saved is None
+    assert store.sentence.startswith('The state saved by an earlier run is not used. ')
+    assert 'alarms and reference of before are gone' in store.sentence
+    assert store.sentence.endswith('.')
+    assert store.lost
+    store.close()
+
+
+def test_a_damaged_state_is_seen_in_the_health_until_the_next_start(tmp_path: Path) -> None:
+    written(tmp_path)
+    path = tmp_path / 'state_unit' / STATE
+    path.write_bytes(path.read_bytes()[:-1])
+    for level, words in ((Level.WARN, 'is not used.'), (Level.OK, 'is saved in its time.')):
+        store = StateStore(settings(tmp_path))
+        item = store.item()
+        assert item.level == level
+        assert words in item.sentence
+        store.close()
+
+
+def test_where_nothing_is_kept_nothing_is_asked_of_a_disk() -> None:
+    store = StateStore(Settings({'record': False}))
+    assert (store.on, store.problem, store.saved_s, store.due) == (False, '', None, False)
+    assert 'Nothing is kept' in store.item().sentence
+    store.write({}, lambda: True)
+    with pytest.raises(DataError, match='Curve abc was not saved'):
+        store.curve('abc')
+    store.close()
+
+
+def test_an_adopted_curve_is_saved_at_once(tmp_path: Path) -> None:
+    store = StateStore(settings(tmp_path))
+    store.note([CurveAdopted(CURVE)])
+    assert repr(store.curve(CURVE.model_id)) == repr(CURVE)
+    with pytest.raises(DataError, match='was not saved'):
+        store.curve('another')
+    store.close()
+
+
+def test_a_state_written_while_another_is_being_written_waits_for_it(tmp_path: Path) -> None:
+    given = settings(tmp_path)
+    store = StateStore(given)
+    for k in range(5):
+        state = {'settings': dict(given), 'numbers': np.full(300_000, float(k))}
+        store.write(state, lambda: True)
+    store.close()
+    found = StateStore(given)
+    assert found.saved is not None
+    assert (found.saved['numbers'] == 4.0).all()
+    assert not list((tmp_path / 'state_unit').glob('.*'))
+    found.close()
+
+
+def test_a_state_is_put_in_place_when_the_recording_is_ready_or_after_its_patience(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(state_store, '_PATIENCE_S', 60.0)
+    store = StateStore(settings(tmp_path))
+    path = tmp_path / 'state_unit' / STATE
+
+    def there() -> bytes:
+        return path.read_bytes() if path.exists() else b''
+
+    for answers in ([True], [False] * 3 + [True]):
+        left = list(answers)
+        asked: list[bytes] = []
+
+        def ready(left: list[bool] = left, asked: list[bytes] = asked) -> bool:
+            asked.append(there())
+            return left.pop(0)
+
+        before = there()
+        store.write({'answers': answers}, ready)
+        store.finish()
+        # Until it is ready, what was there before is there.
+        assert asked == [before] * len(answers)
+        assert from_bytes(there()) == {'answers': answers}
+    monkeypatch.setattr(state_store, '_PATIENCE_S', 0.3)
+    begun = time.monotonic()
+    store.write({'never': 'ready'}, lambda: False)
+    assert store.busy
+    assert not store.due
+    store.finish()
+    assert 0.3 <= time.monotonic() - begun < 20.0
+    assert not store.busy
+    assert from_bytes(there()) == {'never': 'ready'}
+    assert store.saved_s is not None
+    assert begun + 0.3 <= store.saved_s <= time.monotonic()
+    store.close()
+
+
+def test_what_cannot_be_written_is_a_problem_until_it_can(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, broken = StateFolder.write, [True]
+
+    def failing(self: StateFolder, data: bytes) -> None:
+        if broken:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write(self, data)
+
+    monkeypatch.setattr(StateFolder, 'write', failing)
+    store = StateStore(settings(tmp_path))
+    path = tmp_path / 'state_unit' / STATE
+    for state, said in (
+        ({}, f'{path}: the state cannot be saved (no space left on device).'),
+        ({'cannot be saved': object()}, 'The state cannot be saved (TypeError: '),
+    ):
+        store.write(state, lambda: True)
+        store.finish()
+        assert store.problem.startswith(said)
+        assert (store.saved_s, store.item().level) == (None, Level.ERROR)
+    broken.clear()
+    store.write({'fine': 1}, lambda: True)
+    store.finish()
+    assert store.problem == ''
+    assert store.saved_s is not None
+    assert from_bytes(path.read_bytes()) == {'fine': 1}
+    store.close()
+
+
+def test_an_end_waits_for_the_one_being_written_but_not_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(state_store, '_LONGEST_S', 0.05)
+    monkeypatch.setattr(state_store, '_PATIENCE_S', 60.0)
+    go = threading.Event()
+    store = StateStore(settings(tmp_path))
+    store.write({'late': 1}, go.is_set)
+    (thread,) = (t for t in threading.enumerate() if t.name == 'state writer')
+    assert thread.daemon
+    store.finish()
+    assert store.busy
+    go.set()
+    monkeypatch.setattr(state_store, '_LONGEST_S', 20.0)
+    store.close()
+    assert not store.busy
+    assert from_bytes((tmp_path / 'state_unit' / STATE).read_bytes()) == {'late': 1}
+
+
+# Continuing an earlier run
+
+NAMES = {'characteristic': '/m/characteristic', 'breakpoints': '/m/breakpoints'}
+LOG_NS = 1_700_000_000_000_000_000
+# As `Session` records them: before the first row there is no time of the plant, and the message
+# bears the time of the log.
+BEFORE, AFTER = Output('characteristic', b'curve', 0), Output('breakpoints', b'knots', 5_000)
+
+
+@pytest.mark.parametrize(
+    ('said', 'again'),
+    [
+        ([], [BEFORE, AFTER]),
+        ([BEFORE], [AFTER]),
+        ([AFTER], [BEFORE]),
+        ([AFTER, BEFORE], []),
+    ],
+)
+def test_each_output_stands_in_the_recording_once(
+    said: list[Output], again: list[Output], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = Settings()
+    tail = [
+        LoggedMessage(NAMES[o.name], 'some/msg/Type', LOG_NS, o.time_ns or LOG_NS, o.data)
+        for o in said
+    ]
+    monkeypatch.setattr(restart, 'recover_leftovers', lambda _: [])
+    monkeypatch.setattr(restart, 'messages_since', lambda _folder, _log_ns: tail)
+    saved = {
+        'settings': dict(given), 'log_ns': 1, 'recording': 'folder', 'engine': None, 'began': {},
+        'topics': {**NAMES, 'journal': '/m/journal'},
+    }  # fmt: skip
+    store: Any = SimpleNamespace(saved=saved, problem='', sentence='', curve=None)
+    engine: Any = SimpleNamespace(
+        monitor=Monitor(given), aligner=Aligner(given), restore=lambda _: None
+    )
+    of_tail = iter([[BEFORE, AFTER]])
+    outputs: Any = SimpleNamespace(of=lambda _: next(of_tail, []))
+    logged: list[tuple[Level, str]] = []
+    ours = Restart(given, store, {}, saved['topics'], lambda *line: logged.append(line))
+    assert ours.engine(lambda _: engine) is engine
+    assert (ours.continues, ours.folder) == (True, Path('folder'))
+    assert ours.log_ns == (LOG_NS if said else 1)
+    assert list(ours.begin(given, engine, outputs)) == again
+    assert logged == [(Level.OK, 'Going on after 0 rows of an earlier run.')]

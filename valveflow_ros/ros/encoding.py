@@ -1,0 +1,350 @@
+"""The engine's records as messages, and messages as bytes that depend on nothing but their fields.
+
+The middleware's own serialiser leaves whatever was in memory in the padding between fields, so two
+equal messages may differ in their bytes. What is recorded here is compared byte for byte and must
+carry nothing of the process's memory, so the padding written here is zero.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+from builtin_interfaces.msg import Time
+from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension
+from valveflow_msgs.msg import (
+    Alarm,
+    Diagnosis,
+    DiagnosisCause,
+    FlowCharacteristic,
+    JournalEntry,
+    SpecialSegment,
+)
+
+from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.shift import Shift
+from valveflow_ros.monitoring import events as engine
+from valveflow_ros.monitoring.alarms import AlarmChange
+from valveflow_ros.monitoring.curves import CurveStatus
+from valveflow_ros.monitoring.prediction import PredictionBlock
+from valveflow_ros.records import NS_PER_S, FloatArray
+from valveflow_ros.records import SpecialSegment as SegmentRecord
+
+# The latest time whose seconds a stamp can hold.
+LAST_NS = (1 << 31) * NS_PER_S - 1
+NOT_YET = 'Not diagnosed yet: a diagnosis needs a curve and a day of data.'
+VERDICTS = {
+    'nothing': Diagnosis.NOTHING,
+    'named': Diagnosis.NAMED,
+    'unexplained': Diagnosis.UNEXPLAINED,
+}
+
+# Records as messages
+
+
+def to_time(time_ns: int) -> Time:
+    """Return a stamp; times before 1970 or after 2038 become the nearest one there is."""
+    sec, nanosec = divmod(min(max(time_ns, 0), LAST_NS), NS_PER_S)
+    return Time(sec=sec, nanosec=nanosec)
+
+
+def header(time_ns: int, tag: str) -> Header:
+    """Return the head of a message."""
+    return Header(stamp=to_time(time_ns), frame_id=tag)
+
+
+def _message(of: Any, record: object, **different: Any) -> Any:
+    """Return a message with the fields that a record has under the same names, and others."""
+    same = {n: getattr(record, n) for n in of.get_fields_and_field_types() if n not in different}
+    return of(**same, **different)
+
+
+def segment_message(found: SegmentRecord, tag: str) -> SpecialSegment:
+    """Return a special segment as a message."""
+    return _message(
+        SpecialSegment, found, header=header(found.end_ns, tag), kind=int(found.kind),
+        start=to_time(found.start_ns), end=to_time(found.end_ns),
+    )  # fmt: skip
+
+
+def alarm_message(change: AlarmChange, tag: str) -> Alarm:
+    """Return a change of an alarm's state as a message."""
+    return _message(
+        Alarm, change, header=header(change.time_ns, tag), state=int(change.state),
+        previous_state=int(change.previous), priority=int(change.priority),
+        raised=to_time(change.raised_ns),
+    )  # fmt: skip
+
+
+def journal_message(entry: engine.JournalEntry, tag: str) -> JournalEntry:
+    """Return a line of the journal as a message; `decoding.journal_entry` is the way back."""
+    return _message(
+        JournalEntry, entry, header=header(entry.time_ns, tag), kind=int(entry.kind),
+        request=to_time(entry.request_ns), samples=entry.rows,
+    )  # fmt: skip
+
+
+def curve_message(
+    curve: Characteristic | None,
+    status: CurveStatus,
+    cause: str,
+    tag: str,
+    reference_id: str = '',
+    shift: Shift | None = None,
+) -> FlowCharacteristic:
+    """Return the running curve and what it is worth; without a curve, say why there is none."""
+    nan = math.nan
+    message = FlowCharacteristic(
+        header=header(0 if curve is None else curve.source.window_end_ns, tag),
+        status=int(status), cause=cause, pressure_exponent=nan, rmse_mw=nan,
+        temperature_mean_degc=nan, temperature_spread_degc=nan, reference_model_id=reference_id,
+    )  # fmt: skip
+    if curve is None:
+        return message
+    source, pieces, dynamics, choice = curve.source, curve.pieces, curve.dynamics, curve.choice
+    message.model_id = curve.model_id
+    message.window_start = to_time(source.window_start_ns)
+    message.window_end = to_time(source.window_end_ns)
+    message.breakpoints = curve.breakpoints.tolist()
+    message.values = curve.values().tolist()
+    message.pieces = len(pieces)
+    message.slopes = [p.slope for p in pieces]
+    message.intercepts = [p.intercept for p in pieces]
+    message.slope_stderr = [p.slope_stderr for p in pieces]
+    message.intercept_stderr = [p.intercept_stderr for p in pieces]
+    message.breakpoint_low = [low for low, _ in curve.breakpoint_intervals]
+    message.breakpoint_high = [high for _, high in curve.breakpoint_intervals]
+    message.region_power_from = [d.power_from for d in dynamics]
+    message.region_power_to = [d.power_to for d in dynamics]
+    message.time_constants = [d.time_constant_s for d in dynamics]
+    message.delays = [d.delay_s for d in dynamics]
+    message.time_constant_stderr = [d.time_constant_stderr_s for d in dynamics]
+    message.delay_stderr = [d.delay_stderr_s for d in dynamics]
+    message.power_to_stderr = [d.power_to_stderr_mw for d in dynamics]
+    # Omega(J), Lambda(J) and the share of J, for J = 1, 2, ...
+    numbers = range(1, max(choice.cost, default=0) + 1)
+    message.cost = [choice.cost.get(j, nan) for j in numbers]
+    message.turning_angle = [choice.turning_angle.get(j, nan) for j in numbers]
+    likely = choice.confidence
+    message.confidence = [likely.get(j, 0.0) for j in range(1, max(likely, default=0) + 1)]
+    message.pressure_exponent = curve.pressure_exponent
+    message.samples = source.samples
+    message.steady_segments = source.steady
+    message.slope_segments = source.slope_response
+    message.rmse_mw = curve.residuals.rmse_mw
+    message.temperature_mean_degc = source.temperature_mean_degc
+    message.temperature_spread_degc = source.temperature_spread_k
+    message.temperature_flag = source.temperature_flag
+    if reference_id and shift is None:
+        # The reference itself has not moved; any other curve has not been judged.
+        message.shift_mw = [0.0 if curve.model_id == reference_id else nan] * len(pieces)
+        message.shift_confidence = list(message.shift_mw)
+    elif reference_id and shift is not None:
+        message.shift_sentence = shift.sentence
+        message.shift_mw = [p.shift_mw for p in shift.pieces]
+        message.shift_confidence = [p.confidence for p in shift.pieces]
+        message.shift_since = to_time(shift.since_ns)
+        message.shift_since_low = to_time(shift.since_low_ns)
+        message.shift_since_high = to_time(shift.since_high_ns)
+    return message
+
+
+def array_message(values: FloatArray | Sequence[float], label: str) -> Float64MultiArray:
+    """Return numbers for clients without our messages; the label says what they are."""
+    numbers = [float(value) for value in values]
+    message = Float64MultiArray(data=numbers)
+    message.layout.dim = [MultiArrayDimension(label=label, size=len(numbers), stride=len(numbers))]
+    return message
+
+
+def no_diagnosis_message(
+    sentence: str, tag: str, task: engine.DiagnosisTask | None = None
+) -> Diagnosis:
+    """Return the message that says why there is no result."""
+    nan = math.nan
+    return Diagnosis(
+        header=header(0 if task is None else task.window_end_ns, tag),
+        model_id='' if task is None else task.curve.model_id,
+        verdict=Diagnosis.UNKNOWN, sentence=sentence, disturbance_rms_mw=nan,
+        disturbance_time_scale_s=nan, rmse_simulation=nan, rmse_extended=nan, rmse_noise_floor=nan,
+    )  # fmt: skip
+
+
+def diagnosis_message(
+    content: Mapping[str, Any], task: engine.DiagnosisTask, tag: str
+) -> Diagnosis:
+    """Return what `diagnosis.json` would hold as a message.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError, AssertionError
+        It is not whole.
+    """
+    message = no_diagnosis_message(str(content['sentence']), tag, task)
+    message.verdict = VERDICTS[content['verdict']]
+    message.causes = [_cause_message(cause) for cause in content['causes']]
+    message.not_told_apart = [str(name) for name in content['not_told_apart']]
+    message.unexplained_by = [str(name) for name in content['unexplained_by']]
+    message.rejected_names = [str(rejected['name']) for rejected in content['rejected']]
+    message.rejected_reasons = [str(rejected['reason']) for rejected in content['rejected']]
+    disturbance = content['disturbance']
+    if disturbance is not None:
+        message.disturbance_rms_mw = _number(disturbance['rms_mw'])
+        message.disturbance_time_scale_s = _number(disturbance['time_scale_s'])
+    for name in ('rmse_simulation', 'rmse_extended', 'rmse_noise_floor'):
+        setattr(message, name, _number(content[name]))
+    return message
+
+
+def _cause_message(cause: Mapping[str, Any]) -> DiagnosisCause:
+    parameters, gain = cause['parameters'], cause['gain']
+    return DiagnosisCause(
+        name=str(cause['name']),
+        sentence=str(cause['sentence']),
+        parameter_names=[str(name) for name in parameters],
+        parameter_values=[_number(p['value']) for p in parameters.values()],
+        parameter_lows=[_number(p['low']) for p in parameters.values()],
+        parameter_highs=[_number(p['high']) for p in parameters.values()],
+        parameter_units=[str(p['unit']) for p in parameters.values()],
+        rmse_before_mw=_number(gain['rmse_before']),
+        rmse_after_mw=_number(gain['rmse_after']),
+        reduction=_number(gain['reduction']),
+        p_value=_number(gain['p_value']),
+    )
+
+
+def _number(value: float | None) -> float:
+    """JSON's null is a number that is not known."""
+    return math.nan if value is None else float(value)
+
+
+# Messages as bytes
+
+_HEAD = b'\x00\x01\x00\x00'  # plain CDR, little endian
+_FLOAT64, _TIME = struct.Struct('<d'), struct.Struct('<iI')
+_CODES = {
+    'boolean': '?', 'int8': 'b', 'uint8': 'B', 'int16': 'h', 'uint16': 'H', 'int32': 'i',
+    'uint32': 'I', 'int64': 'q', 'uint64': 'Q', 'float': 'f', 'double': 'd',
+}  # fmt: skip
+_Writer = Callable[[bytearray, Any], None]
+
+
+def encode(message: Any) -> bytes:
+    """Return a message as it goes over the wire.
+
+    Raises
+    ------
+    TypeError
+        A field is of a kind that none of our messages has.
+    """
+    out = bytearray()
+    _write_message(out, message)
+    return _HEAD + out
+
+
+def float64_bytes(value: float) -> bytes:
+    """Return a std_msgs/Float64."""
+    return _HEAD + _FLOAT64.pack(value)
+
+
+def clock_bytes(time_ns: int) -> bytes:
+    """Return a rosgraph_msgs/Clock; times before 1970 or after 2038 become the nearest one."""
+    return _HEAD + _TIME.pack(*_seconds(time_ns))
+
+
+def _seconds(time_ns: int) -> tuple[int, int]:
+    return divmod(min(max(time_ns, 0), LAST_NS), NS_PER_S)
+
+
+def prediction_bytes(block: PredictionBlock, tag: str) -> Iterator[tuple[int, bytes]]:
+    """Yield the valveflow_msgs/Prediction of each row with the row's time in ns.
+
+    There is one for every sample, and a message object for each would be the monitor's largest
+    cost. The bytes equal those of `encode`; a test compares the two, and the order of the fields.
+    """
+    frame, model = tag.encode() + b'\x00', block.model_id.encode() + b'\x00'
+    pack = _prediction_layout(len(frame), len(model)).pack
+    expected = block.measured_mw - block.residual_mw
+    columns = (
+        block.time_ns, block.state, block.u, block.measured_mw, block.static_mw,
+        block.dynamic_mw, block.residual_mw, block.average_mw, expected - block.width_mw,
+        expected + block.width_mw, block.evidence, block.shift_mw,
+    )  # fmt: skip
+    for row in zip(*(column.tolist() for column in columns), strict=True):
+        time_ns, state, *numbers = row
+        stamp = _seconds(time_ns)
+        yield (
+            time_ns,
+            pack(_HEAD, *stamp, len(frame), frame, state, len(model), model, *numbers),
+        )
+
+
+@functools.lru_cache(maxsize=16)
+def _prediction_layout(tag_bytes: int, model_bytes: int) -> struct.Struct:
+    """Return the layout for texts of these lengths, zero bytes included."""
+    size = 12 + tag_bytes + 1
+    before_model = -size % 4
+    size += before_model + 4 + model_bytes
+    before_numbers = -size % 8
+    return struct.Struct(f'<4siII{tag_bytes}sB{before_model}xI{model_bytes}s{before_numbers}x10d')
+
+
+def _write_message(out: bytearray, message: Any) -> None:
+    for name, write in _writers(type(message)):
+        write(out, getattr(message, name))
+
+
+@functools.cache
+def _writers(kind: type) -> tuple[tuple[str, _Writer], ...]:
+    fields: dict[str, str] = kind.get_fields_and_field_types()  # type: ignore[attr-defined]
+    return tuple((name, _writer(text)) for name, text in fields.items())
+
+
+def _writer(text: str) -> _Writer:
+    """Return what writes a field of this type."""
+    if text.startswith('sequence<') and ',' not in text:
+        return functools.partial(_write_sequence, text[len('sequence<') : -1])
+    if text == 'string':
+        return _write_string
+    if text == 'octet':
+        return bytearray.extend
+    if text in _CODES:
+        return _number_writer(_CODES[text])
+    if '/' in text and '[' not in text and '<' not in text:
+        return _write_message
+    raise TypeError(f"fields of type '{text}' are not supported")
+
+
+def _number_writer(code: str) -> _Writer:
+    layout = struct.Struct(f'<{code}')
+    size = layout.size
+
+    def write(out: bytearray, value: Any) -> None:
+        out += bytes(-len(out) % size) + layout.pack(value)
+
+    return write
+
+
+_write_length = _number_writer('I')
+
+
+def _write_sequence(element: str, out: bytearray, values: Any) -> None:
+    _write_length(out, len(values))
+    if element in _CODES:
+        if len(values):
+            code = _CODES[element]
+            out += bytes(-len(out) % struct.calcsize(f'<{code}'))
+            out += struct.pack(f'<{len(values)}{code}', *values)
+        return
+    write = _writer(element)
+    for value in values:
+        write(out, value)
+
+
+def _write_string(out: bytearray, value: Any) -> None:
+    data = value.encode()
+    _write_length(out, len(data) + 1)
+    out += data + b'\x00'

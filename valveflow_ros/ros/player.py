@@ -1,0 +1,189 @@
+"""Publish samples in their own time, at any rate, with or without a clock.
+
+What is sent in one go beyond what the middleware's queues hold is lost. The monitor answers each
+row with a prediction that carries the row's stamp, so what is unanswered is known, and a player
+waits while that is too much. Where nobody predicts, a player without a rate is limited to what an
+ordinary subscriber takes.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple
+
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from valveflow_msgs.msg import Prediction
+
+from valveflow_ros.ros.decoding import INPUT_BY_NAME, header_time_ns
+from valveflow_ros.ros.encoding import clock_bytes
+from valveflow_ros.ros.polled_subscription import PolledSubscription
+
+_PREDICTION = 'valveflow_msgs/msg/Prediction'
+_DEPTH = 1000
+# Between two processes on one machine the middleware's queue holds 512 messages of all topics.
+_MAX_UNANSWERED = 240
+_LEAST_STEPS = 8
+_FLOW_NAP_S = 0.002
+_STUCK_S = 0.5
+_MAX_STUCK = 3
+_UNLED_STEPS_PER_S = 1000.0
+_LOOK_S = 1.0
+_NAP_S = 0.05
+# The other side may discover us a little later than we it.
+_SETTLE_S = 1.0
+
+
+class Step(NamedTuple):
+    """The messages of one instant: (input's name, bytes)."""
+
+    time_ns: int
+    messages: list[tuple[str, bytes]]
+
+
+class Player:
+    """Publishes steps.
+
+    Parameters
+    ----------
+    node : Node
+    names : iterable of str
+        The inputs that will be published.
+    rate : float
+        Seconds of the samples' own time in a second; 0 as fast as the monitor takes them.
+    use_clock : bool
+        Publish /clock before each step.
+    stop : callable
+        Returns True to stop.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        names: Iterable[str],
+        rate: float,
+        use_clock: bool,
+        stop: Callable[[], bool],
+    ) -> None:
+        self._node = node
+        self._rate = rate
+        self._stop = stop
+        qos = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
+        self.publishers: Mapping[str, Publisher] = {
+            name: node.create_publisher(INPUT_BY_NAME[name].message_type, name, qos)
+            for name in names
+        }
+        self._clock = node.create_publisher(Clock, '/clock', qos) if use_clock else None
+        self.sent: dict[str, int] = dict.fromkeys(self.publishers, 0)
+        self._window = max(_LEAST_STEPS, _MAX_UNANSWERED // (len(self.publishers) + use_clock))
+        self._predictions: list[PolledSubscription] = []
+        self._unanswered: deque[int] = deque()
+        self._answered_ns = 0
+        self._stuck = 0
+        self._free_at_s = self._looked_s = 0.0
+
+    def wait_for_listeners(self, patience_s: float) -> list[str]:
+        """Wait until every input has a subscriber; return the topics that have none.
+
+        Parameters
+        ----------
+        patience_s : float
+            How long to wait; 0 waits for nobody.
+        """
+        begun_s = time.monotonic()
+        missing = self._without_listener()
+        while missing and time.monotonic() - begun_s < patience_s and not self._stop():
+            time.sleep(_NAP_S)
+            missing = self._without_listener()
+        if len(missing) < len(self.publishers):
+            self._sleep_until(time.monotonic() + _SETTLE_S)
+        return missing
+
+    def play(self, steps: Iterable[Step]) -> int:
+        """Publish steps until they end or we are asked to stop; return how many."""
+        self._find_predictions()
+        log = self._node.get_logger()
+        if self._predictions:
+            topics = ', '.join(found.topic for found in self._predictions)
+            log.info(f'Sending no faster than {topics} answers.')
+        elif self._rate == 0:
+            log.info('Nobody predicts, so there is nobody to follow: 1000 samples a second.')
+        done = 0
+        first_ns, begun_s = 0, time.monotonic()
+        for step in steps:
+            if done == 0:
+                first_ns = step.time_ns
+            if self._rate > 0:
+                self._sleep_until(begun_s + (step.time_ns - first_ns) * 1e-9 / self._rate)
+            self._wait_for_answers()
+            if self._stop():
+                break
+            if self._clock is not None:
+                self._clock.publish(clock_bytes(step.time_ns))
+            for name, data in step.messages:
+                self.publishers[name].publish(data)
+                self.sent[name] += 1
+            self._unanswered.append(step.time_ns)
+            done += 1
+        for publisher in self.publishers.values():
+            publisher.wait_for_all_acked(Duration(seconds=_SETTLE_S))
+        return done
+
+    def _without_listener(self) -> list[str]:
+        return [
+            str(publisher.topic_name)
+            for publisher in self.publishers.values()
+            if publisher.get_subscription_count() == 0
+        ]
+
+    def _sleep_until(self, until_s: float) -> None:
+        while not self._stop() and (left := until_s - time.monotonic()) > 0:
+            time.sleep(min(left, _NAP_S))
+
+    def _find_predictions(self) -> None:
+        known = {found.topic for found in self._predictions}
+        for topic, types in self._node.get_topic_names_and_types():
+            if _PREDICTION in types and topic not in known:
+                made = PolledSubscription(self._node, Prediction, topic, reliable=True)
+                self._predictions.append(made)
+
+    def _wait_for_answers(self) -> None:
+        """Return when the next step may be sent."""
+        now_s = time.monotonic()
+        if not self._predictions and now_s - self._looked_s > _LOOK_S:
+            self._looked_s = now_s
+            self._find_predictions()
+        if not self._predictions or self._stuck >= _MAX_STUCK:
+            self._unanswered.clear()
+            if self._rate == 0:
+                now_s = time.monotonic()
+                self._free_at_s = max(self._free_at_s, now_s - 0.05) + 1.0 / _UNLED_STEPS_PER_S
+                time.sleep(max(0.0, self._free_at_s - now_s))
+            return
+        begun_s = now_s
+        while len(self._unanswered) >= self._window and not self._stop():
+            if self._take_answers():
+                self._stuck = 0
+                begun_s = time.monotonic()
+            elif time.monotonic() - begun_s > _STUCK_S:
+                # It may be waiting for what we hold back; and if it has gone, so be it.
+                self._stuck += 1
+                for _ in range(self._window // 4):
+                    self._unanswered.popleft()
+            else:
+                time.sleep(_FLOW_NAP_S)
+
+    def _take_answers(self) -> bool:
+        """Take predictions; return True if one answers something unanswered."""
+        for predictions in self._predictions:
+            for message in predictions.take():
+                self._answered_ns = max(self._answered_ns, header_time_ns(message.data))
+        before = len(self._unanswered)
+        while self._unanswered and self._unanswered[0] <= self._answered_ns:
+            self._unanswered.popleft()
+        return len(self._unanswered) < before

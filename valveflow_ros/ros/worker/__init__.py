@@ -1,1 +1,0 @@
-"""Fits and diagnoses in a process of their own."""
