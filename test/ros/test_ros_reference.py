@@ -16,6 +16,7 @@ from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
 from valveflow_ros.curve.shift import judge_shift
 from valveflow_ros.errors import DataError, ParameterError
+from valveflow_ros.monitoring.alarm import AlarmAction
 from valveflow_ros.monitoring.alarms import AlarmState
 from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.events import (
@@ -107,7 +108,7 @@ def test_a_run_with_references_is_repeated_byte_for_byte(curve: Characteristic) 
     for k in range(3):
         calls.append(feed_rows(monitor, TABLE.part(k * third, (k + 1) * third)))
         if k == 1:
-            calls.append(monitor.acknowledge())
+            calls.append(monitor.operate_alarms(AlarmAction.ACKNOWLEDGE))
             calls.append(monitor.set_reference())
     events = [event for call in calls for event in call]
     kinds = [e.kind for e in events if isinstance(e, JournalEntry)]
@@ -145,7 +146,7 @@ def test_health_says_how_the_curve_stands_to_its_reference(curve: Characteristic
     item = reference_item(monitor)
     assert item.values['Alarm'] == 'unacknowledged'
     assert 'less than the reference' in item.sentence
-    monitor.acknowledge()
+    monitor.operate_alarms(AlarmAction.ACKNOWLEDGE)
     monitor.set_reference()
     assert monitor.reference.alarm.state == AlarmState.NORMAL
 

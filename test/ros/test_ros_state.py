@@ -50,8 +50,6 @@ from valveflow_ros.signals.align import Aligner
 from valveflow_ros.state import (
     FORMAT,
     VERSION,
-    ArrayMemory,
-    copies,
     from_bytes,
     put_back,
     to_bytes,
@@ -198,34 +196,6 @@ def test_what_is_no_state_is_a_sentence(data: bytes, sentence: str) -> None:
 def test_what_only_looks_like_a_place_of_an_array_is_a_table() -> None:
     for state in ({'x': {'$array': 0, 'y': 1}}, {'x': {'a': {'b': {}}}}):
         assert from_bytes(to_bytes(state)) == state
-
-
-def test_what_is_remembered_is_a_copy_both_ways() -> None:
-    class Two(ArrayMemory):
-        def __init__(self) -> None:
-            self.one, self.two = np.zeros(2), np.zeros((2, 2), dtype=np.int64)
-
-        def _memory(self) -> dict[str, Any]:
-            return {'one': self.one, 'two': self.two}
-
-    first, second = Two(), Two()
-    first.one += 1.0
-    kept = first.snapshot()
-    first.one += 1.0
-    assert kept['one'].tolist() == [1.0, 1.0]
-    array = second.one
-    second.restore({**kept, 'more': 'is not asked for'})
-    assert array is second.one
-    assert array.tolist() == [1.0, 1.0]
-    second.one += 5.0
-    assert kept['one'].tolist() == [1.0, 1.0]
-    assert ArrayMemory().snapshot() == {}
-    ArrayMemory().restore({})
-    assert copies({}) == {}
-    with pytest.raises(DataError, match=r"lacks 'one'"):
-        second.restore({})
-    with pytest.raises(DataError, match=r"'one' as float32 \(2,\), float64 \(2,\) is wanted"):
-        put_back({'one': np.zeros(2)}, {'one': np.zeros(2, dtype=np.float32)})
 
 
 def test_every_single_cut_and_many_flips_are_noticed() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from functools import partialmethod
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
@@ -210,10 +209,6 @@ class Monitor(Memory):
         model_id = self._model_id()
         changes = self._alarms.operate(action, self.judged, model_id)
         return [*changes, self._journal(JournalKind[action.name], 0, model_id, '')]
-
-    acknowledge = partialmethod(operate_alarms, AlarmAction.ACKNOWLEDGE)
-    shelve = partialmethod(operate_alarms, AlarmAction.SHELVE)
-    unshelve = partialmethod(operate_alarms, AlarmAction.UNSHELVE)
 
     def set_reference(self, given: Characteristic | None = None) -> list[Event]:
         """Let the running curve, or one that is given, be what later ones are judged against.

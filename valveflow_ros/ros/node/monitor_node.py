@@ -20,6 +20,7 @@ from std_srvs.srv import Trigger
 
 from valveflow_ros.errors import ParameterError, ValveflowError, counted
 from valveflow_ros.logs import RecorderState, RecorderStatus
+from valveflow_ros.monitoring.alarm import AlarmAction
 from valveflow_ros.parameters import Settings
 from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.ros import declare
@@ -47,6 +48,16 @@ _LONGEST_START_S = 600.0
 _STALL_S = 1.0
 
 _Transition = Callable[['MonitorNode', LifecycleState], TransitionCallbackReturn]
+
+_ALARM_SERVICES = {
+    'acknowledge_alarms': (AlarmAction.ACKNOWLEDGE, 'The alarm is acknowledged.'),
+    'shelve_alarms': (
+        AlarmAction.SHELVE,
+        'The standing alarms are put aside for {:g} h; then they come back by themselves if their '
+        'cause is still there. New alarms are not hidden.',
+    ),
+    'unshelve_alarms': (AlarmAction.UNSHELVE, 'The alarms are no longer put aside.'),
+}
 
 
 class Watchdog:
@@ -395,19 +406,10 @@ class MonitorNode(LifecycleNode):
         if name == 'diagnose':
             session.publish(engine.request_diagnosis())
             return 'A diagnosis was started; the result follows on ~/diagnosis.'
-        if name == 'acknowledge_alarms':
-            session.publish(monitor.acknowledge())
-            return 'The alarm is acknowledged.'
-        if name == 'shelve_alarms':
-            session.publish(monitor.shelve())
-            hours = self.settings.real('alarm_shelve_time') / 3600.0
-            return (
-                f'The standing alarms are put aside for {hours:g} h; then they come back by '
-                'themselves if their cause is still there. New alarms are not hidden.'
-            )
-        if name == 'unshelve_alarms':
-            session.publish(monitor.unshelve())
-            return 'The alarms are no longer put aside.'
+        if name in _ALARM_SERVICES:
+            action, sentence = _ALARM_SERVICES[name]
+            session.publish(monitor.operate_alarms(action))
+            return sentence.format(self.settings.real('alarm_shelve_time') / 3600.0)
         session.publish(monitor.set_reference())
         curve = monitor.reference.curve
         assert curve is not None
