@@ -11,9 +11,6 @@ import re
 import numpy as np
 import pytest
 
-from valveflow_ros.interface.logs import open_log
-from valveflow_ros.interface.observation import cut_in_two
-
 pytestmark = pytest.mark.skipif(
     os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
 )
@@ -160,17 +157,6 @@ def test_other_days_and_json(run, logs, tmp_path):
     assert content['files']['comparison.json'] == str(tmp_path / 'a' / 'comparison.json')
     head = (tmp_path / 'a' / 'curves.csv').read_text().splitlines()[0]
     assert head == 'u,paper,proposed,hammerstein,sparse'
-
-
-def test_the_cut_lies_at_the_border_of_a_block(logs):
-    log = open_log(logs / 'plant.mcap')
-    first, second = cut_in_two(log, 10.0)
-    times = log.readings.time_ns
-    assert len(first.readings) + len(second.readings) == len(log.readings)
-    assert first.readings.time_ns.max() < second.readings.time_ns.min()
-    assert (second.readings.time_ns.min() - times.min()) % 10_000_000_000 == 0
-    share = len(first.readings) / len(log.readings)
-    assert share == pytest.approx(2.0 / 3.0, abs=0.01)
 
 
 def test_too_short_a_log_names_the_part_that_is(run, tmp_path):

@@ -10,12 +10,9 @@ import numpy as np
 import pytest
 
 from valveflow_ros.curve.characteristic_json import from_json
-from valveflow_ros.errors import DataError
-from valveflow_ros.interface.observation import align, observe
 from valveflow_ros.logs import open_log, write_table
-from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.unit import UnitDescription
-from valveflow_ros.records import NS_PER_S, Readings, SampleTable, Signal, table_to_readings
+from valveflow_ros.records import NS_PER_S, SampleTable, Signal
 
 pytestmark = pytest.mark.skipif(
     os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
@@ -229,47 +226,6 @@ def test_slow_data_are_met_with_fitting_parameters(run, tmp_path):
     slope = 4.0 / 12.0**1.125
     for piece in ran.json['pieces']:
         assert piece['slope'] == pytest.approx(slope, rel=0.05)
-
-
-def test_only_what_follows_the_last_step_back_of_the_clock_counts(run, tmp_path):
-    first = table_to_readings(table(3, stairs))
-    second = table_to_readings(table(2, stairs))
-    joined = Readings(*(
-        np.concatenate([getattr(first, name), getattr(second, name)])
-        for name in ('time_ns', 'signal', 'value', 'quality')
-    ))  # fmt: skip
-    watched = observe(joined, Settings({'refit_period': 0.0}))
-    alone = observe(second, Settings({'refit_period': 0.0}))
-    assert watched.clock_resets == 1
-    assert (np.diff(watched.table.time_ns) > 0).all()
-    assert len(alone.table) - 30 < len(watched.table) <= len(alone.table)
-    assert watched.segments
-    assert all(s.end_ns <= watched.table.time_ns[-1] for s in watched.segments)
-    inside = {s.start_ns for s in watched.segments}
-    assert len(inside) == len(watched.segments), 'no segment of the forgotten rows'
-
-
-def test_stamps_of_1970_for_a_minute_cost_that_minute():
-    true = table_to_readings(table(2, stairs))
-    slip = slice(len(true) // 2, len(true) // 2 + 300)
-    time_ns = true.time_ns.copy()
-    time_ns[slip] -= true.time_ns[0]
-    settings = Settings({'refit_period': 0.0})
-    wrong = Readings(time_ns, true.signal, true.value, true.quality)
-    watched, whole = observe(wrong, settings), observe(true, settings)
-    assert watched.clock_resets == 1
-    lost = set(whole.table.time_ns.tolist()) - set(watched.table.time_ns.tolist())
-    assert 0 < len(lost) <= 80
-    assert min(lost) >= true.time_ns[slip][0]
-    # What was aligned is found again by its place, as a diagnosis on top of a model needs it.
-    rows, resets, _ = align(wrong, settings)
-    assert len(resets) == 1
-    assert rows.take(watched.rows).time_ns.tolist() == watched.table.time_ns.tolist()
-
-
-def test_a_log_without_any_reading_is_refused():
-    with pytest.raises(DataError, match='The log has no valve_opening; name yours with --column'):
-        observe(Readings.of([]), Settings())
 
 
 def test_readings_that_were_not_used_are_told(run, logs, tmp_path):

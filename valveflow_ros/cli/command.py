@@ -292,7 +292,9 @@ def checked_parameters(options: Namespace) -> dict[str, Any]:
     return given
 
 
-def written(result: Result, options: Namespace, text: str, data: Mapping[str, Any]) -> Outcome:
+def write_results(
+    result: Result, options: Namespace, text: str, data: Mapping[str, Any]
+) -> Outcome:
     """Write the files of a result; return its text and data with what was written.
 
     Raises

@@ -17,7 +17,7 @@ from valveflow_ros.cli.command import (
     columns,
     lines,
     mapping_of,
-    written,
+    write_results,
 )
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     text = lines(data_words(data), *finding_words(data), _parameters(data), _errors(data))
     # The segments stand in the file only.
     brief = {k: v for k, v in found.to_json().items() if k != 'segments'}
-    return written(found, options, text, brief)
+    return write_results(found, options, text, brief)
 
 
 def _parameters(data: Compared) -> str:

@@ -17,7 +17,7 @@ from valveflow_ros.cli.command import (
     columns,
     lines,
     mapping_of,
-    written,
+    write_results,
 )
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     log = open_log(options.log, mapping, progress=console)
     found = diagnose(log, parameters=given, model=model, progress=console)
     console(0.95, 'writing the report')
-    return written(found, options, _text(found), to_json(found.diagnosis))
+    return write_results(found, options, _text(found), to_json(found.diagnosis))
 
 
 def _text(found: DiagnosisResult) -> str:

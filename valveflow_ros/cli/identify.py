@@ -19,7 +19,7 @@ from valveflow_ros.cli.command import (
     lines,
     mapping_of,
     rejected_words,
-    written,
+    write_results,
 )
 from valveflow_ros.errors import UsageError
 
@@ -99,7 +99,7 @@ def run(options: Namespace, console: Console) -> Outcome:
         progress=console,
     )  # fmt: skip
     console(0.9, 'writing the report')
-    return written(found, options, _text(found.data), _data(found))
+    return write_results(found, options, _text(found.data), _data(found))
 
 
 def _data(found: Identification) -> dict[str, Any]:

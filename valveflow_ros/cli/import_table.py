@@ -66,7 +66,7 @@ def run(options: Namespace, console: Console) -> Outcome:
         raise UsageError('Name the log to write with -o LOG.mcap, or add --dry-run to look only.')
     from valveflow_ros.interface import SILENT
     from valveflow_ros.interface.files import check_log
-    from valveflow_ros.interface.mapping import LOOKING_ON, looked_through
+    from valveflow_ros.interface.mapping import LOOKING_ON, gather_refusals
     from valveflow_ros.interface.table_import import TableImport
     from valveflow_ros.logs.tables.refusal import RefusedError
 
@@ -78,7 +78,7 @@ def run(options: Namespace, console: Console) -> Outcome:
         TableImport(options.table, said, SILENT, strict=True).read(None)
 
     try:
-        return looked_through(
+        return gather_refusals(
             options.table, lambda said: _imported(options, said, console), mapping, again
         )
     except RefusedError as refused:

@@ -17,7 +17,7 @@ from valveflow_ros.cli.command import (
     columns,
     lines,
     mapping_of,
-    written,
+    write_results,
 )
 from valveflow_ros.report.terminal.text import number
 
@@ -82,7 +82,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     )  # fmt: skip
     # The segments stand in the file only.
     brief = {k: v for k, v in found.to_json().items() if k != 'segments'}
-    return written(found, options, text, brief)
+    return write_results(found, options, text, brief)
 
 
 def _pieces(data: Validated) -> str:

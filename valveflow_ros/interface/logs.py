@@ -12,7 +12,7 @@ import numpy as np
 
 from valveflow_ros.errors import DataError, InputError
 from valveflow_ros.interface import SILENT, Progress
-from valveflow_ros.interface.mapping import LOOKING_ON, LogMapping, looked_through, read_mapping
+from valveflow_ros.interface.mapping import LOOKING_ON, LogMapping, gather_refusals, read_mapping
 from valveflow_ros.interface.plausibility import (
     Doubt,
     air_note,
@@ -158,13 +158,13 @@ def open_log(
             **{name: value for name, value in table.items() if value},
         )
     if hasattr(source, 'columns'):
-        contents = mapping.opened(lambda names: _from_dataframe(source, names))
+        contents = mapping.open_with(lambda names: _from_dataframe(source, names))
         return _understood('DataFrame', contents, mapping, progress)
     path = Path(source)
 
     def look(said: LogMapping) -> LogContents:
         absent = list(said.constants)
-        return said.opened(
+        return said.open_with(
             lambda names: read_file(path, columns=names, absent=absent, table=said.table)
         )
 
@@ -172,7 +172,7 @@ def open_log(
         progress(0.02, LOOKING_ON)
         return look(said)
 
-    contents = looked_through(path, look, mapping, again)
+    contents = gather_refusals(path, look, mapping, again)
     return _understood(path.name, contents, mapping, progress)
 
 

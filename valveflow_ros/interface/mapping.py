@@ -89,7 +89,7 @@ class LogMapping:
         """
         return {c.name: c.theirs if c.known else c.whole for c in self.columns.values()}
 
-    def opened(self, look: Callable[[dict[str, str]], Answer]) -> Answer:
+    def open_with(self, look: Callable[[dict[str, str]], Answer]) -> Answer:
         """Return what ``look`` gives for these names; an unknown unit explains a failure.
 
         Raises
@@ -220,7 +220,7 @@ def _signal(name: str, option: str) -> Signal:
     raise UsageError(f"--{option} '{name}': there is no signal of that name,{hint}")
 
 
-def looked_through(
+def gather_refusals(
     path: object,
     look: Callable[[LogMapping], Answer],
     mapping: LogMapping,
@@ -258,7 +258,7 @@ def looked_through(
             break
     # Of two options about one thing the later one counts.
     newest = list({subject(remedy): remedy for remedy in remedies}.values())
-    raise joined(path, found, newest) from None
+    raise merge_refusals(path, found, newest) from None
 
 
 def _answered(mapping: LogMapping, remedies: Iterable[Remedy]) -> LogMapping:
@@ -279,7 +279,7 @@ def _answered(mapping: LogMapping, remedies: Iterable[Remedy]) -> LogMapping:
     return LogMapping(columns, constants, table)
 
 
-def joined(
+def merge_refusals(
     path: object, refused: Sequence[RefusedError], remedies: Sequence[Remedy] | None = None
 ) -> RefusedError:
     """Return one refusal that says what all of these say."""

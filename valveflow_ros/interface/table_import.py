@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from valveflow_ros.errors import DataError, RecordingError
 from valveflow_ros.interface import Progress
 from valveflow_ros.interface.files import reason
-from valveflow_ros.interface.mapping import LogMapping, joined
+from valveflow_ros.interface.mapping import LogMapping, merge_refusals
 from valveflow_ros.interface.plausibility import (
     air_note,
     check_constants,
@@ -196,7 +196,7 @@ class TableImport:
         if path.suffix.lower() not in TABLE_SUFFIXES:
             raise RecordingError(path, 'is no .csv, .xlsx or .parquet table')
         self._progress, self._mapping, self._strict = progress, mapping, strict
-        self._reader = mapping.opened(
+        self._reader = mapping.open_with(
             lambda names: TableReader(path, names, list(mapping.constants), mapping.table)
         )
         self._constants = mapping.constant_signals
@@ -431,6 +431,6 @@ class TableImport:
             # What was understood until then is of use to who has to correct it.
             for sentence in reader.understood():
                 self._progress.say(sentence)
-            raise joined(reader.path, refused)
+            raise merge_refusals(reader.path, refused)
         for found in doubts:
             self._progress.warn(found.advice(names[found.signal]))
