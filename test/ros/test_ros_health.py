@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
+from diagnostic_msgs.msg import DiagnosticStatus
+from listener import Listener
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_helpers import Processes, wait_until
+from ros_helpers import Processes
 from std_msgs.msg import Float32, Float64
 
 from valveflow_ros.curve.characteristic import Characteristic, Support
@@ -430,15 +429,8 @@ def test_diagnostics_tell_of_shelf_and_suppression() -> None:
     assert after([0.0]).level == Level.OK
 
 
-class Listener:
-    """Hears the health of a monitor that runs, and publishes to it."""
-
-    def __init__(self, context: Any) -> None:
-        self.node = Node('gateway', context=context)
-        self._executor = SingleThreadedExecutor(context=context)
-        self._executor.add_node(self.node)
-        self._said: dict[str, DiagnosticStatus] = {}
-        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._hear, 10)
+class Gateway(Listener):
+    """Publishes to a monitor that runs and hears its health."""
 
     def publisher(self, kind: type, topic: str, reliable: bool = True) -> Publisher:
         weak, strong = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
@@ -446,40 +438,31 @@ class Listener:
             kind, topic, QoSProfile(depth=10, reliability=strong if reliable else weak)
         )
 
-    def until(self, condition: Any, what: str) -> float:
+    def seconds_until(self, condition: Any, what: str) -> float:
         """Listen until something holds; return how many seconds that took."""
         begun_s = time.monotonic()
-
-        def look() -> bool:
-            self._executor.spin_once(timeout_sec=0.02)
-            return bool(condition())
-
-        wait_until(look, what, 60.0)
+        self.until(condition, what, 60.0)
         return time.monotonic() - begun_s
 
     def says(self, topic: str, level: Level, words: str) -> bool:
         """Tell whether the newest health of an input is that."""
-        status = self._said.get(f'input {topic}')
-        return status is not None and status.level == bytes([level]) and words in status.message
-
-    def close(self) -> None:
-        self._executor.shutdown()
-        self.node.destroy_node()
-
-    def _hear(self, message: DiagnosticArray) -> None:
-        self._said |= {status.name.split(' ', 2)[2]: status for status in message.status}
+        newest = self.health[-1].status if self.health else []
+        return any(
+            s.name.endswith(f' input {topic}') and s.level == bytes([level]) and words in s.message
+            for s in newest
+        )
 
 
 @pytest.fixture
-def gateway(context: Any) -> Iterator[Listener]:
-    made = Listener(context)
+def gateway(context: Any) -> Iterator[Gateway]:
+    made = Gateway(context)
     yield made
     made.close()
 
 
 @pytest.mark.ros
 def test_publishers_that_do_not_fit_are_named_while_the_monitor_runs(
-    processes: Processes, gateway: Listener
+    processes: Processes, gateway: Gateway
 ) -> None:
     """Weak quality of service is said within 1 s, another publisher or a wrong type within 2 s."""
     given = {'input_reliability': 'reliable', 'record': False, 'diagnostics_period': 0.5}
@@ -493,7 +476,7 @@ def test_publishers_that_do_not_fit_are_named_while_the_monitor_runs(
     took = {}
     gateway.publisher(Float64, '/valve_opening', reliable=False)
     words = 'published as best effort and asked for as reliable, so nothing comes'
-    took['mismatch'] = gateway.until(
+    took['mismatch'] = gateway.seconds_until(
         lambda: gateway.says('valve_opening', Level.ERROR, words), 'the mismatch'
     )
     first = gateway.publisher(Float64, '/main_steam_pressure')
@@ -505,11 +488,11 @@ def test_publishers_that_do_not_fit_are_named_while_the_monitor_runs(
 
     gateway.until(lambda: sent_and(Level.OK, 'Hz'), 'one publisher')
     gateway.publisher(Float64, '/main_steam_pressure')
-    took['second'] = gateway.until(
+    took['second'] = gateway.seconds_until(
         lambda: sent_and(Level.WARN, '/main_steam_pressure has 2 publishers'), 'the second'
     )
     gateway.publisher(Float32, '/generated_power')
-    took['type'] = gateway.until(
+    took['type'] = gateway.seconds_until(
         lambda: gateway.says('generated_power', Level.ERROR, 'published as std_msgs/msg/Float32'),
         'the wrong type',
     )

@@ -42,7 +42,7 @@ def test_a_model_is_read_from_its_file(tmp_path: Path) -> None:
     ('text', 'said'),
     [
         ('{', 'cannot be used'),
-        ('{"format": "valveflow/characteristic"}', "'format' must be"),
+        ('{"format": "x"}', "'format' must be"),
         (None, 'no such file'),
         ('\udcff', 'cannot be used'),
         (json.dumps({**extended_json(), 'pressure_exponent': 1.0}), 'pressure exponent 1, the'),
@@ -50,16 +50,22 @@ def test_a_model_is_read_from_its_file(tmp_path: Path) -> None:
         ('[' * 100_000, 'cannot be used'),
     ],
 )  # fmt: skip
+@pytest.mark.parametrize('parameter', ['model_file', 'reference_file'])
 def test_a_bad_file_is_refused_with_a_sentence(
-    tmp_path: Path, text: str | None, said: str
+    tmp_path: Path, parameter: str, text: str | None, said: str
 ) -> None:
-    path = tmp_path / 'extended_model.json'
+    path = tmp_path / 'given.json'
     if text is not None:
         path.write_text(text, encoding='utf-8', errors='surrogateescape')
+    of_model = parameter == 'model_file'
+    read = given_files.given_model if of_model else given_files.given_reference
     with pytest.raises(ParameterError) as caught:
-        given_files.given_model(Settings({'model_file': str(path)}))
-    assert said in str(caught.value)
-    assert str(caught.value).startswith("Parameter 'model_file' names")
+        read(Settings({parameter: str(path)}))
+    # An extended model is no curve, whatever is wrong with it.
+    assert (said if of_model or 'causes' not in (text or '') else "'format' must be") in str(
+        caught.value
+    )
+    assert str(caught.value).startswith(f"Parameter '{parameter}' names")
 
 
 def test_a_bad_model_keeps_the_node_unconfigured(tmp_path: Path) -> None:

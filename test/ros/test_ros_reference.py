@@ -160,27 +160,6 @@ def test_a_reference_is_read_from_its_file(curve: Characteristic, tmp_path: Path
     assert to_json(read) == to_json(curve)
 
 
-@pytest.mark.parametrize(
-    ('text', 'said'),
-    [
-        ('{', 'cannot be used'),
-        ('{"format": "x"}', "'format' must be"),
-        (None, 'no such file'),
-        ('\udcff', 'cannot be used'),
-    ],
-)
-def test_a_bad_file_is_refused_with_a_sentence(
-    tmp_path: Path, text: str | None, said: str
-) -> None:
-    path = tmp_path / 'characteristic.json'
-    if text is not None:
-        path.write_text(text, encoding='utf-8', errors='surrogateescape')
-    with pytest.raises(ParameterError) as caught:
-        given_reference(Settings({'reference_file': str(path)}))
-    assert said in str(caught.value)
-    assert str(caught.value).startswith("Parameter 'reference_file' names")
-
-
 def test_a_file_for_another_exponent_is_refused(curve: Characteristic, tmp_path: Path) -> None:
     path = tmp_path / 'characteristic.json'
     path.write_text(json.dumps(to_json(curve)), encoding='utf-8')

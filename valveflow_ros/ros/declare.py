@@ -92,7 +92,7 @@ def changed(settings: Settings, wanted: Iterable[RosParameter]) -> Settings:
     values = {}
     for item in wanted:
         if item.name == _SIM_TIME:
-            # Whoever may set it would take the node's clock over.
+            # Setting it would replace the node's clock.
             raise ParameterError(item.name, _AT_THE_START)
         if item.name in _FOREIGN:
             continue

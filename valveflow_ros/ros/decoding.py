@@ -37,7 +37,7 @@ class InputTopic:
     signals: tuple[Signal, ...]
 
 
-# The optional signal comes first: who waits for the required ones of an instant has it then.
+# The optional signal comes first, so that it is there when the required ones are complete.
 _IN_ORDER = tuple(sorted(SIGNALS, key=lambda info: info.required))
 INPUTS: tuple[InputTopic, ...] = (
     *(

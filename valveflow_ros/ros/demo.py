@@ -322,7 +322,9 @@ def run(options: argparse.Namespace, stop: StopFlag) -> int:
     try:
         _introduce(options, fault_ns)
         begun_s = time.monotonic()
-        monitor, plant = processes[:] = _start(options, folder)
+        for name, module, parameters in _commands(options, folder):
+            processes.append(Process(name, module, parameters, folder))
+        monitor, plant = processes
         _follow(watch, executor, monitor, plant, stop)
         if stop:
             return 130
@@ -358,8 +360,11 @@ def _introduce(options: argparse.Namespace, fault_ns: int) -> None:
         tell(line)
 
 
-def _start(options: argparse.Namespace, folder: Path) -> tuple[Process, Process]:
-    monitor = {
+def _commands(
+    options: argparse.Namespace, folder: Path
+) -> list[tuple[str, str, dict[str, object]]]:
+    """Return name, module and parameters of both processes."""
+    monitor: dict[str, object] = {
         'unit_tag': 'demo', 'record_directory': folder / 'recordings',
         # Shown anew each time.
         'keep_state': False,
@@ -370,14 +375,11 @@ def _start(options: argparse.Namespace, folder: Path) -> tuple[Process, Process]
         'record_flush': 1.0,
     }  # fmt: skip
     fault = f'{_FAULT}:s_mw={_FAULT_MW:g},t0_days={_FAULT_FROM * options.days:.6g}'
-    plant = {
+    plant: dict[str, object] = {
         'days': options.days, 'seed': options.seed, 'rate': float(options.rate), 'stamped': True,
         'unit_tag': 'demo', 'effects': f'"{fault}"', 'wait': 600.0,
     }  # fmt: skip
-    return (
-        Process('monitor', 'monitor_main', monitor, folder),
-        Process('plant', 'simulator_main', plant, folder),
-    )
+    return [('monitor', 'monitor_main', monitor), ('plant', 'simulator_main', plant)]
 
 
 def _follow(

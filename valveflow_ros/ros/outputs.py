@@ -153,7 +153,7 @@ class Outputs:
         elif isinstance(event, engine.JournalEntry):
             yield _output('journal', encoding.journal_message(event, tag), event.time_ns)
             if event.kind == JournalKind.RESUMED:
-                # Who listens to a process that was started again finds everything there.
+                # A subscriber to the restarted process must find everything there.
                 self.shift = None
                 yield from self.latched()
                 yield from self._standing()
@@ -170,12 +170,12 @@ class Outputs:
         self._alarms = {change.name: change for change in told if change is not None}
 
     def latched(self) -> Iterator[Output]:
-        """Yield the messages that stand on the latched topics."""
+        """Yield the current messages of the latched topics."""
         yield from self._curve_messages()
         yield self._diagnosis()
 
     def _standing(self) -> Iterator[Output]:
-        """Yield what was said last of the alarms that stand; nothing in it is new."""
+        """Yield the last message of each standing alarm again, unchanged."""
         told = sorted(self._alarms.values(), key=lambda change: (change.time_ns, change.name))
         for change in told:
             if change.state != AlarmState.NORMAL:
@@ -193,7 +193,7 @@ class Outputs:
         return _output('diagnosis', message, task.window_end_ns)
 
     def _note(self, entry: engine.JournalEntry) -> bool:
-        """Take what an entry says about the curve; tell whether it says anything."""
+        """Take over what an entry tells about the curve; return True if it tells anything."""
         if entry.kind == JournalKind.FIT_REFUSED:
             self.status = CurveStatus.STALE if self.curve else CurveStatus.REFUSED
         elif entry.kind == JournalKind.RESET and self.curve:

@@ -105,7 +105,7 @@ def wants_help(args: Sequence[str] | None) -> bool:
 
 
 def show(text: str) -> None:
-    """Print, also where whoever reads has had enough: ``monitor --help | head``."""
+    """Print; a reader that ends early, as in ``monitor --help | head``, is no error."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
@@ -114,7 +114,7 @@ def show(text: str) -> None:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose help may be cut short by whoever reads it."""
+    """A parser whose help may be read by a pipe that ends early."""
 
     def print_help(self, file: object = None) -> None:
         """Print the help on stdout."""

@@ -78,7 +78,7 @@ def start_ns_of(text: str, rate: float, now_ns: int) -> int:
 
 
 def check_together(rate: float, stamped: bool, use_clock: bool) -> None:
-    """Refuse plain values in another time than the machine's, with nothing that says so.
+    """Refuse plain values in simulated time without a clock or stamps.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Feed a recording again and compare every message the monitor sent with what it says now."""
+"""Feed a recording again and compare every recorded output with that of the replay."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
 from valveflow_ros.ros.worker import DiagnosisWorker
 from valveflow_ros.signals.align import Aligner
 
-# Small, so that what is said before a decision that cannot be repeated is compared first.
+# Small, so that outputs before a decision that cannot be repeated are compared first.
 _BLOCK = 500
 _LOOK_S = 0.05
 
@@ -161,7 +161,7 @@ class _Replay:
         return self._found
 
     def _outputs_now(self) -> Iterator[Output]:
-        """Yield what the engine says to the recorded inputs and decisions."""
+        """Yield the outputs of the engine for the recorded inputs and decisions."""
         found, settings = self._found, self._settings
         journal_topics = [topic for topic, name in self._outputs.items() if name == 'journal']
         messages = list(self._messages(journal_topics))

@@ -42,6 +42,10 @@ _LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # A sample that is lost here is lost to the eye only.
 _STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 _CURVE_TOPIC = '/characteristic'
+_LOOK_S = 0.5
+# For one picture: how long a monitor may take to be found, and then to say how it is.
+_FIND_S, _HEAR_S = 5.0, 3.0
+_ANSWER_S = 10.0
 
 
 class WatchNode(Node):
@@ -128,12 +132,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
     return value
-
-
-_LOOK_S = 0.5
-# For one picture: how long a monitor may take to be found, and then to say how it is.
-_FIND_S, _HEAR_S = 5.0, 3.0
-_ANSWER_S = 10.0
 
 
 def parser() -> argparse.ArgumentParser:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
 
 import numpy as np
 
@@ -41,20 +40,10 @@ from valveflow_ros.records import (
 )
 from valveflow_ros.report.first_run import must_compile_to_fit
 from valveflow_ros.ros.decoding import Row
-from valveflow_ros.ros.worker import FitWorker, Outcome
+from valveflow_ros.ros.worker import FitWorker, Worker
 from valveflow_ros.segments.window import WindowContents
 from valveflow_ros.signals.align import Aligner
 from valveflow_ros.state import State
-
-
-class Worker(Protocol):
-    """Whoever computes fits or diagnoses."""
-
-    def submit(self, task: Any) -> None:
-        """Take a task; its outcome comes with a later `poll`."""
-
-    def poll(self) -> list[Outcome]:
-        """Return the outcomes there are, without waiting."""
 
 
 class LiveEngine:

@@ -48,7 +48,7 @@ class Publishers:
 
 
 def publishers(node: Node, topic: str, type_name: str) -> Publishers:
-    """Look up in the ROS graph who publishes a topic; a wrong type makes no noise of its own."""
+    """Look up in the ROS graph who publishes a topic; a wrong type is reported nowhere else."""
     found = node.get_publishers_info_by_topic(topic)
     right = [info for info in found if info.topic_type == type_name]
     wrong = sorted({info.topic_type for info in found} - {type_name})
@@ -289,7 +289,7 @@ def _wrong_type(topic: str, seen: Publishers) -> tuple[Level, str]:
 def _speaking(
     topic: str, statistics: Mapping[str, TopicStatistics], publishers: Mapping[str, Publishers]
 ) -> str:
-    """Return the topic that feeds a signal: the one heard last, or the one that somebody has."""
+    """Return the topic that feeds a signal: the one received last, or the one published."""
     own, stamped = statistics[topic].last_s, statistics[PLANT_SAMPLE].last_s
     if own is None and stamped is None:
         nobody = publishers.get(topic, Publishers()) == Publishers()
@@ -298,7 +298,7 @@ def _speaking(
     return PLANT_SAMPLE if stamped is not None and (own is None or stamped > own) else topic
 
 
-# Somebody knows of it, or nothing can be known of it.
+# The operator has put it aside, or it cannot be judged.
 _ASIDE = (AlarmState.SHELVED, AlarmState.SUPPRESSED)
 
 

@@ -88,7 +88,7 @@ def check_record_directory(settings: Settings) -> None:
 
 
 class Recording:
-    """Writes inputs and outputs; where that fails, says so and goes on.
+    """Records inputs and outputs; a failure is reported and never stops the monitor.
 
     Parameters
     ----------
