@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from valveflow_ros.baselines.judged import judge, trial_of
-from valveflow_ros.baselines.verdict import (
+from valveflow_ros.baselines.comparison import (
     Finding,
     Outcome,
     Terms,
@@ -17,6 +16,7 @@ from valveflow_ros.baselines.verdict import (
     finding_of,
     pairs_on_segments,
 )
+from valveflow_ros.baselines.judged import judge, trial_of
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.report.comparison_tables import pairs_table

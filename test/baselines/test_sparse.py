@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from valveflow_ros.baselines import library
+from valveflow_ros.baselines import sparse as library
 from valveflow_ros.baselines.judged import part_of
 from valveflow_ros.baselines.sparse import (
     THRESHOLDS,

@@ -12,8 +12,7 @@ from report_stories import diagnosed, diagnosis
 from valveflow_ros.curve.characteristic import HeldCause
 from valveflow_ros.diagnosis import causes
 from valveflow_ros.diagnosis.result import NOTHING
-from valveflow_ros.report.diagnosis import diagnosis_page
-from valveflow_ros.report.diagnosis_figures import axis_titles, points_to
+from valveflow_ros.report.diagnosis import axis_titles, diagnosis_page, points_to
 from valveflow_ros.report.figure import plain_text
 from valveflow_ros.report.words import _FROM_THE_MEAN, decimals, held_words
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Protocol
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.special import stdtr, stdtrit
@@ -19,14 +19,16 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray, IntArray, SegmentKind
 from valveflow_ros.segments.window import WindowContents
 
-# Is a mean difference zero? Paired t tests that count samples, and ones that do not.
-#
-# The paper's test takes each sample of a segment for independent (its reference
-# [38]). At 1 Hz the noise of the power is correlated over a minute or more, so that
-# test sees ten or a hundred times the evidence there is. Beside it stand tests
-# that count what the samples are worth.
-
 _LONGEST_S = 300.0
+_LEAST_ROWS = 10  # of a segment that can be judged
+LEARN_SHARE = 0.7
+_LEAST_OF_PART = 0.1  # of the settled rows needed altogether, in each part
+
+
+# Is a mean difference zero? The paper's test takes each sample of a segment for independent (its
+# reference [38]). At 1 Hz the noise of the power is correlated over a minute or more, so that
+# test sees ten or a hundred times the evidence there is. Beside it stand tests that count what
+# the samples are worth.
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +65,7 @@ class PairedTest:
 
 
 def _test(mean: float, stderr: float, effective: float) -> PairedTest:
+    """Return the t test of a mean with its standard error; NaN where it cannot be done."""
     if not (math.isfinite(mean) and math.isfinite(stderr) and effective > 1.0):
         return PairedTest(mean, math.nan, math.nan, math.nan, effective)
     if stderr == 0.0:
@@ -97,11 +100,10 @@ def with_effective_size(difference: FloatArray, widening: float) -> PairedTest:
     """
     n = len(difference)
     effective = n / max(widening, 1.0)
-    if n < 2 or effective < 2.0:
-        mean = float(difference.mean()) if n else math.nan
-        return PairedTest(mean, math.nan, math.nan, math.nan, effective)
-    stderr = float(difference.std(ddof=1)) / math.sqrt(effective)
-    return _test(float(difference.mean()), stderr, effective)
+    mean, stderr = float(difference.mean()) if n else math.nan, math.nan
+    if n >= 2 and effective >= 2.0:
+        stderr = float(difference.std(ddof=1)) / math.sqrt(effective)
+    return _test(mean, stderr, effective)
 
 
 def over_blocks(blocks: FloatArray) -> PairedTest:
@@ -158,9 +160,6 @@ def widening_of(residual: FloatArray, spans: IntArray, step_s: float) -> float:
     )
     half = float(np.median(spans[:, 1] - spans[:, 0])) / 2.0
     return inflation(series, weight, max(1, int(min(_LONGEST_S / step_s, half))))
-
-
-_LEAST_ROWS = 10  # of a segment that can be judged
 
 
 @dataclass(frozen=True, slots=True)
@@ -377,20 +376,16 @@ def _widening(trial: Trial, predictions: Mapping[str, FloatArray], spans: IntArr
             best, least = predicted, mse
     if best is None:
         return 1.0
-    residual = np.where(trial.good, trial.power_mw - best, 0.0)
-    return widening_of(residual, spans, trial.step_s)
+    return widening_of(np.where(trial.good, trial.power_mw - best, 0.0), spans, trial.step_s)
 
 
 def _score(difference: FloatArray, widening: float) -> Score:
     with np.errstate(over='ignore', invalid='ignore'):
         mse = float(np.mean(difference**2))
     if not np.isfinite(mse):
-        none = PairedTest(float('nan'), float('nan'), float('nan'), float('nan'), 0.0)
+        none = _test(math.nan, math.nan, 0.0)
         return Score(mse, none, none)
     return Score(mse, over_samples(difference), with_effective_size(difference, widening))
-
-
-# Rows of a log in the form every method of the comparison takes them.
 
 
 def samples_of(contents: WindowContents, settings: Settings) -> Samples:
@@ -415,12 +410,6 @@ def samples_of(contents: WindowContents, settings: Settings) -> Samples:
 def other_data(contents: WindowContents, settings: Settings) -> OtherData:
     """Return the rows of a window with its special segments, to judge by."""
     return OtherData(samples_of(contents, settings), contents.time_ns, contents.spans)
-
-
-# A part of the identification data held back to choose between candidates.
-
-LEARN_SHARE = 0.7
-_LEAST_OF_PART = 0.1  # of the settled rows needed altogether, in each part
 
 
 class Runnable(Protocol):
@@ -491,9 +480,6 @@ def run_mse(model: Runnable, samples: Samples) -> float:
     return value if np.isfinite(value) else float('inf')
 
 
-# What an identified characteristic predicts on other data, and where it may be judged.
-
-
 def dynamic(characteristic: Characteristic, samples: Samples) -> FloatArray:
     """Return the power that curve and regional dynamics simulate, MW, shape (n,)."""
     model = characteristic.model
@@ -507,8 +493,70 @@ def trial_of(other: OtherData, characteristic: Characteristic) -> Trial:
     for, and as far behind a gap as the slowest dynamics allowed for.
     """
     samples = other.samples
-    flat = characteristic.model
-    good = samples.usable > 0
-    good &= (samples.u >= flat.knots[0]) & (samples.u <= flat.knots[-1])
+    low, high = characteristic.model.knots[[0, -1]]
+    good = (samples.usable > 0) & (samples.u >= low) & (samples.u <= high)
     good &= settled_rows(samples)
     return Trial(other.time_ns, samples.u, samples.power_mw, good, other.spans, samples.step_s)
+
+
+# What the JSON of a comparison and that of a validation have in common.
+
+
+def number(value: float) -> float | None:
+    """Return a number for JSON, which has neither NaN nor infinity: absent is null."""
+    return float(value) if math.isfinite(value) else None
+
+
+def fields_json(value: Any, **renamed: str) -> dict[str, Any]:
+    """Return the fields of a dataclass of numbers, some under another name."""
+    return {renamed.get(f.name, f.name): number(getattr(value, f.name)) for f in fields(value)}
+
+
+def totals_json(judgement: Judgement, names: Iterable[str]) -> dict[str, Any]:
+    """Return each prediction over all segments."""
+    totals = {}
+    for name in names:
+        stands = {}
+        for key, as_paper in (('each_sample', True), ('correlation_counted', False)):
+            count, of = judgement.passed(name, as_paper=as_paper)
+            stands[key] = {'segments': count, 'of': of}
+        totals[name] = {
+            'mse_mw2': number(judgement.mse(name)),
+            'mse_steady_mw2': number(judgement.mse(name, SegmentKind.STEADY)),
+            'mse_slope_mw2': number(judgement.mse(name, SegmentKind.SLOPE)),
+            'mean_difference_mw': fields_json(judgement.bias(name)),
+            'zero_stands': stands,
+            'segments_not_finite': judgement.failed(name),
+        }
+    return totals
+
+
+def judged_json(judgement: Judgement) -> dict[str, Any]:
+    """Return what was judged, and each special segment with the scores of all predictions."""
+    return {
+        'judged': {
+            'segments': len(judgement.segments),
+            'samples': judgement.samples,
+            'samples_not_judged': judgement.outside,
+            'samples_per_independent_value': judgement.widening,
+        },
+        'segments': [
+            {
+                'number': s.number,
+                'kind': s.kind.name.lower(),
+                'start_ns': s.start_ns,
+                'end_ns': s.end_ns,
+                'samples': len(s.rows),
+                'power_mw': s.power_mw,
+                'scores': {
+                    name: {
+                        'mse_mw2': number(score.mse_mw2),
+                        'each_sample': fields_json(score.samples),
+                        'correlation_counted': fields_json(score.effective),
+                    }
+                    for name, score in s.scores.items()
+                },
+            }
+            for s in judgement.segments
+        ],
+    }

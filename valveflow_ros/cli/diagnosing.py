@@ -38,8 +38,7 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.monitoring.rows import Corrector
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SIGNALS, IntArray, SampleTable
-from valveflow_ros.report.diagnosis import Diagnosed
-from valveflow_ros.report.diagnosis_figures import cells
+from valveflow_ros.report.diagnosis import Diagnosed, cells
 from valveflow_ros.report.words import decimals, held_words
 
 _BLIND = 'cannot be judged'
