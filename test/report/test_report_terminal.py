@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from valveflow_ros.report.terminal import text
-from valveflow_ros.report.terminal.draw import DOTS_X, DOTS_Y, Canvas, screen
+from valveflow_ros.report.terminal.screen import DOTS_X, DOTS_Y, Canvas, screen
 from valveflow_ros.report.terminal.frame import (
     AlarmView,
     CurveView,

@@ -354,7 +354,9 @@ def _errors(
     if truth is None:
         return {}
     ends = float(characteristic.breakpoints[0]), float(characteristic.breakpoints[-1])
-    curves = {**lines, **({'sparse': sparse.model.static} if sparse is not None else {})}
+    curves: dict[str, Callable[[FloatArray], FloatArray]] = dict(lines)
+    if sparse is not None:
+        curves['sparse'] = sparse.model.static
     return {name: curve_error(curve, truth, *ends) for name, curve in curves.items()}
 
 

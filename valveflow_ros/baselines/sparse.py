@@ -403,7 +403,8 @@ def _triangle(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     scale = np.sqrt(np.mean(rows**2, axis=0))
     scale = np.where(scale > 0.0, scale, 1.0)
-    return np.linalg.qr(rows / scale / np.sqrt(len(rows)), mode='r'), scale
+    triangle: FloatArray = np.asarray(np.linalg.qr(rows / scale / np.sqrt(len(rows)), mode='r'))
+    return triangle, scale
 
 
 def fit_sparse(samples: Samples, progress: Progress = lambda _: None) -> SparseFit:

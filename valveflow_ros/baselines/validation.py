@@ -185,7 +185,7 @@ def _checks(
     last = len(knots) - 1
     middle = [float(trial.u[s.rows].mean()) for s in judgement.segments]
     piece = np.clip(np.searchsorted(knots, middle, side='right') - 1, 0, last - 1)
-    found = []
+    found: list[PieceCheck] = []
     for first, end in ((0, last), *((k, k + 1) for k in range(last))):
         whole = not found
         mine = tuple(

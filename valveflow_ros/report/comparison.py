@@ -488,7 +488,7 @@ def moves_figure(data: Compared) -> Figure | None:
         span = _fastest(data, load == 'low')
         if span is None:
             return None
-        place = {'xaxis': f'x{side}', 'yaxis': f'y{side}', 'showlegend': not side}
+        place: Spec = {'xaxis': f'x{side}', 'yaxis': f'y{side}', 'showlegend': not side}
         x, y, hover = _over_time(data, data.result.predictions['proposed.static'], *span)
         traces += [
             _measured(data, *span, **place),

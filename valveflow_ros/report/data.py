@@ -293,7 +293,8 @@ def signals_figure(data: Identified) -> Figure:
 
 def _panel(data: Identified, values: FloatArray, axis: str, unit: str, places: int) -> list[Spec]:
     """Return the measured signal in grey and its special segments in colour."""
-    time_ns, shown = data.table.time_ns, {'yaxis': axis, 'showlegend': axis == 'y'}
+    time_ns = data.table.time_ns
+    shown: Spec = {'yaxis': axis, 'showlegend': axis == 'y'}
     start_ns, step_ns, ends = envelope(time_ns, values, _DRAWN_STRETCHES, data.period_ns)
     measured = line(
         None, rounded(ends), 'measured', 'data-soft', width=1, x0=start_ns / 1e6,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -22,6 +24,8 @@ from valveflow_ros.report.figure import (
     token,
 )
 from valveflow_ros.report.page import Section, folded, notice, paragraph, table, text
+from valveflow_ros.report.terminal.board import decoded
+from valveflow_ros.report.terminal.frame import AlarmView, CurveView, DiagnosisView
 from valveflow_ros.report.words import counted, decimals, duration, input_unit, moment, plain
 
 
@@ -61,6 +65,7 @@ class AlarmMoment:
     name: str
     state: AlarmState
     sentence: str
+    again: bool = field(default=False, compare=False)  # the alarm was in this state before
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +98,79 @@ class History:
     alarms: tuple[AlarmMoment, ...] = ()
     diagnoses: tuple[DiagnosisMoment, ...] = ()
     notes: tuple[str, ...] = ()
+
+
+Moment = CurveMoment | AlarmMoment | DiagnosisMoment
+Item = TypeVar('Item')
+
+
+def moment_of(type_name: str, fields: Mapping[str, Any]) -> Moment | None:
+    """Return what a message adds to a history; None while there is nothing to show.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        The message cannot be read.
+    """
+    time_ns, view = decoded(type_name, fields)
+    if isinstance(view, AlarmView):
+        again = view.previous == view.state
+        return AlarmMoment(time_ns, view.name, AlarmState(view.state), view.sentence, again)
+    if isinstance(view, DiagnosisView):
+        return DiagnosisMoment(time_ns, view.sentence) if view.verdict and view.sentence else None
+    if not isinstance(view, CurveView):
+        return None
+    u, power, low, high = (
+        np.array(v, dtype=np.float64) for v in (view.breakpoints, view.values, view.low, view.high)
+    )
+    finite = np.all(np.isfinite(u)) and np.all(np.isfinite(power))
+    if len(u) < 2 or len(power) != len(u) or not finite or np.any(np.diff(u) <= 0.0):
+        return None
+    if len(low) != len(u) - 2 or len(high) != len(u) - 2:
+        low = high = np.full(len(u) - 2, np.nan)
+    return CurveMoment(time_ns, view.model_id, view.exponent, u, power, low, high, view.rmse_mw)
+
+
+def history_of(
+    told: Iterable[Moment], times_ns: Iterable[int], notes: Iterable[str]
+) -> History | None:
+    """Return the history of what was published; None where a log tells nothing of a monitor.
+
+    Parameters
+    ----------
+    told : iterable of CurveMoment, AlarmMoment, DiagnosisMoment
+        In any order. What is latched is published again and again, and all that stands at a new
+        start: each counts once.
+    times_ns : iterable of int
+        Other times of the log, such as those of its first and last reading.
+    notes : iterable of str
+        What could not be read, as sentences.
+    """
+    found, said = sorted(told, key=lambda m: m.time_ns), tuple(notes)
+    if not found and not said:
+        return None
+    times = [*times_ns, *(m.time_ns for m in found)]
+    curves = _once((m for m in found if isinstance(m, CurveMoment)), lambda c: c.model_id)
+    diagnoses = _once((m for m in found if isinstance(m, DiagnosisMoment)), lambda d: d)
+    alarms, known = [], set()
+    for a in _once((m for m in found if isinstance(m, AlarmMoment)), lambda a: a):
+        # That an alarm still stands, which is told every day, is no change. The first word of a
+        # standing alarm counts even so: it stood when the recording began.
+        if not a.again or (a.name not in known and a.state != AlarmState.NORMAL):
+            alarms.append(a)
+        known.add(a.name)
+    return History(
+        min(times, default=0), max(times, default=0), tuple(curves), tuple(alarms),
+        tuple(diagnoses), said,
+    )  # fmt: skip
+
+
+def _once(items: Iterable[Item], key: Callable[[Item], Hashable]) -> list[Item]:
+    """Return each item when it first came."""
+    first: dict[Hashable, Item] = {}
+    for item in items:
+        first.setdefault(key(item), item)
+    return list(first.values())
 
 
 # Word, colour and sign of each state that is worth a bar, the gravest first.
