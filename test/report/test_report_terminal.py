@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from valveflow_ros.report.terminal import text
-from valveflow_ros.report.terminal.screen import DOTS_X, DOTS_Y, Canvas, screen
 from valveflow_ros.report.terminal.frame import (
     AlarmView,
     CurveView,
@@ -19,7 +18,7 @@ from valveflow_ros.report.terminal.frame import (
     HealthView,
     SampleView,
 )
-from valveflow_ros.report.terminal.screen import changes
+from valveflow_ros.report.terminal.screen import DOTS_X, DOTS_Y, Canvas, changes, screen
 from valveflow_ros.report.terminal.text import cells, clean, cut, painted, wrapped
 
 SECOND = 10**9

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,8 @@ from valveflow_ros.baselines.judged import (
     PairedTest,
     Trial,
     dynamic,
-    fields_json,
     judge,
-    judged_json,
-    number,
     over_blocks,
-    totals_json,
     trial_of,
 )
 from valveflow_ros.baselines.sparse import NAMES, SparseFit, fit_sparse
@@ -432,3 +429,66 @@ def _methods_json(c: Comparison) -> dict[str, Any]:
         ],
     }  # fmt: skip
     return methods
+
+
+# What the JSON of a comparison and that of a validation have in common.
+
+
+def number(value: float) -> float | None:
+    """Return a number for JSON, which has neither NaN nor infinity: absent is null."""
+    return float(value) if math.isfinite(value) else None
+
+
+def fields_json(value: Any, **renamed: str) -> dict[str, Any]:
+    """Return the fields of a dataclass of numbers, some under another name."""
+    return {renamed.get(f.name, f.name): number(getattr(value, f.name)) for f in fields(value)}
+
+
+def totals_json(judgement: Judgement, names: Iterable[str]) -> dict[str, Any]:
+    """Return each prediction over all segments."""
+    totals = {}
+    for name in names:
+        stands = {}
+        for key, as_paper in (('each_sample', True), ('correlation_counted', False)):
+            count, of = judgement.passed(name, as_paper=as_paper)
+            stands[key] = {'segments': count, 'of': of}
+        totals[name] = {
+            'mse_mw2': number(judgement.mse(name)),
+            'mse_steady_mw2': number(judgement.mse(name, SegmentKind.STEADY)),
+            'mse_slope_mw2': number(judgement.mse(name, SegmentKind.SLOPE)),
+            'mean_difference_mw': fields_json(judgement.bias(name)),
+            'zero_stands': stands,
+            'segments_not_finite': judgement.failed(name),
+        }
+    return totals
+
+
+def judged_json(judgement: Judgement) -> dict[str, Any]:
+    """Return what was judged, and each special segment with the scores of all predictions."""
+    return {
+        'judged': {
+            'segments': len(judgement.segments),
+            'samples': judgement.samples,
+            'samples_not_judged': judgement.outside,
+            'samples_per_independent_value': judgement.widening,
+        },
+        'segments': [
+            {
+                'number': s.number,
+                'kind': s.kind.name.lower(),
+                'start_ns': s.start_ns,
+                'end_ns': s.end_ns,
+                'samples': len(s.rows),
+                'power_mw': s.power_mw,
+                'scores': {
+                    name: {
+                        'mse_mw2': number(score.mse_mw2),
+                        'each_sample': fields_json(score.samples),
+                        'correlation_counted': fields_json(score.effective),
+                    }
+                    for name, score in s.scores.items()
+                },
+            }
+            for s in judgement.segments
+        ],
+    }

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any, Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from scipy.special import stdtr, stdtrit
@@ -75,24 +75,15 @@ def _test(mean: float, stderr: float, effective: float) -> PairedTest:
     return PairedTest(mean, stderr, t, float(2.0 * stdtr(effective - 1.0, -abs(t))), effective)
 
 
-def over_samples(difference: FloatArray) -> PairedTest:
-    """Test as the paper does: each sample counts.
-
-    Parameters
-    ----------
-    difference : float64 (n,)
-    """
-    return with_effective_size(difference, 1.0)
-
-
-def with_effective_size(difference: FloatArray, widening: float) -> PairedTest:
-    """Test with n / widening independent values.
+def over_samples(difference: FloatArray, widening: float = 1.0) -> PairedTest:
+    """Test the samples of a segment; as the paper does, each counts.
 
     Parameters
     ----------
     difference : float64 (n,)
     widening : float
-        How many times the variance of a long mean exceeds that of independent samples.
+        How many times the variance of a long mean exceeds that of independent samples: the
+        test then counts n / widening of them.
 
     Notes
     -----
@@ -385,7 +376,7 @@ def _score(difference: FloatArray, widening: float) -> Score:
     if not np.isfinite(mse):
         none = _test(math.nan, math.nan, 0.0)
         return Score(mse, none, none)
-    return Score(mse, over_samples(difference), with_effective_size(difference, widening))
+    return Score(mse, over_samples(difference), over_samples(difference, widening))
 
 
 def samples_of(contents: WindowContents, settings: Settings) -> Samples:
@@ -497,66 +488,3 @@ def trial_of(other: OtherData, characteristic: Characteristic) -> Trial:
     good = (samples.usable > 0) & (samples.u >= low) & (samples.u <= high)
     good &= settled_rows(samples)
     return Trial(other.time_ns, samples.u, samples.power_mw, good, other.spans, samples.step_s)
-
-
-# What the JSON of a comparison and that of a validation have in common.
-
-
-def number(value: float) -> float | None:
-    """Return a number for JSON, which has neither NaN nor infinity: absent is null."""
-    return float(value) if math.isfinite(value) else None
-
-
-def fields_json(value: Any, **renamed: str) -> dict[str, Any]:
-    """Return the fields of a dataclass of numbers, some under another name."""
-    return {renamed.get(f.name, f.name): number(getattr(value, f.name)) for f in fields(value)}
-
-
-def totals_json(judgement: Judgement, names: Iterable[str]) -> dict[str, Any]:
-    """Return each prediction over all segments."""
-    totals = {}
-    for name in names:
-        stands = {}
-        for key, as_paper in (('each_sample', True), ('correlation_counted', False)):
-            count, of = judgement.passed(name, as_paper=as_paper)
-            stands[key] = {'segments': count, 'of': of}
-        totals[name] = {
-            'mse_mw2': number(judgement.mse(name)),
-            'mse_steady_mw2': number(judgement.mse(name, SegmentKind.STEADY)),
-            'mse_slope_mw2': number(judgement.mse(name, SegmentKind.SLOPE)),
-            'mean_difference_mw': fields_json(judgement.bias(name)),
-            'zero_stands': stands,
-            'segments_not_finite': judgement.failed(name),
-        }
-    return totals
-
-
-def judged_json(judgement: Judgement) -> dict[str, Any]:
-    """Return what was judged, and each special segment with the scores of all predictions."""
-    return {
-        'judged': {
-            'segments': len(judgement.segments),
-            'samples': judgement.samples,
-            'samples_not_judged': judgement.outside,
-            'samples_per_independent_value': judgement.widening,
-        },
-        'segments': [
-            {
-                'number': s.number,
-                'kind': s.kind.name.lower(),
-                'start_ns': s.start_ns,
-                'end_ns': s.end_ns,
-                'samples': len(s.rows),
-                'power_mw': s.power_mw,
-                'scores': {
-                    name: {
-                        'mse_mw2': number(score.mse_mw2),
-                        'each_sample': fields_json(score.samples),
-                        'correlation_counted': fields_json(score.effective),
-                    }
-                    for name, score in s.scores.items()
-                },
-            }
-            for s in judgement.segments
-        ],
-    }

@@ -9,17 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from valveflow_ros.baselines.comparison import fields_json, judged_json, number, totals_json
 from valveflow_ros.baselines.judged import (
     Judgement,
     OtherData,
     PairedTest,
     Trial,
     dynamic,
-    fields_json,
     judge,
-    judged_json,
-    number,
-    totals_json,
     trial_of,
 )
 from valveflow_ros.curve.characteristic import Characteristic

@@ -12,7 +12,7 @@ import numpy as np
 from valveflow_ros.baselines.comparison import BASELINES, Finding, Outcome, Pair, Terms, finding_of
 from valveflow_ros.baselines.judged import JudgedSegment
 from valveflow_ros.baselines.sparse import NAMES
-from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SegmentKind
+from valveflow_ros.records import NS_PER_S, FloatArray, SegmentKind
 from valveflow_ros.report.answer import choice_figure, dynamics_table
 from valveflow_ros.report.comparison_tables import (
     LABELS,
@@ -298,19 +298,13 @@ def _cloud(contents: WindowContents, special: bool) -> Spec:
     """Return some of the measured points, of special segments or of all rows."""
     rows = contents.special_rows() if special else np.arange(len(contents.u))
     rows = rows[np.isfinite(contents.u[rows]) & np.isfinite(contents.power_mw[rows])]
-    rows = rows[thin(len(rows), _DOTS)]
+    if len(rows) > _DOTS:
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, _DOTS).round().astype(np.int64))]
     return points(
         rounded(contents.u[rows]), rounded(contents.power_mw[rows], 4),
         'special samples' if special else 'all samples', 'data-soft', size=2.5,
         marker={'opacity': 0.5},
     )  # fmt: skip
-
-
-def thin(number: int, most: int) -> IntArray:
-    """Return at most ``most`` of ``number`` places, evenly spread, both ends kept."""
-    if number <= most:
-        return np.arange(number, dtype=np.int64)
-    return np.unique(np.linspace(0, number - 1, most).round().astype(np.int64))
 
 
 def _curves(data: Compared) -> list[Spec]:
