@@ -434,13 +434,11 @@ def fit_sparse(samples: Samples, progress: Progress = lambda _: None) -> SparseF
     chosen = min(near, key=lambda c: (int(c.support.sum()), c.mse))
     progress('sparse model: all data')
     model = _on_support(samples, *_triangle(equations(samples, chosen.form)), chosen.support)
-    best_of = {}
-    for c in sorted(reversed(candidates), key=lambda c: -c.mse):
-        best_of[c.form] = c
-    tried = tuple(
-        (form.kind, form.window_s, int(best_of[form].support.sum()), best_of[form].mse)
-        for form in dict.fromkeys(c.form for c in candidates)
-    )
+    best_of: dict[Form, _Candidate] = {}
+    for c in candidates:
+        if c.form not in best_of or c.mse < best_of[c.form].mse:
+            best_of[c.form] = c
+    tried = tuple((f.kind, f.window_s, int(c.support.sum()), c.mse) for f, c in best_of.items())
     return SparseFit(model, chosen.form, chosen.threshold, tried)
 
 
