@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.curve.regional_model import piece_of
+from valveflow_ros.curve.regional_model import curve, piece_of
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.numerics import jit
 from valveflow_ros.records import ByteArray, FloatArray
@@ -14,14 +14,6 @@ from valveflow_ros.records import ByteArray, FloatArray
 # The model is ``x = F(u)`` with F continuous and piecewise linear, followed by one
 # linear block ``y[t] = -f_1 y[t-1] - ... + b_0 x[t-d] + b_1 x[t-d-1] + ...``. Its static
 # gain is 1, as eq. (5) of the paper sets K_g = 1: ``b_0`` follows from the others.
-
-
-@jit
-def value_at(u: float, knots: FloatArray, values: FloatArray) -> float:
-    """Evaluate F; the outer pieces go on for ever."""
-    k = piece_of(u, knots)
-    w = (u - knots[k]) / (knots[k + 1] - knots[k])
-    return float(values[k] + (values[k + 1] - values[k]) * w)
 
 
 @jit
@@ -44,18 +36,14 @@ def _slopes_of_curve(
 
 @jit
 def _push(
-    u: FloatArray,
-    flow: FloatArray,
-    knots: FloatArray,
-    values: FloatArray,
-    b: FloatArray,
-    past: FloatArray,
-    t: int,
-    delay: int,
-    age: int,
-    gains: FloatArray,
-) -> None:
-    """Write what flow and past power at row ``t`` add to each derivative, before the poles."""
+    u: FloatArray, flow: FloatArray, knots: FloatArray, values: FloatArray, b: FloatArray,
+    f: FloatArray, past: FloatArray, t: int, delay: int, age: int, gains: FloatArray,
+    lag: FloatArray, sums: FloatArray,
+) -> None:  # fmt: skip
+    """Advance the derivatives by row ``t`` and add them to ``sums``.
+
+    ``gains`` takes what flow and past power add, ``lag`` the derivatives behind the poles.
+    """
     n_curve = 2 * (knots.size - 1)
     gains[:] = 0.0
     first = flow[t - min(delay, age)]
@@ -66,6 +54,14 @@ def _push(
             gains[n_curve + past.size + j - 1] = flow[back] - first
     for i in range(past.size):
         gains[n_curve + i] = first - past[i]
+    for p in range(sums.size):
+        value = gains[p]
+        for i in range(f.size):
+            value -= f[i] * lag[i, p]
+        for i in range(f.size - 1, 0, -1):
+            lag[i, p] = lag[i - 1, p]
+        lag[0, p] = value
+        sums[p] += value
 
 
 @jit
@@ -84,33 +80,11 @@ def _next(flow: FloatArray, b: FloatArray, f: FloatArray, past: FloatArray, t: i
 
 
 @jit
-def _turn(gains: FloatArray, lag: FloatArray, f: FloatArray, sums: FloatArray) -> None:
-    """Advance the derivatives by one row: what the flow adds, through the poles."""
-    for p in range(sums.size):
-        value = gains[p]
-        for i in range(f.size):
-            value -= f[i] * lag[i, p]
-        for i in range(f.size - 1, 0, -1):
-            lag[i, p] = lag[i - 1, p]
-        lag[0, p] = value
-        sums[p] += value
-
-
-@jit
 def run_with_tangents(
-    u: FloatArray,
-    usable: ByteArray,
-    knots: FloatArray,
-    values: FloatArray,
-    b: FloatArray,
-    f: FloatArray,
-    delay: int,
-    settle: int,
-    group: int,
-    answer: FloatArray,
-    jacobian: FloatArray,
-    weight: ByteArray,
-) -> None:
+    u: FloatArray, usable: ByteArray, knots: FloatArray, values: FloatArray, b: FloatArray,
+    f: FloatArray, delay: int, settle: int, group: int, answer: FloatArray,
+    jacobian: FloatArray, weight: ByteArray,
+) -> None:  # fmt: skip
     """Write means over ``group`` rows of the simulated power and of its derivatives.
 
     Parameters
@@ -141,7 +115,7 @@ def run_with_tangents(
                 age = 0
                 good = False
                 continue
-            flow[t] = value_at(u[t], knots, values)
+            flow[t] = curve(u[t], knots, values[:-1], values[1:])
             if age == 0:
                 past[:] = flow[t]
             if columns > 0:
@@ -150,8 +124,7 @@ def run_with_tangents(
                     _slopes_of_curve(u[t], knots, values, 1.0, gains)
                     for i in range(n_f):
                         lag[i] = gains[:columns]
-                _push(u, flow, knots, values, b, past, t, delay, age, gains)
-                _turn(gains, lag, f, sums)
+                _push(u, flow, knots, values, b, f, past, t, delay, age, gains, lag, sums)
             total += _next(flow, b, f, past, t, delay, age)
             age += 1
             good = good and age > settle

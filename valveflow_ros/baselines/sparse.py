@@ -95,15 +95,9 @@ def _advance(y: float, before: float, now: float, xi: FloatArray, step_s: float)
 
 @jit
 def simulate(
-    u: FloatArray,
-    usable: ByteArray,
-    begin: FloatArray,
-    xi: FloatArray,
-    step_s: float,
-    settle: int,
-    answer: FloatArray,
-    settled: ByteArray,
-) -> None:
+    u: FloatArray, usable: ByteArray, begin: FloatArray, xi: FloatArray, step_s: float,
+    settle: int, answer: FloatArray, settled: ByteArray,
+) -> None:  # fmt: skip
     """Integrate, u straight between rows.
 
     ``begin`` (n,) is the power to begin with after a gap. ``answer`` is NaN in
@@ -128,14 +122,9 @@ def simulate(
 
 @jit
 def weak_rows(
-    y: FloatArray,
-    theta_rows: FloatArray,
-    usable: ByteArray,
-    centres: np.ndarray,
-    test: FloatArray,
-    slope: FloatArray,
-    out: FloatArray,
-) -> int:
+    y: FloatArray, theta_rows: FloatArray, usable: ByteArray, centres: IntArray,
+    test: FloatArray, slope: FloatArray, out: FloatArray,
+) -> int:  # fmt: skip
     """Write rows ``[integral of phi theta, - integral of phi' y]``; return how many.
 
     ``test`` and ``slope`` are phi and phi' on rows -w..w. A window with a gap in
