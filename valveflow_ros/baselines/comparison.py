@@ -38,7 +38,7 @@ _LEVEL = 0.05
 
 
 class Terms(enum.Enum):
-    """What is held against what."""
+    """What is compared with what."""
 
     AS_PAPER = 'as the paper'
     STATIC = 'curve against curve, steady-state segments'
@@ -64,7 +64,7 @@ class Finding(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Two predictions held against each other.
+    """Two predictions compared.
 
     Attributes
     ----------
@@ -109,7 +109,7 @@ class Pair:
 def pairs_on_segments(
     judgement: Judgement, predictions: Mapping[str, FloatArray]
 ) -> tuple[Pair, ...]:
-    """Hold the proposed method against both others on special segments.
+    """Compare the proposed method with both others on special segments.
 
     As the paper does it: the static curve of the special segments against the others'
     simulations. And on equal terms: simulation against simulation, and curve against curve

@@ -192,7 +192,7 @@ class HammersteinModel:
         return np.asarray(self.slopes()[k] * (u - self.knots[k]) + self.values[k])
 
     def stable(self) -> bool:
-        """Tell whether the linear block comes to rest."""
+        """Return True if the linear block is stable."""
         poles = np.roots(np.concatenate([[1.0], self.denominator]))
         return bool(np.all(np.abs(poles) < 1.0 - 1e-6))
 

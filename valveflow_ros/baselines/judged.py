@@ -60,7 +60,7 @@ class PairedTest:
         return self.mean - reach, self.mean + reach
 
     def zero_is_rejected(self, level: float = 0.05) -> bool:
-        """Tell whether zero is ruled out; a test that could not be done rules nothing out."""
+        """Return True if zero is ruled out; a test that could not be done rules nothing out."""
         return self.p_value < level
 
 

@@ -237,7 +237,7 @@ def _order(taps: int, poles: int) -> str:
 
 
 def _tuning(data: Compared) -> Section:
-    """Tell what each baseline was chosen from; a baseline that was not tuned proves nothing."""
+    """Return what each baseline was chosen from; one that was not tuned proves nothing."""
     h, s = data.result.hammerstein, data.result.sparse
     rows = [
         [f'Hammerstein, {_order(n_b, n_f)}', text(noise), plain(mse)]

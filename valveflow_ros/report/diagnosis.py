@@ -213,7 +213,7 @@ def _proof(data: Diagnosed) -> Section:
 
 # How a diagnosis is put for people: its variables, its parameters, times as dates.
 
-# What the residual is held against: in a sentence, at an axis, at a narrow one, and what a
+# What the residual is drawn against: in a sentence, at an axis, at a narrow one, and what a
 # line that leaves the band there points to.
 _VARIABLES = {
     'u': (

@@ -89,24 +89,24 @@ class Canvas:
                     round(a[1] + (b[1] - a[1]) * k / steps),
                 )
 
-    def level(self, y: float, letter: str) -> None:
-        """Put a letter along a level wherever nothing else is drawn."""
+    def level(self, y: float, character: str) -> None:
+        """Put a character along a level wherever nothing else is drawn."""
         row = self.place(0.0, y)[1] // DOTS_Y
         if 0 <= row < self.height:
             for column in range(self.width):
-                self._marks.setdefault((row, -1 - column), letter)
+                self._marks.setdefault((row, -1 - column), character)
 
-    def mark(self, x: float, y: float, letter: str) -> None:
-        """Put a letter over everything; outside, it stands at the border."""
+    def mark(self, x: float, y: float, character: str) -> None:
+        """Put a character over everything; outside, it stands at the border."""
         across, down = self.place(x, y)
         column = min(max(across // DOTS_X, 0), self.width - 1)
         row = min(max(down // DOTS_Y, 0), self.height - 1)
-        self._marks[row, column] = letter
+        self._marks[row, column] = character
 
     def rows(self) -> list[str]:
         """Return the lines of characters, from above, each as long as the canvas is wide."""
         return [
-            ''.join(self._letter(row, column) for column in range(self.width))
+            ''.join(self._character(row, column) for column in range(self.width))
             for row in range(self.height)
         ]
 
@@ -115,7 +115,7 @@ class Canvas:
         if 0 <= column < self.width and 0 <= row < self.height:
             self._bits[row][column] |= _BITS[down % DOTS_Y][across % DOTS_X]
 
-    def _letter(self, row: int, column: int) -> str:
+    def _character(self, row: int, column: int) -> str:
         if (row, column) in self._marks:
             return self._marks[row, column]
         bits = self._bits[row][column]

@@ -13,7 +13,7 @@ Line = tuple[tuple[str, str], ...]
 
 # Colour-blind safe: bad differs from good in weight and brightness too, and in the words.
 TONES = {'strong': '1', 'dim': '2', 'curve': '36', 'good': '32', 'warn': '33', 'bad': '1;31'}
-# One letter for one, so that a line stays as long as it was.
+# One character for one, so that a line stays as long as it was.
 _PLAIN = str.maketrans('…·●┄─−\u202f±│°', '~|@--- ~| ')
 # More than any terminal shows of a sentence: what comes from others may be of any length.
 _LONGEST = 4096
@@ -37,8 +37,8 @@ def cells(text: str) -> int:
 def cut(text: str, width: int) -> str:
     """Return a text, shortened to a width."""
     taken, kept = 0, 0
-    for place, letter in enumerate(text):
-        taken += cells(letter)
+    for place, character in enumerate(text):
+        taken += cells(character)
         if taken > width:
             return f'{text[:kept].rstrip()}…' if width > 0 else ''
         if taken <= width - 1:
