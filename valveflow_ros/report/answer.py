@@ -21,6 +21,7 @@ from valveflow_ros.report.words import (
     interval,
     percent,
     plain,
+    span,
     with_error,
 )
 
@@ -73,8 +74,8 @@ def answer_words(data: Identified) -> str:
     ends, values = c.breakpoints, c.values()
     words = (
         f'The flow characteristic has <b>{counted(len(c.pieces), "piece")}</b> and is known for '
-        f'u from {_range(ends[0], ends[-1])} {input_unit(c.pressure_exponent)}, that is from '
-        f'{_range(values[0], values[-1])} MW.{_bends(c)} It explains {percent(explained(data))} '
+        f'u from {span(ends[0], ends[-1])} {input_unit(c.pressure_exponent)}, that is from '
+        f'{span(values[0], values[-1])} MW.{_bends(c)} It explains {percent(explained(data))} '
         f'of the variance of the power in {counted(c.source.steady, "steady-state segment")} and '
         f'{counted(c.source.slope_response, "slope-response segment")} '
         f'({counted(c.source.samples, "sample")}), and leaves a typical difference of '
@@ -95,10 +96,6 @@ def answer_words(data: Identified) -> str:
         )
     told += [text(n) for n in (held_words(c.held), *c.notes)]
     return paragraph(words, 'answer') + ''.join(notice(n) for n in told if n)
-
-
-def _range(low: float, high: float, places: int = 0) -> str:
-    return f'{decimals(float(low), places)} to {decimals(float(high), places)}'
 
 
 def _bends(c: Characteristic) -> str:
@@ -128,7 +125,7 @@ def pieces_table(data: Identified) -> str:
         at = f' at {plain(pressure, 3)} MPa' if math.isfinite(pressure) else ''
         low, high = (piece.slope * u + piece.intercept for u in (piece.u_from, piece.u_to))
         rows.append([
-            str(k + 1), _range(piece.u_from, piece.u_to, 1), _range(low, high, 1),
+            str(k + 1), span(piece.u_from, piece.u_to, 1), span(low, high, 1),
             with_error(piece.slope, piece.slope_stderr),
             with_error(piece.intercept, piece.intercept_stderr), plain(gain, 3) + at,
             count(piece.samples), *_rests(c, k),
@@ -194,7 +191,7 @@ def dynamics_table(dynamics: tuple[RegionDynamics, ...]) -> str:
     """Return time constant and delay by region of power."""
     rows = [
         [
-            f'{_range(d.power_from, d.power_to)} MW',
+            f'{span(d.power_from, d.power_to)} MW',
             with_error(d.time_constant_s, d.time_constant_stderr_s),
             with_error(d.delay_s, d.delay_stderr_s),
             decimals(d.delay_s + 3.0 * d.time_constant_s, 0),
@@ -215,7 +212,7 @@ def dynamics_figure(dynamics: tuple[RegionDynamics, ...]) -> Figure:
         colour, dash = _LOOKS[k % 3]
         moved = 100.0 * (1.0 - np.exp(-np.maximum(t - d.delay_s, 0.0) / d.time_constant_s))
         traces.append(line(
-            rounded(t), rounded(moved, 4), f'{_range(d.power_from, d.power_to)} MW', colour,
+            rounded(t), rounded(moved, 4), f'{span(d.power_from, d.power_to)} MW', colour,
             '%{x:.0f} s: %{y:.0f} %', width=2.2, dash=dash,
         ))  # fmt: skip
     title = {'text': 'seconds after a step of the steam flow', 'short': 'seconds after a step'}

@@ -46,7 +46,7 @@ from valveflow_ros.report.page import (
     text,
     where,
 )
-from valveflow_ros.report.words import counted, duration, input_axis, moment, p_value, plain
+from valveflow_ros.report.words import counted, duration, input_axis, p_value, period, plain
 from valveflow_ros.segments.window import WindowContents
 
 # What came out of a comparison, in sentences.
@@ -185,10 +185,7 @@ def comparison_page(data: Compared) -> Page:
     """Return the report: what came out and the curves first, then the evidence."""
     c = data.result.characteristic
     first, *rest = finding_words(data)
-    spans = [
-        f'{moment(int(part.time_ns[0]))} to {moment(int(part.time_ns[-1]))}'
-        for part in (data.learnt, data.judged)
-    ]
+    spans = [period(part.time_ns[0], part.time_ns[-1]) for part in (data.learnt, data.judged)]
     shown = stretches(data)
     segments = [s for stretch in shown for s in stretch.segments]
     moves = moves_figure(data)

@@ -14,7 +14,7 @@ from valveflow_ros.baselines.truth import Line
 from valveflow_ros.records import FloatArray, SegmentKind
 from valveflow_ros.report.figure import csv_text
 from valveflow_ros.report.page import paragraph, table, text
-from valveflow_ros.report.words import decimals, interval, moment, p_value, plain
+from valveflow_ros.report.words import decimals, interval, moment, p_value, plain, span
 from valveflow_ros.segments.window import WindowContents
 
 # In the order in which they are told; the names of the numbers, and those for people.
@@ -99,7 +99,7 @@ def parameters_table(data: Compared) -> str:
         [
             '' if j else text(LABELS[method]), str(j + 1), plain(float(line.slopes[j])),
             decimals(float(line.intercepts[j]), 2),
-            f'{decimals(float(line.knots[j]), 1)} to {decimals(float(line.knots[j + 1]), 1)}',
+            span(line.knots[j], line.knots[j + 1], 1),
         ]
         for method, j, line in _pieces(data)
     ]  # fmt: skip

@@ -36,6 +36,7 @@ from valveflow_ros.report.words import (
     input_unit,
     moment,
     plain,
+    span,
     with_error,
 )
 
@@ -291,12 +292,12 @@ def _row(number: int, p: PieceShift) -> list[str]:
     sure = f'> {100.0 * _SURE:g} %' if p.confidence > _SURE else f'{100.0 * p.confidence:.1f} %'
     return [
         str(number),
-        f'{decimals(p.u_from, 0)} to {decimals(p.u_to, 0)}',
+        span(p.u_from, p.u_to),
         '<b>yes</b>' if p.moved else 'no',
         with_error(p.now_mw, p.now_error_mw) if math.isfinite(p.now_mw) else '–',
         decimals(p.percent, 2) if p.moved else '–',
         with_error(p.middle_mw, p.error_mw),
-        f'{decimals(p.low_mw, 2)} to {decimals(p.high_mw, 2)}',
+        span(p.low_mw, p.high_mw, 2),
         sure,
         plain(p.smallest_mw, 2),
     ]

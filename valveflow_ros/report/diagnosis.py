@@ -45,8 +45,8 @@ from valveflow_ros.report.words import (
     input_unit,
     input_unit_plain,
     interval,
-    moment,
     percent,
+    period,
     plain,
 )
 
@@ -86,7 +86,7 @@ def diagnosis_page(data: Diagnosed) -> Page:
         'The same numbers, unrounded, stand in diagnosis.json and extended_model.json beside '
         'this page.'
     )
-    lead = where(data.source, f'{moment(data.start_ns)} to {moment(data.end_ns)}')
+    lead = where(data.source, period(data.start_ns, data.end_ns))
     return Page(title, lead, sections, end_of_page, 'diagnose')
 
 

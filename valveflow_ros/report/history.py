@@ -26,7 +26,15 @@ from valveflow_ros.report.figure import (
 from valveflow_ros.report.page import Section, folded, notice, paragraph, table, text
 from valveflow_ros.report.terminal.board import decoded
 from valveflow_ros.report.terminal.frame import AlarmView, CurveView, DiagnosisView
-from valveflow_ros.report.words import counted, decimals, duration, input_unit, moment, plain
+from valveflow_ros.report.words import (
+    counted,
+    decimals,
+    duration,
+    input_unit,
+    moment,
+    period,
+    plain,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +208,7 @@ def history_sections(history: History | None) -> list[Section]:
         told = f'{counted(changes, "change")} of {counted(names, "alarm")}'
         if history.diagnoses:
             told += f' and {counted(len(history.diagnoses), "diagnosis", "diagnoses")}'
-        told += f' from {moment(history.start_ns)} to {moment(history.end_ns)}.'
+        told += f' from {period(history.start_ns, history.end_ns)}.'
         sections.append(Section('What the monitor said', [
             paragraph(told), timeline_figure(history), alarms_table(history),
         ]))  # fmt: skip

@@ -27,7 +27,7 @@ from valveflow_ros.report.data import (
 from valveflow_ros.report.history import history_sections
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import Page, Section, bullets, foot, paragraph, table, text, where
-from valveflow_ros.report.words import moment, plain
+from valveflow_ros.report.words import period, plain
 
 
 def identification_report(data: Identified) -> str:
@@ -41,7 +41,7 @@ def identification_page(data: Identified) -> Page:
     tag = data.settings.text('unit_tag')
     named = tag != PARAMETERS['unit_tag'].default
     title = f'Flow characteristic of {tag}' if named else 'Main steam valve flow characteristic'
-    start, end = moment(c.source.window_start_ns), moment(c.source.window_end_ns)
+    times = period(c.source.window_start_ns, c.source.window_end_ns)
     # A picture for which there is nothing to show is left out.
     evidence = [signals_figure(data), segments_figure(data)]
     missing = [presence_figure(data), coverage_figure(data)]
@@ -63,7 +63,7 @@ def identification_page(data: Identified) -> Page:
         f'Curve <code>{text(c.model_id)}</code>; the same numbers, unrounded, stand in '
         'characteristic.json beside this page.'
     )
-    lead = where(data.source, f'{start} to {end} ({window_words(c)})')
+    lead = where(data.source, f'{times} ({window_words(c)})')
     return Page(title, lead, sections, end_of_page, 'identify')
 
 

@@ -44,8 +44,10 @@ from valveflow_ros.report.words import (
     interval,
     moment,
     percent,
+    period,
     plain,
     signed,
+    span,
 )
 from valveflow_ros.segments.window import WindowContents
 
@@ -114,14 +116,10 @@ def verdict_words(data: Validated) -> list[str]:
             f'{percent(v.outside_share, 2)} of the special samples lie beyond the ends of the '
             'curve, where nothing is known; they were not judged.'
         )
-    if blind := [_range(c) for c in v.pieces if not c.segments]:
+    if blind := [span(c.u_from, c.u_to) for c in v.pieces if not c.segments]:
         told.append(f'No special segment lies at u from {", ".join(blind)}: nothing is said of '
                     'that.')  # fmt: skip
     return told
-
-
-def _range(check: PieceCheck) -> str:
-    return f'{decimals(check.u_from, 0)} to {decimals(check.u_to, 0)}'
 
 
 def _verdict(v: Validation) -> str:
@@ -139,8 +137,8 @@ def _verdict(v: Validation) -> str:
         off = [c for c in (v.overall, *v.pieces) if c.beyond(v.tolerance_mw)]
         worst = max(off, key=lambda c: abs(c.test.mean))
         return (
-            f'The characteristic is off: at u from {_range(worst)} {differs(worst)}, more than '
-            f'the {tolerance} that are let pass.'
+            f'The characteristic is off: at u from {span(worst.u_from, worst.u_to)} '
+            f'{differs(worst)}, more than the {tolerance} that are let pass.'
         )
     real = '; the difference is real' if v.overall.test.zero_is_rejected() else ''
     which = 'For the mean over all segments'
@@ -183,7 +181,7 @@ def validation_page(data: Validated) -> Page:
     times = data.contents.time_ns
     lead = where(
         f'{data.model}, held against {data.source}',
-        f'{moment(int(times[0]))} to {moment(int(times[-1]))}',
+        period(times[0], times[-1]),
     )
     return Page('Does the flow characteristic hold?', lead, sections, end, 'validate')
 
@@ -244,7 +242,7 @@ def pieces_table(v: Validation) -> str:
     """Return the mean difference overall and on each piece."""
     rows = [
         [
-            f'piece {k}' if k else 'all', _range(check), str(check.segments),
+            f'piece {k}' if k else 'all', span(check.u_from, check.u_to), str(check.segments),
             signed(check.test.mean, 2) if math.isfinite(check.test.mean) else '–',
             interval(check.low_mw, check.high_mw),
             decimals(check.test.effective, 0) if check.segments else '–',

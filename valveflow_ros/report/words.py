@@ -83,6 +83,11 @@ def interval(low: float, high: float) -> str:
     return f'{decimals(low, places)} to {decimals(high, places)}'
 
 
+def span(low: float, high: float, places: int = 0) -> str:
+    """Write 'low to high' with a fixed number of decimals."""
+    return f'{decimals(float(low), places)} to {decimals(float(high), places)}'
+
+
 def count(value: int) -> str:
     """Write a whole number in groups of three."""
     return f'{value:,}'.replace(',', '\u202f')
@@ -131,6 +136,11 @@ def moment(time_ns: int) -> str:
     except (OverflowError, OSError, ValueError):
         return f'{second} s since 1970'
     return f'{at:%Y-%m-%d %H:%M:%S} UTC'
+
+
+def period(start_ns: int, end_ns: int) -> str:
+    """Write two times as 'from to'."""
+    return f'{moment(int(start_ns))} to {moment(int(end_ns))}'
 
 
 def exponent(value: float) -> str:
