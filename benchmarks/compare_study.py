@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from valveflow_ros.baselines.comparison import Comparison, compare
+from valveflow_ros.baselines.comparison import Comparison, compare, finding_of
 from valveflow_ros.baselines.hammerstein import HammersteinModel
 from valveflow_ros.baselines.hammerstein_fit import (
     OUTPUT_ERROR,
@@ -29,7 +29,6 @@ from valveflow_ros.baselines.hammerstein_fit import (
 )
 from valveflow_ros.baselines.judged import other_data, samples_of
 from valveflow_ros.baselines.truth import Truth, curve_error
-from valveflow_ros.baselines.verdict import finding_of
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.fit.task import FitTask

@@ -14,7 +14,6 @@ from valveflow_ros.baselines.judged import (
     over_blocks,
     over_samples,
     widening_of,
-    with_effective_size,
 )
 
 compiled = pytest.mark.skipif(
@@ -53,7 +52,7 @@ def test_correlated_noise_fools_the_one_and_not_the_other():
         spans = np.column_stack([edges[:-1], edges[1:]])
         widening = widening_of(np.concatenate(segments), spans, 1.0)
         naive += over_samples(segments[0]).zero_is_rejected()
-        counted += with_effective_size(segments[0], widening).zero_is_rejected()
+        counted += over_samples(segments[0], widening).zero_is_rejected()
     assert naive > 100
     # A dozen short segments teach the correlation roughly; 5 % becomes 5 to 15 %.
     assert counted < 23
@@ -96,7 +95,7 @@ def test_rows_between_stretches_do_not_matter():
 
 def test_what_cannot_be_tested_says_so():
     for difference, widening in ((np.array([1.0]), 1.0), (np.arange(5.0), 4.0), (np.empty(0), 1)):
-        test = with_effective_size(difference, widening)
+        test = over_samples(difference, widening)
         assert np.isnan(test.p_value)
         assert not test.zero_is_rejected()
         assert np.isnan(test.interval()).all()

@@ -10,10 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from valveflow_ros.baselines import library
+from valveflow_ros.baselines import sparse as library
 from valveflow_ros.baselines.judged import part_of
 from valveflow_ros.baselines.sparse import (
-    THRESHOLDS,
     Form,
     SparseModel,
     equations,
@@ -188,40 +187,3 @@ def test_a_rest_that_swings_with_sin_u_is_followed():
     error = model(xi).static(u) - (GAIN * u + OFFSET + 4.0 * np.sin(u))
     # Straight between places 0.25 apart: 4 * 0.25**2 / 8 at most.
     assert np.abs(error).max() < 0.035
-
-
-def test_thresholds_rise_from_none():
-    assert THRESHOLDS[0] == 0.0
-    assert np.all(np.diff(THRESHOLDS) > 0.0)
-
-
-@pytest.mark.parametrize('threshold', [0.0, 0.05, 0.3, 2.0])
-def test_pysindy_thresholds_alike(threshold):
-    """The package of the method's own authors, where it is installed."""
-    pysindy = pytest.importorskip('pysindy')
-    data, _ = linear_plant(3.0, 1.0)
-    rows = equations(data, Form('weak', 61.0))
-    rows = rows / np.sqrt(np.mean(rows**2, axis=0))
-    ours = thresholded(rows[:, :-1], rows[:, -1], threshold)
-    # Its last, "unbiased" refit cuts singular values below 1e-6, which this library has.
-    theirs = pysindy.STLSQ(threshold=threshold, alpha=0.0, max_iter=30, unbias=False)
-    theirs.fit(rows[:, :-1], rows[:, -1:])
-    found = np.asarray(theirs.coef_)[0]
-    assert np.array_equal(found != 0.0, ours != 0.0)
-    predicted, ours_predicted = rows[:, :-1] @ found, rows[:, :-1] @ ours
-    # It solves normal equations, whose condition is 5e13 here; both sides have unit size.
-    np.testing.assert_allclose(predicted, ours_predicted, atol=2e-4)
-    left, ours_left = (np.sum((p - rows[:, -1]) ** 2) for p in (predicted, ours_predicted))
-    assert left == pytest.approx(ours_left, rel=1e-6)
-
-
-def test_pysindy_has_the_same_library():
-    pysindy = pytest.importorskip('pysindy')
-    rng = np.random.default_rng(3)
-    x = rng.uniform(-2.0, 2.0, (20, 2))
-    theirs = (pysindy.PolynomialLibrary(degree=3) + pysindy.FourierLibrary(n_frequencies=1)).fit(x)
-    table = np.asarray(theirs.transform(x))
-    ours = library.columns(x[:, 0].copy(), x[:, 1].copy())
-    assert table.shape == ours.shape
-    for column in ours.T:
-        assert np.isclose(table, column[:, None]).all(axis=0).any()

@@ -7,7 +7,7 @@ import copy
 import numpy as np
 import pytest
 
-from valveflow_ros.baselines.truth import curve_error, pieces_error, read_truth
+from valveflow_ros.baselines.truth import Line, curve_error, read_truth
 from valveflow_ros.curve.characteristic_json import to_json
 from valveflow_ros.errors import DataError
 
@@ -43,11 +43,12 @@ def test_errors_are_those_of_the_curve_and_of_its_parameters():
     nothing = curve_error(lambda u: u * np.nan, truth, 0.0, 20.0)
     assert np.isnan(nothing.rmse_mw)
     assert nothing.known == 0.0
-    off = pieces_error(
-        np.array([0.0, 11.5, 20.0]), np.array([2.1, 0.8]), np.array([1.0, 12.0]), truth
-    )
-    assert off == pytest.approx((0.2, 1.5, 1.0))
-    assert np.isnan(pieces_error(np.array([0.0, 1.0]), np.ones(1), np.ones(1), truth)).all()
+    assert np.isnan([found.slope, found.knee, found.intercept]).all()
+    moved = Line(np.array([0.0, 11.5, 20.0]), np.array([2.1, 0.8]), np.array([1.0, 12.0]))
+    off = curve_error(moved, truth, 0.0, 20.0)
+    assert (off.slope, off.knee, off.intercept) == pytest.approx((0.2, 1.5, 1.0))
+    one = curve_error(Line(np.array([0.0, 1.0]), np.ones(1), np.ones(1)), truth, 0.0, 20.0)
+    assert np.isnan([one.slope, one.knee, one.intercept]).all()
 
 
 @pytest.mark.parametrize(

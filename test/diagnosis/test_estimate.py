@@ -14,7 +14,7 @@ from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.evidence import Gain
 from valveflow_ros.diagnosis.result import NamedCause, cause_json
 from valveflow_ros.records import NS_PER_S
-from valveflow_ros.report.diagnosis_figures import cells, times_in_effect
+from valveflow_ros.report.diagnosis import cells, times_in_effect
 
 # 2025-03-01 00:00 UTC
 ORIGIN_NS = 1_740_787_200 * NS_PER_S

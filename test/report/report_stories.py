@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import html
+import re
+
 import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
@@ -21,6 +24,12 @@ HOUR_NS = 3600 * NS_PER_S
 KNOTS = np.array([800.0, 1200.0, 1500.0])
 POWER = np.array([100.0, 180.0, 195.0])
 STEP_MW = -6.0  # at the last knot, from the fourth curve on
+
+
+def words_of(page: str) -> str:
+    """What a person reads of a page."""
+    body = page.split('<body>')[1].split('<script')[0]
+    return re.sub(r'\s+', ' ', html.unescape(re.sub(r'<[^>]+>', ' ', body)))
 
 
 def curve(number: int, hour: int, knots: np.ndarray, power: np.ndarray) -> CurveMoment:

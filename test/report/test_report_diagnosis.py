@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import html
 import re
 from dataclasses import replace
 
 import pytest
-from report_stories import diagnosed, diagnosis
+from report_stories import diagnosed, diagnosis, words_of
 
 from valveflow_ros.curve.characteristic import HeldCause
 from valveflow_ros.diagnosis import causes
 from valveflow_ros.diagnosis.result import NOTHING
-from valveflow_ros.report.diagnosis import diagnosis_page
-from valveflow_ros.report.diagnosis_figures import axis_titles, points_to
+from valveflow_ros.report.diagnosis import axis_titles, diagnosis_page, points_to
 from valveflow_ros.report.figure import plain_text
 from valveflow_ros.report.words import _FROM_THE_MEAN, decimals, held_words
-
-
-def words_of(text):
-    body = text.split('<body>')[1].split('<script')[0]
-    return re.sub(r'\s+', ' ', html.unescape(re.sub(r'<[^>]+>', ' ', body)))
 
 
 @pytest.fixture(scope='module')

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import gzip
-import html
 import json
 import math
 import re
@@ -12,17 +11,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from report_stories import diagnosed, history
+from report_stories import diagnosed, history, words_of
 
+from valveflow_ros.curve.characteristic import Support
 from valveflow_ros.errors import InputError
 from valveflow_ros.parameters import Settings
 from valveflow_ros.report import page
+from valveflow_ros.report.answer import confidence_table
 from valveflow_ros.report.curve import band
 from valveflow_ros.report.data import gaps, rejected, usable_share
 from valveflow_ros.report.diagnosis import diagnosis_page
 from valveflow_ros.report.figure import Figure, packed, rounded
 from valveflow_ros.report.identification import identification_page, identification_report
-from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import packed_plotly, read_text
 
 MEGABYTE = 1_000_000
@@ -31,12 +31,6 @@ MEGABYTE = 1_000_000
 @pytest.fixture(scope='module')
 def report(identified):
     return identification_report(identified)
-
-
-def words_of(page):
-    """Return what a person reads."""
-    body = page.split('<body>')[1].split('<script')[0]
-    return re.sub(r'\s+', ' ', html.unescape(re.sub(r'<[^>]+>', ' ', body)))
 
 
 def figures_of(page):
@@ -128,10 +122,7 @@ def test_what_comes_from_outside_is_escaped(make):
 
 
 def replace_characteristic(data, **changes):
-    return Identified(
-        data.source, replace(data.characteristic, **changes), data.table, data.segments,
-        data.counts, data.settings, data.notes,
-    )  # fmt: skip
+    return replace(data, characteristic=replace(data.characteristic, **changes))
 
 
 def test_what_is_not_known_is_called_unknown(make):
@@ -177,6 +168,24 @@ def test_what_endangers_the_answer_stands_beside_it(make):
     answer = words[: words.index('The moments that carry it')]
     for part in ('31.0 K', 'does not rise', 'Not refined.', 'does not raise the power'):
         assert part in answer
+
+
+def test_confidence_and_support_stand_in_the_page(make):
+    c = make().characteristic
+    without = identification_report(make())
+    assert 'How probable each number of pieces is' not in without
+    assert 'rests on' not in without
+    choice = replace(c.choice, confidence={1: 0.0001, 2: 0.93, 3: 0.0699})
+    support = (
+        Support(3, 2, 900, (1100.0, 1150.0), True),
+        Support(1, 0, 40, (1300.0,), False),
+    )
+    page = identification_report(make(characteristic=replace(c, choice=choice, support=support)))
+    for part in ('93.0 %', '7.0 %', '3 steady states at 2 levels, 2 slope responses',
+                 '1 steady state at 1 level'):  # fmt: skip
+        assert part in page
+    assert page.count('not identifiable by itself') == 1
+    assert 'more than 99.9 %' in confidence_table(replace(choice, confidence={2: 1.0}))
 
 
 def test_no_segment_and_no_value_still_make_a_page(make):

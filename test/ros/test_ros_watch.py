@@ -16,7 +16,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from valveflow_msgs.msg import Alarm, Diagnosis, DiagnosisCause, FlowCharacteristic, Prediction
 
-from valveflow_ros.report.terminal.draw import screen
+from valveflow_ros.report.terminal.screen import screen
 from valveflow_ros.ros import watch_main
 from valveflow_ros.ros.node.diagnostics import Item, Level, diagnostics_message
 from valveflow_ros.ros.watch_main import WatchNode, fields_of

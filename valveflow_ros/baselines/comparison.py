@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
+import enum
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from valveflow_ros.baselines.hammerstein_fit import HammersteinFit, fit_hammerstein
 from valveflow_ros.baselines.judged import (
-    JudgedSegment,
     Judgement,
     OtherData,
     PairedTest,
     Trial,
     dynamic,
     judge,
+    over_blocks,
     trial_of,
 )
-from valveflow_ros.baselines.library import NAMES
-from valveflow_ros.baselines.sparse import SparseFit, fit_sparse
-from valveflow_ros.baselines.truth import CurveError, Truth, curve_error, pieces_error
-from valveflow_ros.baselines.verdict import Pair, everywhere, finding_of, pairs_on_segments
+from valveflow_ros.baselines.sparse import NAMES, SparseFit, fit_sparse
+from valveflow_ros.baselines.truth import CurveError, Line, Truth, curve_error
 from valveflow_ros.curve.characteristic import Characteristic, Piece
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.problem import Samples
@@ -31,19 +30,165 @@ from valveflow_ros.records import FloatArray, SegmentKind
 
 Progress = Callable[[float, str], None]
 
+FORMAT = 'valveflow/comparison'
+VERSION = 1
+BASELINES = ('hammerstein', 'sparse')
+_BLOCK_S = 1800.0
+_LEVEL = 0.05
+
+
+class Terms(enum.Enum):
+    """What is compared with what."""
+
+    AS_PAPER = 'as the paper'
+    STATIC = 'curve against curve, steady-state segments'
+    DYNAMIC = 'simulation against simulation, special segments'
+    ALL_ROWS = 'simulation against simulation, all rows'
+
+
+class Outcome(enum.Enum):
+    """Which of two has the smaller squared error."""
+
+    BETTER = 'better'
+    WORSE = 'worse'
+    OPEN = 'not told apart'
+
+
+class Finding(enum.Enum):
+    """What becomes of the paper's finding."""
+
+    CONFIRMED = 'confirmed'
+    CONTRADICTED = 'contradicted'
+    OPEN = 'open'
+
 
 @dataclass(frozen=True, slots=True)
-class Line:
-    """A piecewise-linear curve as numbers; knots (J + 1,), slopes and intercepts (J,)."""
+class Pair:
+    """Two predictions compared.
 
-    knots: FloatArray
-    slopes: FloatArray
-    intercepts: FloatArray
+    Attributes
+    ----------
+    terms : Terms
+    ours, theirs : str
+        Names of the predictions.
+    mse_ours_mw2, mse_theirs_mw2 : float
+    test : PairedTest
+        Of the difference of squared errors, theirs less ours, over segments or blocks.
+    failed : int
+        Segments or blocks in which theirs is not finite; the test leaves them out.
+    judged : int
+        All segments or blocks, those among them.
+    """
 
-    def __call__(self, u: FloatArray) -> FloatArray:
-        """Evaluate; the outer pieces go on."""
-        k = np.searchsorted(self.knots[1:-1], u, side='right')
-        return np.asarray(self.slopes[k] * u + self.intercepts[k])
+    terms: Terms
+    ours: str
+    theirs: str
+    mse_ours_mw2: float
+    mse_theirs_mw2: float
+    test: PairedTest
+    failed: int = 0
+    judged: int = 0
+
+    @property
+    def baseline(self) -> str:
+        """Return the method it is compared with."""
+        return self.theirs.partition('.')[0]
+
+    @property
+    def outcome(self) -> Outcome:
+        """Return who is better at the 5 % level.
+
+        Where the test tells nothing, theirs loses only if it mostly gives no answer: a few
+        segments without one are no evidence about the others.
+        """
+        if not self.test.zero_is_rejected(_LEVEL):
+            return Outcome.BETTER if 2 * self.failed > self.judged else Outcome.OPEN
+        return Outcome.BETTER if self.test.mean > 0.0 else Outcome.WORSE
+
+
+def pairs_on_segments(
+    judgement: Judgement, predictions: Mapping[str, FloatArray]
+) -> tuple[Pair, ...]:
+    """Compare the proposed method with both others on special segments.
+
+    As the paper does it: the static curve of the special segments against the others'
+    simulations. And on equal terms: simulation against simulation, and curve against curve
+    where the power rests, since on a ramp it lags behind any curve.
+    """
+    paper = 'paper' if 'paper.static' in predictions else 'proposed'
+    met = [
+        (terms, ours, f'{name}.{theirs}')
+        for name in BASELINES
+        for terms, ours, theirs in (
+            (Terms.AS_PAPER, f'{paper}.static', 'dynamic'),
+            (Terms.STATIC, 'proposed.static', 'static'),
+            (Terms.DYNAMIC, 'proposed.dynamic', 'dynamic'),
+        )
+    ]
+    found = []
+    for terms, ours, theirs in met:
+        kind = SegmentKind.STEADY if terms is Terms.STATIC else None
+        if ours in predictions and theirs in predictions and judgement.kinds(kind):
+            found.append(
+                Pair(
+                    terms, ours, theirs, judgement.mse(ours, kind), judgement.mse(theirs, kind),
+                    judgement.gain(ours, theirs, kind), judgement.failed(theirs, kind),
+                    len(judgement.kinds(kind)),
+                )
+            )  # fmt: skip
+    return tuple(found)
+
+
+def everywhere(
+    trial: Trial, predictions: Mapping[str, FloatArray]
+) -> tuple[dict[str, float], tuple[Pair, ...]]:
+    """Judge simulations on all rows; test over blocks of half an hour.
+
+    Returns
+    -------
+    dict
+        Mean squared error in MW^2 of each simulation.
+    tuple of Pair
+    """
+    names = [n for n in predictions if n.endswith('.dynamic')]
+    good = trial.good
+    squares = {}
+    for name in names:
+        with np.errstate(over='ignore', invalid='ignore'):
+            squares[name] = (trial.power_mw - predictions[name])[good] ** 2
+    mse = {name: float(np.mean(s)) if len(s) else float('nan') for name, s in squares.items()}
+    ours = 'proposed.dynamic'
+    if ours not in squares:
+        return mse, ()
+    block = np.flatnonzero(good) // max(1, round(_BLOCK_S / trial.step_s))
+    counts = np.bincount(block)
+    there = counts > 0
+    pairs = []
+    for theirs in (f'{b}.dynamic' for b in BASELINES if f'{b}.dynamic' in squares):
+        with np.errstate(over='ignore', invalid='ignore'):
+            sums = np.bincount(block, weights=squares[theirs] - squares[ours])[there]
+        finite = np.isfinite(sums)
+        rows = counts[there][finite]
+        test = over_blocks(sums[finite] / rows.mean() if len(rows) else np.empty(0))
+        failed = int((~finite).sum())
+        pairs.append(
+            Pair(Terms.ALL_ROWS, ours, theirs, mse[ours], mse[theirs], test, failed, len(sums))
+        )
+    return mse, tuple(pairs)
+
+
+def finding_of(pairs: Iterable[Pair]) -> Finding:
+    """Return what becomes of the finding that the proposed curve beats both others.
+
+    Judged as the paper does, on special segments of other data. One baseline that does
+    better contradicts it; both must do worse to confirm it, so both must be there.
+    """
+    met = [(p.baseline, p.outcome) for p in pairs if p.terms is Terms.AS_PAPER]
+    outcomes = {outcome for _, outcome in met}
+    if Outcome.WORSE in outcomes:
+        return Finding.CONTRADICTED
+    both = {name for name, _ in met} == set(BASELINES)
+    return Finding.CONFIRMED if both and outcomes == {Outcome.BETTER} else Finding.OPEN
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,16 +244,12 @@ class Comparison:
         return (*self.lines, *(('sparse',) if self.sparse else ()))
 
 
-def _quiet(_share: float, _what: str) -> None:
-    """Show no progress."""
-
-
 def compare(
     learn: Samples,
     characteristic: Characteristic,
     other: OtherData,
     truth: Truth | None = None,
-    progress: Progress = _quiet,
+    progress: Progress = lambda _share, _what: None,
 ) -> Comparison:
     """Identify by the two methods of the literature and judge all on other data.
 
@@ -136,7 +277,12 @@ def compare(
     hammerstein = fit_hammerstein(
         learn, len(characteristic.pieces), lambda what: progress(0.5, what)
     )
-    sparse, failure = _sparse(learn, lambda what: progress(0.75, what))
+    sparse, failure = None, ''
+    try:
+        sparse = fit_sparse(learn, lambda what: progress(0.75, what))
+    except DataError as error:
+        # The others can be compared without it.
+        failure = str(error)
     progress(0.85, 'judging')
     lines = _lines(characteristic, hammerstein)
     trial = trial_of(other, characteristic)
@@ -188,14 +334,6 @@ def _predictions(
     return found
 
 
-def _sparse(learn: Samples, progress: Callable[[str], None]) -> tuple[SparseFit | None, str]:
-    """Return the sparse model, or why there is none: the others can be compared without it."""
-    try:
-        return fit_sparse(learn, progress), ''
-    except DataError as error:
-        return None, str(error)
-
-
 def line_of(pieces: tuple[Piece, ...]) -> Line:
     """Return pieces as a curve; between pieces that do not touch the left one goes on."""
     return Line(
@@ -213,104 +351,61 @@ def _errors(
     if truth is None:
         return {}
     ends = float(characteristic.breakpoints[0]), float(characteristic.breakpoints[-1])
-    found = {}
-    for name, line in lines.items():
-        e = curve_error(line, truth, *ends)
-        off = pieces_error(line.knots, line.slopes, line.intercepts, truth)
-        found[name] = CurveError(e.rmse_mw, e.largest_mw, e.known, *off)
+    curves: dict[str, Callable[[FloatArray], FloatArray]] = dict(lines)
     if sparse is not None:
-        found['sparse'] = curve_error(sparse.model.static, truth, *ends)
-    return found
+        curves['sparse'] = sparse.model.static
+    return {name: curve_error(curve, truth, *ends) for name, curve in curves.items()}
 
 
-# A comparison as JSON: what ``comparison.json`` holds.
-
-FORMAT = 'valveflow/comparison'
-VERSION = 1
-
-
-def number(value: float) -> float | None:
-    """JSON has neither NaN nor infinity: absent is null."""
-    return float(value) if math.isfinite(value) else None
-
-
-def paired_json(test: PairedTest) -> dict[str, Any]:
-    """Return a test."""
+def to_json(c: Comparison) -> dict[str, Any]:
+    """Return the content of ``comparison.json``, without the words."""
     return {
-        'mean': number(test.mean),
-        'stderr': number(test.stderr),
-        't': number(test.t),
-        'p_value': number(test.p_value),
-        'effective': number(test.effective),
-    }
-
-
-def segment_json(segment: JudgedSegment) -> dict[str, Any]:
-    """Return one special segment with the scores of all predictions."""
-    return {
-        'number': segment.number,
-        'kind': segment.kind.name.lower(),
-        'start_ns': segment.start_ns,
-        'end_ns': segment.end_ns,
-        'samples': len(segment.rows),
-        'power_mw': segment.power_mw,
-        'scores': {
-            name: {
-                'mse_mw2': number(score.mse_mw2),
-                'each_sample': paired_json(score.samples),
-                'correlation_counted': paired_json(score.effective),
+        'format': FORMAT,
+        'version': VERSION,
+        'pressure_exponent': c.characteristic.pressure_exponent,
+        'finding': finding_of(c.pairs).value,
+        'methods': _methods_json(c),
+        'pairs': [
+            {
+                'terms': p.terms.value,
+                'ours': p.ours,
+                'theirs': p.theirs,
+                'mse_ours_mw2': number(p.mse_ours_mw2),
+                'mse_theirs_mw2': number(p.mse_theirs_mw2),
+                'theirs_less_ours': fields_json(p.test),
+                'segments_not_finite': p.failed,
+                'ours_is': p.outcome.value,
             }
-            for name, score in segment.scores.items()
-        },
-    }
+            for p in c.pairs
+        ],
+        'totals': totals_json(c.judgement, c.predictions),
+        'all_rows_mse_mw2': {name: number(v) for name, v in c.all_rows.items()},
+        'errors_against_truth': {
+            method: fields_json(
+                error, known='known_share', slope='largest_slope_error', knee='largest_knee_error',
+                intercept='largest_intercept_error_mw',
+            )
+            for method, error in c.errors.items()
+        } or None,
+        **judged_json(c.judgement),
+    }  # fmt: skip
 
 
-def total_json(judgement: Judgement, name: str) -> dict[str, Any]:
-    """Return one prediction over all segments."""
-    each, of_each = judgement.passed(name, as_paper=True)
-    counted, of_counted = judgement.passed(name, as_paper=False)
-    return {
-        'mse_mw2': number(judgement.mse(name)),
-        'mse_steady_mw2': number(judgement.mse(name, SegmentKind.STEADY)),
-        'mse_slope_mw2': number(judgement.mse(name, SegmentKind.SLOPE)),
-        'mean_difference_mw': paired_json(judgement.bias(name)),
-        'zero_stands': {
-            'each_sample': {'segments': each, 'of': of_each},
-            'correlation_counted': {'segments': counted, 'of': of_counted},
-        },
-        'segments_not_finite': judgement.failed(name),
-    }
-
-
-def _line_json(line: Line) -> list[dict[str, float]]:
-    return [
-        {
-            'u_from': float(line.knots[j]),
-            'u_to': float(line.knots[j + 1]),
-            'slope': float(line.slopes[j]),
-            'intercept': float(line.intercepts[j]),
-        }
-        for j in range(len(line.slopes))
-    ]
-
-
-def _methods(c: Comparison) -> dict[str, Any]:
-    methods: dict[str, Any] = {
-        name: {'pieces': _line_json(line)} for name, line in c.lines.items()
-    }
+def _methods_json(c: Comparison) -> dict[str, Any]:
+    names = ('u_from', 'u_to', 'slope', 'intercept')
+    methods: dict[str, Any] = {}
+    for method, line in c.lines.items():
+        table = zip(
+            line.knots[:-1].tolist(), line.knots[1:].tolist(), line.slopes.tolist(),
+            line.intercepts.tolist(), strict=True,
+        )  # fmt: skip
+        methods[method] = {'pieces': [dict(zip(names, row, strict=True)) for row in table]}
+    names = ('power_from', 'power_to', 'time_constant_s', 'delay_s')
     methods['proposed'] |= {
         'model_id': c.characteristic.model_id,
-        'dynamics': [
-            {
-                'power_from': d.power_from,
-                'power_to': d.power_to,
-                'time_constant_s': d.time_constant_s,
-                'delay_s': d.delay_s,
-            }
-            for d in c.characteristic.dynamics
-        ],
+        'dynamics': [{n: getattr(d, n) for n in names} for d in c.characteristic.dynamics],
     }
-    m = c.hammerstein.model
+    m, s = c.hammerstein.model, c.sparse
     methods['hammerstein'] |= {
         'numerator': m.b.tolist(),
         'denominator': [1.0, *m.denominator.tolist()],
@@ -323,12 +418,7 @@ def _methods(c: Comparison) -> dict[str, Any]:
             for n_b, n_f, noise, mse in c.hammerstein.tried
         ],
     }
-    methods['sparse'] = {'failure': c.failure} if c.sparse is None else _sparse_json(c.sparse)
-    return methods
-
-
-def _sparse_json(s: SparseFit) -> dict[str, Any]:
-    return {
+    methods['sparse'] = {'failure': c.failure} if s is None else {
         'functions': dict(zip(NAMES, s.model.xi.tolist(), strict=True)),
         'form': s.form.kind,
         'window_s': s.form.window_s,
@@ -337,51 +427,68 @@ def _sparse_json(s: SparseFit) -> dict[str, Any]:
             {'form': kind, 'window_s': window, 'functions': terms, 'mse_mw2': number(mse)}
             for kind, window, terms, mse in s.mse_by_form
         ],
-    }
+    }  # fmt: skip
+    return methods
 
 
-def _pair_json(pair: Pair) -> dict[str, Any]:
+# What the JSON of a comparison and that of a validation have in common.
+
+
+def number(value: float) -> float | None:
+    """Return a number for JSON, which has neither NaN nor infinity: absent is null."""
+    return float(value) if math.isfinite(value) else None
+
+
+def fields_json(value: Any, **renamed: str) -> dict[str, Any]:
+    """Return the fields of a dataclass of numbers, some under another name."""
+    return {renamed.get(f.name, f.name): number(getattr(value, f.name)) for f in fields(value)}
+
+
+def totals_json(judgement: Judgement, names: Iterable[str]) -> dict[str, Any]:
+    """Return each prediction over all segments."""
+    totals = {}
+    for name in names:
+        stands = {}
+        for key, as_paper in (('each_sample', True), ('correlation_counted', False)):
+            count, of = judgement.passed(name, as_paper=as_paper)
+            stands[key] = {'segments': count, 'of': of}
+        totals[name] = {
+            'mse_mw2': number(judgement.mse(name)),
+            'mse_steady_mw2': number(judgement.mse(name, SegmentKind.STEADY)),
+            'mse_slope_mw2': number(judgement.mse(name, SegmentKind.SLOPE)),
+            'mean_difference_mw': fields_json(judgement.bias(name)),
+            'zero_stands': stands,
+            'segments_not_finite': judgement.failed(name),
+        }
+    return totals
+
+
+def judged_json(judgement: Judgement) -> dict[str, Any]:
+    """Return what was judged, and each special segment with the scores of all predictions."""
     return {
-        'terms': pair.terms.value,
-        'ours': pair.ours,
-        'theirs': pair.theirs,
-        'mse_ours_mw2': number(pair.mse_ours_mw2),
-        'mse_theirs_mw2': number(pair.mse_theirs_mw2),
-        'theirs_less_ours': paired_json(pair.test),
-        'segments_not_finite': pair.failed,
-        'ours_is': pair.outcome.value,
-    }
-
-
-def _error_json(error: CurveError) -> dict[str, Any]:
-    return {
-        'rmse_mw': number(error.rmse_mw),
-        'largest_mw': number(error.largest_mw),
-        'known_share': error.known,
-        'largest_slope_error': number(error.slope),
-        'largest_knee_error': number(error.knee),
-        'largest_intercept_error_mw': number(error.intercept),
-    }
-
-
-def to_json(c: Comparison) -> dict[str, Any]:
-    """Return the content of ``comparison.json``, without the words."""
-    j = c.judgement
-    return {
-        'format': FORMAT,
-        'version': VERSION,
-        'pressure_exponent': c.characteristic.pressure_exponent,
-        'finding': finding_of(c.pairs).value,
-        'methods': _methods(c),
-        'pairs': [_pair_json(p) for p in c.pairs],
-        'totals': {name: total_json(j, name) for name in c.predictions},
-        'all_rows_mse_mw2': {name: number(v) for name, v in c.all_rows.items()},
-        'errors_against_truth': {m: _error_json(e) for m, e in c.errors.items()} or None,
         'judged': {
-            'segments': len(j.segments),
-            'samples': j.samples,
-            'samples_not_judged': j.outside,
-            'samples_per_independent_value': j.widening,
+            'segments': len(judgement.segments),
+            'samples': judgement.samples,
+            'samples_not_judged': judgement.outside,
+            'samples_per_independent_value': judgement.widening,
         },
-        'segments': [segment_json(s) for s in j.segments],
+        'segments': [
+            {
+                'number': s.number,
+                'kind': s.kind.name.lower(),
+                'start_ns': s.start_ns,
+                'end_ns': s.end_ns,
+                'samples': len(s.rows),
+                'power_mw': s.power_mw,
+                'scores': {
+                    name: {
+                        'mse_mw2': number(score.mse_mw2),
+                        'each_sample': fields_json(score.samples),
+                        'correlation_counted': fields_json(score.effective),
+                    }
+                    for name, score in s.scores.items()
+                },
+            }
+            for s in judgement.segments
+        ],
     }

@@ -6,24 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.curve.regional_model import piece_of
+from valveflow_ros.curve.regional_model import curve, piece_of
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.numerics import jit
 from valveflow_ros.records import ByteArray, FloatArray
 
-# Run a Hammerstein model over measured inputs, with derivatives, in one pass.
-#
 # The model is ``x = F(u)`` with F continuous and piecewise linear, followed by one
 # linear block ``y[t] = -f_1 y[t-1] - ... + b_0 x[t-d] + b_1 x[t-d-1] + ...``. Its static
 # gain is 1, as eq. (5) of the paper sets K_g = 1: ``b_0`` follows from the others.
-
-
-@jit
-def value_at(u: float, knots: FloatArray, values: FloatArray) -> float:
-    """Evaluate F; the outer pieces go on for ever."""
-    k = piece_of(u, knots)
-    w = (u - knots[k]) / (knots[k + 1] - knots[k])
-    return float(values[k] + (values[k + 1] - values[k]) * w)
 
 
 @jit
@@ -45,53 +35,15 @@ def _slopes_of_curve(
 
 
 @jit
-def run(
-    u: FloatArray,
-    usable: ByteArray,
-    knots: FloatArray,
-    values: FloatArray,
-    b: FloatArray,
-    f: FloatArray,
-    delay: int,
-    settle: int,
-    answer: FloatArray,
-    settled: ByteArray,
-) -> None:
-    """Write the simulated power (n,), NaN in gaps; ``settled`` is 0 for ``settle`` rows after one.
-
-    After a gap the block starts in equilibrium.
-    """
-    past = np.zeros(f.size)
-    flow = np.empty(u.size)
-    age = 0
-    for t in range(u.size):
-        if not usable[t]:
-            age = 0
-            answer[t] = np.nan
-            settled[t] = 0
-            continue
-        flow[t] = value_at(u[t], knots, values)
-        if age == 0:
-            past[:] = flow[t]
-        answer[t] = _next(flow, b, f, past, t, delay, age)
-        age += 1
-        settled[t] = 1 if age > settle else 0
-
-
-@jit
 def _push(
-    u: FloatArray,
-    flow: FloatArray,
-    knots: FloatArray,
-    values: FloatArray,
-    b: FloatArray,
-    past: FloatArray,
-    t: int,
-    delay: int,
-    age: int,
-    gains: FloatArray,
-) -> None:
-    """Write what flow and past power at row ``t`` add to each derivative, before the poles."""
+    u: FloatArray, flow: FloatArray, knots: FloatArray, values: FloatArray, b: FloatArray,
+    f: FloatArray, past: FloatArray, t: int, delay: int, age: int, gains: FloatArray,
+    lag: FloatArray, sums: FloatArray,
+) -> None:  # fmt: skip
+    """Advance the derivatives by row ``t`` and add them to ``sums``.
+
+    ``gains`` takes what flow and past power add, ``lag`` the derivatives behind the poles.
+    """
     n_curve = 2 * (knots.size - 1)
     gains[:] = 0.0
     first = flow[t - min(delay, age)]
@@ -102,6 +54,14 @@ def _push(
             gains[n_curve + past.size + j - 1] = flow[back] - first
     for i in range(past.size):
         gains[n_curve + i] = first - past[i]
+    for p in range(sums.size):
+        value = gains[p]
+        for i in range(f.size):
+            value -= f[i] * lag[i, p]
+        for i in range(f.size - 1, 0, -1):
+            lag[i, p] = lag[i - 1, p]
+        lag[0, p] = value
+        sums[p] += value
 
 
 @jit
@@ -120,33 +80,11 @@ def _next(flow: FloatArray, b: FloatArray, f: FloatArray, past: FloatArray, t: i
 
 
 @jit
-def _turn(gains: FloatArray, lag: FloatArray, f: FloatArray, sums: FloatArray) -> None:
-    """Advance the derivatives by one row: what the flow adds, through the poles."""
-    for p in range(sums.size):
-        value = gains[p]
-        for i in range(f.size):
-            value -= f[i] * lag[i, p]
-        for i in range(f.size - 1, 0, -1):
-            lag[i, p] = lag[i - 1, p]
-        lag[0, p] = value
-        sums[p] += value
-
-
-@jit
 def run_with_tangents(
-    u: FloatArray,
-    usable: ByteArray,
-    knots: FloatArray,
-    values: FloatArray,
-    b: FloatArray,
-    f: FloatArray,
-    delay: int,
-    settle: int,
-    group: int,
-    answer: FloatArray,
-    jacobian: FloatArray,
-    weight: ByteArray,
-) -> None:
+    u: FloatArray, usable: ByteArray, knots: FloatArray, values: FloatArray, b: FloatArray,
+    f: FloatArray, delay: int, settle: int, group: int, answer: FloatArray,
+    jacobian: FloatArray, weight: ByteArray,
+) -> None:  # fmt: skip
     """Write means over ``group`` rows of the simulated power and of its derivatives.
 
     Parameters
@@ -177,7 +115,7 @@ def run_with_tangents(
                 age = 0
                 good = False
                 continue
-            flow[t] = value_at(u[t], knots, values)
+            flow[t] = curve(u[t], knots, values[:-1], values[1:])
             if age == 0:
                 past[:] = flow[t]
             if columns > 0:
@@ -186,8 +124,7 @@ def run_with_tangents(
                     _slopes_of_curve(u[t], knots, values, 1.0, gains)
                     for i in range(n_f):
                         lag[i] = gains[:columns]
-                _push(u, flow, knots, values, b, past, t, delay, age, gains)
-                _turn(gains, lag, f, sums)
+                _push(u, flow, knots, values, b, f, past, t, delay, age, gains, lag, sums)
             total += _next(flow, b, f, past, t, delay, age)
             age += 1
             good = good and age > settle
@@ -255,22 +192,34 @@ class HammersteinModel:
         return np.asarray(self.slopes()[k] * (u - self.knots[k]) + self.values[k])
 
     def stable(self) -> bool:
-        """Tell whether the linear block comes to rest."""
+        """Return True if the linear block is stable."""
         poles = np.roots(np.concatenate([[1.0], self.denominator]))
         return bool(np.all(np.abs(poles) < 1.0 - 1e-6))
 
     def run(self, samples: Samples) -> tuple[FloatArray, ByteArray]:
-        """Return the simulated power in MW and where it has settled, shapes (n,)."""
-        return self._run(samples.u, samples.usable, round(samples.settle_s / self.step_s))
+        """Return the simulated power in MW and where it has settled, shapes (n,).
 
-    def _run(self, u: FloatArray, usable: ByteArray, settle: int) -> tuple[FloatArray, ByteArray]:
-        answer = np.empty(len(u))
-        settled = np.empty(len(u), dtype=np.uint8)
-        run(
-            u, usable, self.knots, self.values, self.b, self.denominator, self.delay,
-            settle, answer, settled,
+        After a gap the block starts in equilibrium; in a gap the power is NaN.
+        """
+        answer, _, settled = self.averaged(replace(samples, group=1), columns=0)
+        return np.where(samples.usable > 0, answer, np.nan), settled
+
+    def averaged(
+        self, samples: Samples, columns: int | None = None
+    ) -> tuple[FloatArray, FloatArray, ByteArray]:
+        """Return means of the simulated power (m,), its derivatives (m, P) and the weight (m,).
+
+        ``columns`` asks for only the first so many derivatives.
+        """
+        m = samples.means
+        answer, weight = np.empty(m), np.empty(m, dtype=np.uint8)
+        jacobian = np.empty((m, len(self.pack()) if columns is None else columns))
+        run_with_tangents(
+            samples.u, samples.usable, self.knots, self.values, self.b, self.denominator,
+            self.delay, round(samples.settle_s / self.step_s), samples.group, answer, jacobian,
+            weight,
         )  # fmt: skip
-        return answer, settled
+        return answer, jacobian, weight
 
     def step_response(self, seconds: FloatArray) -> FloatArray:
         """Return how much of a unit step of the flow the power has followed, shape (n,)."""
@@ -279,7 +228,8 @@ class HammersteinModel:
         flat = replace(self, knots=np.array([0.0, 1.0]), values=np.array([0.0, 1.0]))
         u = np.ones(rows + 1)
         u[0] = 0.0
-        answer, _ = flat._run(u, np.ones(rows + 1, dtype=np.uint8), 0)
+        usable = np.ones(rows + 1, dtype=np.uint8)
+        answer, _ = flat.run(Samples(u, u, usable, self.step_s, 0.0, 1))
         return np.asarray(np.interp(seconds, np.arange(rows) * self.step_s, answer[1:]))
 
     def pack(self) -> FloatArray:
@@ -308,12 +258,7 @@ def tangents(
     columns : int, optional
         Only the first so many derivatives.
     """
-    m, group = samples.means, samples.group
-    answer, weight = np.empty(m), np.empty(m, dtype=np.uint8)
-    jacobian = np.empty((m, len(model.pack()) if columns is None else columns))
-    run_with_tangents(
-        samples.u, samples.usable, model.knots, model.values, model.b, model.denominator,
-        model.delay, round(samples.settle_s / samples.step_s), group, answer, jacobian, weight,
-    )  # fmt: skip
-    power = samples.power_mw[: m * group].reshape(m, group).mean(axis=1)
+    answer, jacobian, weight = model.averaged(samples, columns)
+    power = samples.power_mw[: samples.means * samples.group]
+    power = power.reshape(samples.means, samples.group).mean(axis=1)
     return np.where(weight > 0, power - answer, 0.0), jacobian, weight

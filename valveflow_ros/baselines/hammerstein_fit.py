@@ -22,23 +22,20 @@ from valveflow_ros.fit.whitening import fit_ar, whitened
 from valveflow_ros.numerics import gram
 from valveflow_ros.records import FloatArray
 
-# Move all parameters of a Hammerstein model together, by the prediction error.
-
 OUTPUT_ERROR: FloatArray = np.empty(0)
 _NARROWEST = 0.004  # of the range of u: as narrow as the proposed method lets a piece be
 _DELAY_STEPS_S = (8.0, 4.0, 2.0, 1.0)
+# Where the search begins: least squares on a grid.
+_GRID_T_S = (3.0, 6.0, 12.0, 25.0, 50.0, 100.0, 200.0)
+_GRID_DELAY_S = (0.0, 5.0, 15.0, 30.0)
+_SEED = 20240229  # of the random knots; a fit is a pure function of its data
+_RANDOM_STARTS = 4
+_LEAST_PART = 0.05
+_KEPT_STARTS = 3
+ORDERS = ((1, 1), (2, 2), (3, 3))  # taps n_b and poles n_f
+_NEW_POLE = 0.5
 
-
-def cost(samples: Samples, model: HammersteinModel, ar: FloatArray) -> float:
-    """Return the sum of squared prediction errors of the means."""
-    residual, _, weight = tangents(samples, model, columns=0)
-    e = whitened(residual, weight, ar)
-    return float((e * e).sum())
-
-
-def _possible(model: HammersteinModel) -> bool:
-    least = _NARROWEST * (model.knots[-1] - model.knots[0])
-    return bool(np.all(np.diff(model.knots) > least)) and model.stable()
+Progress = Callable[[str], None]
 
 
 def move(
@@ -52,6 +49,11 @@ def move(
         Of the noise of the means; empty is the output error, which calls all noise white.
     """
 
+    def cost(model: HammersteinModel) -> float:
+        residual, _, weight = tangents(samples, model, columns=0)
+        e = whitened(residual, weight, ar)
+        return float((e * e).sum())
+
     def equations(model: HammersteinModel) -> tuple[FloatArray, FloatArray]:
         residual, jacobian, weight = tangents(samples, model)
         sums = gram(whitened(np.column_stack([jacobian, residual]), weight, ar))
@@ -59,11 +61,10 @@ def move(
 
     def shifted(model: HammersteinModel, step: FloatArray) -> HammersteinModel | None:
         moved = model.unpack(model.pack() + step)
-        return moved if _possible(moved) else None
+        least = _NARROWEST * (moved.knots[-1] - moved.knots[0])
+        return moved if np.all(np.diff(moved.knots) > least) and moved.stable() else None
 
-    return gauss_newton(
-        model, lambda m: cost(samples, m, ar), equations, shifted, steps, least_gain=1e-6
-    )
+    return gauss_newton(model, cost, equations, shifted, steps, least_gain=1e-6)
 
 
 def search_delay(
@@ -82,35 +83,21 @@ def search_delay(
     return model, best
 
 
-# Where the search for a Hammerstein model begins: least squares on a grid.
-
-_GRID_T_S = (3.0, 6.0, 12.0, 25.0, 50.0, 100.0, 200.0)
-_GRID_DELAY_S = (0.0, 5.0, 15.0, 30.0)
-_SEED = 20240229  # of the random knots; a fit is a pure function of its data
-_RANDOM_STARTS = 4
-_LEAST_PART = 0.05
-
-
 def knots_to_try(u: FloatArray, pieces: int) -> list[FloatArray]:
     """Return sets of J + 1 knots over the range of ``u``: even, by quantiles, at random."""
     low, high = float(u.min()), float(u.max())
     even = np.linspace(low, high, pieces + 1)
     by_share = np.quantile(u, np.linspace(0.0, 1.0, pieces + 1))
-    tried = [even, 0.5 * (even + by_share), _apart(by_share)]
+    # Quantiles that are nowhere closer than a twentieth of an even spacing.
+    widths = np.maximum(np.diff(by_share), 0.05 * (high - low) / pieces)
+    inner = low + (high - low) * np.cumsum(widths / widths.sum())[:-1]
+    tried = [even, 0.5 * (even + by_share), np.concatenate([[low], inner, [high]])]
     rng = np.random.default_rng(_SEED)
     for _ in range(_RANDOM_STARTS if pieces > 1 else 0):
         widths = _LEAST_PART + rng.dirichlet(np.ones(pieces))
         inner = low + (high - low) * np.cumsum(widths / widths.sum())[:-1]
         tried.append(np.concatenate([[low], inner, [high]]))
     return tried if pieces > 1 else tried[:1]
-
-
-def _apart(knots: FloatArray) -> FloatArray:
-    """Return knots that are nowhere closer than a twentieth of an even spacing."""
-    least = 0.05 * (knots[-1] - knots[0]) / (len(knots) - 1)
-    widths = np.maximum(np.diff(knots), least)
-    inner = knots[0] + (knots[-1] - knots[0]) * np.cumsum(widths / widths.sum())
-    return np.concatenate([knots[:1], inner[:-1], knots[-1:]])
 
 
 def first_order(
@@ -157,13 +144,6 @@ def starts(samples: Samples, pieces: int) -> list[HammersteinModel]:
     return [model for model, _ in sorted(found, key=lambda pair: pair[1])]
 
 
-ORDERS = ((1, 1), (2, 2), (3, 3))  # taps n_b and poles n_f
-_KEPT_STARTS = 3
-_NEW_POLE = 0.5
-
-Progress = Callable[[str], None]
-
-
 @dataclass(frozen=True, slots=True)
 class HammersteinFit:
     """The model and how it was chosen.
@@ -196,16 +176,12 @@ def fit_hammerstein(
     coarse = _at_coarse(learn, pieces)
     progress('Hammerstein model: orders')
     candidates = _orders(learn, coarse)
-    tried = [(*_order(m), noise, run_mse(m, judge)) for noise, m in candidates]
+    tried = [(len(m.b), len(m.denominator), noise, run_mse(m, judge)) for noise, m in candidates]
     best = int(np.argmin([t[-1] for t in tried]))
     noise, model = candidates[best]
     progress('Hammerstein model: all data')
     model = _on_all(samples, model, noise)
     return HammersteinFit(model, noise, tuple(tried))
-
-
-def _order(model: HammersteinModel) -> tuple[int, int]:
-    return len(model.numerator) + 1, len(model.denominator)
 
 
 def _at_coarse(samples: Samples, pieces: int) -> HammersteinModel:
@@ -222,26 +198,19 @@ def _at_coarse(samples: Samples, pieces: int) -> HammersteinModel:
 
 def _orders(samples: Samples, model: HammersteinModel) -> list[tuple[str, HammersteinModel]]:
     """Return a model of each order, each begun at the one before, under both noises."""
-    found = []
-    delayed = False
+    found: list[tuple[str, HammersteinModel]] = []
     for n_b, n_f in ORDERS:
         model, best = move(samples, grown(model, n_b, n_f), OUTPUT_ERROR, 12)
-        if not delayed:
-            model, best = search_delay(samples, model, OUTPUT_ERROR, best)
-            delayed = True
-        found.append(('output error', model))
-        found.append(('autoregressive', _whitened(samples, model)))
+        if not found:
+            model, _ = search_delay(samples, model, OUTPUT_ERROR, best)
+        found += [('output error', model), ('autoregressive', _whitened(samples, model))]
     return found
-
-
-def _noise_of(samples: Samples, model: HammersteinModel) -> FloatArray:
-    residual, _, weight = tangents(samples, model, columns=0)
-    return fit_ar(residual, weight)
 
 
 def _whitened(samples: Samples, model: HammersteinModel) -> HammersteinModel:
     """Refit under an AR model of the noise, which is far from white."""
-    return move(samples, model, _noise_of(samples, model), 8)[0]
+    residual, _, weight = tangents(samples, model, columns=0)
+    return move(samples, model, fit_ar(residual, weight), 8)[0]
 
 
 def grown(model: HammersteinModel, n_b: int, n_f: int) -> HammersteinModel:

@@ -19,14 +19,16 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray, IntArray, SegmentKind
 from valveflow_ros.segments.window import WindowContents
 
-# Is a mean difference zero? Paired t tests that count samples, and ones that do not.
-#
-# The paper's test takes each sample of a segment for independent (its reference
-# [38]). At 1 Hz the noise of the power is correlated over a minute or more, so that
-# test sees ten or a hundred times the evidence there is. Beside it stand tests
-# that count what the samples are worth.
-
 _LONGEST_S = 300.0
+_LEAST_ROWS = 10  # of a segment that can be judged
+LEARN_SHARE = 0.7
+_LEAST_OF_PART = 0.1  # of the settled rows needed altogether, in each part
+
+
+# Is a mean difference zero? The paper's test takes each sample of a segment for independent (its
+# reference [38]). At 1 Hz the noise of the power is correlated over a minute or more, so that
+# test sees ten or a hundred times the evidence there is. Beside it stand tests that count what
+# the samples are worth.
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +60,12 @@ class PairedTest:
         return self.mean - reach, self.mean + reach
 
     def zero_is_rejected(self, level: float = 0.05) -> bool:
-        """Tell whether zero is ruled out; a test that could not be done rules nothing out."""
+        """Return True if zero is ruled out; a test that could not be done rules nothing out."""
         return self.p_value < level
 
 
 def _test(mean: float, stderr: float, effective: float) -> PairedTest:
+    """Return the t test of a mean with its standard error; NaN where it cannot be done."""
     if not (math.isfinite(mean) and math.isfinite(stderr) and effective > 1.0):
         return PairedTest(mean, math.nan, math.nan, math.nan, effective)
     if stderr == 0.0:
@@ -72,24 +75,15 @@ def _test(mean: float, stderr: float, effective: float) -> PairedTest:
     return PairedTest(mean, stderr, t, float(2.0 * stdtr(effective - 1.0, -abs(t))), effective)
 
 
-def over_samples(difference: FloatArray) -> PairedTest:
-    """Test as the paper does: each sample counts.
-
-    Parameters
-    ----------
-    difference : float64 (n,)
-    """
-    return with_effective_size(difference, 1.0)
-
-
-def with_effective_size(difference: FloatArray, widening: float) -> PairedTest:
-    """Test with n / widening independent values.
+def over_samples(difference: FloatArray, widening: float = 1.0) -> PairedTest:
+    """Test the samples of a segment; as the paper does, each counts.
 
     Parameters
     ----------
     difference : float64 (n,)
     widening : float
-        How many times the variance of a long mean exceeds that of independent samples.
+        How many times the variance of a long mean exceeds that of independent samples: the
+        test then counts n / widening of them.
 
     Notes
     -----
@@ -97,11 +91,10 @@ def with_effective_size(difference: FloatArray, widening: float) -> PairedTest:
     """
     n = len(difference)
     effective = n / max(widening, 1.0)
-    if n < 2 or effective < 2.0:
-        mean = float(difference.mean()) if n else math.nan
-        return PairedTest(mean, math.nan, math.nan, math.nan, effective)
-    stderr = float(difference.std(ddof=1)) / math.sqrt(effective)
-    return _test(float(difference.mean()), stderr, effective)
+    mean, stderr = float(difference.mean()) if n else math.nan, math.nan
+    if n >= 2 and effective >= 2.0:
+        stderr = float(difference.std(ddof=1)) / math.sqrt(effective)
+    return _test(mean, stderr, effective)
 
 
 def over_blocks(blocks: FloatArray) -> PairedTest:
@@ -158,9 +151,6 @@ def widening_of(residual: FloatArray, spans: IntArray, step_s: float) -> float:
     )
     half = float(np.median(spans[:, 1] - spans[:, 0])) / 2.0
     return inflation(series, weight, max(1, int(min(_LONGEST_S / step_s, half))))
-
-
-_LEAST_ROWS = 10  # of a segment that can be judged
 
 
 @dataclass(frozen=True, slots=True)
@@ -377,20 +367,16 @@ def _widening(trial: Trial, predictions: Mapping[str, FloatArray], spans: IntArr
             best, least = predicted, mse
     if best is None:
         return 1.0
-    residual = np.where(trial.good, trial.power_mw - best, 0.0)
-    return widening_of(residual, spans, trial.step_s)
+    return widening_of(np.where(trial.good, trial.power_mw - best, 0.0), spans, trial.step_s)
 
 
 def _score(difference: FloatArray, widening: float) -> Score:
     with np.errstate(over='ignore', invalid='ignore'):
         mse = float(np.mean(difference**2))
     if not np.isfinite(mse):
-        none = PairedTest(float('nan'), float('nan'), float('nan'), float('nan'), 0.0)
+        none = _test(math.nan, math.nan, 0.0)
         return Score(mse, none, none)
-    return Score(mse, over_samples(difference), with_effective_size(difference, widening))
-
-
-# Rows of a log in the form every method of the comparison takes them.
+    return Score(mse, over_samples(difference), over_samples(difference, widening))
 
 
 def samples_of(contents: WindowContents, settings: Settings) -> Samples:
@@ -415,12 +401,6 @@ def samples_of(contents: WindowContents, settings: Settings) -> Samples:
 def other_data(contents: WindowContents, settings: Settings) -> OtherData:
     """Return the rows of a window with its special segments, to judge by."""
     return OtherData(samples_of(contents, settings), contents.time_ns, contents.spans)
-
-
-# A part of the identification data held back to choose between candidates.
-
-LEARN_SHARE = 0.7
-_LEAST_OF_PART = 0.1  # of the settled rows needed altogether, in each part
 
 
 class Runnable(Protocol):
@@ -491,9 +471,6 @@ def run_mse(model: Runnable, samples: Samples) -> float:
     return value if np.isfinite(value) else float('inf')
 
 
-# What an identified characteristic predicts on other data, and where it may be judged.
-
-
 def dynamic(characteristic: Characteristic, samples: Samples) -> FloatArray:
     """Return the power that curve and regional dynamics simulate, MW, shape (n,)."""
     model = characteristic.model
@@ -507,8 +484,7 @@ def trial_of(other: OtherData, characteristic: Characteristic) -> Trial:
     for, and as far behind a gap as the slowest dynamics allowed for.
     """
     samples = other.samples
-    flat = characteristic.model
-    good = samples.usable > 0
-    good &= (samples.u >= flat.knots[0]) & (samples.u <= flat.knots[-1])
+    low, high = characteristic.model.knots[[0, -1]]
+    good = (samples.usable > 0) & (samples.u >= low) & (samples.u <= high)
     good &= settled_rows(samples)
     return Trial(other.time_ns, samples.u, samples.power_mw, good, other.spans, samples.step_s)

@@ -1,10 +1,11 @@
 """Sparse identification of nonlinear dynamics (SINDy), tuned on data of its own.
 
-The library is that of Section IV of the paper, the solver sequentially thresholded
-least squares. Columns are scaled to unit size first: u^3 is 1e10 and cos u is 1, and
-one threshold must mean the same for both. How derivatives are taken and the
-threshold are chosen by how well the last part of the identification data is
-simulated from the first.
+The model is ``y' = xi . theta(y, u)`` with theta = [1, y, u, y^2, y u, u^2, y^3, y^2 u, y u^2,
+u^3, sin y, sin u, cos y, cos u]: the 14 entries of the paper's vector Xi (Section IV), of which
+the first belongs to the constant. The solver is sequentially thresholded least squares. Columns
+are scaled to unit size first: u^3 is 1e10 and cos u is 1, and one threshold must mean the same
+for both. How derivatives are taken and the threshold are chosen by how well the last part of the
+identification data is simulated from the first.
 """
 
 from __future__ import annotations
@@ -16,18 +17,143 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import savgol_coeffs
 
-from valveflow_ros.baselines import library
 from valveflow_ros.baselines.judged import cut_samples, run_mse
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.problem import Samples
+from valveflow_ros.numerics import jit
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray, IntArray
 
-# A sparse model of the power: an ordinary differential equation, and where it rests.
+NAMES = (
+    '1', 'y', 'u', 'y^2', 'y u', 'u^2', 'y^3', 'y^2 u', 'y u^2', 'u^3',
+    'sin y', 'sin u', 'cos y', 'cos u',
+)  # fmt: skip
+SIZE = len(NAMES)
+_LONGEST_STEP_S = 5.0  # of an integration
+_AWAY = 1e6  # MW; what has gone further does not come back
+
+
+@jit
+def theta(y: float, u: float, out: FloatArray) -> None:
+    """Write the 14 functions at one point."""
+    out[0] = 1.0
+    out[1] = y
+    out[2] = u
+    out[3] = y * y
+    out[4] = y * u
+    out[5] = u * u
+    out[6] = y * y * y
+    out[7] = y * y * u
+    out[8] = y * u * u
+    out[9] = u * u * u
+    out[10] = math.sin(y)
+    out[11] = math.sin(u)
+    out[12] = math.cos(y)
+    out[13] = math.cos(u)
+
+
+@jit
+def columns(y: FloatArray, u: FloatArray) -> FloatArray:
+    """Return the functions at all rows, shape (n, 14)."""
+    out = np.empty((y.size, SIZE))
+    for t in range(y.size):
+        theta(y[t], u[t], out[t])
+    return out
+
+
+@jit
+def rate(y: float, u: float, xi: FloatArray) -> float:
+    """Return y' in MW/s; absent functions are not computed."""
+    powers = xi[0] + u * (xi[2] + u * (xi[5] + u * xi[9]))
+    powers += y * (xi[1] + u * (xi[4] + u * xi[8]) + y * (xi[3] + u * xi[7] + y * xi[6]))
+    if xi[10] != 0.0:
+        powers += xi[10] * math.sin(y)
+    if xi[11] != 0.0:
+        powers += xi[11] * math.sin(u)
+    if xi[12] != 0.0:
+        powers += xi[12] * math.cos(y)
+    if xi[13] != 0.0:
+        powers += xi[13] * math.cos(u)
+    return float(powers)
+
+
+@jit
+def _advance(y: float, before: float, now: float, xi: FloatArray, step_s: float) -> float:
+    """Integrate over one row by Runge-Kutta of fourth order, in short enough steps."""
+    parts = max(1, math.ceil(step_s / _LONGEST_STEP_S))
+    h = step_s / parts
+    move = (now - before) / parts
+    u = before
+    for _ in range(parts):
+        k1 = rate(y, u, xi)
+        k2 = rate(y + 0.5 * h * k1, u + 0.5 * move, xi)
+        k3 = rate(y + 0.5 * h * k2, u + 0.5 * move, xi)
+        k4 = rate(y + h * k3, u + move, xi)
+        y += h * (k1 + 2.0 * k2 + 2.0 * k3 + k4) / 6.0
+        u += move
+    return y
+
+
+@jit
+def simulate(
+    u: FloatArray, usable: ByteArray, begin: FloatArray, xi: FloatArray, step_s: float,
+    settle: int, answer: FloatArray, settled: ByteArray,
+) -> None:  # fmt: skip
+    """Integrate, u straight between rows.
+
+    ``begin`` (n,) is the power to begin with after a gap. ``answer`` is NaN in
+    gaps and infinite once the solution has run away.
+    """
+    y = 0.0
+    age = 0
+    for t in range(u.size):
+        if not usable[t]:
+            age = 0
+            answer[t] = np.nan
+            settled[t] = 0
+            continue
+        if age == 0:
+            y = begin[t]
+        elif abs(y) < _AWAY:
+            y = _advance(y, u[t - 1], u[t], xi, step_s)
+        answer[t] = y if abs(y) < _AWAY else np.inf
+        age += 1
+        settled[t] = 1 if age > settle else 0
+
+
+@jit
+def weak_rows(
+    y: FloatArray, theta_rows: FloatArray, usable: ByteArray, centres: IntArray,
+    test: FloatArray, slope: FloatArray, out: FloatArray,
+) -> int:  # fmt: skip
+    """Write rows ``[integral of phi theta, - integral of phi' y]``; return how many.
+
+    ``test`` and ``slope`` are phi and phi' on rows -w..w. A window with a gap in
+    it is left out.
+    """
+    half = test.size // 2
+    written = 0
+    size = theta_rows.shape[1]
+    for c in centres:
+        good = True
+        for k in range(test.size):
+            good = good and usable[c - half + k] > 0
+        if not good:
+            continue
+        for p in range(size + 1):
+            out[written, p] = 0.0
+        for k in range(test.size):
+            t = c - half + k
+            for p in range(size):
+                out[written, p] += test[k] * theta_rows[t, p]
+            out[written, size] -= slope[k] * y[t]
+        written += 1
+    return written
+
 
 _START_S = 30.0  # power averaged to begin with after a gap
 _PLACES = 400  # inputs at which the rest is searched, at least
 _FINE_U = 0.25  # farthest apart where the rest swings with sin u or cos u: 25 to a period
-_SWINGING = tuple(library.NAMES.index(name) for name in ('sin u', 'cos u'))
+_SWINGING = tuple(NAMES.index(name) for name in ('sin u', 'cos u'))
 _GRID = 1500  # places at which a change of sign is looked for
 
 
@@ -57,7 +183,7 @@ class SparseModel:
     @property
     def terms(self) -> tuple[str, ...]:
         """Return the names of the functions that are there."""
-        return tuple(n for n, x in zip(library.NAMES, self.xi, strict=True) if x != 0.0)
+        return tuple(n for n, x in zip(NAMES, self.xi, strict=True) if x != 0.0)
 
     def run(self, samples: Samples) -> tuple[FloatArray, ByteArray]:
         """Return the simulated power in MW and where it has settled, shapes (n,).
@@ -72,7 +198,7 @@ class SparseModel:
             begin[t] = np.mean(samples.power_mw[part][samples.usable[part] > 0])
         answer = np.empty(len(samples.u))
         settled = np.empty(len(samples.u), dtype=np.uint8)
-        library.simulate(
+        simulate(
             samples.u, samples.usable, begin, self.xi, samples.step_s,
             round(samples.settle_s / samples.step_s), answer, settled,
         )  # fmt: skip
@@ -108,7 +234,7 @@ class SparseModel:
 
 def _rest(xi: FloatArray, u: float, y: FloatArray, near: float) -> float:
     """Return the stable rest nearest to ``near``, NaN if there is none."""
-    values = library.columns(y, np.full(len(y), u)) @ xi
+    values = columns(y, np.full(len(y), u)) @ xi
     falls = np.flatnonzero((values[:-1] > 0.0) & (values[1:] <= 0.0))
     if not len(falls):
         return float('nan')
@@ -117,12 +243,10 @@ def _rest(xi: FloatArray, u: float, y: FloatArray, near: float) -> float:
     return float(rests[np.argmin(np.abs(rests - near))])
 
 
-# Equations for sparse identification: by derivatives of smoothed data, or in weak form.
-#
-# A derivative of noisy power is mostly noise. Either the data are smoothed by
-# local polynomials (Savitzky and Golay) and the polynomial is differentiated, or
-# both sides are multiplied by a smooth test function that vanishes at the ends of
-# a window and integrated, which moves the derivative from the data to the test function.
+# A derivative of noisy power is mostly noise. Either the data are smoothed by local polynomials
+# (Savitzky and Golay) and the polynomial is differentiated, or both sides are multiplied by a
+# smooth test function that vanishes at the ends of a window and integrated, which moves the
+# derivative from the data to the test function.
 
 _ORDER = 2  # of the local polynomials
 _STEEP = 4  # phi = (1 - s^2)^4: smooth enough that its derivative vanishes at the ends too
@@ -151,15 +275,8 @@ _FAR_S = 5.0
 
 def forms_for(step_s: float) -> tuple[Form, ...]:
     """Return what to try for rows ``step_s`` apart."""
-    windows: tuple[float, ...] = _WINDOWS_S
-    if step_s > _FAR_S:
-        windows = tuple(rows * step_s for rows in _WINDOWS_ROWS)
+    windows = [rows * step_s for rows in _WINDOWS_ROWS] if step_s > _FAR_S else _WINDOWS_S
     return tuple(Form(kind, w) for kind in ('derivative', 'weak') for w in windows)
-
-
-def half_width(form: Form, step_s: float) -> int:
-    """Return how many rows a window reaches to each side, at least two."""
-    return max(2, round(0.5 * form.window_s / step_s))
 
 
 def equations(samples: Samples, form: Form) -> FloatArray:
@@ -167,33 +284,28 @@ def equations(samples: Samples, form: Form) -> FloatArray:
 
     Windows overlap by half; what is nearer says little new.
     """
-    half = half_width(form, samples.step_s)
+    half = max(2, round(0.5 * form.window_s / samples.step_s))
     make = _weak if form.kind == 'weak' else _derivative
     if len(samples.u) <= 2 * half:
-        return np.empty((0, library.SIZE + 1))
+        return np.empty((0, SIZE + 1))
     centres = np.arange(half, len(samples.u) - half, half, dtype=np.int64)
     return make(samples, half, centres)
 
 
-def _whole(usable: ByteArray, half: int, centres: IntArray) -> IntArray:
-    """Return the centres whose window has no gap."""
-    missing = np.concatenate([[0], np.cumsum(usable == 0)])
-    return np.asarray(centres[missing[centres + half + 1] == missing[centres - half]])
-
-
-def _convolved(values: FloatArray, weights: FloatArray, centres: IntArray) -> FloatArray:
-    smoothed = np.convolve(values, weights, mode='valid')
-    return np.asarray(smoothed[centres - len(weights) // 2])
-
-
 def _derivative(samples: Samples, half: int, centres: IntArray) -> FloatArray:
-    centres = _whole(samples.usable, half, centres)
-    size, step = 2 * half + 1, samples.step_s
+    # Windows without a gap.
+    missing = np.concatenate([[0], np.cumsum(samples.usable == 0)])
+    centres = centres[missing[centres + half + 1] == missing[centres - half]]
+    size = 2 * half + 1
     value = savgol_coeffs(size, _ORDER)
-    slope = savgol_coeffs(size, _ORDER, deriv=1, delta=step)
-    y = _convolved(samples.power_mw, value, centres)
-    u = _convolved(samples.u, value, centres)
-    return np.column_stack([library.columns(y, u), _convolved(samples.power_mw, slope, centres)])
+    slope = savgol_coeffs(size, _ORDER, deriv=1, delta=samples.step_s)
+    y, u, rate_of_y = (
+        np.convolve(values, weights, mode='valid')[centres - half]
+        for values, weights in (
+            (samples.power_mw, value), (samples.u, value), (samples.power_mw, slope),
+        )
+    )  # fmt: skip
+    return np.column_stack([columns(y, u), rate_of_y])
 
 
 def _weak(samples: Samples, half: int, centres: IntArray) -> FloatArray:
@@ -201,9 +313,9 @@ def _weak(samples: Samples, half: int, centres: IntArray) -> FloatArray:
     test = (1.0 - s**2) ** _STEEP
     slope = -2.0 * _STEEP * s * (1.0 - s**2) ** (_STEEP - 1) / ((half + 1.0) * samples.step_s)
     total = test.sum()
-    out = np.empty((len(centres), library.SIZE + 1))
-    rows = library.weak_rows(
-        samples.power_mw, library.columns(samples.power_mw, samples.u), samples.usable,
+    out = np.empty((len(centres), SIZE + 1))
+    rows = weak_rows(
+        samples.power_mw, columns(samples.power_mw, samples.u), samples.usable,
         centres, test / total, slope / total, out,
     )  # fmt: skip
     return out[:rows]
@@ -272,24 +384,16 @@ def thresholded(theta: FloatArray, target: FloatArray, threshold: float) -> Floa
     return xi
 
 
-@dataclass(frozen=True, slots=True)
-class _Folded:
-    """Scaled columns (15, 14) and target (15,) folded into a triangle, and the scales (15,)."""
-
-    theta: FloatArray
-    target: FloatArray
-    scale: FloatArray
-
-
-def _triangle(rows: FloatArray) -> _Folded:
+def _triangle(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Scale columns to unit size and fold all rows into a triangle.
 
-    Least squares in any subset of columns is the same in the triangle as in all rows.
+    Least squares in any subset of columns is the same in the triangle (15, 15) as in all rows;
+    returned with it are the scales (15,).
     """
     scale = np.sqrt(np.mean(rows**2, axis=0))
     scale = np.where(scale > 0.0, scale, 1.0)
-    r: FloatArray = np.asarray(np.linalg.qr(rows / scale / np.sqrt(len(rows)), mode='r'))
-    return _Folded(r[:, :-1], r[:, -1], scale)
+    triangle: FloatArray = np.asarray(np.linalg.qr(rows / scale / np.sqrt(len(rows)), mode='r'))
+    return triangle, scale
 
 
 def fit_sparse(samples: Samples, progress: Progress = lambda _: None) -> SparseFit:
@@ -318,44 +422,40 @@ def fit_sparse(samples: Samples, progress: Progress = lambda _: None) -> SparseF
     near = [c for c in finite if c.mse <= _SPARE * best.mse]
     chosen = min(near, key=lambda c: (int(c.support.sum()), c.mse))
     progress('sparse model: all data')
-    folded = _triangle(equations(samples, chosen.form))
-    model = _on_support(samples, folded, chosen.support)
-    return SparseFit(model, chosen.form, chosen.threshold, _best_by_form(candidates))
+    model = _on_support(samples, *_triangle(equations(samples, chosen.form)), chosen.support)
+    best_of: dict[Form, _Candidate] = {}
+    for c in candidates:
+        if c.form not in best_of or c.mse < best_of[c.form].mse:
+            best_of[c.form] = c
+    tried = tuple((f.kind, f.window_s, int(c.support.sum()), c.mse) for f, c in best_of.items())
+    return SparseFit(model, chosen.form, chosen.threshold, tried)
 
 
 def _of_form(learn: Samples, judge: Samples, form: Form) -> list[_Candidate]:
     rows = equations(learn, form)
-    if len(rows) < 4 * library.SIZE:
+    if len(rows) < 4 * SIZE:
         return []
-    folded = _triangle(rows)
+    triangle, scale = _triangle(rows)
     found: dict[bytes, _Candidate] = {}
     for threshold in THRESHOLDS:
-        support = thresholded(folded.theta, folded.target, threshold) != 0.0
+        support = thresholded(triangle[:, :-1], triangle[:, -1], threshold) != 0.0
         if support.any() and support.tobytes() not in found:
-            model = _on_support(learn, folded, support)
+            model = _on_support(learn, triangle, scale, support)
             candidate = _Candidate(form, threshold, support, run_mse(model, judge))
             found[support.tobytes()] = candidate
     return list(found.values())
 
 
-def _on_support(samples: Samples, folded: _Folded, support: BoolArray) -> SparseModel:
+def _on_support(
+    samples: Samples, triangle: FloatArray, scale: FloatArray, support: BoolArray
+) -> SparseModel:
     """Fit the functions of a support."""
-    xi = np.zeros(library.SIZE)
-    xi[support] = np.linalg.lstsq(folded.theta[:, support], folded.target, rcond=None)[0]
-    xi *= folded.scale[-1] / folded.scale[:-1]
+    xi = np.zeros(SIZE)
+    xi[support] = np.linalg.lstsq(triangle[:, :-1][:, support], triangle[:, -1], rcond=None)[0]
+    xi *= scale[-1] / scale[:-1]
     good = samples.usable > 0
     u, y = samples.u[good], samples.power_mw[good]
     return SparseModel(
         xi, float(u.min()), float(u.max()), float(y.min()), float(y.max()), float(y.mean()),
         samples.step_s,
     )  # fmt: skip
-
-
-def _best_by_form(candidates: list[_Candidate]) -> tuple[tuple[str, float, int, float], ...]:
-    best = []
-    for form in dict.fromkeys(c.form for c in candidates):
-        mine = [c for c in candidates if c.form == form]
-        if mine:
-            c = min(mine, key=lambda c: c.mse)
-            best.append((form.kind, form.window_s, int(c.support.sum()), c.mse))
-    return tuple(best)

@@ -16,25 +16,30 @@ _LARGEST = 1e9
 
 
 @dataclass(frozen=True, slots=True)
-class Truth:
-    """The true curve.
+class Line:
+    """A piecewise-linear curve as numbers.
 
     Attributes
     ----------
     knots : float64 (J + 1,)
     slopes, intercepts : float64 (J,)
-    pressure_exponent : float
     """
 
     knots: FloatArray
     slopes: FloatArray
     intercepts: FloatArray
-    pressure_exponent: float
 
     def __call__(self, u: FloatArray) -> FloatArray:
         """Evaluate F; the outer pieces go on."""
         k = np.searchsorted(self.knots[1:-1], u, side='right')
         return np.asarray(self.slopes[k] * u + self.intercepts[k])
+
+
+@dataclass(frozen=True, slots=True)
+class Truth(Line):
+    """The true curve over V p^pressure_exponent."""
+
+    pressure_exponent: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,27 +108,26 @@ def _number(value: object, where: str) -> float:
 def curve_error(
     curve: Callable[[FloatArray], FloatArray], truth: Truth, u_from: float, u_to: float
 ) -> CurveError:
-    """Return how far ``curve`` is from the truth at evenly spaced inputs."""
+    """Return how far ``curve`` is from the truth at evenly spaced inputs.
+
+    A `Line` with as many pieces as the truth is compared piece by piece too.
+    """
     u = np.linspace(u_from, u_to, _PLACES)
     found = curve(u)
     known = np.isfinite(found)
     if not known.any():
         return CurveError(math.nan, math.nan, 0.0)
     off = found[known] - truth(u[known])
+    parameters = [math.nan] * 3
+    if isinstance(curve, Line) and len(curve.slopes) == len(truth.slopes):
+        parameters = [
+            float(np.abs(ours - theirs).max(initial=0.0))
+            for ours, theirs in (
+                (curve.slopes, truth.slopes),
+                (curve.knots[1:-1], truth.knots[1:-1]),
+                (curve.intercepts, truth.intercepts),
+            )
+        ]
     return CurveError(
-        float(np.sqrt(np.mean(off**2))), float(np.abs(off).max()), float(known.mean())
-    )
-
-
-def pieces_error(
-    knots: FloatArray, slopes: FloatArray, intercepts: FloatArray, truth: Truth
-) -> tuple[float, float, float]:
-    """Return the largest errors of slopes, inner knots and intercepts; NaN if J is not right."""
-    if len(slopes) != len(truth.slopes):
-        return math.nan, math.nan, math.nan
-    knees = np.abs(np.asarray(knots)[1:-1] - truth.knots[1:-1])
-    return (
-        float(np.abs(slopes - truth.slopes).max()),
-        float(knees.max()) if len(knees) else 0.0,
-        float(np.abs(intercepts - truth.intercepts).max()),
+        float(np.sqrt(np.mean(off**2))), float(np.abs(off).max()), float(known.mean()), *parameters
     )

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from valveflow_ros.baselines.comparison import number, paired_json, segment_json, total_json
+from valveflow_ros.baselines.comparison import fields_json, judged_json, number, totals_json
 from valveflow_ros.baselines.judged import (
-    JudgedSegment,
     Judgement,
     OtherData,
     PairedTest,
@@ -27,6 +26,9 @@ from valveflow_ros.records import FloatArray
 CURVE, SIMULATED = 'curve', 'simulated'
 OTHER = 'against.'
 _LEVEL = 0.05
+
+FORMAT = 'valveflow/validation'
+VERSION = 1
 
 
 class Verdict(enum.Enum):
@@ -58,6 +60,14 @@ class PieceCheck:
     test: PairedTest
     low_mw: float
     high_mw: float
+
+    def within(self, tolerance_mw: float) -> bool:
+        """Return True if the mean surely lies within the tolerance."""
+        return -tolerance_mw <= self.low_mw and self.high_mw <= tolerance_mw
+
+    def beyond(self, tolerance_mw: float) -> bool:
+        """Return True if the mean surely lies beyond the tolerance."""
+        return self.low_mw > tolerance_mw or self.high_mw < -tolerance_mw
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +134,12 @@ def validate(
     outside = _outside(trial, characteristic)
     predictions = _predictions(characteristic, other, trial)
     if against is not None:
-        _same_input(characteristic, against)
+        if abs(characteristic.pressure_exponent - against.pressure_exponent) > 1e-9:
+            raise DataError(
+                f'The two characteristics are curves over different inputs, V p^'
+                f'{characteristic.pressure_exponent:g} and V p^{against.pressure_exponent:g}: '
+                'they cannot be held against each other.'
+            )
         trial = replace(trial, good=trial.good & trial_of(other, against).good)
         theirs = _predictions(against, other, trial)
         predictions |= {OTHER + name: values for name, values in theirs.items()}
@@ -150,15 +165,6 @@ def _predictions(
     return found
 
 
-def _same_input(ours: Characteristic, theirs: Characteristic) -> None:
-    if abs(ours.pressure_exponent - theirs.pressure_exponent) > 1e-9:
-        raise DataError(
-            f'The two characteristics are curves over different inputs, V p^'
-            f'{ours.pressure_exponent:g} and V p^{theirs.pressure_exponent:g}: they cannot be '
-            'held against each other.'
-        )
-
-
 def _outside(trial: Trial, characteristic: Characteristic) -> float:
     """Return the share of special samples beyond the ends of the curve."""
     if not len(trial.spans):
@@ -173,24 +179,23 @@ def _checks(
 ) -> tuple[PieceCheck, ...]:
     """Return the check over everything, then one for each piece."""
     knots = characteristic.breakpoints
-    level = _LEVEL / len(characteristic.pieces)
+    last = len(knots) - 1
     middle = [float(trial.u[s.rows].mean()) for s in judgement.segments]
-    piece = np.clip(np.searchsorted(knots, middle, side='right') - 1, 0, len(knots) - 2)
-    found = [_check(float(knots[0]), float(knots[-1]), judgement.segments, by, judgement, _LEVEL)]
-    for k in range(len(knots) - 1):
-        mine = tuple(s for s, p in zip(judgement.segments, piece, strict=True) if p == k)
-        ends = float(knots[k]), float(knots[k + 1])
-        found.append(_check(*ends, mine, by, judgement, level))
+    piece = np.clip(np.searchsorted(knots, middle, side='right') - 1, 0, last - 1)
+    found: list[PieceCheck] = []
+    for first, end in ((0, last), *((k, k + 1) for k in range(last))):
+        whole = not found
+        mine = tuple(
+            s for s, p in zip(judgement.segments, piece, strict=True) if whole or p == first
+        )
+        test = replace(judgement, segments=mine).bias(by)
+        # All pieces together hold the level.
+        low, high = test.interval(_LEVEL if whole else _LEVEL / last)
+        samples = sum(len(s.rows) for s in mine)
+        found.append(PieceCheck(
+            float(knots[first]), float(knots[end]), len(mine), samples, test, low, high
+        ))  # fmt: skip
     return tuple(found)
-
-
-def _check(
-    u_from: float, u_to: float, segments: tuple[JudgedSegment, ...], by: str,
-    judgement: Judgement, level: float,
-) -> PieceCheck:  # fmt: skip
-    test = replace(judgement, segments=segments).bias(by)
-    samples = sum(len(s.rows) for s in segments)
-    return PieceCheck(u_from, u_to, len(segments), samples, test, *test.interval(level))
 
 
 def _verdict(checks: tuple[PieceCheck, ...], tolerance_mw: float) -> Verdict:
@@ -200,32 +205,24 @@ def _verdict(checks: tuple[PieceCheck, ...], tolerance_mw: float) -> Verdict:
     whose interval reaches beyond the tolerance, leaves it open.
     """
     seen = [c for c in checks if c.segments]
-    if any(c.low_mw > tolerance_mw or c.high_mw < -tolerance_mw for c in seen):
+    if any(c.beyond(tolerance_mw) for c in seen):
         return Verdict.OFF
-    within = all(-tolerance_mw <= c.low_mw and c.high_mw <= tolerance_mw for c in seen)
-    return Verdict.HOLDS if within else Verdict.OPEN
-
-
-# A validation as JSON: what ``validation.json`` holds.
-
-FORMAT = 'valveflow/validation'
-VERSION = 1
-
-
-def _check_json(check: PieceCheck) -> dict[str, Any]:
-    return {
-        'u_from': check.u_from,
-        'u_to': check.u_to,
-        'segments': check.segments,
-        'samples': check.samples,
-        'mean_difference_mw': paired_json(check.test),
-        'interval_mw': [number(check.low_mw), number(check.high_mw)],
-    }
+    return Verdict.HOLDS if all(c.within(tolerance_mw) for c in seen) else Verdict.OPEN
 
 
 def to_json(v: Validation) -> dict[str, Any]:
     """Return the content of ``validation.json``, without the words."""
-    j = v.judgement
+    overall, *pieces = (
+        {
+            'u_from': c.u_from,
+            'u_to': c.u_to,
+            'segments': c.segments,
+            'samples': c.samples,
+            'mean_difference_mw': fields_json(c.test),
+            'interval_mw': [number(c.low_mw), number(c.high_mw)],
+        }
+        for c in (v.overall, *v.pieces)
+    )
     return {
         'format': FORMAT,
         'version': VERSION,
@@ -235,16 +232,10 @@ def to_json(v: Validation) -> dict[str, Any]:
         'verdict': v.verdict.value,
         'judged_by': v.judged_by,
         'tolerance_mw': v.tolerance_mw,
-        'overall': _check_json(v.overall),
-        'pieces': [_check_json(c) for c in v.pieces],
-        'totals': {name: total_json(j, name) for name in v.predictions},
-        'gain_over_against_mw2': None if v.gain is None else paired_json(v.gain),
+        'overall': overall,
+        'pieces': pieces,
+        'totals': totals_json(v.judgement, v.predictions),
+        'gain_over_against_mw2': None if v.gain is None else fields_json(v.gain),
         'outside_share': v.outside_share,
-        'judged': {
-            'segments': len(j.segments),
-            'samples': j.samples,
-            'samples_not_judged': j.outside,
-            'samples_per_independent_value': j.widening,
-        },
-        'segments': [segment_json(s) for s in j.segments],
+        **judged_json(v.judgement),
     }

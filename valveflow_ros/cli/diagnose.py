@@ -75,7 +75,7 @@ def run(options: Namespace, console: Console) -> Outcome:
 
 def _text(found: DiagnosisResult) -> str:
     from valveflow_ros.diagnosis.result import NAMED, NOTHING, UNEXPLAINED
-    from valveflow_ros.report.diagnosis_figures import cells
+    from valveflow_ros.report.diagnosis import cells
     from valveflow_ros.report.words import decimals
 
     verdicts = {

@@ -1,15 +1,14 @@
-"""The answer in words, and the table of pieces."""
+"""The answer in words and tables: the curve, its number of pieces, its dynamics."""
 
 from __future__ import annotations
 
 import math
-from html import escape
 
 import numpy as np
 
 from valveflow_ros.curve.characteristic import Characteristic, Choice, Piece, RegionDynamics
 from valveflow_ros.records import FloatArray, Signal
-from valveflow_ros.report.figure import Figure, Spec, rounded, token
+from valveflow_ros.report.figure import Figure, Spec, axis, line, rounded, token
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import notice, paragraph, table, text
 from valveflow_ros.report.words import (
@@ -22,6 +21,7 @@ from valveflow_ros.report.words import (
     interval,
     percent,
     plain,
+    span,
     with_error,
 )
 
@@ -69,66 +69,51 @@ def opening_gain(data: Identified, piece: Piece) -> tuple[float, float]:
 
 
 def answer_words(data: Identified) -> str:
-    """Return the paragraph an engineer would tell a colleague."""
+    """Return the paragraph an engineer would tell a colleague, and what endangers it."""
     c = data.characteristic
     ends, values = c.breakpoints, c.values()
     words = (
         f'The flow characteristic has <b>{counted(len(c.pieces), "piece")}</b> and is known for '
-        f'u from {decimals(float(ends[0]), 0)} to {decimals(float(ends[-1]), 0)} '
-        f'{input_unit(c.pressure_exponent)}, that is from {decimals(float(values[0]), 0)} to '
-        f'{decimals(float(values[-1]), 0)} MW.'
-    )
-    words += _bends(c)
-    words += (
-        f' It explains {percent(explained(data))} of the variance of the power in '
-        f'{counted(c.source.steady, "steady-state segment")} and '
+        f'u from {span(ends[0], ends[-1])} {input_unit(c.pressure_exponent)}, that is from '
+        f'{span(values[0], values[-1])} MW.{_bends(c)} It explains {percent(explained(data))} '
+        f'of the variance of the power in {counted(c.source.steady, "steady-state segment")} and '
         f'{counted(c.source.slope_response, "slope-response segment")} '
         f'({counted(c.source.samples, "sample")}), and leaves a typical difference of '
         f'{plain(c.residuals.rmse_mw, 2)} MW.'
     )
-    return paragraph(words, 'answer') + _warnings(data)
+    told = [text(doubt(data))]
+    if c.source.temperature_flag:
+        limit = plain(data.settings.real('temperature_spread_limit'))
+        told.append(
+            f'The main steam temperature spread over {plain(c.source.temperature_spread_k, 3)} K '
+            f'in the special segments (limit {limit} K). The method assumes it unchanged: part '
+            'of what looks like the valve may be the temperature.'
+        )
+    if any(p.slope <= 0.0 for p in c.pieces):
+        told.append(
+            'A piece does not rise, so the curve has no inverse there and cannot be compensated '
+            'as it stands. A flat end is ordinary; a falling piece elsewhere is not.'
+        )
+    told += [text(n) for n in (held_words(c.held), *c.notes)]
+    return paragraph(words, 'answer') + ''.join(notice(n) for n in told if n)
 
 
 def _bends(c: Characteristic) -> str:
     """Say what the shape means for control."""
     if len(c.pieces) == 1:
         return f' It is straight: {plain(c.pieces[0].slope)} MW per unit of u everywhere.'
-    slopes = np.array([p.slope for p in c.pieces])
-    steep, flat = int(np.argmax(slopes)), int(np.argmin(slopes))
+    steep = max(c.pieces, key=lambda p: p.slope)
+    flat = min(c.pieces, key=lambda p: p.slope)
     said = (
-        f' The valve moves the unit most between u = {decimals(c.pieces[steep].u_from, 0)} and '
-        f'{decimals(c.pieces[steep].u_to, 0)} ({plain(slopes[steep], 3)} MW per unit of u)'
+        f' The valve moves the unit most between u = {decimals(steep.u_from, 0)} and '
+        f'{decimals(steep.u_to, 0)} ({plain(steep.slope, 3)} MW per unit of u)'
     )
-    if slopes[flat] <= 0.0:
-        return said + (
-            f'; between {decimals(c.pieces[flat].u_from, 0)} and '
-            f'{decimals(c.pieces[flat].u_to, 0)} opening further <b>does not raise the power</b>.'
-        )
-    times = slopes[steep] / slopes[flat]
-    weak = ': there it hardly answers' if slopes[flat] < _FLAT * slopes[steep] else ''
-    return said + (
-        f', and {plain(float(times), 2)} times less between '
-        f'{decimals(c.pieces[flat].u_from, 0)} and {decimals(c.pieces[flat].u_to, 0)} '
-        f'({plain(slopes[flat], 3)}){weak}.'
-    )
-
-
-def _warnings(data: Identified) -> str:
-    c = data.characteristic
-    told = notice(doubt(data)) if doubt(data) else ''
-    if c.source.temperature_flag:
-        limit = plain(data.settings.real('temperature_spread_limit'))
-        told += notice(
-            f'The main steam temperature spread over {plain(c.source.temperature_spread_k, 3)} K '
-            f'in the special segments (limit {limit} K). The method assumes it unchanged: part '
-            'of what looks like the valve may be the temperature.'
-        )
-    if any(p.slope <= 0.0 for p in c.pieces):
-        told += notice(
-            'A piece does not rise, so the curve has no inverse there and cannot be compensated '
-            'as it stands. A flat end is ordinary; a falling piece elsewhere is not.'
-        )
-    return told + ''.join(notice(text(n)) for n in (held_words(c.held), *c.notes) if n)
+    there = f'between {decimals(flat.u_from, 0)} and {decimals(flat.u_to, 0)}'
+    if flat.slope <= 0.0:
+        return f'{said}; {there} opening further <b>does not raise the power</b>.'
+    weak = ': there it hardly answers' if flat.slope < _FLAT * steep.slope else ''
+    times = plain(steep.slope / flat.slope, 2)
+    return f'{said}, and {times} times less {there} ({plain(flat.slope, 3)}){weak}.'
 
 
 def pieces_table(data: Identified) -> str:
@@ -138,19 +123,13 @@ def pieces_table(data: Identified) -> str:
     for k, piece in enumerate(c.pieces):
         gain, pressure = opening_gain(data, piece)
         at = f' at {plain(pressure, 3)} MPa' if math.isfinite(pressure) else ''
-        low, high = _ends(piece)
-        rows.append(
-            [
-                str(k + 1),
-                f'{decimals(piece.u_from, 1)} to {decimals(piece.u_to, 1)}',
-                f'{decimals(low, 1)} to {decimals(high, 1)}',
-                with_error(piece.slope, piece.slope_stderr),
-                with_error(piece.intercept, piece.intercept_stderr),
-                plain(gain, 3) + at,
-                count(piece.samples),
-                *_rests(c, k),
-            ]
-        )
+        low, high = (piece.slope * u + piece.intercept for u in (piece.u_from, piece.u_to))
+        rows.append([
+            str(k + 1), span(piece.u_from, piece.u_to, 1), span(low, high, 1),
+            with_error(piece.slope, piece.slope_stderr),
+            with_error(piece.intercept, piece.intercept_stderr), plain(gain, 3) + at,
+            count(piece.samples), *_rests(c, k),
+        ])  # fmt: skip
     head = [
         'piece', f'u ({input_unit(c.pressure_exponent)})', 'power (MW)',
         'slope ± standard error (MW per unit of u)', 'intercept ± standard error (MW)',
@@ -171,23 +150,18 @@ def _rests(c: Characteristic, k: int) -> list[str]:
     return [said if found.identifiable else f'<b>not identifiable by itself</b>: {said}']
 
 
-def _ends(piece: Piece) -> FloatArray:
-    return np.array([piece.u_from, piece.u_to]) * piece.slope + piece.intercept
-
-
 def breakpoints_table(c: Characteristic) -> str:
     """Return one row a breakpoint between pieces; empty for a straight curve."""
     if len(c.pieces) < 2:
         return ''
     rows = [
-        [str(k + 1), decimals(piece.u_to, 1), interval(low, high), decimals(float(value), 1)]
+        [str(k), decimals(piece.u_to, 1), interval(low, high), decimals(float(value), 1)]
         for k, (piece, (low, high), value) in enumerate(
-            zip(c.pieces[:-1], c.breakpoint_intervals, c.values()[1:-1], strict=True)
+            zip(c.pieces[:-1], c.breakpoint_intervals, c.values()[1:-1], strict=True), 1
         )
     ]
     unit = input_unit(c.pressure_exponent)
-    head = ['break&shy;point', f'u ({unit})', '95 % interval', 'power (MW)']
-    return table(head, rows)
+    return table(['break&shy;point', f'u ({unit})', '95 % interval', 'power (MW)'], rows)
 
 
 def temperature_words(c: Characteristic) -> str:
@@ -210,17 +184,14 @@ def window_words(c: Characteristic) -> str:
     return duration((c.source.window_end_ns - c.source.window_start_ns) / 1e9)
 
 
-# Time constant and delay by region of power.
-
-_COLOURS = ('chosen', 'steady', 'slope')
-_DASHES = ('solid', 'dash', 'dot')
+_LOOKS = (('chosen', 'solid'), ('steady', 'dash'), ('slope', 'dot'))
 
 
 def dynamics_table(dynamics: tuple[RegionDynamics, ...]) -> str:
-    """Return the table of regions."""
+    """Return time constant and delay by region of power."""
     rows = [
         [
-            f'{decimals(d.power_from, 0)} to {decimals(d.power_to, 0)} MW',
+            f'{span(d.power_from, d.power_to)} MW',
             with_error(d.time_constant_s, d.time_constant_stderr_s),
             with_error(d.delay_s, d.delay_stderr_s),
             decimals(d.delay_s + 3.0 * d.time_constant_s, 0),
@@ -236,31 +207,16 @@ def dynamics_figure(dynamics: tuple[RegionDynamics, ...]) -> Figure:
     ends = [d.delay_s + 4.0 * d.time_constant_s for d in dynamics]
     # One slow region must not press the others against the edge.
     t = np.linspace(0.0, min(max(ends), 8.0 * min(ends)), 160)
-    traces: list[Spec] = []
+    traces = []
     for k, d in enumerate(dynamics):
-        late = np.maximum(t - d.delay_s, 0.0)
-        moved = 100.0 * (1.0 - np.exp(-late / d.time_constant_s))
-        traces.append(
-            {
-                'type': 'scatter', 'mode': 'lines',
-                'name': f'{decimals(d.power_from, 0)} to {decimals(d.power_to, 0)} MW',
-                'x': rounded(t), 'y': rounded(moved, 4),
-                'line': {
-                    'color': token(_COLOURS[k % 3]), 'dash': _DASHES[k % 3], 'width': 2.2,
-                },
-                'hovertemplate': '%{x:.0f} s: %{y:.0f} %',
-            }
-        )  # fmt: skip
-    layout = {
-        'xaxis': {
-            'title': {
-                'text': 'seconds after a step of the steam flow',
-                'short': 'seconds after a step',
-            }
-        },
-        'yaxis': {'title': {'text': 'power has moved (%)'}},
-        'showlegend': True,
-    }
+        colour, dash = _LOOKS[k % 3]
+        moved = 100.0 * (1.0 - np.exp(-np.maximum(t - d.delay_s, 0.0) / d.time_constant_s))
+        traces.append(line(
+            rounded(t), rounded(moved, 4), f'{span(d.power_from, d.power_to)} MW', colour,
+            '%{x:.0f} s: %{y:.0f} %', width=2.2, dash=dash,
+        ))  # fmt: skip
+    title = {'text': 'seconds after a step of the steam flow', 'short': 'seconds after a step'}
+    layout = {'xaxis': axis(title), 'yaxis': axis('power has moved (%)'), 'showlegend': True}
     caption = (
         '<b>The further right a line rises, the slower the unit answers there.</b> '
         'Each line is the identified first-order answer of one range of power.'
@@ -283,85 +239,66 @@ _STEPS = (
 )
 
 
-def _points(
-    values: dict[int, float], axis: str, chosen: int, name: str, template: str
-) -> list[Spec]:
-    j = sorted(values)
-    y = np.array([values[k] for k in j])
-    size = [13 if k == chosen else 7 for k in j]
-    colour = [token('chosen') if k == chosen else token('data') for k in j]
-    return [
-        {
-            'type': 'scatter', 'mode': 'lines+markers', 'name': name, 'yaxis': axis,
-            'x': j, 'y': rounded(y, 8), 'showlegend': False,
-            'line': {'color': token('data'), 'width': 1.5},
-            'marker': {'size': size, 'color': colour}, 'hovertemplate': template,
-        }
-    ]  # fmt: skip
-
-
 def choice_figure(choice: Choice, chosen: int) -> Figure:
-    """Return Omega(J) on a log axis above Lambda(J)."""
-    traces = _points(
-        choice.cost, 'y', chosen, 'cost', 'J = %{x}<br>Ω = %{y:.4s} MW²<extra></extra>'
-    ) + _points(
-        choice.turning_angle, 'y2', chosen, 'turning angle',
-        'J = %{x}<br>Λ = %{y:.3f}<extra></extra>',
-    )  # fmt: skip
+    """Return Omega(J) on a log axis above Lambda(J), and the confidence where there is one."""
+
+    def colours(numbers: list[int]) -> list[str]:
+        return [token('chosen' if k == chosen else 'data') for k in numbers]
+
+    def values_of(values: dict[int, float], axis: str, name: str, hover: str) -> Spec:
+        j = sorted(values)
+        sizes = [13 if k == chosen else 7 for k in j]
+        return line(
+            j, rounded([values[k] for k in j], 8), name, 'data', f'J = %{{x}}<br>{hover}',
+            width=1.5, mode='lines+markers', yaxis=axis, showlegend=False,
+            marker={'size': sizes, 'color': colours(j)},
+        )  # fmt: skip
+
+    traces = [
+        values_of(choice.cost, 'y', 'cost', 'Ω = %{y:.4s} MW²<extra></extra>'),
+        values_of(choice.turning_angle, 'y2', 'turning angle', 'Λ = %{y:.3f}<extra></extra>'),
+    ]
     sure = bool(choice.confidence)
     first, second = ([0.7, 1.0], [0.34, 0.64]) if sure else ([0.56, 1.0], [0.0, 0.44])
     layout = {
-        'xaxis': {
-            'title': {'text': 'number of pieces J'}, 'dtick': 1, 'anchor': 'y3' if sure else 'y2',
-        },
-        'yaxis': {
-            'domain': first, 'type': 'log', 'title': {'text': 'cost Ω(J)<br>(MW²)'},
-            **_ticks(np.array(list(choice.cost.values()))),
-        },
-        'yaxis2': {
-            'domain': second, 'rangemode': 'tozero', 'title': {'text': 'turning<br>angle Λ(J)'},
-        },
+        'xaxis': axis('number of pieces J', dtick=1, anchor='y3' if sure else 'y2'),
+        'yaxis': axis('cost Ω(J)<br>(MW²)', domain=first, type='log',
+                      **_ticks(np.array(list(choice.cost.values())))),
+        'yaxis2': axis('turning<br>angle Λ(J)', domain=second, rangemode='tozero'),
         'hovermode': 'closest',
     }  # fmt: skip
     if sure:
-        traces.append(_confidence(choice, chosen))
-        layout['yaxis3'] = {
-            'domain': [0.0, 0.28], 'rangemode': 'tozero', 'title': {'text': 'confidence<br>(%)'},
-        }  # fmt: skip
+        j = sorted(choice.confidence)
+        traces.append({
+            'type': 'bar', 'name': 'confidence', 'yaxis': 'y3', 'showlegend': False, 'x': j,
+            'y': [100.0 * choice.confidence[k] for k in j], 'marker': {'color': colours(j)},
+            'hovertemplate': 'J = %{x}<br>%{y:.1f} %<extra></extra>',
+        })  # fmt: skip
+        layout['yaxis3'] = axis('confidence<br>(%)', domain=[0.0, 0.28], rangemode='tozero')
+    costs = ', '.join(f'{j}: {plain(v, 3)}' for j, v in sorted(choice.cost.items()))
     return Figure(
-        'choice', _caption(choice, chosen), _description(choice, chosen), traces, layout,
+        'choice', _choice_caption(choice, chosen),
+        f'Cost by number of pieces ({costs}); chosen is {chosen}.', traces, layout,
         height=560 if sure else 420,
     )  # fmt: skip
 
 
-def _confidence(choice: Choice, chosen: int) -> Spec:
-    j = sorted(choice.confidence)
-    return {
-        'type': 'bar', 'name': 'confidence', 'yaxis': 'y3', 'showlegend': False, 'x': j,
-        'y': [100.0 * choice.confidence[k] for k in j],
-        'marker': {'color': [token('chosen') if k == chosen else token('data') for k in j]},
-        'hovertemplate': 'J = %{x}<br>%{y:.1f} %<extra></extra>',
-    }  # fmt: skip
-
-
-def confidence_table(choice: Choice) -> str:
-    """Return how probable each number of pieces is; empty where the rule has no confidence."""
-    likely = {j: p for j, p in sorted(choice.confidence.items()) if p >= _LEAST_SHOWN}
-    if not likely:
-        return ''
-    rows = [[str(j), _percent(p)] for j, p in likely.items()]
-    rest = sum(p for p in choice.confidence.values() if p < _LEAST_SHOWN)
-    words = paragraph(
-        'How probable each number of pieces is, given these data and their noise; all others '
-        f'together {_percent(rest)}.'
+def _choice_caption(choice: Choice, chosen: int) -> str:
+    words = (
+        '<b>Look for the elbow.</b> Above, what the best curve of J pieces leaves unexplained '
+        '(on a logarithmic axis); each point is the exact optimum. Below, how sharply that line '
+        'turns at J, eq. (24) of the paper: after the sharpest turn another piece gains little. '
     )
-    return words + table(['number of pieces J', 'probability'], rows)
-
-
-def _percent(share: float) -> str:
-    if share > 0.9995:
-        return 'more than 99.9 %'
-    return 'less than 0.1 %' if share < 0.0005 else f'{100.0 * share:.1f} %'
+    sharpest = max(choice.turning_angle, key=lambda j: choice.turning_angle[j], default=chosen)
+    if choice.rule != 'paper' and sharpest != chosen:
+        kept = _KEPT.get(choice.rule, 'another number was kept')
+        words += f'It turns most sharply at J = {sharpest}; {kept}. '
+    words += f'<b>Chosen: J = {chosen}.</b>'
+    if choice.confidence:
+        words += ' At the bottom, how probable each J is.'
+    if choice.note:
+        words += f' {text(choice.note).removesuffix(".")}.'
+    return words
 
 
 def _ticks(costs: FloatArray) -> Spec:
@@ -377,11 +314,8 @@ def _ticks(costs: FloatArray) -> Spec:
         ticks = ticks[(ticks >= 0.98 * low) & (ticks <= 1.02 * high)]
         if len(ticks) >= 3:
             break
-    return {
-        'tickmode': 'array',
-        'tickvals': ticks.tolist(),
-        'ticktext': [_power(t) for t in ticks],
-    }
+    told = [_power(t) for t in ticks]
+    return {'tickmode': 'array', 'tickvals': ticks.tolist(), 'ticktext': told}
 
 
 def _power(value: float) -> str:
@@ -392,25 +326,21 @@ def _power(value: float) -> str:
     return ('' if lead == '1' else f'{lead}·') + f'10<sup>{exponent}</sup>'
 
 
-def _caption(choice: Choice, chosen: int) -> str:
-    words = (
-        '<b>Look for the elbow.</b> Above, what the best curve of J pieces leaves unexplained '
-        '(on a logarithmic axis); each point is the exact optimum. Below, how sharply that line '
-        'turns at J, eq. (24) of the paper: after the sharpest turn another piece gains little. '
+def confidence_table(choice: Choice) -> str:
+    """Return how probable each number of pieces is; empty where the rule has no confidence."""
+    likely = {j: p for j, p in sorted(choice.confidence.items()) if p >= _LEAST_SHOWN}
+    if not likely:
+        return ''
+    rest = sum(p for p in choice.confidence.values() if p < _LEAST_SHOWN)
+    words = paragraph(
+        'How probable each number of pieces is, given these data and their noise; all others '
+        f'together {_percent(rest)}.'
     )
-    sharpest = max(choice.turning_angle, key=lambda j: choice.turning_angle[j], default=chosen)
-    if choice.rule != 'paper' and sharpest != chosen:
-        kept = _KEPT.get(choice.rule, 'another number was kept')
-        words += f'It turns most sharply at J = {sharpest}; {kept}. '
-    words += f'<b>Chosen: J = {chosen}.</b>'
-    if choice.confidence:
-        words += ' At the bottom, how probable each J is.'
-    if choice.note:
-        words += f' {escape(choice.note)}'
-        words += '' if choice.note.endswith('.') else '.'
-    return words
+    rows = [[str(j), _percent(p)] for j, p in likely.items()]
+    return words + table(['number of pieces J', 'probability'], rows)
 
 
-def _description(choice: Choice, chosen: int) -> str:
-    costs = ', '.join(f'{j}: {plain(v, 3)}' for j, v in sorted(choice.cost.items()))
-    return f'Cost by number of pieces ({costs}); chosen is {chosen}.'
+def _percent(share: float) -> str:
+    if share > 0.9995:
+        return 'more than 99.9 %'
+    return 'less than 0.1 %' if share < 0.0005 else f'{100.0 * share:.1f} %'

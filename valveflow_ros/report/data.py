@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,13 +16,17 @@ from valveflow_ros.records import (
     SignalInfo,
 )
 from valveflow_ros.report.figure import (
+    DAY_HOUR,
     Figure,
     Spec,
-    envelope,
+    axis,
+    line,
+    moments,
     packed,
     rounded,
-    segment_path,
+    time_axis,
     token,
+    upright,
 )
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import paragraph, table
@@ -38,10 +41,6 @@ from valveflow_ros.report.words import (
     plain,
 )
 
-if TYPE_CHECKING:
-    from valveflow_ros.report.identified import Identified
-
-
 # The aligner's reasons as a person would say them, in the order of the table.
 REASON_WORDS = {
     'not_finite': 'not a number',
@@ -52,8 +51,12 @@ REASON_WORDS = {
     'time_outlier': 'time far from all others',
     'late': 'too late for its row (used later)',
 }
-# These readings were used after all, or are copies of a used one.
-_HARMLESS = ('late',)
+_NEEDED = ('valve_opening', 'main_steam_pressure', 'generated_power')
+_BINS = 60
+_STRETCHES = 240
+_WHOLE = 0.999  # a stretch of time with fewer of its values is drawn as incomplete
+_DRAWN_STRETCHES = 5000
+_SEGMENT_POINTS = 4000
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +74,7 @@ class Gap:
 
 def gaps(time_ns: IntArray, period_ns: int, at_least: float = 1.5) -> list[Gap]:
     """Return the stretches in which rows are missing, the longest first."""
-    step = np.diff(time_ns)
-    places = np.flatnonzero(step > at_least * period_ns)
+    places = np.flatnonzero(np.diff(time_ns) > at_least * period_ns)
     found = [Gap(int(time_ns[k]), int(time_ns[k + 1])) for k in places]
     return sorted(found, key=lambda g: g.start_ns - g.end_ns)
 
@@ -82,7 +84,7 @@ def rejected(counts: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
     total = {
         reason: sum(by_reason.get(reason, 0) for by_reason in counts.values())
         for reason in REASON_WORDS
-        if reason not in _HARMLESS
+        if reason != 'late'  # these were used after all
     }
     return {reason: n for reason, n in total.items() if n}
 
@@ -95,25 +97,23 @@ def usable_share(table: SampleTable) -> float:
     return float(np.isfinite(table.values[:, needed]).all(axis=1).mean())
 
 
-_NEEDED = ('valve_opening', 'main_steam_pressure', 'generated_power')
-
-
-def _row(info: SignalInfo, data: Identified, reasons: list[str]) -> list[str]:
-    counts = data.counts.get(info.topic, {})
-    values = data.table.column(info.signal)
-    known = values[np.isfinite(values)]
-    low, middle, high = np.quantile(known, (0.0, 0.5, 1.0)) if len(known) else (np.nan,) * 3
-    received = sum(n for reason, n in counts.items() if reason != 'late')
-    share = len(known) / len(values) if len(values) else float('nan')
-    return [
-        info.topic.replace('_', ' '),
-        count(received),
-        *(count(counts.get(reason, 0)) for reason in reasons),
-        percent(share),
-        f'{plain(float(low))}',
-        f'{plain(float(middle))}',
-        f'{plain(float(high))} {info.unit.replace("degC", "°C")}',
-    ]
+def quality_words(data: Identified) -> str:
+    """Return what an engineer should know about the data, as a paragraph."""
+    words = (
+        f'{counted(len(data.table), "row")} of {duration(data.period_ns / 1e9)}; opening, '
+        f'pressure and power are all known in {percent(usable_share(data.table))} of them. '
+    )
+    found = gaps(data.table.time_ns, data.period_ns)
+    words += (
+        f'Rows are missing in {counted(len(found), "place")}; the longest gap lasts '
+        f'{duration(found[0].seconds)} from {moment(found[0].start_ns)}. '
+        if found else 'No row is missing. '
+    )  # fmt: skip
+    refused = rejected(data.counts)
+    told = ', '.join(f'{count(n)} {REASON_WORDS[r]}' for r, n in refused.items())
+    return paragraph(
+        words + (f'Readings not used: {told}.' if refused else 'Every reading was used.')
+    )
 
 
 def quality_table(data: Identified) -> str:
@@ -128,37 +128,20 @@ def quality_table(data: Identified) -> str:
     return table(head, [_row(info, data, reasons) for info in sent])
 
 
-def quality_words(data: Identified) -> str:
-    """Return what an engineer should know about the data, as paragraphs."""
-    table_ = data.table
-    found = gaps(table_.time_ns, data.period_ns)
-    words = (
-        f'{counted(len(table_), "row")} of {duration(data.period_ns / 1e9)}; opening, pressure '
-        f'and power are all known in {percent(usable_share(table_))} of them.'
-    )
-    if found:
-        longest = found[0]
-        words += (
-            f' Rows are missing in {counted(len(found), "place")}; the longest gap lasts '
-            f'{duration(longest.seconds)} from {moment(longest.start_ns)}.'
-        )
-    else:
-        words += ' No row is missing.'
-    refused = rejected(data.counts)
-    if refused:
-        told = ', '.join(f'{count(n)} {REASON_WORDS[r]}' for r, n in refused.items())
-        words += f' Readings not used: {told}.'
-    else:
-        words += ' Every reading was used.'
-    return paragraph(words)
-
-
-# Where the data are: over u, and over time.
-
-_BINS = 60
-_STRETCHES = 240
-_WHOLE = 0.999  # a stretch of time with fewer of its values is drawn as incomplete
-_MS = 13
+def _row(info: SignalInfo, data: Identified, reasons: list[str]) -> list[str]:
+    counts = data.counts.get(info.topic, {})
+    values = data.table.column(info.signal)
+    known = values[np.isfinite(values)]
+    low, middle, high = np.quantile(known, (0.0, 0.5, 1.0)) if len(known) else (np.nan,) * 3
+    return [
+        info.topic.replace('_', ' '),
+        count(sum(n for reason, n in counts.items() if reason != 'late')),
+        *(count(counts.get(reason, 0)) for reason in reasons),
+        percent(len(known) / len(values) if len(values) else float('nan')),
+        plain(float(low)),
+        plain(float(middle)),
+        f'{plain(float(high))} {info.unit.replace("degC", "°C")}',
+    ]
 
 
 def coverage_figure(data: Identified) -> Figure | None:
@@ -167,50 +150,45 @@ def coverage_figure(data: Identified) -> Figure | None:
     if not len(known):
         return None
     edges = np.histogram_bin_edges(known, bins=_BINS)
-    hours = data.period_ns / 3600e9
     every, _ = np.histogram(known, bins=edges)
     special, _ = np.histogram(data.u[data.special], bins=edges)
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    traces = [
-        _bars(middle, (every - special) * hours, 'other', 'data-soft'),
-        _bars(middle, special * hours, 'special segments', 'density-3'),
-    ]
-    exponent = data.characteristic.pressure_exponent
-    inner = data.characteristic.breakpoints[1:-1]
+    x = rounded(0.5 * (edges[1:] + edges[:-1]), 6)
+    hours = data.period_ns / 3600e9
+    traces: list[Spec] = [
+        {
+            'type': 'bar', 'name': name, 'x': x, 'y': rounded(rows * hours, 4),
+            'marker': {'color': token(colour)},
+            'hovertemplate': f'u %{{x:.0f}}<br>%{{y:.2f}} h<extra>{name}</extra>',
+        }
+        for rows, name, colour in (
+            (every - special, 'other', 'data-soft'), (special, 'special segments', 'density-3'),
+        )
+    ]  # fmt: skip
+    c = data.characteristic
     layout: Spec = {
-        'xaxis': {'title': input_axis(exponent)},
-        'yaxis': {'title': {'text': 'time there (h)'}, 'rangemode': 'tozero'},
+        'xaxis': axis(input_axis(c.pressure_exponent)),
+        'yaxis': axis('time there (h)', rangemode='tozero'),
         'barmode': 'stack', 'bargap': 0, 'showlegend': True,
-        'shapes': [
-            {
-                'type': 'line', 'yref': 'paper', 'y0': 0, 'y1': 1, 'x0': float(u),
-                'x1': float(u), 'line': {'color': token('curve'), 'width': 1.5, 'dash': 'dot'},
-            }
-            for u in inner
-        ],
+        'shapes': [upright(float(u), 'curve', 1.5, dash='dot') for u in c.breakpoints[1:-1]],
     }  # fmt: skip
-    share = len(data.special) / len(known)
+    share = percent(len(data.special) / len(known), 2)
     caption = (
         '<b>Every piece needs blue.</b> How long the unit ran at each u; blue, the part inside '
-        f'special segments, {percent(share, 2)} of all. Dotted, the breakpoints. Where there is '
+        f'special segments, {share} of all. Dotted, the breakpoints. Where there is '
         'little blue the curve has little to stand on: more data at that load would help.'
     )
     words = (
         f'Hours by u from {plain(float(edges[0]))} to {plain(float(edges[-1]))}; '
-        f'{percent(share, 2)} of the time lies in special segments.'
+        f'{share} of the time lies in special segments.'
     )
     return Figure('coverage', caption, words, traces, layout, height=320)
 
 
-def _bars(x: FloatArray, y: FloatArray, name: str, colour: str) -> Spec:
-    return {
-        'type': 'bar', 'name': name, 'x': rounded(x, 6), 'y': rounded(y, 4),
-        'marker': {'color': token(colour)},
-        'hovertemplate': f'u %{{x:.0f}}<br>%{{y:.2f}} h<extra>{name}</extra>',
-    }  # fmt: skip
+def _sent(data: Identified) -> list[SignalInfo]:
+    return [i for i in SIGNALS if np.isfinite(data.table.column(i.signal)).any()]
 
 
-def presence(data: Identified, stretches: int = _STRETCHES) -> tuple[FloatArray, FloatArray]:
+def presence(data: Identified) -> tuple[FloatArray, FloatArray]:
     """Return the share of expected rows that have a value, by signal and stretch of time.
 
     Returns
@@ -221,20 +199,14 @@ def presence(data: Identified, stretches: int = _STRETCHES) -> tuple[FloatArray,
     """
     time_ns = data.table.time_ns
     span = int(time_ns[-1] - time_ns[0]) + data.period_ns
-    k = max(1, min(stretches, span // (20 * data.period_ns)))
+    k = max(1, min(_STRETCHES, span // (20 * data.period_ns)))
     edges = np.linspace(0.0, float(span), k + 1)
     place = np.minimum(((time_ns - time_ns[0]) / (span / k)).astype(np.int64), k - 1)
     expected = np.maximum(np.diff(np.ceil(edges / data.period_ns)), 1.0)
     known = np.isfinite(data.table.values)
-    sent = [i for i in SIGNALS if _sent(data, i)]
-    counts = np.zeros((len(sent), k))
-    for row, info in zip(counts, sent, strict=True):
-        row[:] = np.bincount(place[known[:, info.signal]], minlength=k)
+    rows = [np.bincount(place[known[:, i.signal]], minlength=k) for i in _sent(data)]
+    counts = np.array(rows, dtype=np.float64).reshape(-1, k)
     return float(time_ns[0]) + edges, np.minimum(counts / expected, 1.0)
-
-
-def _sent(data: Identified, info: SignalInfo) -> bool:
-    return bool(np.isfinite(data.table.column(info.signal)).any())
 
 
 def presence_figure(data: Identified) -> Figure | None:
@@ -244,129 +216,157 @@ def presence_figure(data: Identified) -> Figure | None:
     edges, share = presence(data)
     if not share.size or share.min() >= _WHOLE:
         return None
-    names = [i.topic.replace('_', ' ') for i in SIGNALS if _sent(data, i)]
+    names = [i.topic.replace('_', ' ') for i in _sent(data)]
+    scale = ((0.0, 'steady'), (0.5, 'notice-rule'), (0.999, 'notice'), (1.0, 'density-1'))
     traces: list[Spec] = [
         {
-            'type': 'heatmap', 'x': rounded(edges / 1e6, _MS), 'y': names, 'ygap': 3,
+            'type': 'heatmap', 'x': moments(edges / 1e6), 'y': names, 'ygap': 3,
             'z': [rounded(100.0 * row, 3) for row in share], 'zmin': 0, 'zmax': 100,
-            'colorscale': [[0.0, token('steady')], [0.5, token('notice-rule')],
-                           [0.999, token('notice')], [1.0, token('density-1')]],
+            'colorscale': [[place, token(colour)] for place, colour in scale],
             'showscale': False,
-            'hovertemplate': '%{x|%d %b %H:%M}<br>%{y}: %{z:.0f} % there<extra></extra>',
+            'hovertemplate': f'{DAY_HOUR}%{{y}}: %{{z:.0f}} % there<extra></extra>',
         }
     ]  # fmt: skip
     layout: Spec = {
-        'xaxis': {'type': 'date', 'title': {'text': 'time (UTC)'}},
-        'yaxis': {'type': 'category', 'autorange': 'reversed'},
-    }
-    gone = float((1.0 - share).max())
+        'xaxis': time_axis(), 'yaxis': {'type': 'category', 'autorange': 'reversed'},
+    }  # fmt: skip
     caption = (
         '<b>Blue: complete. Yellow to red: values are missing then.</b> Missing are times '
         'without any row and values that were refused; the table above counts them by reason.'
     )
-    words = f'Share of values there by signal and time; at worst {percent(gone, 2)} are missing.'
+    gone = percent(float((1.0 - share).max()), 2)
+    words = f'Share of values there by signal and time; at worst {gone} are missing.'
     return Figure('presence', caption, words, traces, layout, height=110 + 34 * len(names))
 
 
 # The signals over time, with the special segments found in them.
 
-_DRAWN_STRETCHES = 5000
-_SEGMENT_POINTS = 4000
 _KINDS = (
     (SegmentKind.STEADY, 'steady state', 'steady'),
     (SegmentKind.SLOPE, 'slope response', 'slope'),
 )
 
 
-def _panel(data: Identified, values: FloatArray, axis: str, unit: str, places: int) -> list[Spec]:
-    """Return the measured signal in grey and its special segments in colour."""
-    first = axis == 'y'
-    all_of_it = envelope(data.table.time_ns, values, _DRAWN_STRETCHES, data.period_ns)
-    traces: list[Spec] = [
-        {
-            'type': 'scatter', 'mode': 'lines', 'name': 'measured', 'yaxis': axis,
-            'x0': all_of_it.start_ns / 1e6, 'dx': all_of_it.step_ns / 1e6,
-            'y': rounded(all_of_it.values), 'line': {'color': token('data-soft'), 'width': 1},
-            'hoverinfo': 'skip', 'showlegend': first, 'legendgroup': 'measured',
-        }
-    ]  # fmt: skip
-    for kind, name, colour in _KINDS:
-        rows = data.rows_of(kind)
-        times, means = segment_path(data.table.time_ns, values, rows, _SEGMENT_POINTS)
-        traces.append(
-            {
-                'type': 'scatter', 'mode': 'lines', 'name': name, 'yaxis': axis,
-                'x': packed(times), 'y': rounded(means),
-                'line': {'color': token(colour), 'width': 2.2},
-                'hovertemplate': f'%{{x|%d %b %H:%M}}<br>%{{y:.{places}f}} {unit}'
-                f'<extra>{name}</extra>',
-                'showlegend': first, 'legendgroup': name,
-            }
-        )  # fmt: skip
-    return traces
-
-
-def _buttons(days: float) -> Spec | None:
-    """Return the buttons that show the last hours or days, where the log is longer."""
+def signals_figure(data: Identified) -> Figure:
+    """Return u and power over time (the paper's Fig. 5)."""
+    unit = input_unit(data.characteristic.pressure_exponent)
+    time_ns = data.table.time_ns
+    days = (int(time_ns[-1]) - int(time_ns[0])) / 86400e9 if len(time_ns) else 0.0
+    # Buttons for the last hours or days, where the log is longer.
     steps: list[Spec] = []
     if days > 0.5:
         steps.append({'step': 'hour', 'count': 6, 'label': 'last 6 h', 'stepmode': 'backward'})
     if days > 2.0:
         steps.append({'step': 'day', 'count': 1, 'label': 'last day', 'stepmode': 'backward'})
-    if not steps:
-        return None
-    steps.append({'step': 'all', 'label': 'all'})
-    return {
-        'buttons': steps, 'x': 1, 'xanchor': 'right', 'y': -0.16, 'yanchor': 'top',
-        'bgcolor': token('panel'), 'activecolor': token('rule'), 'bordercolor': token('rule'),
-        'borderwidth': 1, 'font': {'color': token('ink')},
-    }  # fmt: skip
-
-
-def signals_figure(data: Identified) -> Figure:
-    """Return u and power over time (the paper's Fig. 5)."""
-    unit = input_unit(data.characteristic.pressure_exponent)
-    traces = [
-        *_panel(data, data.u, 'y', unit, 0),
-        *_panel(data, data.power, 'y2', 'MW', 1),
-    ]
-    table = data.table
-    days = (int(table.time_ns[-1]) - int(table.time_ns[0])) / 86400e9 if len(table) else 0.0
-    axis: Spec = {'type': 'date', 'anchor': 'y2', 'title': {'text': 'time (UTC)'}}
-    if buttons := _buttons(days):
-        axis['rangeselector'] = buttons
+    across = time_axis(anchor='y2')
+    if steps:
+        across['rangeselector'] = {
+            'buttons': [*steps, {'step': 'all', 'label': 'all'}], 'x': 1, 'xanchor': 'right',
+            'y': -0.16, 'yanchor': 'top', 'bgcolor': token('panel'), 'activecolor': token('rule'),
+            'bordercolor': token('rule'), 'borderwidth': 1, 'font': {'color': token('ink')},
+        }  # fmt: skip
     layout = {
-        'xaxis': axis,
-        'margin': {'l': 60, 'r': 12, 't': 34, 'b': 96 if buttons else 46},
-        'yaxis': {'domain': [0.54, 1.0], 'title': {'text': f'u ({unit})'}},
-        'yaxis2': {'domain': [0.0, 0.48], 'title': {'text': 'power (MW)'}},
+        'xaxis': across,
+        'margin': {'l': 60, 'r': 12, 't': 34, 'b': 96 if steps else 46},
+        'yaxis': axis(f'u ({unit})', domain=[0.54, 1.0]),
+        'yaxis2': axis('power (MW)', domain=[0.0, 0.48]),
     }
-    return Figure('signals', _caption(data), _description(data), traces, layout, height=560)
-
-
-def _share(data: Identified) -> tuple[int, int, float]:
     steady, slope = (len(data.rows_of(kind)) for kind, _, _ in _KINDS)
-    rows = data.rows
-    return steady, slope, float((rows[:, 1] - rows[:, 0]).sum()) if len(rows) else 0.0
-
-
-def _caption(data: Identified) -> str:
-    steady, slope, samples = _share(data)
-    time = duration(samples * data.settings.real('sample_period'))
-    return (
+    samples = float((data.rows[:, 1] - data.rows[:, 0]).sum()) if len(data.rows) else 0.0
+    caption = (
         f'<b>Coloured stretches should look straight.</b> '
         f'<span class="key steady">Steady state</span> ({steady}): input and power hold. '
         f'<span class="key slope">Slope response</span> ({slope}): both move along a ramp, '
         'counted only after the turbine has caught up. Together they last '
-        f'{time}; everything else (grey) is left out of the search for the pieces. '
+        f'{duration(samples * data.settings.real("sample_period"))}; everything else (grey) is '
+        'left out of the search for the pieces. '
         '<span class="mouse">Drag to zoom, double-click to return.</span>'
     )
-
-
-def _description(data: Identified) -> str:
-    steady, slope, _ = _share(data)
-    return (
+    words = (
         f'Integrated input and generated power over time with '
         f'{counted(steady, "steady-state segment")} and '
         f'{counted(slope, "slope-response segment")} marked.'
     )
+    traces = [*_panel(data, data.u, 'y', unit, 0), *_panel(data, data.power, 'y2', 'MW', 1)]
+    return Figure('signals', caption, words, traces, layout, height=560)
+
+
+def _panel(data: Identified, values: FloatArray, axis: str, unit: str, places: int) -> list[Spec]:
+    """Return the measured signal in grey and its special segments in colour."""
+    time_ns = data.table.time_ns
+    shown: Spec = {'yaxis': axis, 'showlegend': axis == 'y'}
+    start_ns, step_ns, ends = envelope(time_ns, values, _DRAWN_STRETCHES, data.period_ns)
+    measured = line(
+        None, rounded(ends), 'measured', 'data-soft', width=1, x0=start_ns / 1e6,
+        dx=step_ns / 1e6, legendgroup='measured', **shown,
+    )  # fmt: skip
+    del measured['x']
+    traces = [measured]
+    for kind, name, colour in _KINDS:
+        times, means = segment_path(time_ns, values, data.rows_of(kind), _SEGMENT_POINTS)
+        hover = f'{DAY_HOUR}%{{y:.{places}f}} {unit}<extra>{name}</extra>'
+        traces.append(line(
+            packed(times), rounded(means), name, colour, hover, width=2.2, legendgroup=name,
+            **shown,
+        ))  # fmt: skip
+    return traces
+
+
+def envelope(
+    time_ns: IntArray, values: FloatArray, stretches: int, period_ns: int
+) -> tuple[int, float, FloatArray]:
+    """Reduce a signal to at most ``2 * stretches`` points that keep every peak.
+
+    A short signal comes back with each of its values on its own grid place.
+
+    Returns
+    -------
+    start_ns, step_ns : int, float
+        Time of the first point and from one point to the next.
+    values : float64 (2 k,)
+        Lowest and highest value of each stretch in the order in which they occur; NaN where
+        nothing was measured.
+    """
+    if not len(time_ns):
+        return 0, 1.0, np.empty(0)
+    span = int(time_ns[-1] - time_ns[0]) + period_ns
+    k = max(1, min(stretches, span // (2 * period_ns)))
+    width = span / k
+    place = np.minimum(((time_ns - time_ns[0]) / width).astype(np.int64), k - 1)
+    good = np.isfinite(values)
+    place, value = place[good], values[good]
+    out = np.full((k, 2), np.nan)
+    if len(value):
+        first = np.flatnonzero(np.diff(place, prepend=-1))
+        low = np.minimum.reduceat(value, first)
+        high = np.maximum.reduceat(value, first)
+        rising = value[first] <= value[np.append(first[1:], len(value)) - 1]
+        out[place[first], 0] = np.where(rising, low, high)
+        out[place[first], 1] = np.where(rising, high, low)
+    return int(time_ns[0]), width / 2.0, out.ravel()
+
+
+def segment_path(
+    time_ns: IntArray, values: FloatArray, rows: IntArray, points: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return times in ms and block means along segments, NaN between two segments.
+
+    Parameters
+    ----------
+    rows : int64 (k, 2)
+        First and end row of each segment.
+    points : int
+        About how many points all segments together may have.
+    """
+    total = int((rows[:, 1] - rows[:, 0]).sum()) if len(rows) else 0
+    block = max(1, -(-total // max(1, points)))
+    times, means = [np.empty(0)], [np.empty(0)]
+    for first, end in rows.tolist():
+        edges = np.arange(first, end, block)
+        if not len(edges):
+            continue
+        sizes = np.diff(np.append(edges, end))
+        means += [np.add.reduceat(values[first:end], edges - first) / sizes, np.array([np.nan])]
+        middle = np.minimum(edges + sizes // 2, end - 1)
+        times += [time_ns[middle] / 1e6, np.array([np.nan])]
+    return np.concatenate(times), np.concatenate(means)

@@ -6,22 +6,49 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from valveflow_ros import __version__
-from valveflow_ros.diagnosis.result import NAMED, NOTHING, Diagnosis, NamedCause
+import numpy as np
+
+from valveflow_ros.diagnosis.cause import Estimate, dates, told
+from valveflow_ros.diagnosis.evidence import SegmentGain
+from valveflow_ros.diagnosis.result import NAMED, NOTHING, Diagnosis
 from valveflow_ros.diagnosis.signature import Answer, ResidualMap, Signature
-from valveflow_ros.report.diagnosis_figures import (
-    answer_figure,
-    cells,
-    map_figure,
-    segments_figure,
-    signature_figure,
-    times_in_effect,
-    variable,
+from valveflow_ros.records import FloatArray
+from valveflow_ros.report.figure import (
+    DAY_HOUR,
+    Figure,
+    Spec,
+    area,
+    axis,
+    line,
+    moments,
+    points,
+    rounded,
+    time_axis,
+    token,
 )
-from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.history import History, history_sections
-from valveflow_ros.report.page import Page, Section, notice, paragraph, table, text
-from valveflow_ros.report.words import counted, decimals, moment, percent, plain
+from valveflow_ros.report.page import (
+    Page,
+    Section,
+    bullets,
+    foot,
+    notice,
+    paragraph,
+    table,
+    text,
+    where,
+)
+from valveflow_ros.report.words import (
+    UNKNOWN,
+    counted,
+    decimals,
+    input_unit,
+    input_unit_plain,
+    interval,
+    percent,
+    period,
+    plain,
+)
 
 _HOW = (
     'Means of bins with equally many minutes. A model that is right stays in the band, here and '
@@ -44,136 +71,107 @@ class Diagnosed:
     exponent: float = math.nan
 
 
-def diagnosis_report(data: Diagnosed) -> str:
-    """Return ``report.html``: one self-contained page in four steps."""
-    return diagnosis_page(data).to_html()
-
-
 def diagnosis_page(data: Diagnosed) -> Page:
     """Return the report: the answer and its picture first, then the four steps."""
-    d = data.diagnosis
     title = {
         NAMED: 'Why simulation and measurement disagree',
         NOTHING: 'Simulation and measurement agree',
-    }.get(d.verdict, 'Simulation and measurement disagree')
-    lead = paragraph(text(data.source), 'where')
-    lead += paragraph(f'{moment(data.start_ns)} to {moment(data.end_ns)}', 'where')
+    }.get(data.diagnosis.verdict, 'Simulation and measurement disagree')
     ranked = sorted(data.signatures, key=lambda s: -(s.share_before / max(s.share_chance, 1e-9)))
     sections = [
         _answer(data, ranked), _wrong(data, ranked), _why(data), _model(data), _proof(data),
         *history_sections(data.history),
     ]  # fmt: skip
-    foot = (
-        f'Made by valveflow {text(__version__)}. The same numbers, unrounded, stand in '
-        'diagnosis.json and extended_model.json beside this page.'
+    end_of_page = foot(
+        'The same numbers, unrounded, stand in diagnosis.json and extended_model.json beside '
+        'this page.'
     )
-    return Page(title, lead, sections, foot, 'diagnose')
+    lead = where(data.source, period(data.start_ns, data.end_ns))
+    return Page(title, lead, sections, end_of_page, 'diagnose')
 
 
 def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
     """Return the verdict with its doubts, what it is worth, and the one telling picture."""
     d = data.diagnosis
-    told = text(d.sentence)
-    parts: list[str | Figure] = [
-        paragraph(told, 'good') if d.verdict == NOTHING else notice(told),
-        *(notice(words) for words in _doubts(d)),
-        paragraph(
-            'On blocks of time that nothing was fitted to, the simulation misses the measured '
-            f'power by {decimals(d.rmse_simulation, 2)} MW, the extended model by '
-            f'{decimals(d.rmse_extended, 2)} MW; noise alone makes about '
-            f'{decimals(d.rmse_noise_floor, 2)} MW.'
-        ),
-    ]
+    said = text(d.sentence)
+    parts: list[str | Figure] = [paragraph(said, 'good') if d.verdict == NOTHING else notice(said)]
+    if d.not_told_apart:
+        names = ' and '.join(text(n) for n in d.not_told_apart)
+        doubt = f'These data do not tell apart: {names}.'
+        if d.experiments:
+            doubt += ' What would tell them apart: ' + ' '.join(text(e) for e in d.experiments)
+        parts.append(notice(doubt))
+    parts.append(paragraph(
+        'On blocks of time that nothing was fitted to, the simulation misses the measured '
+        f'power by {decimals(d.rmse_simulation, 2)} MW, the extended model by '
+        f'{decimals(d.rmse_extended, 2)} MW; noise alone makes about '
+        f'{decimals(d.rmse_noise_floor, 2)} MW.'
+    ))  # fmt: skip
     if ranked:
-        parts.append(signature_figure(ranked[0], data.start_ns, _HOW, data.exponent))
+        parts.append(signature_figure(ranked[0], data, _HOW))
     return Section('The answer', parts)
-
-
-def _doubts(d: Diagnosis) -> list[str]:
-    """Return what the verdict cannot tell apart, and what would; HTML."""
-    if not d.not_told_apart:
-        return []
-    names = ' and '.join(text(n) for n in d.not_told_apart)
-    told = f'These data do not tell apart: {names}.'
-    if d.experiments:
-        told += ' What would tell them apart: ' + ' '.join(text(e) for e in d.experiments)
-    return [told]
 
 
 def _wrong(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
     rows = [
-        [
-            text(variable(s.variable).removeprefix('the ')), percent(s.share_before),
-            percent(s.share_after), percent(s.share_chance),
-        ]
+        [text(_variable(s.variable).removeprefix('the ')),
+         *(percent(share) for share in (s.share_before, s.share_after, s.share_chance))]
         for s in ranked
     ]  # fmt: skip
-    told = paragraph(
-        'The simulation (curve and regional dynamics) was run on the measured opening and '
-        'pressure. How much of the difference to the measured power depends on each variable:'
-    )
     parts: list[str | Figure] = [
-        told,
+        paragraph(
+            'The simulation (curve and regional dynamics) was run on the measured opening and '
+            'pressure. How much of the difference to the measured power depends on each variable:'
+        ),
         table(['variable', 'simulation', 'extended model', 'by chance (99 %)'], rows),
+        *(signature_figure(s, data) for s in ranked[1:]),
     ]
-    parts += [signature_figure(s, data.start_ns, exponent=data.exponent) for s in ranked[1:]]
     if data.answers:
         parts.append(answer_figure(data.answers))
-    parts += [map_figure(m, data.start_ns, data.exponent) for m in data.maps]
+    parts += [map_figure(m, data) for m in data.maps]
     return Section('1. What is wrong', parts)
 
 
 def _why(data: Diagnosed) -> Section:
     d = data.diagnosis
-    parts: list[str | Figure] = [paragraph(text(c.sentence)) for c in d.causes]
-    if not d.causes:
-        parts.append(paragraph(text(d.sentence)))
+    parts = [paragraph(text(c.sentence)) for c in d.causes] or [paragraph(text(d.sentence))]
     for c in d.causes:
         if c.switches_s:
             spans = times_in_effect(c.switches_s, data.start_ns, data.end_ns)
             parts.append(paragraph(f'{text(c.name)} was in effect: {text(spans)}.'))
         if c.not_told_apart:
-            parts.append(
-                notice(
-                    f'{text(c.name)} cannot be told from {text(", ".join(c.not_told_apart))} '
-                    f'with these data. What would tell them apart: {text(c.experiment)}'
-                )
-            )
+            parts.append(notice(
+                f'{text(c.name)} cannot be told from {text(", ".join(c.not_told_apart))} '
+                f'with these data. What would tell them apart: {text(c.experiment)}'
+            ))  # fmt: skip
     if d.unexplained_by:
         parts.append(notice(f'Unexplained: depends on {text(" and ".join(d.unexplained_by))}.'))
     if d.disturbance:
-        hours = d.disturbance.time_scale_s / 3600.0
-        parts.append(
-            paragraph(
-                f'The power wanders slowly by {plain(d.disturbance.rms_mw, 2)} MW over about '
-                f'{plain(hours, 2)} h; that is a disturbance and no cause.'
-            )
-        )
+        hours = plain(d.disturbance.time_scale_s / 3600.0, 2)
+        parts.append(paragraph(
+            f'The power wanders slowly by {plain(d.disturbance.rms_mw, 2)} MW over about '
+            f'{hours} h; that is a disturbance and no cause.'
+        ))  # fmt: skip
     if d.rejected:
-        told = 'Other causes that were tried or could not be, and why they are not named:'
-        items = ''.join(f'<li><b>{text(n)}</b>: {text(reason)}</li>' for n, reason in d.rejected)
-        parts.append(f'{paragraph(told)}<ul>{items}</ul>')
-    parts += [paragraph(text(note)) for note in d.notes]
-    return Section('2. Why', parts)
-
-
-def _parameters(causes: Sequence[NamedCause], exponent: float) -> list[list[str]]:
-    return [
-        [text(c.name), text(key), *(text(cell) for cell in cells(e, exponent))]
-        for c in causes
-        for key, e in c.parameters.items()
-    ]
+        said = 'Other causes that were tried or could not be, and why they are not named:'
+        parts.append(paragraph(said) + bullets(
+            f'<b>{text(n)}</b>: {text(reason)}' for n, reason in d.rejected
+        ))  # fmt: skip
+    return Section('2. Why', [*parts, *(paragraph(text(note)) for note in d.notes)])
 
 
 def _model(data: Diagnosed) -> Section:
     d = data.diagnosis
-    rows = _parameters(d.causes, data.exponent)
-    m = d.final.base
-    told = paragraph(
-        f'A curve of {counted(m.pieces, "piece")}, {counted(m.regions, "region")} of dynamics'
-        + (f', and {", ".join(text(n) for n in d.final.names)}.' if d.final.names else '.')
-    )
-    parts: list[str | Figure] = [told]
+    names = f', and {", ".join(text(n) for n in d.final.names)}.' if d.final.names else '.'
+    parts: list[str | Figure] = [paragraph(
+        f'A curve of {counted(d.final.base.pieces, "piece")}, '
+        f'{counted(d.final.base.regions, "region")} of dynamics{names}'
+    )]  # fmt: skip
+    rows = [
+        [text(c.name), text(key), *(text(cell) for cell in cells(e, data.exponent))]
+        for c in d.causes
+        for key, e in c.parameters.items()
+    ]
     if rows:
         head = ['cause', 'parameter', 'value', '95 % interval']
         parts.append(table(head, rows, sentences=True))
@@ -194,27 +192,244 @@ def _proof(data: Diagnosed) -> Section:
         ),
         table(['model', 'MW'], rows),
     ]
-    modelled = [c for c in d.causes if math.isfinite(c.gain.p_value)]
-    if modelled:
-        parts.append(
+    gains = [(c.name, c.gain) for c in d.causes if math.isfinite(c.gain.p_value)]
+    if gains:
+        rows = [
+            [text(name), decimals(g.rmse_before, 3), decimals(g.rmse_after, 3),
+             percent(g.reduction), plain(g.p_value, 2)]
+            for name, g in gains
+        ]  # fmt: skip
+        parts += [
             paragraph(
                 'What each cause is worth there; p is the chance of such a gain if the cause were '
                 'absent, with the number of causes tried in it:'
-            )
-        )
-        parts.append(
-            table(
-                ['cause', 'before (MW)', 'after (MW)', 'smaller by', 'p'],
-                [
-                    [
-                        text(c.name), decimals(c.gain.rmse_before, 3),
-                        decimals(c.gain.rmse_after, 3), percent(c.gain.reduction),
-                        plain(c.gain.p_value, 2),
-                    ]
-                    for c in modelled
-                ],
-            )
-        )  # fmt: skip
+            ),
+            table(['cause', 'before (MW)', 'after (MW)', 'smaller by', 'p'], rows),
+        ]
     if d.segments:
         parts.append(segments_figure(d.segments))
     return Section('4. The proof', parts)
+
+
+# How a diagnosis is put for people: its variables, its parameters, times as dates.
+
+# What the residual is drawn against: in a sentence, at an axis, at a narrow one, and what a
+# line that leaves the band there points to.
+_VARIABLES = {
+    'u': (
+        'the integrated input u', 'integrated input u ({unit})', '',
+        'A bend or a step here points to the shape of the curve.',
+    ),
+    'pressure given u': (
+        'the steam pressure given u', 'pressure above its usual at that u (MPa)',
+        'pressure above usual (MPa)',
+        'A tilt here points to the pressure exponent or to a flow that is choked.',
+    ),
+    'temperature': (
+        'the steam temperature', 'main steam temperature (°C)', 'steam temperature (°C)',
+        'A tilt here points to steam temperature or reheating.',
+    ),
+    'time': (
+        'time', 'time (UTC)', '',
+        'A step points to something that happened then, a slope to wear or drift.',
+    ),
+    'time of day': (
+        'the time of day', 'time of day (h UTC)', '',
+        'A wave here points to cooling water or ambient temperature.',
+    ),
+    'ramp': (
+        'the ramp rate', 'change of u in 3 min ({unit})', '',
+        'A tilt here points to lag and delay, or to a valve that is slower than its command.',
+    ),
+    'direction': (
+        'the direction of motion', 'last motion (−1 closing, +1 opening)',
+        'last motion (−1 to +1)',
+        'A difference between the two ends points to backlash or stiction.',
+    ),
+}  # fmt: skip
+_MOST_SPANS = 20
+
+
+def _variable(name: str) -> str:
+    """Return a variable as it stands in a sentence."""
+    return _VARIABLES[name][0] if name in _VARIABLES else name
+
+
+def axis_titles(name: str, exponent: float) -> dict[str, str]:
+    """Return what stands at an axis, and at a narrow one, as HTML; the exponent is that of u."""
+    if name not in _VARIABLES:
+        return {'text': name}
+    _, long, short, _ = _VARIABLES[name]
+    long = long.replace('{unit}', input_unit(exponent))
+    return {'text': long, 'short': short} if short else {'text': long}
+
+
+def points_to(name: str) -> str:
+    """Return what a line that leaves the band points to; '' where nothing is known."""
+    return _VARIABLES[name][3] if name in _VARIABLES else ''
+
+
+def cells(estimate: Estimate, exponent: float) -> tuple[str, str]:
+    """Return a parameter with its unit, and its 95 % interval; a time and its own as dates."""
+    if estimate.origin_ns is not None:
+        at, between = dates(estimate)
+        return at, between or UNKNOWN
+    unit = estimate.unit.replace(input_unit_plain(math.nan), input_unit_plain(exponent))
+    value = f'{plain(estimate.value)} {unit}'.strip()
+    return value, interval(estimate.low, estimate.high)
+
+
+def times_in_effect(switches_s: Sequence[float], start_ns: int, end_ns: int) -> str:
+    """Return when a cause was in effect that is switched in and out, as dates.
+
+    Parameters
+    ----------
+    switches_s : sequence of float
+        In, out, in, ...: seconds after the first row.
+    start_ns, end_ns : int
+        First and last row.
+    """
+    moments = [told(start_ns, s) for s in switches_s]
+    if len(moments) % 2:
+        moments.append(told(end_ns, 0.0))
+    spans = [f'{a} to {b}' for a, b in zip(moments[::2], moments[1::2], strict=True)]
+    shown = '; '.join(spans[:_MOST_SPANS])
+    more = len(spans) - _MOST_SPANS
+    return f'{shown}; and {more} times more' if more > 0 else shown
+
+
+_BOTH = (('simulation', 'raw', 'dash'), ('extended model', 'curve', 'solid'))
+
+
+def _moments(start_ns: int, time_s: FloatArray) -> list[float | None]:
+    """Return times since the first row as a date axis wants them."""
+    return moments(start_ns / 1e6 + 1e3 * np.asarray(time_s))
+
+
+def _marked(
+    x: list[float | None], y: FloatArray, name: str, colour: str, dash: str, hover: str
+) -> Spec:
+    return line(
+        x, rounded(y, 4), name, colour, hover, dash=dash, mode='lines+markers', marker={'size': 5}
+    )
+
+
+def signature_figure(s: Signature, data: Diagnosed, how: str = '') -> Figure:
+    """Return the mean residual against one variable, before and after extending.
+
+    ``how`` says how such a picture is read.
+    """
+    titles = axis_titles(s.variable, data.exponent)
+    across, x = axis(titles), rounded(s.middle, 6)
+    hover = f'{titles["text"]}: %{{x:.4~g}}<br>%{{y:+.2f}} MW'
+    if s.variable == 'time':
+        across, x, hover = time_axis(), _moments(data.start_ns, s.middle), (
+            f'{DAY_HOUR}%{{y:+.2f}} MW'
+        )  # fmt: skip
+    elif s.variable == 'time of day':
+        x = rounded(s.middle / 3600.0, 6)
+    chance = rounded(np.concatenate([s.chance, -s.chance[::-1]]), 4)
+    traces = [area([*x, *x[::-1]], chance, 'by chance (99 %)',
+                   line={'width': 0, 'color': token('band')})]  # fmt: skip
+    traces += [
+        _marked(x, values, *look, hover)
+        for values, look in zip((s.before, s.after), _BOTH, strict=True)
+    ]
+    ends = [plain(float(v), 2) for v in (s.before.min(), s.before.max(), s.after.min(),
+                                         s.after.max())]  # fmt: skip
+    return Figure(
+        f'residual-{s.variable.replace(" ", "-")}',
+        f'<b>Measured minus simulated power against {text(_variable(s.variable))}.</b> '
+        f'{points_to(s.variable)} {how}',
+        f'Mean residual against {_variable(s.variable)}, from {ends[0]} to {ends[1]} MW before '
+        f'and {ends[2]} to {ends[3]} MW after.',
+        traces, {'xaxis': across, 'yaxis': axis('mean residual (MW)')}, height=300,
+    )  # fmt: skip
+
+
+def answer_figure(answers: Sequence[Answer]) -> Figure:
+    """Return the mean residual around fast moves, opening and closing apart."""
+    traces = []
+    for a in answers:
+        way = f'{"opening" if a.up else "closing"}, {counted(a.moves, "move")}'
+        for (name, _, dash), values in zip(_BOTH, (a.before, a.after), strict=True):
+            traces.append(_marked(
+                rounded(a.time_s, 6), values, f'{name}, {way}', 'steady' if a.up else 'slope',
+                dash, '%{x:.0f} s<br>%{y:+.2f} MW',
+            ))  # fmt: skip
+    chance = max(a.chance for a in answers)
+    return Figure(
+        'fast-moves',
+        '<b>Mean residual around fast moves of the valve.</b> A slow or early answer shows here '
+        f'only. By chance a point lies within ±{plain(chance, 2)} MW.',
+        'Mean residual from a minute before to five minutes after fast moves.', traces,
+        {'xaxis': axis('time after the move (s)'), 'yaxis': axis('mean residual (MW)')},
+        height=340,
+    )  # fmt: skip
+
+
+def segments_figure(segments: Sequence[SegmentGain]) -> Figure:
+    """Return the error in every special segment of the sealed blocks, before and after."""
+    better = sum(s.rmse_after < s.rmse_before for s in segments)
+    at = moments([s.start_ns / 1e6 for s in segments])
+    errors = [s.rmse_before for s in segments], [s.rmse_after for s in segments]
+    traces = [
+        points(at, rounded(values, 4), name, colour, f'{DAY_HOUR}%{{y:.2f}} MW',
+               marker={'symbol': sign})
+        for values, (name, colour, _), sign in zip(
+            errors, _BOTH, ('circle-open', 'circle'), strict=True
+        )
+    ]  # fmt: skip
+    return Figure(
+        'segments',
+        f'<b>Special segments inside the sealed blocks.</b> {better} of {len(segments)} are '
+        'predicted better by the extended model.',
+        f'{counted(len(segments), "segment")}, {better} of them predicted better.', traces,
+        {'xaxis': time_axis(), 'yaxis': axis('RMSE (MW)')}, height=340,
+    )  # fmt: skip
+
+
+def map_figure(m: ResidualMap, data: Diagnosed) -> Figure:
+    """Return where the simulation is wrong over two variables, and where the extended model is."""
+    across, over = rounded(m.across_edges, 6), Spec()
+    below = axis_titles(m.across, data.exponent)['text']
+    if m.across == 'time':
+        across, below = _moments(data.start_ns, m.across_edges), 'day of the month (UTC)'
+        over = {'type': 'date', 'nticks': 4, 'tickangle': 0, 'tickformat': '%-d'}
+    largest = max(
+        (float(np.nanmax(np.abs(x))) for x in (m.before, m.after) if np.isfinite(x).any()),
+        default=1.0,
+    )
+    traces: list[Spec] = [
+        {
+            'type': 'heatmap', 'name': name, 'x': across, 'y': rounded(m.up_edges, 4),
+            'z': [rounded(row, 3) for row in residual], 'zmin': -largest, 'zmax': largest,
+            'zmid': 0.0, 'colorscale': 'RdBu', 'showscale': bool(side),
+            'colorbar': {'title': {'text': 'MW'}}, 'xaxis': f'x{side}', 'yaxis': f'y{side}',
+            'hovertemplate': '%{z} MW<extra></extra>',
+        }
+        for name, residual, side in (
+            ('simulation', m.before, ''), ('extended model', m.after, '2'),
+        )
+    ]  # fmt: skip
+    layout = {
+        'xaxis': {**over, 'domain': [0.0, 0.46]},
+        'xaxis2': {**over, 'domain': [0.54, 1.0], 'anchor': 'y2'},
+        'yaxis': axis(axis_titles(m.up, data.exponent)['text']),
+        # One title for both axes: side by side there is no room for two on a telephone.
+        'annotations': [
+            {'text': below, 'showarrow': False, 'xref': 'paper', 'x': 0.5, 'xanchor': 'center',
+             'yref': 'paper', 'y': 0.0, 'yshift': -56}
+        ],
+        'margin': {'l': 56, 'r': 12, 't': 34, 'b': 70},
+        'yaxis2': {'anchor': 'x2', 'matches': 'y', 'showticklabels': False},
+    }  # fmt: skip
+    return Figure(
+        f'map-{m.across.replace(" ", "-")}',
+        f'<b>Residual over {text(_variable(m.across))} and {text(_variable(m.up))}</b>, '
+        'simulation left, extended model right. Only cells beyond chance are filled: '
+        f'{m.shown_before} of {m.cells} for the simulation, {m.shown_after} for the extended '
+        f'model; chance alone fills about {plain(0.01 * m.cells, 1)}.',
+        f'{m.shown_before} of {m.cells} cells are beyond chance before, {m.shown_after} after.',
+        traces, layout, height=380,
+    )  # fmt: skip

@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -16,9 +17,10 @@ from valveflow_ros.records import FloatArray
 from valveflow_ros.report.figure import Figure, Spec, axis_of, column, is_date, numbers, plain_text
 from valveflow_ros.report.page import read_text
 
-# One line, cloud, map or set of bars of a picture, drawn by matplotlib.
-
-Palette = Mapping[str, str]
+FORMATS = ('png', 'svg')
+_WIDTH, _INCH = 9.6, 96.0  # of a picture in inches; the page's pixels in an inch
+_DPI = 150
+_LONG = 26  # signs of a legend's entry; longer ones stand in two columns
 _DASHES = {'dash': '--', 'dot': ':', 'dashdot': '-.'}
 _SIGNS = {
     'circle': 'o', 'circle-open': 'o', 'square': 's', 'diamond': 'D', 'triangle-up': '^',
@@ -26,164 +28,9 @@ _SIGNS = {
 }  # fmt: skip
 _POINTS = 72.0 / 96.0  # of a pixel
 _MAPS = {'RdBu': 'RdBu_r'}  # plotly's runs the other way round
-
-
-def colour_of(name: str, colours: Palette) -> Any:
-    """Return a colour as matplotlib takes it; ``token:steady`` is looked up."""
-    value = colours[name[6:]] if name.startswith('token:') else name
-    if match := re.fullmatch(r'rgba\((\d+), (\d+), (\d+), ([\d.]+)\)', value):
-        red, green, blue, alpha = (float(v) for v in match.groups())
-        return red / 255.0, green / 255.0, blue / 255.0, alpha
-    return value
-
-
-def hours(ms: Sequence[Any] | FloatArray) -> FloatArray:
-    """Return ms since 1970 as matplotlib's days."""
-    return np.asarray(ms, dtype=np.float64) / 86400e3
-
-
-def draw_trace(pane: Any, trace: Spec, colours: Palette, date: bool) -> None:
-    """Draw one trace into a pane; ``date`` tells that x are ms since 1970."""
-    kind = trace['type']
-    if kind == 'heatmap':
-        _heat(pane, trace, colours, date)
-    elif kind == 'bar':
-        _bars(pane, trace, colours)
-    else:
-        _scatter(pane, trace, colours, date)
-
-
-def _label(trace: Spec) -> str:
-    shown = trace.get('showlegend', True) and trace.get('name')
-    return plain_text(str(trace['name'])) if shown else '_'
-
-
-def _x(trace: Spec, date: bool) -> FloatArray:
-    return hours(numbers(trace, 'x')) if date else numbers(trace, 'x')
-
-
-def _y(trace: Spec) -> Any:
-    values = column(trace, 'y')
-    if any(isinstance(v, str) for v in values):
-        # matplotlib wants words throughout; a gap of x breaks the line all the same.
-        words = [v for v in values if isinstance(v, str)]
-        return [v if isinstance(v, str) else words[0] for v in values]
-    return np.array(values, dtype=np.float64)
-
-
-def _scatter(pane: Any, trace: Spec, colours: Palette, date: bool) -> None:
-    x, y = _x(trace, date), _y(trace)
-    if trace.get('fill') == 'toself':
-        pane.fill(
-            x, y, facecolor=colour_of(trace['fillcolor'], colours), linewidth=0,
-            label=_label(trace),
-        )  # fmt: skip
-        return
-    mode, line = trace.get('mode', 'lines'), trace.get('line', {})
-    look: dict[str, Any] = {'linestyle': 'none', 'label': _label(trace)}
-    if 'lines' in mode:
-        look['linestyle'] = _DASHES.get(line.get('dash', ''), '-')
-        look['color'] = colour_of(line['color'], colours)
-        look['linewidth'] = line.get('width', 2) * _POINTS
-        look['solid_capstyle'] = 'butt'
-        if line.get('shape') == 'hv':
-            look['drawstyle'] = 'steps-post'
-    if 'markers' not in mode:
-        pane.plot(x, y, **look)
-        return
-    _marked(pane, trace, colours, x, y, look)
-
-
-def _marked(
-    pane: Any, trace: Spec, colours: Palette, x: FloatArray, y: Any, look: dict[str, Any]
-) -> None:
-    marker = trace.get('marker', {})
-    sign = str(marker.get('symbol', 'circle'))
-    given = marker.get('color', look.get('color', 'token:curve'))
-    if isinstance(given, list) or isinstance(marker.get('size'), list):
-        _one_by_one(pane, marker, colours, x, y, look)
-        return
-    colour = colour_of(given, colours) if isinstance(given, str) else given
-    edge = marker.get('line', {}).get('color')
-    look |= {
-        'marker': _SIGNS.get(sign, 'o'), 'markersize': marker.get('size', 6) * _POINTS,
-        'markerfacecolor': 'none' if sign == 'circle-open' else colour,
-        'markeredgecolor': colour_of(edge, colours) if edge else colour,
-        'alpha': marker.get('opacity'),
-    }  # fmt: skip
-    look.setdefault('color', colour)
-    pane.plot(x, y, **look)
-    for letter in 'xy':
-        if bars := trace.get(f'error_{letter}'):
-            ends = np.array([bars['arrayminus'], bars['array']], dtype=np.float64)
-            pane.errorbar(
-                x, y, fmt='none', capsize=3, ecolor=colour_of(bars['color'], colours),
-                **{f'{letter}err': np.abs(ends)},
-            )  # fmt: skip
-
-
-def _one_by_one(
-    pane: Any, marker: Spec, colours: Palette, x: FloatArray, y: Any, look: dict[str, Any]
-) -> None:
-    """Draw points that differ in colour or size over their line."""
-    pane.plot(x, y, **look)
-    size, colour = marker.get('size', 6), marker['color']
-    sizes = size if isinstance(size, list) else [size] * len(x)
-    shades = colour if isinstance(colour, list) else [colour] * len(x)
-    pane.scatter(
-        x, y, s=[(v * _POINTS) ** 2 for v in sizes],
-        c=[colour_of(c, colours) for c in shades], zorder=3,
-    )  # fmt: skip
-
-
-def _edges(places: FloatArray, count: int) -> FloatArray:
-    """Return the edges of cells that are given by their middles or by their edges."""
-    if len(places) == count + 1:
-        return places
-    half = 0.5 * (places[1] - places[0]) if count > 1 else 0.5
-    return np.append(places - half, places[-1] + half)
-
-
-def _heat(pane: Any, trace: Spec, colours: Palette, date: bool) -> None:
-    from matplotlib.colors import LinearSegmentedColormap
-
-    cells = np.array([[np.nan if v is None else v for v in row] for row in trace['z']])
-    rows, across = cells.shape
-    given = column(trace, 'y')
-    words = bool(given) and isinstance(given[0], str)
-    up = np.arange(rows) if words else np.array(given, dtype=np.float64)
-    scale = trace['colorscale']
-    if isinstance(scale, str):
-        shades: Any = _MAPS.get(scale, scale)
-    else:
-        places = [(place, colour_of(name, colours)) for place, name in scale]
-        shades = LinearSegmentedColormap.from_list('own', places)
-    drawn = pane.pcolormesh(
-        _edges(_x(trace, date), across), _edges(np.asarray(up, dtype=np.float64), rows), cells,
-        vmin=trace.get('zmin'), vmax=trace.get('zmax'), cmap=shades, rasterized=True,
-    )  # fmt: skip
-    if trace.get('showscale', True):
-        title = trace.get('colorbar', {}).get('title', {}).get('text', '')
-        pane.figure.colorbar(drawn, ax=pane, label=title)
-
-
-def _bars(pane: Any, trace: Spec, colours: Palette) -> None:
-    """Draw bars on top of those that stand there already, as the page stacks them."""
-    x, y = numbers(trace, 'x'), numbers(trace, 'y')
-    below = getattr(pane, 'stacked', np.zeros_like(y))
-    width = float(x[1] - x[0]) if len(x) > 1 else 1.0
-    given = trace['marker']['color']
-    shades = [given] if isinstance(given, str) else given
-    colour = [colour_of(c, colours) for c in shades]
-    width *= 0.8 if len(shades) > 1 else 1.0
-    pane.bar(x, y, width=width, bottom=below, color=colour, label=_label(trace))
-    pane.stacked = below + y
-
-
-FORMATS = ('png', 'svg')
-_WIDTH, _INCH = 9.6, 96.0  # of a picture in inches; the page's pixels in an inch
-_DPI = 150
-_LONG = 26  # signs of a legend's entry; longer ones stand in two columns
+_DAY_MS = 86400e3  # matplotlib counts days
+_RGBA = re.compile(r'rgba\((\d+), (\d+), (\d+), ([\d.]+)\)')
+_NUMBERS = ('x', 'y', 'z', 'customdata', 'hovertext')  # of a trace: no colours in there
 
 
 def check_drawing() -> None:
@@ -201,7 +48,7 @@ def check_drawing() -> None:
         )
 
 
-def palette() -> Palette:
+def palette() -> Mapping[str, str]:
     """Return the colours of the page's light look by name."""
     light = read_text('style.css').split('@media', 1)[0]
     return dict(re.findall(r'--([a-z0-9-]+):\s*([^;]+);', light))
@@ -221,46 +68,65 @@ def figure_files(figure: Figure) -> dict[str, bytes]:
     from matplotlib.figure import Figure as Sheet
 
     colours = palette()
-    about = plain_text(figure.caption)
     files = {}
     # The same log gives the same files: no date, no names by chance.
     with rc_context({'svg.hashsalt': figure.name, 'font.size': 10, 'svg.fonttype': 'path'}):
         sheet = Sheet(figsize=(_WIDTH, figure.height / _INCH), layout='constrained')
         FigureCanvasAgg(sheet)
-        _fill(sheet, figure, colours)
+        _fill(sheet, replace(
+            figure, traces=_painted(figure.traces, colours),
+            layout=_painted(figure.layout, colours),
+        ), colours['grid'])  # fmt: skip
         for kind in FORMATS:
             out = io.BytesIO()
-            told: dict[str, Any] = {'Title': figure.name, 'Description': about}
-            if kind == 'svg':
-                told['Date'] = None
+            told = {'Title': figure.name, 'Description': plain_text(figure.caption)}
+            date = {'Date': None} if kind == 'svg' else {}
             with warnings.catch_warnings():
                 # A sign no font has is drawn as a box; that is no reason to speak.
                 warnings.simplefilter('ignore', UserWarning)
-                sheet.savefig(out, format=kind, dpi=_DPI, metadata=told)
+                sheet.savefig(out, format=kind, dpi=_DPI, metadata={**told, **date})
             files[f'{figure.name}.{kind}'] = out.getvalue()
     return files
 
 
-def _fill(sheet: Any, figure: Figure, colours: Palette) -> None:
-    places = _grid(figure.layout)
-    heights = [h for _, h in sorted(places['rows'].items())]
-    grid = sheet.add_gridspec(
-        len(heights), len(places['columns']), height_ratios=heights
-    )  # fmt: skip
+def _painted(value: Any, colours: Mapping[str, str]) -> Any:
+    """Return plotly's data with its colours as matplotlib takes them."""
+    if isinstance(value, dict):
+        return {k: v if k in _NUMBERS else _painted(v, colours) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_painted(v, colours) for v in value]
+    if not isinstance(value, str):
+        return value
+    value = colours[value[6:]] if value.startswith('token:') else value
+    if match := _RGBA.fullmatch(value):
+        red, green, blue, alpha = (float(v) for v in match.groups())
+        return red / 255.0, green / 255.0, blue / 255.0, alpha
+    return value
+
+
+def _fill(sheet: Any, figure: Figure, grid_colour: Any) -> None:
+    """Draw a picture whose colours are painted: a pane for each pair of axes."""
+    columns, column_of = _places(figure.layout, 'x')
+    rows, row_of = _places(figure.layout, 'y')
+    # The highest share of the page is the first row.
+    row_of = {name: len(rows) - 1 - k for name, k in row_of.items()}
+    heights = [high - low for low, high in reversed(rows)]
+    grid = sheet.add_gridspec(len(rows), len(columns), height_ratios=heights)
     panes: dict[tuple[str, str], Any] = {}
     for trace in figure.traces:
         key = str(trace.get('xaxis', 'x')), str(trace.get('yaxis', 'y'))
         if key not in panes:
-            row, column = places['row'].get(key[1], 0), places['column'].get(key[0], 0)
             same = next((p for (x, _), p in panes.items() if x == key[0]), None)
-            place = sheet.add_subplot(grid[row, column], sharex=same)
-            panes[key] = _pane(place, figure, trace, colours)
-        draw_trace(panes[key], trace, colours, is_date(axis_of(figure, trace, 'x')))
+            place = grid[row_of.get(key[1], 0), column_of.get(key[0], 0)]
+            panes[key] = sheet.add_subplot(place, sharex=same)
+            _prepare(panes[key], figure, trace, grid_colour)
+        _draw(panes[key], trace, is_date(axis_of(figure, trace, 'x')))
     for (x, y), pane in panes.items():
-        _marks(pane, figure, x, y, colours)
-        _limits(pane, figure, x, y)
-        lowest = max(places['row'].get(b, 0) for a, b in panes if a == x)
-        if places['row'].get(y, 0) < lowest:
+        _marks(pane, figure.layout, x, y)
+        pane.margins(x=0.01)
+        if figure.layout.get(f'yaxis{y[1:]}', {}).get('rangemode') == 'tozero':
+            pane.set_ylim(bottom=0.0)
+        if row_of.get(y, 0) < max(row_of.get(b, 0) for a, b in panes if a == x):
             # The axis stands below the last of the panes that share it, as on the page.
             pane.set_xlabel('')
             pane.tick_params(labelbottom=False)
@@ -274,32 +140,25 @@ def _fill(sheet: Any, figure: Figure, colours: Palette) -> None:
         )  # fmt: skip
 
 
-def _grid(layout: Spec) -> dict[str, Any]:
-    """Return row and column of each axis, from the shares of the page it takes."""
-    shares: dict[str, dict[str, tuple[float, float]]] = {'x': {}, 'y': {}}
-    for key, axis in layout.items():
-        if match := re.fullmatch(r'([xy])axis(\d*)', key):
-            low, high = axis.get('domain', (0.0, 1.0))
-            shares[match[1]][match[1] + match[2]] = (low, high)
-    # A second axis of one row lies on the first: side by side, not one below the other.
-    rows = sorted(set(shares['y'].values()) or {(0.0, 1.0)}, reverse=True)
-    columns = sorted(set(shares['x'].values()) or {(0.0, 1.0)})
-    return {
-        'row': {name: rows.index(share) for name, share in shares['y'].items()},
-        'column': {name: columns.index(share) for name, share in shares['x'].items()},
-        'rows': {k: high - low for k, (low, high) in enumerate(rows)},
-        'columns': columns,
+def _places(layout: Spec, letter: str) -> tuple[list[tuple[float, float]], dict[str, int]]:
+    """Return the shares of the page that axes take, in their order, and which one each takes."""
+    shares = {
+        key.replace('axis', ''): tuple(axis.get('domain', (0.0, 1.0)))
+        for key, axis in layout.items()
+        if key.startswith(f'{letter}axis')
     }
+    order = sorted(set(shares.values()) or {(0.0, 1.0)})
+    return order, {name: order.index(share) for name, share in shares.items()}
 
 
-def _pane(pane: Any, figure: Figure, trace: Spec, colours: Palette) -> Any:
+def _prepare(pane: Any, figure: Figure, trace: Spec, grid_colour: Any) -> None:
     """Give a pane its titles and its axes' kinds."""
     from matplotlib import dates, ticker
 
     across, up = axis_of(figure, trace, 'x'), axis_of(figure, trace, 'y')
     pane.set_xlabel(_words(across))
     pane.set_ylabel(_words(up))
-    pane.grid(color=colours['grid'], linewidth=0.8)
+    pane.grid(color=grid_colour, linewidth=0.8)
     pane.set_axisbelow(True)
     pane.spines[['top', 'right']].set_visible(False)
     if is_date(across):
@@ -317,7 +176,6 @@ def _pane(pane: Any, figure: Figure, trace: Spec, colours: Palette) -> Any:
         pane.plot([], [])
         pane.yaxis.update_units(order or trace['y'])
         pane.invert_yaxis()
-    return pane
 
 
 def _words(axis: Spec) -> str:
@@ -327,33 +185,123 @@ def _words(axis: Spec) -> str:
     return re.sub(r'<[^>]+>', '', html)
 
 
-def _marks(pane: Any, figure: Figure, x: str, y: str, colours: Palette) -> None:
-    date = is_date(figure.layout.get(f'xaxis{x[1:]}', {}))
-    for shape in figure.layout.get('shapes', []):
-        axes = shape.get('xref', 'x'), shape.get('yref', 'y')
-        if axes[0] not in (x, 'paper') or axes[1] not in (y, 'paper'):
+def _marks(pane: Any, layout: Spec, x: str, y: str) -> None:
+    """Draw the shapes that belong to a pane."""
+    unit = _DAY_MS if is_date(layout.get(f'xaxis{x[1:]}', {})) else 1.0
+    for shape in layout.get('shapes', []):
+        across, up = shape.get('xref', 'x'), shape.get('yref', 'y')
+        if across not in (x, 'paper') or up not in (y, 'paper'):
             continue
-        if shape['type'] == 'rect' and axes[0] == 'paper':
-            fill, opacity = _colour(shape['fillcolor'], colours), shape.get('opacity', 1.0)
-            pane.axhspan(shape['y0'], shape['y1'], facecolor=fill, alpha=opacity, zorder=0.5)
-        elif shape['type'] == 'rect':
-            ends = hours([shape['x0'], shape['x1']]) if date else [shape['x0'], shape['x1']]
-            fill, opacity = _colour(shape['fillcolor'], colours), shape.get('opacity', 1.0)
-            pane.axvspan(*ends, facecolor=fill, alpha=opacity, zorder=0.5, linewidth=0)
-        elif shape.get('xref') == 'paper':
-            pane.axhline(shape['y0'], color=_colour(shape['line']['color'], colours), linewidth=1)
+        if shape['type'] == 'rect':
+            look = {'facecolor': shape['fillcolor'], 'alpha': shape.get('opacity', 1.0),
+                    'zorder': 0.5}  # fmt: skip
+            if across == 'paper':
+                pane.axhspan(shape['y0'], shape['y1'], **look)
+            else:
+                pane.axvspan(shape['x0'] / unit, shape['x1'] / unit, linewidth=0, **look)
+        elif across == 'paper':
+            pane.axhline(shape['y0'], color=shape['line']['color'], linewidth=1)
         else:
-            at = hours([shape['x0']])[0] if date else shape['x0']
             style = ':' if shape['line'].get('dash') else '-'
-            pane.axvline(at, color=_colour(shape['line']['color'], colours), linestyle=style)
+            pane.axvline(shape['x0'] / unit, color=shape['line']['color'], linestyle=style)
 
 
-def _colour(name: str, colours: Palette) -> Any:
+def _draw(pane: Any, trace: Spec, date: bool) -> None:
+    """Draw one trace into a pane; ``date`` tells that x are ms since 1970."""
+    x = numbers(trace, 'x') / (_DAY_MS if date else 1.0)
+    shown = trace.get('showlegend', True) and trace.get('name')
+    label = plain_text(str(trace['name'])) if shown else '_'
+    if trace['type'] == 'heatmap':
+        _heat(pane, trace, x)
+    elif trace['type'] == 'bar':
+        _bars(pane, trace, x, label)
+    elif trace.get('fill') == 'toself':
+        pane.fill(x, _heights(trace), facecolor=trace['fillcolor'], linewidth=0, label=label)
+    else:
+        _scatter(pane, trace, x, _heights(trace), label)
 
-    return colour_of(name, colours)
+
+def _heights(trace: Spec) -> Any:
+    values = column(trace, 'y')
+    if any(isinstance(v, str) for v in values):
+        # matplotlib wants words throughout; a gap of x breaks the line all the same.
+        words = [v for v in values if isinstance(v, str)]
+        return [v if isinstance(v, str) else words[0] for v in values]
+    return np.array(values, dtype=np.float64)
 
 
-def _limits(pane: Any, figure: Figure, x: str, y: str) -> None:
-    pane.margins(x=0.01)
-    if figure.layout.get(f'yaxis{y[1:]}', {}).get('rangemode') == 'tozero':
-        pane.set_ylim(bottom=0.0)
+def _scatter(pane: Any, trace: Spec, x: FloatArray, y: Any, label: str) -> None:
+    mode, line, marker = trace.get('mode', 'lines'), trace.get('line', {}), trace.get('marker', {})
+    look: dict[str, Any] = {'linestyle': 'none', 'label': label}
+    if 'lines' in mode:
+        look |= {
+            'linestyle': _DASHES.get(line.get('dash', ''), '-'), 'color': line['color'],
+            'linewidth': line.get('width', 2) * _POINTS, 'solid_capstyle': 'butt',
+        }  # fmt: skip
+        if line.get('shape') == 'hv':
+            look['drawstyle'] = 'steps-post'
+    if 'markers' not in mode:
+        pane.plot(x, y, **look)
+        return
+    sign, size = str(marker.get('symbol', 'circle')), marker.get('size', 6)
+    colour = marker.get('color', look.get('color'))
+    if isinstance(colour, list) or isinstance(size, list):
+        # Points that differ in colour or size stand over their line.
+        pane.plot(x, y, **look)
+        sizes = size if isinstance(size, list) else [size] * len(x)
+        shades = colour if isinstance(colour, list) else [colour] * len(x)
+        pane.scatter(x, y, s=[(v * _POINTS) ** 2 for v in sizes], c=shades, zorder=3)
+        return
+    look |= {
+        'marker': _SIGNS.get(sign, 'o'), 'markersize': size * _POINTS,
+        'markerfacecolor': 'none' if sign == 'circle-open' else colour,
+        'markeredgecolor': marker.get('line', {}).get('color') or colour,
+        'alpha': marker.get('opacity'),
+    }  # fmt: skip
+    look.setdefault('color', colour)
+    pane.plot(x, y, **look)
+    for letter in 'xy':
+        if bars := trace.get(f'error_{letter}'):
+            ends = np.abs(np.array([bars['arrayminus'], bars['array']], dtype=np.float64))
+            pane.errorbar(
+                x, y, fmt='none', capsize=3, ecolor=bars['color'], **{f'{letter}err': ends}
+            )
+
+
+def _heat(pane: Any, trace: Spec, x: FloatArray) -> None:
+    from matplotlib.colors import LinearSegmentedColormap
+
+    cells = np.array([[np.nan if v is None else v for v in row] for row in trace['z']])
+    rows, across = cells.shape
+    given = column(trace, 'y')
+    words = bool(given) and isinstance(given[0], str)
+    up = np.asarray(np.arange(rows) if words else given, dtype=np.float64)
+    scale = trace['colorscale']
+    shades: Any = _MAPS.get(scale, scale) if isinstance(scale, str) else (
+        LinearSegmentedColormap.from_list('own', [tuple(step) for step in scale])
+    )  # fmt: skip
+    drawn = pane.pcolormesh(
+        _edges(x, across), _edges(up, rows), cells, vmin=trace.get('zmin'),
+        vmax=trace.get('zmax'), cmap=shades, rasterized=True,
+    )  # fmt: skip
+    if trace.get('showscale', True):
+        title = trace.get('colorbar', {}).get('title', {}).get('text', '')
+        pane.figure.colorbar(drawn, ax=pane, label=title)
+
+
+def _edges(places: FloatArray, count: int) -> FloatArray:
+    """Return the edges of cells that are given by their middles or by their edges."""
+    if len(places) == count + 1:
+        return places
+    half = 0.5 * (places[1] - places[0]) if count > 1 else 0.5
+    return np.append(places - half, places[-1] + half)
+
+
+def _bars(pane: Any, trace: Spec, x: FloatArray, label: str) -> None:
+    """Draw bars on top of those that stand there already, as the page stacks them."""
+    y, colour = numbers(trace, 'y'), trace['marker']['color']
+    below = getattr(pane, 'stacked', np.zeros_like(y))
+    width = float(x[1] - x[0]) if len(x) > 1 else 1.0
+    width *= 0.8 if isinstance(colour, list) and len(colour) > 1 else 1.0
+    pane.bar(x, y, width=width, bottom=below, color=colour, label=label)
+    pane.stacked = below + y

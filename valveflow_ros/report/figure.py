@@ -12,7 +12,7 @@ import io
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import unescape
 from itertools import pairwise
@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from valveflow_ros.records import FloatArray, IntArray, SpecialSegment
+from valveflow_ros.records import FloatArray
 
 Spec = dict[str, Any]
+DAY_HOUR = '%{x|%d %b %H:%M}<br>'  # the time at the head of a hover text
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,36 +61,6 @@ class Figure:
         return text.replace('<', '\\u003c').replace('>', '\\u003e').replace('&', '\\u0026')
 
 
-def without_tags(html: str) -> str:
-    """Return HTML without its tags, powers with a caret: ``MPa^(9/8)``; signs stay escaped."""
-    html = re.sub(r'<sup>([^<]*/[^<]*)</sup>', r'^(\1)', html)
-    html = re.sub(r'<sup>([^<]*)</sup>', r'^\1', html)
-    return re.sub(r'<[^>]+>', '', html)
-
-
-def token(name: str) -> str:
-    """Return a colour by its name in the style sheet."""
-    return f'token:{name}'
-
-
-def rounded(values: NDArray[Any], digits: int = 5) -> list[float | None]:
-    """Return values for the eye: so many significant digits of the largest; NaN is a gap."""
-    values = np.asarray(values, dtype=np.float64)
-    good = np.isfinite(values)
-    largest = float(np.abs(values[good]).max()) if good.any() else 0.0
-    places = digits - 1 - math.floor(math.log10(largest)) if largest > 0.0 else 0
-    return [
-        round(v, places) if ok else None
-        for v, ok in zip(values.tolist(), good.tolist(), strict=True)
-    ]
-
-
-def packed(values: NDArray[Any]) -> Spec:
-    """Return an array in plotly's binary form, exact and compact; NaN stays a gap."""
-    data = np.ascontiguousarray(values, dtype='<f8')
-    return {'dtype': 'f8', 'bdata': base64.b64encode(data.tobytes()).decode()}
-
-
 def _clean(value: Any) -> Any:
     """Turn numpy scalars into Python's and what is not finite into null."""
     if isinstance(value, Mapping):
@@ -103,7 +74,116 @@ def _clean(value: Any) -> Any:
     return value
 
 
-# The numbers of a picture as arrays and as a table, whichever way plotly was given them.
+# Numbers for a picture.
+
+
+def rounded(values: NDArray[Any] | Sequence[float], digits: int = 5) -> list[float | None]:
+    """Return values for the eye: so many significant digits of the largest; NaN is a gap."""
+    values = np.asarray(values, dtype=np.float64)
+    good = np.isfinite(values)
+    largest = float(np.abs(values[good]).max()) if good.any() else 0.0
+    places = digits - 1 - math.floor(math.log10(largest)) if largest > 0.0 else 0
+    return [
+        round(v, places) if ok else None
+        for v, ok in zip(values.tolist(), good.tolist(), strict=True)
+    ]
+
+
+def moments(time_ms: NDArray[Any] | Sequence[float]) -> list[float | None]:
+    """Return times in ms since 1970 to the ms, as a date axis takes them."""
+    return rounded(time_ms, 13)
+
+
+def packed(values: NDArray[Any]) -> Spec:
+    """Return an array in plotly's binary form, exact and compact; NaN stays a gap."""
+    data = np.ascontiguousarray(values, dtype='<f8')
+    return {'dtype': 'f8', 'bdata': base64.b64encode(data.tobytes()).decode()}
+
+
+# Traces, axes and marks. What a caller adds as a keyword is plotly's own and goes before.
+
+
+def token(name: str) -> str:
+    """Return a colour by its name in the style sheet."""
+    return f'token:{name}'
+
+
+def _hover(template: str) -> Spec:
+    return {'hovertemplate': template} if template else {'hoverinfo': 'skip'}
+
+
+def line(
+    x: Any, y: Any, name: str, colour: str, hover: str = '', *, width: float = 2,
+    dash: str = '', shape: str = '', **more: Any,
+) -> Spec:  # fmt: skip
+    """Return a line; without a hover text it cannot be pointed at."""
+    look: Spec = {'color': token(colour), 'width': width}
+    look |= {k: v for k, v in (('dash', dash), ('shape', shape)) if v}
+    return {'type': 'scatter', 'mode': 'lines', 'name': name, 'x': x, 'y': y, 'line': look,
+            **_hover(hover), **more}  # fmt: skip
+
+
+def points(
+    x: Any, y: Any, name: str, colour: str, hover: str = '', *, size: float = 6,
+    marker: Mapping[str, Any] | None = None, **more: Any,
+) -> Spec:  # fmt: skip
+    """Return a cloud of points; ``marker`` adds to their look."""
+    look = {'color': token(colour), 'size': size, **(marker or {})}
+    return {'type': 'scatter', 'mode': 'markers', 'name': name, 'x': x, 'y': y, 'marker': look,
+            **_hover(hover), **more}  # fmt: skip
+
+
+def area(x: Any, y: Any, name: str, **more: Any) -> Spec:
+    """Return the area inside a closed line, in the colour of a band."""
+    return {'type': 'scatter', 'mode': 'lines', 'fill': 'toself', 'hoverinfo': 'skip', 'x': x,
+            'y': y, 'fillcolor': token('band'), 'line': {'width': 0}, 'name': name,
+            **more}  # fmt: skip
+
+
+def error_bars(low: FloatArray, middle: FloatArray, high: FloatArray, **more: Any) -> Spec:
+    """Return the bars from ``low`` to ``high``; of no length where an end is not known."""
+    known = np.isfinite(low) & np.isfinite(high)
+    return {'type': 'data', 'symmetric': False,
+            'array': rounded(np.where(known, high - middle, 0.0)),
+            'arrayminus': rounded(np.where(known, middle - low, 0.0)), **more}  # fmt: skip
+
+
+def axis(title: str | Mapping[str, str], **more: Any) -> Spec:
+    """Return an axis; a title with a short form for narrow windows comes as a mapping."""
+    return {'title': {'text': title} if isinstance(title, str) else dict(title), **more}
+
+
+def time_axis(**more: Any) -> Spec:
+    """Return an axis of times in ms since 1970."""
+    return axis('time (UTC)', type='date', **more)
+
+
+def stripe(x0: float, x1: float, colour: str, **more: Any) -> Spec:
+    """Return a tinted background between two places of the x axis."""
+    return {'type': 'rect', 'layer': 'below', 'yref': 'paper', 'y0': 0, 'y1': 1, 'x0': x0,
+            'x1': x1, 'fillcolor': token(colour), 'line': {'width': 0}, **more}  # fmt: skip
+
+
+def upright(x: float, colour: str, width: float, **look: Any) -> Spec:
+    """Return a line across the picture at one place of the x axis."""
+    return {'type': 'line', 'yref': 'paper', 'y0': 0, 'y1': 1, 'x0': x, 'x1': x,
+            'line': {'color': token(colour), 'width': width, **look}}  # fmt: skip
+
+
+def zero_line(x0: float = 0, x1: float = 1, **more: Any) -> Spec:
+    """Return a line at y = 0, by default across the picture."""
+    return {'type': 'line', 'xref': 'paper', 'x0': x0, 'x1': x1, 'y0': 0, 'y1': 0,
+            'line': {'color': token('muted'), 'width': 1}, **more}  # fmt: skip
+
+
+# The numbers of a picture read back, whichever way plotly was given them.
+
+
+def without_tags(html: str) -> str:
+    """Return HTML without its tags, powers with a caret: ``MPa^(9/8)``; signs stay escaped."""
+    html = re.sub(r'<sup>([^<]*/[^<]*)</sup>', r'^(\1)', html)
+    html = re.sub(r'<sup>([^<]*)</sup>', r'^\1', html)
+    return re.sub(r'<[^>]+>', '', html)
 
 
 def plain_text(html: str) -> str:
@@ -136,18 +216,18 @@ def axis_of(figure: Figure, trace: Spec, letter: str) -> Spec:
 
 
 def is_date(axis: Spec) -> bool:
-    """Tell whether an axis shows ms since 1970."""
+    """Return True if an axis shows ms since 1970."""
     return axis.get('type') == 'date'
 
 
-def _cell(value: Any, date: bool) -> str:
-    if isinstance(value, str) or value is None:
-        return value or ''
-    if not math.isfinite(value):
-        return ''
-    if not date:
-        return repr(value)
-    return f'{np.datetime64(round(value), "ms")}Z'
+def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a table as CSV; a number that is not finite becomes an empty cell."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator='\n')
+    writer.writerow(head)
+    for row in rows:
+        writer.writerow(['' if isinstance(v, float) and not math.isfinite(v) else v for v in row])
+    return out.getvalue()
 
 
 def figure_csv(figure: Figure) -> str:
@@ -156,27 +236,33 @@ def figure_csv(figure: Figure) -> str:
     Times are written in UTC. Lines are broken where a row is missing. The values are those that
     are drawn, thinned out and rounded for the eye; the result's JSON has them unrounded.
     """
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator='\n')
-    writer.writerow(['line', 'x', 'y', 'value', 'y_low', 'y_high', 'x_axis', 'y_axis'])
+    rows = []
     for number, trace in enumerate(figure.traces):
         name = plain_text(str(trace.get('name', f'line {number + 1}')))
         across, up = axis_of(figure, trace, 'x'), axis_of(figure, trace, 'y')
         titles = [plain_text(str(a.get('title', {}).get('text', ''))) for a in (across, up)]
-        for x, y, value, low, high in _points(trace):
-            cells = [_cell(x, is_date(across)), _cell(y, is_date(up))]
-            ends = [_cell(v, False) for v in (value, low, high)]
-            if cells[0] and (cells[1] or ends[0]):
-                writer.writerow([name, *cells, *ends, *titles])
-    return out.getvalue()
+        for x, y, *values in _points(trace):
+            cells = [_cell(x, is_date(across)), _cell(y, is_date(up)), *map(_cell, values)]
+            if cells[0] and (cells[1] or cells[2]):
+                rows.append([name, *cells, *titles])
+    head = ['line', 'x', 'y', 'value', 'y_low', 'y_high', 'x_axis', 'y_axis']
+    return csv_text(head, rows)
+
+
+def _cell(value: Any, date: bool = False) -> str:
+    if isinstance(value, str) or value is None:
+        return value or ''
+    if not math.isfinite(value):
+        return ''
+    return f'{np.datetime64(round(value), "ms")}Z' if date else repr(value)
 
 
 def _points(trace: Spec) -> Iterator[tuple[Any, Any, Any, Any, Any]]:
+    """Yield x, y, value, and the ends of the bar through the point."""
     x, y = column(trace, 'x'), column(trace, 'y')
     if trace['type'] == 'heatmap':
         across = _centres(x, len(trace['z'][0]))
-        up = _centres(y, len(trace['z']))
-        for place, row in zip(up, trace['z'], strict=True):
+        for place, row in zip(_centres(y, len(trace['z'])), trace['z'], strict=True):
             for at, value in zip(across, row, strict=True):
                 if value is not None:
                     yield at, place, value, None, None
@@ -194,135 +280,3 @@ def _centres(places: list[Any], count: int) -> list[Any]:
     if len(places) == count:
         return places
     return [0.5 * (a + b) for a, b in pairwise(places)]
-
-
-# Fewer points for the eye; the numbers of the report never come from here.
-
-
-@dataclass(frozen=True, slots=True)
-class Envelope:
-    """A signal as its lowest and highest value in each of many equal stretches of time.
-
-    Attributes
-    ----------
-    start_ns, step_ns : int
-        Time of the first point and from one point to the next.
-    values : float64 (2 k,)
-        Two points a stretch, in the order in which they occur; NaN where nothing was measured.
-    """
-
-    start_ns: int
-    step_ns: float
-    values: FloatArray
-
-
-def envelope(time_ns: IntArray, values: FloatArray, stretches: int, period_ns: int) -> Envelope:
-    """Reduce a signal to at most ``2 * stretches`` points that keep every peak.
-
-    A short signal comes back with each of its values on its own grid place.
-    """
-    if not len(time_ns):
-        return Envelope(0, 1.0, np.empty(0))
-    span = int(time_ns[-1] - time_ns[0]) + period_ns
-    k = max(1, min(stretches, span // (2 * period_ns)))
-    width = span / k
-    place = np.minimum(((time_ns - time_ns[0]) / width).astype(np.int64), k - 1)
-    good = np.isfinite(values)
-    place, value = place[good], values[good]
-    out = np.full((k, 2), np.nan)
-    if len(value):
-        first = np.flatnonzero(np.diff(place, prepend=-1))
-        where = place[first]
-        low = np.minimum.reduceat(value, first)
-        high = np.maximum.reduceat(value, first)
-        rising = value[first] <= value[np.append(first[1:], len(value)) - 1]
-        out[where, 0] = np.where(rising, low, high)
-        out[where, 1] = np.where(rising, high, low)
-    return Envelope(int(time_ns[0]), width / 2.0, out.ravel())
-
-
-@dataclass(frozen=True, slots=True)
-class Density:
-    """How many samples fall into each cell of a grid.
-
-    Attributes
-    ----------
-    x_from, x_step, y_from, y_step : float
-        Centre of the first cell and distance of cells.
-    counts : int64 (rows, columns)
-    """
-
-    x_from: float
-    x_step: float
-    y_from: float
-    y_step: float
-    counts: IntArray
-
-
-def density(x: FloatArray, y: FloatArray, columns: int, rows: int) -> Density:
-    """Count points in a grid that spans them."""
-    x_low, x_high = _span(x)
-    y_low, y_high = _span(y)
-    counts, _, _ = np.histogram2d(
-        y, x, bins=(rows, columns), range=((y_low, y_high), (x_low, x_high))
-    )
-    x_step, y_step = (x_high - x_low) / columns, (y_high - y_low) / rows
-    return Density(
-        x_low + 0.5 * x_step, x_step, y_low + 0.5 * y_step, y_step, counts.astype(np.int64)
-    )
-
-
-def _span(values: FloatArray) -> tuple[float, float]:
-    """Return the ends of the values, a little apart even where all are equal."""
-    if not len(values):
-        return 0.0, 1.0
-    low, high = float(values.min()), float(values.max())
-    pad = max(1e-9, 1e-6 * abs(low)) if high <= low else 0.0
-    return low - pad, high + pad
-
-
-def thin(number: int, most: int) -> IntArray:
-    """Return at most ``most`` of ``number`` places, evenly spread, both ends kept."""
-    if number <= most:
-        return np.arange(number, dtype=np.int64)
-    return np.unique(np.linspace(0, number - 1, most).round().astype(np.int64))
-
-
-def segment_rows(time_ns: IntArray, segments: list[SpecialSegment]) -> IntArray:
-    """Return (first row, end row) of each segment within ``time_ns``, shape (k, 2)."""
-    starts = np.array([s.start_ns for s in segments], dtype=np.int64)
-    ends = np.array([s.end_ns for s in segments], dtype=np.int64)
-    return np.column_stack(
-        [
-            np.searchsorted(time_ns, starts, side='left'),
-            np.searchsorted(time_ns, ends, side='right'),
-        ]
-    ).astype(np.int64)
-
-
-def segment_path(
-    time_ns: IntArray, values: FloatArray, rows: IntArray, points: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return times in ms and block means along segments, NaN between two segments.
-
-    Parameters
-    ----------
-    rows : int64 (k, 2)
-        First and end row of each segment.
-    points : int
-        About how many points all segments together may have.
-    """
-    total = int((rows[:, 1] - rows[:, 0]).sum()) if len(rows) else 0
-    block = max(1, -(-total // max(1, points)))
-    times, means = [], []
-    for first, end in rows.tolist():
-        edges = np.arange(first, end, block)
-        if not len(edges):
-            continue
-        sizes = np.diff(np.append(edges, end))
-        means += [np.add.reduceat(values[first:end], edges - first) / sizes, np.array([np.nan])]
-        middle = np.minimum(edges + sizes // 2, end - 1)
-        times += [time_ns[middle] / 1e6, np.array([np.nan])]
-    if not times:
-        return np.empty(0), np.empty(0)
-    return np.concatenate(times), np.concatenate(means)

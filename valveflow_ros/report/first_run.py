@@ -1,4 +1,4 @@
-"""Tell whether the engine has to be compiled first, which takes a while, once."""
+"""Whether the engine has to be compiled first, which takes about a minute, once."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from collections.abc import Iterator
 from typing import Any
 
 SENTENCE = 'The engine is compiled for this machine now, once; that takes about a minute.'
-_ROOMS = ('numerics', 'signals', 'segments', 'partition', 'curve', 'fit', 'monitoring')
-_ENGINE = tuple(f'valveflow_ros.{room}' for room in _ROOMS)
+_FOLDERS = ('numerics', 'signals', 'segments', 'partition', 'curve', 'fit', 'monitoring')
+_ENGINE = tuple(f'valveflow_ros.{name}' for name in _FOLDERS)
 # Some are only ever compiled into others, or for tests.
 _FEW = 0.05
 
 
 def is_first_run() -> bool:
-    """Tell whether most of the engine is not in numba's cache for this machine and version.
+    """Return True if most of the engine is not in numba's cache for this machine and version.
 
-    False as well where nothing is compiled or nothing can be told.
+    False as well where nothing is compiled or nothing is known.
     """
     from valveflow_ros.monitoring import monitor  # noqa: F401 - what is asked about must be loaded
 
@@ -24,7 +24,7 @@ def is_first_run() -> bool:
 
 
 def must_compile_to_fit() -> bool:
-    """Tell whether more than a few functions of engine and fit have to be compiled for a fit."""
+    """Return True if more than a few functions have to be compiled for a fit."""
     from valveflow_ros.fit import fit  # noqa: F401 - what is asked about must be loaded
     from valveflow_ros.monitoring import monitor  # noqa: F401
 
@@ -49,7 +49,7 @@ def _compiled() -> Iterator[Any]:
 
 
 def _is_cold(dispatcher: Any) -> bool | None:
-    """Tell whether a function is not in the cache; None if that cannot be told."""
+    """Return True if a function is not in the cache; None if that is not known."""
     if dispatcher.signatures:
         return False
     # numba shows no more than the folder, in which there may be older or foreign code.

@@ -1,18 +1,40 @@
-"""How the curve moved while a monitor watched."""
+"""What a monitor published while it recorded: its curves, its alarms, its diagnoses."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 
 from valveflow_ros.monitoring.alarm import AlarmState
 from valveflow_ros.records import FloatArray
-from valveflow_ros.report.figure import Figure, Spec, rounded, token
-from valveflow_ros.report.page import Section, notice, paragraph, table, text
-from valveflow_ros.report.words import counted, decimals, duration, input_unit, moment, plain
-
-# What a monitor published while it recorded: its curves, its alarms, its diagnoses.
+from valveflow_ros.report.figure import (
+    DAY_HOUR,
+    Figure,
+    Spec,
+    axis,
+    error_bars,
+    line,
+    moments,
+    points,
+    rounded,
+    time_axis,
+    token,
+)
+from valveflow_ros.report.page import Section, folded, notice, paragraph, table, text
+from valveflow_ros.report.terminal.board import decoded
+from valveflow_ros.report.terminal.frame import AlarmView, CurveView, DiagnosisView
+from valveflow_ros.report.words import (
+    counted,
+    decimals,
+    duration,
+    input_unit,
+    moment,
+    period,
+    plain,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +73,7 @@ class AlarmMoment:
     name: str
     state: AlarmState
     sentence: str
+    again: bool = field(default=False, compare=False)  # the alarm was in this state before
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +108,77 @@ class History:
     notes: tuple[str, ...] = ()
 
 
-# What a monitor said, on a line of time: alarms, diagnoses, new curves.
+Moment = CurveMoment | AlarmMoment | DiagnosisMoment
+Item = TypeVar('Item')
+
+
+def moment_of(type_name: str, fields: Mapping[str, Any]) -> Moment | None:
+    """Return what a message adds to a history; None while there is nothing to show.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        The message cannot be read.
+    """
+    time_ns, view = decoded(type_name, fields)
+    if isinstance(view, AlarmView):
+        again = view.previous == view.state
+        return AlarmMoment(time_ns, view.name, AlarmState(view.state), view.sentence, again)
+    if isinstance(view, DiagnosisView):
+        return DiagnosisMoment(time_ns, view.sentence) if view.verdict and view.sentence else None
+    if not isinstance(view, CurveView):
+        return None
+    u, power, low, high = (
+        np.array(v, dtype=np.float64) for v in (view.breakpoints, view.values, view.low, view.high)
+    )
+    finite = np.all(np.isfinite(u)) and np.all(np.isfinite(power))
+    if len(u) < 2 or len(power) != len(u) or not finite or np.any(np.diff(u) <= 0.0):
+        return None
+    if len(low) != len(u) - 2 or len(high) != len(u) - 2:
+        low = high = np.full(len(u) - 2, np.nan)
+    return CurveMoment(time_ns, view.model_id, view.exponent, u, power, low, high, view.rmse_mw)
+
+
+def history_of(
+    told: Iterable[Moment], times_ns: Iterable[int], notes: Iterable[str]
+) -> History | None:
+    """Return the history of what was published; None where a log tells nothing of a monitor.
+
+    Parameters
+    ----------
+    told : iterable of CurveMoment, AlarmMoment, DiagnosisMoment
+        In any order. What is latched is published again and again, and all that stands at a new
+        start: each counts once.
+    times_ns : iterable of int
+        Other times of the log, such as those of its first and last reading.
+    notes : iterable of str
+        What could not be read, as sentences.
+    """
+    found, said = sorted(told, key=lambda m: m.time_ns), tuple(notes)
+    if not found and not said:
+        return None
+    times = [*times_ns, *(m.time_ns for m in found)]
+    curves = _once((m for m in found if isinstance(m, CurveMoment)), lambda c: c.model_id)
+    diagnoses = _once((m for m in found if isinstance(m, DiagnosisMoment)), lambda d: d)
+    alarms, known = [], set()
+    for a in _once((m for m in found if isinstance(m, AlarmMoment)), lambda a: a):
+        # That an alarm still stands, which is told every day, is no change. The first word of a
+        # standing alarm counts even so: it stood when the recording began.
+        if not a.again or (a.name not in known and a.state != AlarmState.NORMAL):
+            alarms.append(a)
+        known.add(a.name)
+    return History(
+        min(times, default=0), max(times, default=0), tuple(curves), tuple(alarms),
+        tuple(diagnoses), said,
+    )  # fmt: skip
+
+
+def _once(items: Iterable[Item], key: Callable[[Item], Hashable]) -> list[Item]:
+    """Return each item when it first came."""
+    first: dict[Hashable, Item] = {}
+    for item in items:
+        first.setdefault(key(item), item)
+    return list(first.values())
 
 
 # Word, colour and sign of each state that is worth a bar, the gravest first.
@@ -98,10 +191,31 @@ _STATES = {
     AlarmState.OUT_OF_SERVICE: ('out of service', 'muted', 'cross'),
 }
 _WORDS = {AlarmState.NORMAL: 'normal', **{s: words for s, (words, _, _) in _STATES.items()}}
-_MS = 13
 _ROW = 46  # pixels
 _MOST = 40
 _LINE = 60  # signs of a hover before it breaks
+
+
+def history_sections(history: History | None) -> list[Section]:
+    """Return the parts of the page about a monitor's recording; none for other logs."""
+    if history is None:
+        return []
+    sections = []
+    if history.curves:
+        sections.append(Section('How the curve moved', _curves(history)))
+    if history.alarms or history.diagnoses:
+        changes, names = len(history.alarms), len(_names(history))
+        told = f'{counted(changes, "change")} of {counted(names, "alarm")}'
+        if history.diagnoses:
+            told += f' and {counted(len(history.diagnoses), "diagnosis", "diagnoses")}'
+        told += f' from {period(history.start_ns, history.end_ns)}.'
+        sections.append(Section('What the monitor said', [
+            paragraph(told), timeline_figure(history), alarms_table(history),
+        ]))  # fmt: skip
+    if history.notes:
+        sections = sections or [Section('What the monitor said')]
+        sections[-1].parts.extend(notice(text(n)) for n in history.notes)
+    return sections
 
 
 def spans(history: History) -> list[tuple[str, AlarmState, int, int, str]]:
@@ -139,83 +253,40 @@ def _row_of(name: str) -> str:
 
 def _broken(sentence: str) -> str:
     """Break a sentence into lines for a hover."""
-    lines, line = [], ''
+    lines = ['']
     for word in text(sentence).split():
-        if line and len(line) + len(word) >= _LINE:
-            lines.append(line)
-            line = word
+        if lines[-1] and len(lines[-1]) + len(word) >= _LINE:
+            lines.append(word)
         else:
-            line = f'{line} {word}'.strip()
-    return '<br>'.join([*lines, line])
-
-
-def _bars(history: History, state: AlarmState) -> list[Spec]:
-    words, colour, sign = _STATES[state]
-    mine = [s for s in spans(history) if s[1] is state]
-    if not mine:
-        return []
-    # A gap between two stretches, so that no line joins them.
-    x = np.array([t for _, _, a, b, _ in mine for t in (a / 1e6, b / 1e6, np.nan)])
-    y = [cell for name, *_ in mine for cell in (_row_of(name), _row_of(name), None)]
-    begins = np.array([a / 1e6 for _, _, a, _, _ in mine])
-    hover = [
-        f'{moment(a)}<br>{_row_of(name)}: {words} for {duration((b - a) / 1e9)}'
-        f'<br>{_broken(sentence)}'
-        for name, _, a, b, sentence in mine
-    ]
-    return [
-        {
-            'type': 'scatter', 'mode': 'lines', 'name': words, 'x': rounded(x, _MS), 'y': y,
-            'line': {'color': token(colour), 'width': 14}, 'legendgroup': words,
-            'showlegend': False, 'hoverinfo': 'skip',
-        },
-        {
-            'type': 'scatter', 'mode': 'markers', 'name': words, 'x': rounded(begins, _MS),
-            'y': [_row_of(name) for name, *_ in mine], 'legendgroup': words, 'showlegend': True,
-            'marker': {
-                'color': token(colour), 'size': 11, 'symbol': sign,
-                'line': {'color': token('ink'), 'width': 1},
-            },
-            'hovertext': hover, 'hoverinfo': 'text',
-        },
-    ]  # fmt: skip
-
-
-def _events(row: str, times_ns: list[int], hover: list[str], sign: str) -> list[Spec]:
-    if not times_ns:
-        return []
-    return [
-        {
-            'type': 'scatter', 'mode': 'markers', 'name': row, 'showlegend': False,
-            'x': rounded(np.array(times_ns) / 1e6, _MS), 'y': [row] * len(times_ns),
-            'marker': {'color': token('curve'), 'size': 9, 'symbol': sign},
-            'hovertext': hover, 'hoverinfo': 'text',
-        }
-    ]  # fmt: skip
+            lines[-1] = f'{lines[-1]} {word}'.strip()
+    return '<br>'.join(lines)
 
 
 def timeline_figure(history: History) -> Figure:
     """Return alarms by state, diagnoses and new curves over time."""
-    names = _names(history)
-    curves = [c.time_ns for c in history.curves]
-    said = [d.time_ns for d in history.diagnoses]
-    traces = [
-        *_events('new curve', curves, [
-            f'{moment(c.time_ns)}<br>{counted(len(c.u) - 1, "piece")}, error {c.rmse_mw:.2f} MW'
+    said = {
+        'new curve': ('line-ns-open', [
+            (c.time_ns, f'{counted(len(c.u) - 1, "piece")}, error {c.rmse_mw:.2f} MW')
             for c in history.curves
-        ], 'line-ns-open'),
-        *_events('diagnosis', said, [
-            f'{moment(d.time_ns)}<br>{_broken(d.sentence)}' for d in history.diagnoses
-        ], 'star'),
+        ]),
+        'diagnosis': ('star', [(d.time_ns, _broken(d.sentence)) for d in history.diagnoses]),
+    }  # fmt: skip
+    traces = [
+        points(
+            moments([t / 1e6 for t, _ in found]), [row] * len(found), row, 'curve', size=9,
+            showlegend=False, marker={'symbol': sign}, hoverinfo='text',
+            hovertext=[f'{moment(t)}<br>{words}' for t, words in found],
+        )
+        for row, (sign, found) in said.items() if found
     ]  # fmt: skip
     for state in _STATES:
         traces += _bars(history, state)
-    rows = ['new curve'] * bool(curves) + ['diagnosis'] * bool(said) + [_row_of(n) for n in names]
+    names = _names(history)
+    rows = [row for row, (_, found) in said.items() if found] + [_row_of(n) for n in names]
+    room = 0.015 * (history.end_ns - history.start_ns)  # for a sign at either end
+    ends = moments([(history.start_ns - room) / 1e6, (history.end_ns + room) / 1e6])
     layout: Spec = {
-        'xaxis': {
-            'type': 'date', 'title': {'text': 'time (UTC)'},
-            'range': _padded(history),
-        },
+        'xaxis': time_axis(range=ends),
         'yaxis': {
             'type': 'category', 'categoryorder': 'array', 'categoryarray': rows[::-1],
             'range': [-0.6, len(rows) - 0.4], 'fixedrange': True,
@@ -227,15 +298,34 @@ def timeline_figure(history: History) -> Figure:
         'the same time.</b> A bar lasts as long as the alarm is in that state; a sign marks its '
         'beginning, and tells the sentence when pointed at. Where there is no bar, all was normal.'
     )
-    words = f'Time line of {counted(len(names), "alarm")} with {_changes(len(history.alarms))}.'
+    changes = counted(len(history.alarms), 'change')
+    words = f'Time line of {counted(len(names), "alarm")} with {changes}.'
     height = 150 + _ROW * max(2, len(rows))
     return Figure('alarms', caption, words, traces, layout, height=height)
 
 
-def _padded(history: History) -> list[float | None]:
-    """Return the ends of the axis, with room for a sign at either end."""
-    room = 0.015 * (history.end_ns - history.start_ns)
-    return rounded(np.array([history.start_ns - room, history.end_ns + room]) / 1e6, _MS)
+def _bars(history: History, state: AlarmState) -> list[Spec]:
+    words, colour, sign = _STATES[state]
+    mine = [s for s in spans(history) if s[1] is state]
+    if not mine:
+        return []
+    # A gap between two stretches, so that no line joins them.
+    x = moments([t for _, _, a, b, _ in mine for t in (a / 1e6, b / 1e6, np.nan)])
+    y = [cell for name, *_ in mine for cell in (_row_of(name), _row_of(name), None)]
+    hover = [
+        f'{moment(a)}<br>{_row_of(name)}: {words} for {duration((b - a) / 1e9)}'
+        f'<br>{_broken(sentence)}'
+        for name, _, a, b, sentence in mine
+    ]
+    return [
+        line(x, y, words, colour, width=14, legendgroup=words, showlegend=False),
+        points(
+            moments([a / 1e6 for _, _, a, _, _ in mine]), [_row_of(name) for name, *_ in mine],
+            words, colour, size=11, legendgroup=words, showlegend=True, hovertext=hover,
+            marker={'symbol': sign, 'line': {'color': token('ink'), 'width': 1}},
+            hoverinfo='text',
+        ),
+    ]  # fmt: skip
 
 
 def alarms_table(history: History) -> str:
@@ -243,25 +333,15 @@ def alarms_table(history: History) -> str:
     if not history.alarms:
         return ''
     shown = history.alarms[-_MOST:]
-    rows = [_cells(a) for a in shown]
+    rows = [[moment(a.time_ns), _row_of(a.name), _WORDS[a.state], text(a.sentence)] for a in shown]
     stood = standing_s(history)
+    changes = counted(len(shown), 'change')
     told = f'Some alarm stood for {duration(stood)} in all.' if stood else 'No alarm ever stood.'
     if len(history.alarms) > len(shown):
-        told += f' The last {_changes(len(shown))}:'
+        told += f' The last {changes}:'
     body = table(['time', 'alarm', 'state', 'what it said'], rows, sentences=True)
-    what = 'The change' if len(shown) == 1 else f'All {_changes(len(shown))}'
-    return paragraph(told) + f'<details><summary>{what} in words</summary>{body}</details>'
-
-
-def _changes(number: int) -> str:
-    return counted(number, 'change')
-
-
-def _cells(change: AlarmMoment) -> list[str]:
-    return [
-        moment(change.time_ns), _row_of(change.name), _WORDS[change.state],
-        text(change.sentence),
-    ]  # fmt: skip
+    what = 'The change' if len(shown) == 1 else f'All {changes}'
+    return paragraph(told) + folded(f'{what} in words', body)
 
 
 # Colour and sign of each input that is followed: told apart without colours too.
@@ -271,32 +351,11 @@ _LOOKS = (
 )  # fmt: skip
 
 
-def history_sections(history: History | None) -> list[Section]:
-    """Return the parts of the page about a monitor's recording; none for other logs."""
-    if history is None:
-        return []
-    sections = []
-    notes: list[str | Figure] = [notice(text(n)) for n in history.notes]
-    if history.curves:
-        sections.append(Section('How the curve moved', _curves(history)))
-    if history.alarms or history.diagnoses:
-        parts: list[str | Figure] = [
-            paragraph(_alarm_words(history)), timeline_figure(history), alarms_table(history),
-        ]  # fmt: skip
-        sections.append(Section('What the monitor said', parts))
-    if notes:
-        place = sections[-1].parts if sections else []
-        place += notes
-        sections = sections or [Section('What the monitor said', place)]
-    return sections
-
-
 def _curves(history: History) -> list[str | Figure]:
     found = history.curves
-    first, last = found[0], found[-1]
     words = (
-        f'{counted(len(found), "curve")}, the first of {moment(first.time_ns)}, the last of '
-        f'{moment(last.time_ns)}.'
+        f'{counted(len(found), "curve")}, the first of {moment(found[0].time_ns)}, the last of '
+        f'{moment(found[-1].time_ns)}.'
     )
     if len(found) < 2:
         return [paragraph(words)]
@@ -312,8 +371,7 @@ def _curves(history: History) -> list[str | Figure]:
 def followed(history: History) -> FloatArray:
     """Return the inputs whose power is followed: evenly over the range of the last curve."""
     last = history.curves[-1].u
-    inner = np.linspace(float(last[0]), float(last[-1]), len(_LOOKS) + 2)
-    return np.asarray(inner[1:-1])
+    return np.linspace(float(last[0]), float(last[-1]), len(_LOOKS) + 2)[1:-1]
 
 
 def powers(curves: tuple[CurveMoment, ...], u: FloatArray) -> FloatArray:
@@ -334,37 +392,49 @@ def largest_move(history: History) -> tuple[float, float]:
     return float(knots[k]), float(moved[k])
 
 
-def _times(history: History) -> list[float | None]:
-    ends = [c.time_ns for c in history.curves]
-    return rounded(np.array([*ends, max(history.end_ns, ends[-1])]) / 1e6, _MS)
+def curve_history_figure(history: History) -> Figure:
+    """Return the power at fixed inputs, and the breakpoints, from curve to curve."""
+    first, last = history.curves[0], history.curves[-1]
+    layout: Spec = {
+        'xaxis': time_axis(anchor='y2'),
+        'yaxis': axis('power less<br>usual (MW)', domain=[0.5, 1.0]),
+        'yaxis2': axis(f'breakpoints<br>u ({input_unit(last.exponent)})', domain=[0.0, 0.42]),
+        'showlegend': True,
+    }
+    caption = (
+        '<b>Flat lines: the valve is as it was. A step: something happened then. A slope: it '
+        'wears.</b> Above, what each curve gives at five inputs, less the median of all curves '
+        'there; a line begins where the first curve that reaches so far was found. Below, where '
+        'the breakpoints lie, with their 95 % intervals. The first curves rest on few data and '
+        'may jump.'
+    )
+    words = (
+        f'{counted(len(history.curves), "curve")} over '
+        f'{duration((history.end_ns - first.time_ns) / 1e9)}; the last has '
+        f'{counted(len(last.u) - 1, "piece")} from '
+        f'u {plain(float(last.u[0]))} to {plain(float(last.u[-1]))}.'
+    )
+    traces = [*_power_lines(history), _knees(history)]
+    return Figure('history', caption, words, traces, layout, height=560)
 
 
-def _power_lines(history: History, u: FloatArray) -> list[Spec]:
-    values = powers(history.curves, u)
-    with np.errstate(all='ignore'):
-        usual = np.array([_median(column) for column in values.T])
-    times = _times(history)
-    traces: list[Spec] = []
-    for k, (colour, sign) in enumerate(_LOOKS):
-        off = values[:, k] - usual[k]
-        # The last curve holds until the end of the recording.
-        off = np.append(off, off[-1])
-        traces.append(
-            {
-                'type': 'scatter', 'mode': 'lines+markers', 'name': f'u = {u[k]:.0f}',
-                'x': times, 'y': rounded(off, 5),
-                'line': {'color': token(colour), 'width': 1.8, 'shape': 'hv'},
-                'marker': {'color': token(colour), 'size': 7, 'symbol': sign},
-                'hovertemplate': f'%{{x|%d %b %H:%M}}<br>u = {u[k]:.0f}, usual {usual[k]:.1f} MW'
-                '<br>%{y:+.2f} MW<extra></extra>',
-            }
-        )  # fmt: skip
+def _power_lines(history: History) -> list[Spec]:
+    u = followed(history)
+    # The last curve holds until the end of the recording.
+    times = [c.time_ns for c in history.curves]
+    at = moments([t / 1e6 for t in (*times, max(history.end_ns, times[-1]))])
+    traces = []
+    for x, values, (colour, sign) in zip(u, powers(history.curves, u).T, _LOOKS, strict=True):
+        known = values[np.isfinite(values)]
+        usual = float(np.median(known)) if len(known) else float('nan')
+        off = np.append(values, values[-1]) - usual
+        traces.append(line(
+            at, rounded(off), f'u = {x:.0f}', colour,
+            f'{DAY_HOUR}u = {x:.0f}, usual {usual:.1f} MW<br>%{{y:+.2f}} MW<extra></extra>',
+            width=1.8, shape='hv', mode='lines+markers',
+            marker={'color': token(colour), 'size': 7, 'symbol': sign},
+        ))  # fmt: skip
     return traces
-
-
-def _median(values: FloatArray) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else float('nan')
 
 
 def _knees(history: History) -> Spec:
@@ -373,53 +443,9 @@ def _knees(history: History) -> Spec:
         for c in history.curves
         for u, lo, hi in zip(c.u[1:-1], c.low, c.high, strict=True)
     ]
-    time, u, low, high = np.array(rows, dtype=np.float64).reshape(-1, 4).T
-    known = np.isfinite(low) & np.isfinite(high)
-    return {
-        'type': 'scatter', 'mode': 'markers', 'name': 'breakpoints, 95 %', 'yaxis': 'y2',
-        'x': rounded(time, _MS), 'y': rounded(u, 6),
-        'marker': {'color': token('curve'), 'size': 6},
-        'error_y': {
-            'type': 'data', 'symmetric': False, 'color': token('data'), 'thickness': 1.5,
-            'width': 3, 'array': rounded(np.where(known, high - u, 0.0)),
-            'arrayminus': rounded(np.where(known, u - low, 0.0)),
-        },
-        'hovertemplate': '%{x|%d %b %H:%M}<br>breakpoint at u %{y:.0f}<extra></extra>',
-    }  # fmt: skip
-
-
-def curve_history_figure(history: History) -> Figure:
-    """Return the power at fixed inputs, and the breakpoints, from curve to curve."""
-    u = followed(history)
-    unit = input_unit(history.curves[-1].exponent)
-    layout: Spec = {
-        'xaxis': {'type': 'date', 'anchor': 'y2', 'title': {'text': 'time (UTC)'}},
-        'yaxis': {'domain': [0.5, 1.0], 'title': {'text': 'power less<br>usual (MW)'}},
-        'yaxis2': {'domain': [0.0, 0.42], 'title': {'text': f'breakpoints<br>u ({unit})'}},
-        'showlegend': True,
-    }
-    span = duration((history.end_ns - history.curves[0].time_ns) / 1e9)
-    caption = (
-        '<b>Flat lines: the valve is as it was. A step: something happened then. A slope: it '
-        'wears.</b> Above, what each curve gives at five inputs, less the median of all curves '
-        'there; a line begins where the first curve that reaches so far was found. Below, where '
-        'the breakpoints lie, with their 95 % intervals. The first curves rest on few data and '
-        'may jump.'
-    )
-    last = history.curves[-1]
-    words = (
-        f'{counted(len(history.curves), "curve")} over {span}; the last has '
-        f'{counted(len(last.u) - 1, "piece")} from '
-        f'u {plain(float(last.u[0]))} to {plain(float(last.u[-1]))}.'
-    )
-    traces = [*_power_lines(history, u), _knees(history)]
-    return Figure('history', caption, words, traces, layout, height=560)
-
-
-def _alarm_words(history: History) -> str:
-    changes = len(history.alarms)
-    names = len({a.name for a in history.alarms})
-    told = f'{counted(changes, "change")} of {counted(names, "alarm")}'
-    if history.diagnoses:
-        told += f' and {counted(len(history.diagnoses), "diagnosis", "diagnoses")}'
-    return f'{told} from {moment(history.start_ns)} to {moment(history.end_ns)}.'
+    time_ms, u, low, high = np.array(rows, dtype=np.float64).reshape(-1, 4).T
+    return points(
+        moments(time_ms), rounded(u, 6), 'breakpoints, 95 %', 'curve',
+        f'{DAY_HOUR}breakpoint at u %{{y:.0f}}<extra></extra>', yaxis='y2',
+        error_y=error_bars(low, u, high, color=token('data'), thickness=1.5, width=3),
+    )  # fmt: skip

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from valveflow_ros import __version__
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.fit.step_test import RULE
-from valveflow_ros.parameters import PARAMETERS
+from valveflow_ros.parameters import PARAMETERS, Settings
 from valveflow_ros.report.answer import (
     answer_words,
     breakpoints_table,
@@ -25,11 +24,10 @@ from valveflow_ros.report.data import (
     quality_words,
     signals_figure,
 )
-from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.history import history_sections
 from valveflow_ros.report.identified import Identified
-from valveflow_ros.report.page import Page, Section, paragraph, table, text
-from valveflow_ros.report.words import moment, plain
+from valveflow_ros.report.page import Page, Section, bullets, foot, paragraph, table, text, where
+from valveflow_ros.report.words import period, plain
 
 
 def identification_report(data: Identified) -> str:
@@ -43,92 +41,68 @@ def identification_page(data: Identified) -> Page:
     tag = data.settings.text('unit_tag')
     named = tag != PARAMETERS['unit_tag'].default
     title = f'Flow characteristic of {tag}' if named else 'Main steam valve flow characteristic'
-    lead = paragraph(text(data.source), 'where') + paragraph(
-        f'{moment(c.source.window_start_ns)} to {moment(c.source.window_end_ns)} '
-        f'({window_words(c)})',
-        'where',
-    )
+    times = period(c.source.window_start_ns, c.source.window_end_ns)
+    # A picture for which there is nothing to show is left out.
+    evidence = [signals_figure(data), segments_figure(data)]
+    missing = [presence_figure(data), coverage_figure(data)]
     sections = [
-        _answer(data),
+        Section('The answer', [
+            answer_words(data), curve_figure(data), pieces_table(data), breakpoints_table(c),
+        ]),
         *([shift] if (shift := shift_section(data)) else []),
         *history_sections(data.history),
-        _moments(data),
+        Section('The moments that carry it', [f for f in evidence if f]),
         _choice(c),
-        _dynamics(data),
-        _data(data),
-        Section('How it was made', [_settings(data)]),
-    ]
-    foot = (
-        f'Made by valveflow {text(__version__)}. Curve <code>{text(c.model_id)}</code>; the same '
-        'numbers, unrounded, stand in characteristic.json beside this page.'
+        _dynamics(c),
+        Section('The data', [
+            quality_words(data), quality_table(data), *(f for f in missing if f), _read(data),
+        ]),
+        Section('How it was made', [_settings(data.settings)]),
+    ]  # fmt: skip
+    end_of_page = foot(
+        f'Curve <code>{text(c.model_id)}</code>; the same numbers, unrounded, stand in '
+        'characteristic.json beside this page.'
     )
-    return Page(title, lead, sections, foot, 'identify')
-
-
-def _answer(data: Identified) -> Section:
-    c = data.characteristic
-    return Section(
-        'The answer',
-        [answer_words(data), curve_figure(data), pieces_table(data), breakpoints_table(c)],
-    )
-
-
-def _moments(data: Identified) -> Section:
-    rest = segments_figure(data)
-    return Section('The moments that carry it', [signals_figure(data), *([rest] if rest else [])])
+    lead = where(data.source, f'{times} ({window_words(c)})')
+    return Page(title, lead, sections, end_of_page, 'identify')
 
 
 def _choice(c: Characteristic) -> Section:
     """Return why there are so many pieces; without a turning angle there is nothing to draw."""
-    number = max(1, len(c.pieces))
-    if not c.choice.turning_angle and c.choice.rule == RULE:
-        return Section('Why this number of pieces', [paragraph(text(c.choice.note))])
-    return Section(
-        'Why this number of pieces', [choice_figure(c.choice, number), confidence_table(c.choice)]
-    )
+    title, choice = 'Why this number of pieces', c.choice
+    if not choice.turning_angle and choice.rule == RULE:
+        return Section(title, [paragraph(text(choice.note))])
+    return Section(title, [choice_figure(choice, max(1, len(c.pieces))), confidence_table(choice)])
 
 
-def _dynamics(data: Identified) -> Section:
-    dynamics = data.characteristic.dynamics
-    if not dynamics:
-        return Section(
-            'How fast the unit answers',
-            [paragraph('Time constants and delays were not estimated for this curve.')],
-        )
-    return Section(
-        'How fast the unit answers', [dynamics_table(dynamics), dynamics_figure(dynamics)]
-    )
-
-
-def _data(data: Identified) -> Section:
-    parts: list[str | Figure] = [quality_words(data), quality_table(data)]
-    parts += [f for f in (presence_figure(data), coverage_figure(data)) if f is not None]
-    return Section('The data', [*parts, _read(data)])
+def _dynamics(c: Characteristic) -> Section:
+    title = 'How fast the unit answers'
+    if not c.dynamics:
+        none = 'Time constants and delays were not estimated for this curve.'
+        return Section(title, [paragraph(none)])
+    return Section(title, [dynamics_table(c.dynamics), dynamics_figure(c.dynamics)])
 
 
 def _read(data: Identified) -> str:
     c = data.characteristic
-    told = paragraph(text(temperature_words(c)))
-    told += paragraph(
+    told = paragraph(text(temperature_words(c))) + paragraph(
         f'Noise the thresholds stand on, as standard deviation of block means: '
         f'{plain(c.residuals.input_noise, 3)} in u, {plain(c.residuals.power_noise_mw, 3)} MW '
         'in power.'
     )
-    if data.notes:
-        told += '<ul>' + ''.join(f'<li>{text(n)}</li>' for n in data.notes) + '</ul>'
-    return told
+    return told + (bullets(map(text, data.notes)) if data.notes else '')
 
 
-def _settings(data: Identified) -> str:
+def _settings(settings: Settings) -> str:
     """Return the parameters that were not left at their default."""
     rows = [
         [
             text(name),
-            text(_shown(data.settings[name]) + (f' {row.unit}' if row.unit else '')),
+            text(_shown(settings[name]) + (f' {row.unit}' if row.unit else '')),
             text(_shown(row.default)),
         ]
         for name, row in PARAMETERS.items()
-        if data.settings[name] != row.default and not name.startswith('refit_')
+        if settings[name] != row.default and not name.startswith('refit_')
     ]
     if not rows:
         return paragraph('Every parameter has its default value.')
@@ -139,7 +113,5 @@ def _settings(data: Identified) -> str:
 
 def _shown(value: object) -> str:
     if isinstance(value, bool):
-        return 'true' if value else 'false'
-    if isinstance(value, int | float):
-        return f'{value:g}' if isinstance(value, float) else str(value)
-    return str(value)
+        return str(value).lower()
+    return f'{value:g}' if isinstance(value, float) else str(value)

@@ -18,7 +18,6 @@ from valveflow_ros.records import (
     Signal,
     SpecialSegment,
 )
-from valveflow_ros.report.figure import segment_rows
 from valveflow_ros.report.history import History
 from valveflow_ros.signals.units import integrated_input
 
@@ -76,7 +75,9 @@ class Identified:
             self.characteristic.pressure_exponent,
         )
         object.__setattr__(self, 'u', u)
-        rows = segment_rows(self.table.time_ns, list(self.segments))
+        first = np.searchsorted(self.table.time_ns, [s.start_ns for s in self.segments])
+        end = np.searchsorted(self.table.time_ns, [s.end_ns for s in self.segments], 'right')
+        rows = np.column_stack([first, end]).astype(np.int64)
         object.__setattr__(self, 'rows', rows)
         inside = [np.arange(a, b, dtype=np.int64) for a, b in rows.tolist()]
         special = np.concatenate([np.empty(0, dtype=np.int64), *inside])

@@ -6,7 +6,7 @@ import base64
 import functools
 import gzip
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib import resources
@@ -16,8 +16,6 @@ from pathlib import Path
 from valveflow_ros import __version__
 from valveflow_ros.errors import InputError
 from valveflow_ros.report.figure import Figure, without_tags
-
-# The drawing library, packed into the page so that it opens without a network.
 
 
 def read_text(name: str) -> str:
@@ -109,7 +107,22 @@ class Page:
 
     def to_html(self) -> str:
         """Return the whole file, which opens without a network."""
-        return _html(self)
+        body = ''.join(_section(k, s) for k, s in enumerate(self.sections))
+        drawn = ','.join(f'"{f.name}":{f.to_json()}' for f in self.figures)
+        library = f'<script id="library" type="text/plain">{packed_plotly()}</script>'
+        title = text(self.title)
+        return (
+            '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+            f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
+            f'<meta name="generator" content="valveflow {text(self.verb)} {text(__version__)}">'
+            '<meta name="viewport" content="width=device-width, initial-scale=1">'
+            '<meta name="color-scheme" content="light dark">'
+            f'<title>{title}</title><link rel="icon" href="data:,">'
+            f'<style>{read_text("style.css")}</style></head>\n<body><main>'
+            f'<header><h1>{title}</h1>{self.lead}</header>{body}<footer>{self.foot}</footer>'
+            f'</main>\n<script id="figures" type="application/json">{{{drawn}}}</script>\n'
+            f'{library}\n<script>{read_text("page.js")}</script></body></html>\n'
+        )
 
 
 def text(value: object) -> str:
@@ -142,7 +155,8 @@ def table(
     sentences : bool
         Some cells are sentences: the table counts as one of many columns.
     """
-    labels = [label(h) for h in head]
+    # Where no HTML can stand.
+    labels = [without_tags(h).replace('&shy;', '').replace('"', '&quot;') for h in head]
     many = sentences or len(head) > _MANY
 
     def cell(k: int, html: str) -> str:
@@ -168,17 +182,27 @@ def table(
     )
 
 
-def label(html: str) -> str:
-    """Return a column's name for where no HTML can stand."""
-    return without_tags(html).replace('&shy;', '').replace('"', '&quot;')
-
-
 def _breaks(html: str) -> str:
     """Return whether a cell may be broken into lines, as a class: a number never is."""
     signs = len(re.sub(r'<[^>]+>', '', html))
     if signs > _SENTENCE:
         return _WORDS
     return ' class="long"' if signs > _NUMBER else ''
+
+
+def bullets(items: Iterable[str]) -> str:
+    """Return a list of ready HTML."""
+    return '<ul>' + ''.join(f'<li>{item}</li>' for item in items) + '</ul>'
+
+
+def where(*lines: str) -> str:
+    """Return what a page is about, under its title: sources and times, as plain text."""
+    return ''.join(paragraph(text(line), 'where') for line in lines)
+
+
+def foot(rest: str) -> str:
+    """Return the end of a page; ``rest`` is HTML."""
+    return f'Made by valveflow {text(__version__)}. {rest}'
 
 
 def folded(title: str, html: str) -> str:
@@ -189,25 +213,6 @@ def folded(title: str, html: str) -> str:
 def notice(html: str) -> str:
     """Return a paragraph that must not be overlooked."""
     return f'<p class="notice" role="note">{html}</p>'
-
-
-def _html(page: Page) -> str:
-    body = ''.join(_section(k, s) for k, s in enumerate(page.sections))
-    drawn = ','.join(f'"{f.name}":{f.to_json()}' for f in page.figures)
-    library = f'<script id="library" type="text/plain">{packed_plotly()}</script>'
-    title = text(page.title)
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
-        f'<meta name="generator" content="valveflow {text(page.verb)} {text(__version__)}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        '<meta name="color-scheme" content="light dark">'
-        f'<title>{title}</title><link rel="icon" href="data:,">'
-        f'<style>{read_text("style.css")}</style></head>\n<body><main>'
-        f'<header><h1>{title}</h1>{page.lead}</header>{body}<footer>{page.foot}</footer></main>\n'
-        f'<script id="figures" type="application/json">{{{drawn}}}</script>\n'
-        f'{library}\n<script>{read_text("page.js")}</script></body></html>\n'
-    )
 
 
 def _section(number: int, section: Section) -> str:

@@ -3,17 +3,38 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from valveflow_ros import __version__
 from valveflow_ros.baselines.judged import JudgedSegment
 from valveflow_ros.baselines.validation import OTHER, PieceCheck, Validation, Verdict
 from valveflow_ros.records import SegmentKind
-from valveflow_ros.report.figure import Figure, Spec, packed, rounded, token
-from valveflow_ros.report.page import Page, Section, folded, notice, paragraph, table, text
+from valveflow_ros.report.figure import (
+    DAY_HOUR,
+    Figure,
+    Spec,
+    axis,
+    line,
+    packed,
+    points,
+    rounded,
+    time_axis,
+    token,
+)
+from valveflow_ros.report.page import (
+    Page,
+    Section,
+    bullets,
+    folded,
+    foot,
+    notice,
+    paragraph,
+    table,
+    text,
+    where,
+)
 from valveflow_ros.report.words import (
     counted,
     decimals,
@@ -23,86 +44,12 @@ from valveflow_ros.report.words import (
     interval,
     moment,
     percent,
+    period,
     plain,
+    signed,
+    span,
 )
 from valveflow_ros.segments.window import WindowContents
-
-# Where and when measured and predicted power differ.
-
-
-def _markers(v: Validation, by_time: bool) -> list[Spec]:
-    traces: list[Spec] = []
-    looks = ((SegmentKind.STEADY, 'steady', 'steady state'),
-             (SegmentKind.SLOPE, 'slope', 'slope response'))  # fmt: skip
-    at = '%{x|%d %b %H:%M}' if by_time else 'u %{x:.0f}'
-    for kind, colour, name in looks:
-        mine = v.judgement.kinds(kind)
-        if by_time:
-            x: object = packed(np.array([0.5 * (s.start_ns + s.end_ns) / 1e6 for s in mine]))
-        else:
-            x = rounded(np.array([v.trial.u[s.rows].mean() for s in mine]), 6)
-        means = np.array([s.scores[v.judged_by].samples.mean for s in mine])
-        traces.append(
-            {
-                'type': 'scatter', 'mode': 'markers', 'name': name, 'x': x,
-                'y': rounded(means, 4),
-                'marker': {'color': token(colour), 'size': 6, 'opacity': 0.75},
-                'hovertemplate': f'{at}<br>%{{y:+.2f}} MW<extra>{name}</extra>',
-            }
-        )  # fmt: skip
-    return traces
-
-
-def _tolerance(v: Validation) -> list[Spec]:
-    return [
-        {
-            'type': 'rect', 'xref': 'paper', 'yref': 'y', 'x0': 0, 'x1': 1, 'layer': 'below',
-            'y0': -v.tolerance_mw, 'y1': v.tolerance_mw, 'line': {'width': 0},
-            'fillcolor': token('density-0'), 'opacity': 0.6,
-        }
-    ]  # fmt: skip
-
-
-def input_figure(v: Validation) -> Figure:
-    """Return the mean difference of each segment over its input."""
-    checks = [c for c in v.pieces if c.segments]
-    x, y = [], []
-    for c in checks:
-        x += [c.u_from, c.u_to, math.nan]
-        y += [c.test.mean, c.test.mean, math.nan]
-    traces: list[Spec] = [
-        *_markers(v, by_time=False),
-        {
-            'type': 'scatter', 'mode': 'lines', 'name': 'mean of each piece', 'x': rounded(
-                np.array(x), 6
-            ), 'y': rounded(np.array(y), 4), 'line': {'color': token('curve'), 'width': 2.4},
-            'hovertemplate': '%{y:+.2f} MW<extra>mean of the piece</extra>',
-        },
-    ]  # fmt: skip
-    layout = {
-        'xaxis': {'title': input_axis(v.characteristic.pressure_exponent)},
-        'yaxis': {'title': {'text': 'measured − predicted (MW)'}},
-        'shapes': _tolerance(v), 'showlegend': True,
-    }  # fmt: skip
-    caption = (
-        '<b>The points should scatter about zero at every u.</b> Each is the mean of a special '
-        f'segment; the band is ± {v.tolerance_mw:.3g} MW.'
-    )
-    return Figure('by-input', caption, 'Mean difference by input.', traces, layout, 400)
-
-
-def time_figure(v: Validation) -> Figure:
-    """Return the mean difference of each segment over time."""
-    layout = {
-        'xaxis': {'type': 'date', 'title': {'text': 'time (UTC)'}},
-        'yaxis': {'title': {'text': 'measured − predicted (MW)'}},
-        'shapes': _tolerance(v), 'showlegend': True,
-    }  # fmt: skip
-    caption = '<b>A step or a drift here is a change of the plant.</b> The same points over time.'
-    return Figure(
-        'by-time', caption, 'Mean difference over time.', _markers(v, by_time=True), layout, 340
-    )
-
 
 LABELS = {
     'curve': 'curve',
@@ -111,6 +58,10 @@ LABELS = {
     'against.simulated': 'the other, simulated',
 }
 OUTSIDE_FLAG = 0.05  # share of special samples beyond the curve that is worth a warning
+_KINDS = (
+    (SegmentKind.STEADY, 'steady', 'steady state'), (SegmentKind.SLOPE, 'slope', 'slope response'),
+)  # fmt: skip
+_DIFFERENCE = 'measured − predicted (MW)'
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,169 +90,177 @@ class Validated:
 
 def verdict_words(data: Validated) -> list[str]:
     """Return the verdict as sentences."""
-    v = data.result
-    told = [_verdict(v), _counted(v)]
-    if v.gain is not None:
-        told.append(_gain(data))
-    if v.outside_share > OUTSIDE_FLAG:
-        told.append(
-            f'{percent(v.outside_share, 2)} of the special samples lie beyond the ends of the '
-            'curve, where nothing is known; they were not judged.'
-        )
-    blind = [c for c in v.pieces if not c.segments]
-    if blind:
-        ranges = ', '.join(f'{decimals(c.u_from, 0)} to {decimals(c.u_to, 0)}' for c in blind)
-        told.append(f'No special segment lies at u from {ranges}: nothing is said of that.')
-    return told
-
-
-def _verdict(v: Validation) -> str:
-    tolerance = f'{v.tolerance_mw:.3g} MW'
-    mean = (
-        f'over all segments the power is {_signed(v.overall.test.mean)} MW from what it predicts '
-        f'({interval(v.overall.low_mw, v.overall.high_mw)} MW with 95 % confidence)'
-    )
-    if v.verdict is Verdict.HOLDS:
-        return f'The characteristic holds: {mean}, and on each piece surely within {tolerance}.'
-    if v.verdict is Verdict.OFF:
-        off = [c for c in (v.overall, *v.pieces) if _beyond(c, v.tolerance_mw)]
-        worst = max(off, key=lambda c: abs(c.test.mean))
-        return (
-            f'The characteristic is off: at u from {decimals(worst.u_from, 0)} to '
-            f'{decimals(worst.u_to, 0)} the power is {_signed(worst.test.mean)} MW from what it '
-            f'predicts ({interval(worst.low_mw, worst.high_mw)} MW with 95 % confidence), more '
-            f'than the {tolerance} that are let pass.'
-        )
-    real = '; the difference is real' if v.overall.test.zero_is_rejected() else ''
-    return (
-        f'Whether the characteristic holds stays open: {mean}{real}. {_unsettled(v)} it cannot be '
-        f'told whether the difference is within {tolerance} or beyond. A longer log, with every '
-        'load in it, would help.'
-    )
-
-
-def _unsettled(v: Validation) -> str:
-    """Name the pieces that leave the verdict open."""
-    open_ones = [
-        str(k) for k, c in enumerate(v.pieces, 1) if c.segments and not _within(c, v.tolerance_mw)
-    ]
-    if not open_ones:
-        return 'For the mean over all segments'
-    *most, last = open_ones
-    return f'For pieces {", ".join(most)} and {last}' if most else f'For piece {last}'
-
-
-def _within(check: PieceCheck, tolerance_mw: float) -> bool:
-    return -tolerance_mw <= check.low_mw and check.high_mw <= tolerance_mw
-
-
-def _beyond(check: PieceCheck, tolerance_mw: float) -> bool:
-    return check.low_mw > tolerance_mw or check.high_mw < -tolerance_mw
-
-
-def _signed(value: float) -> str:
-    return ('+' if value > 0.0 else '') + decimals(value, 2)
-
-
-def _counted(v: Validation) -> str:
-    j = v.judgement
-    steady, slope = (len(j.kinds(k)) for k in (SegmentKind.STEADY, SegmentKind.SLOPE))
+    v, j = data.result, data.result.judgement
+    steady, slope = (len(j.kinds(kind)) for kind, _, _ in _KINDS)
     each, _ = j.passed(v.judged_by, as_paper=True)
     worth, tested = j.passed(v.judged_by, as_paper=False)
-    return (
+    told = [
+        _verdict(v),
         f'{counted(steady, "steady-state segment")} and '
         f'{counted(slope, "slope-response segment")} were judged; mean squared error '
         f'{plain(j.mse(v.judged_by))} MW². A mean difference of zero stands in {worth} of '
         f'{tested} segments (one independent value takes '
         f'{duration(j.widening * v.trial.step_s)}), and in {each} if each sample is counted, '
-        'as the paper does.'
-    )
+        'as the paper does.',
+    ]
+    if v.gain is not None:
+        theirs = OTHER + ('simulated' if OTHER + 'simulated' in v.predictions else 'curve')
+        better = f'{data.model if v.gain.mean > 0.0 else data.other} is better.'
+        told.append(
+            f'{data.other} has a mean squared error of {plain(j.mse(theirs))} MW² there, '
+            f'against {plain(j.mse(v.judged_by))} MW² of {data.model}: '
+            + (better if v.gain.zero_is_rejected() else 'the two cannot be told apart.')
+        )
+    if v.outside_share > OUTSIDE_FLAG:
+        told.append(
+            f'{percent(v.outside_share, 2)} of the special samples lie beyond the ends of the '
+            'curve, where nothing is known; they were not judged.'
+        )
+    if blind := [span(c.u_from, c.u_to) for c in v.pieces if not c.segments]:
+        told.append(f'No special segment lies at u from {", ".join(blind)}: nothing is said of '
+                    'that.')  # fmt: skip
+    return told
 
 
-def _gain(data: Validated) -> str:
-    v = data.result
-    assert v.gain is not None
-    theirs = OTHER + ('simulated' if OTHER + 'simulated' in v.predictions else 'curve')
-    told = (
-        f'{data.other} has a mean squared error of {plain(v.judgement.mse(theirs))} MW² there, '
-        f'against {plain(v.judgement.mse(v.judged_by))} MW² of {data.model}: '
+def _verdict(v: Validation) -> str:
+    def differs(check: PieceCheck) -> str:
+        return (
+            f'the power is {signed(check.test.mean, 2)} MW from what it predicts '
+            f'({interval(check.low_mw, check.high_mw)} MW with 95 % confidence)'
+        )
+
+    tolerance = f'{v.tolerance_mw:.3g} MW'
+    mean = f'over all segments {differs(v.overall)}'
+    if v.verdict is Verdict.HOLDS:
+        return f'The characteristic holds: {mean}, and on each piece surely within {tolerance}.'
+    if v.verdict is Verdict.OFF:
+        off = [c for c in (v.overall, *v.pieces) if c.beyond(v.tolerance_mw)]
+        worst = max(off, key=lambda c: abs(c.test.mean))
+        return (
+            f'The characteristic is off: at u from {span(worst.u_from, worst.u_to)} '
+            f'{differs(worst)}, more than the {tolerance} that are let pass.'
+        )
+    real = '; the difference is real' if v.overall.test.zero_is_rejected() else ''
+    which = 'For the mean over all segments'
+    # The pieces that leave the verdict open.
+    if unsettled := [
+        str(k) for k, c in enumerate(v.pieces, 1) if c.segments and not c.within(v.tolerance_mw)
+    ]:
+        *most, last = unsettled
+        which = f'For pieces {", ".join(most)} and {last}' if most else f'For piece {last}'
+    return (
+        f'Whether the characteristic holds stays open: {mean}{real}. {which} it cannot be '
+        f'told whether the difference is within {tolerance} or beyond. A longer log, with every '
+        'load in it, would help.'
     )
-    if not v.gain.zero_is_rejected():
-        return told + 'the two cannot be told apart.'
-    better = data.model if v.gain.mean > 0.0 else data.other
-    return told + f'{better} is better.'
 
 
 def validation_page(data: Validated) -> Page:
     """Return the report: the verdict and where it comes from, then the evidence."""
     v = data.result
     first, *rest = verdict_words(data)
-    lead = paragraph(text(f'{data.model}, held against {data.source}'), 'where') + paragraph(
-        f'{moment(int(data.contents.time_ns[0]))} to {moment(int(data.contents.time_ns[-1]))}',
-        'where',
-    )
+    flag = v.outside_share > OUTSIDE_FLAG
     sections = [
-        Section(
-            'The verdict',
-            [
-                paragraph(text(first), 'answer'),
-                *(_told(sentence, v) for sentence in rest),
-                notice(text(data.held)) if data.held else '',
-                input_figure(v),
-                pieces_table(v),
-            ],
-        ),
+        Section('The verdict', [
+            paragraph(text(first), 'answer'),
+            *(notice(text(s)) if flag and 'beyond the ends' in s else paragraph(text(s))
+              for s in rest),
+            notice(text(data.held)) if data.held else '',
+            input_figure(v),
+            pieces_table(v),
+        ]),
         Section('When it differs', [time_figure(v)]),
         Section('Predictions', [totals_table(v), segments_table(v)]),
-    ]
+    ]  # fmt: skip
     if data.notes:
-        notes = '<ul>' + ''.join(f'<li>{text(n)}</li>' for n in data.notes) + '</ul>'
-        sections.append(Section('How the data were read', [notes]))
-    foot = (
-        f'Made by valveflow {text(__version__)}. Curve <code>{text(v.characteristic.model_id)}'
-        '</code>; the same numbers, unrounded, stand in validation.json and segments.csv.'
+        sections.append(Section('How the data were read', [bullets(map(text, data.notes))]))
+    end = foot(
+        f'Curve <code>{text(v.characteristic.model_id)}</code>; the same numbers, unrounded, '
+        'stand in validation.json and segments.csv.'
     )
-    return Page('Does the flow characteristic hold?', lead, sections, foot, 'validate')
+    times = data.contents.time_ns
+    lead = where(
+        f'{data.model}, held against {data.source}',
+        period(times[0], times[-1]),
+    )
+    return Page('Does the flow characteristic hold?', lead, sections, end, 'validate')
 
 
-def _told(sentence: str, v: Validation) -> str:
-    flagged = v.outside_share > OUTSIDE_FLAG and 'beyond the ends' in sentence
-    return notice(text(sentence)) if flagged else paragraph(text(sentence))
+def _markers(v: Validation, by_time: bool) -> list[Spec]:
+    traces = []
+    for kind, colour, name in _KINDS:
+        mine = v.judgement.kinds(kind)
+        means = [s.scores[v.judged_by].samples.mean for s in mine]
+        x: Any = rounded([float(v.trial.u[s.rows].mean()) for s in mine], 6)
+        if by_time:
+            x = packed(np.array([0.5 * (s.start_ns + s.end_ns) / 1e6 for s in mine]))
+        at = DAY_HOUR if by_time else 'u %{x:.0f}<br>'
+        traces.append(points(
+            x, rounded(means, 4), name, colour, f'{at}%{{y:+.2f}} MW<extra>{name}</extra>',
+            marker={'opacity': 0.75},
+        ))  # fmt: skip
+    return traces
+
+
+def _layout(v: Validation, across: Spec) -> Spec:
+    """Return the layout of a picture of differences, with the tolerance as a band."""
+    tolerance = {
+        'type': 'rect', 'xref': 'paper', 'yref': 'y', 'x0': 0, 'x1': 1, 'layer': 'below',
+        'y0': -v.tolerance_mw, 'y1': v.tolerance_mw, 'line': {'width': 0},
+        'fillcolor': token('density-0'), 'opacity': 0.6,
+    }  # fmt: skip
+    return {'xaxis': across, 'yaxis': axis(_DIFFERENCE), 'shapes': [tolerance],
+            'showlegend': True}  # fmt: skip
+
+
+def input_figure(v: Validation) -> Figure:
+    """Return the mean difference of each segment over its input."""
+    checks = [c for c in v.pieces if c.segments]
+    x = [u for c in checks for u in (c.u_from, c.u_to, math.nan)]
+    y = [mw for c in checks for mw in (c.test.mean, c.test.mean, math.nan)]
+    traces = [
+        *_markers(v, by_time=False),
+        line(rounded(x, 6), rounded(y, 4), 'mean of each piece', 'curve',
+             '%{y:+.2f} MW<extra>mean of the piece</extra>', width=2.4),
+    ]  # fmt: skip
+    caption = (
+        '<b>The points should scatter about zero at every u.</b> Each is the mean of a special '
+        f'segment; the band is ± {v.tolerance_mw:.3g} MW.'
+    )
+    layout = _layout(v, axis(input_axis(v.characteristic.pressure_exponent)))
+    return Figure('by-input', caption, 'Mean difference by input.', traces, layout, 400)
+
+
+def time_figure(v: Validation) -> Figure:
+    """Return the mean difference of each segment over time."""
+    caption = '<b>A step or a drift here is a change of the plant.</b> The same points over time.'
+    traces, layout = _markers(v, by_time=True), _layout(v, time_axis())
+    return Figure('by-time', caption, 'Mean difference over time.', traces, layout, 340)
 
 
 def pieces_table(v: Validation) -> str:
     """Return the mean difference overall and on each piece."""
-    rows = []
-    for k, check in enumerate((v.overall, *v.pieces)):
-        mean = _signed(check.test.mean) if math.isfinite(check.test.mean) else '–'
-        rows.append(
-            [
-                'all' if k == 0 else f'piece {k}',
-                f'{decimals(check.u_from, 0)} to {decimals(check.u_to, 0)}',
-                str(check.segments),
-                mean,
-                interval(check.low_mw, check.high_mw),
-                decimals(check.test.effective, 0) if check.segments else '–',
-            ]
-        )
+    rows = [
+        [
+            f'piece {k}' if k else 'all', span(check.u_from, check.u_to), str(check.segments),
+            signed(check.test.mean, 2) if math.isfinite(check.test.mean) else '–',
+            interval(check.low_mw, check.high_mw),
+            decimals(check.test.effective, 0) if check.segments else '–',
+        ]
+        for k, check in enumerate((v.overall, *v.pieces))
+    ]  # fmt: skip
     head = [
-        '', f'u ({input_unit(v.characteristic.pressure_exponent)})', 'segments',
-        'measured − predicted (MW)', '95 % (MW)', 'independent segments',
+        '', f'u ({input_unit(v.characteristic.pressure_exponent)})', 'segments', _DIFFERENCE,
+        '95 % (MW)', 'independent segments',
     ]  # fmt: skip
     return table(head, rows)
 
 
 def totals_table(v: Validation) -> str:
     """Return mean squared errors by kind of segment."""
-    j = v.judgement
+    j, kinds = v.judgement, (None, SegmentKind.STEADY, SegmentKind.SLOPE)
     rows = [
-        [
-            text(LABELS[name]),
-            *(
-                plain(j.mse(name, k)) if j.kinds(k) else '–'
-                for k in (None, SegmentKind.STEADY, SegmentKind.SLOPE)
-            ),
-        ]
+        [text(LABELS[name]), *(plain(j.mse(name, k)) if j.kinds(k) else '–' for k in kinds)]
         for name in v.predictions
     ]
     return table(['prediction', 'all (MW²)', 'steady (MW²)', 'slope (MW²)'], rows)
@@ -314,22 +273,18 @@ def segments_table(v: Validation, most: int = 40) -> str:
         t = s.scores[v.judged_by].effective.t
         return abs(t) if math.isfinite(t) else 0.0
 
-    shown: Sequence[JudgedSegment] = sorted(v.judgement.segments, key=size, reverse=True)[:most]
     rows = []
-    for s in shown:
+    for s in sorted(v.judgement.segments, key=size, reverse=True)[:most]:
         score = s.scores[v.judged_by]
-        rows.append(
-            [
-                f'{s.kind.name.lower()} {s.number}', moment(s.start_ns)[:16], str(len(s.rows)),
-                decimals(s.power_mw, 0), plain(score.mse_mw2), _signed(score.samples.mean),
-                plain(score.samples.t, 2), plain(score.effective.t, 2),
-                decimals(score.effective.effective, 1),
-            ]
-        )  # fmt: skip
+        rows.append([
+            f'{s.kind.name.lower()} {s.number}', moment(s.start_ns)[:16], str(len(s.rows)),
+            decimals(s.power_mw, 0), plain(score.mse_mw2), signed(score.samples.mean, 2),
+            plain(score.samples.t, 2), plain(score.effective.t, 2),
+            decimals(score.effective.effective, 1),
+        ])  # fmt: skip
     head = [
-        'segment', 'from', 'samples', 'MW', 'mean squared error (MW²)',
-        'measured − predicted (MW)', 't, each sample', 't, correlation counted',
-        'independent values',
+        'segment', 'from', 'samples', 'MW', 'mean squared error (MW²)', _DIFFERENCE,
+        't, each sample', 't, correlation counted', 'independent values',
     ]  # fmt: skip
     many = counted(len(rows), 'segment')
     which = f'The {many} that differ most' if len(rows) < len(v.judgement.segments) else many

@@ -1,4 +1,4 @@
-"""Words and units that several parts of the report share."""
+"""Numbers, times and units as people read them: rounded by what they are worth."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from fractions import Fraction
 
 from valveflow_ros.curve.characteristic import HeldCause
 from valveflow_ros.records import NS_PER_S
-
-# Numbers as people read them: rounded by what they are worth, with their unit.
 
 UNKNOWN = 'unknown'
 _MINUS = '−'
@@ -43,6 +41,19 @@ def decimals(value: float, places: int) -> str:
     return text.replace('-', _MINUS)
 
 
+def signed(value: float, places: int = 1) -> str:
+    """Write a number with its sign and a fixed number of decimals."""
+    text = decimals(value, places)
+    return f'+{text}' if value > 0.0 and float(f'{value:.{places}f}') else text
+
+
+def p_value(value: float) -> str:
+    """Write the p value of a test: 'p = 0.03', 'p < 0.0001', 'not tested'."""
+    if not math.isfinite(value):
+        return 'not tested'
+    return 'p < 0.0001' if value < 1e-4 else f'p = {plain(value, 2)}'
+
+
 def places_for(error: float, digits: int = 2) -> int:
     """Return the decimals at which an error shows ``digits`` significant digits."""
     if not math.isfinite(error) or error <= 0.0:
@@ -70,6 +81,11 @@ def interval(low: float, high: float) -> str:
         return UNKNOWN
     places = places_for(high - low)
     return f'{decimals(low, places)} to {decimals(high, places)}'
+
+
+def span(low: float, high: float, places: int = 0) -> str:
+    """Write 'low to high' with a fixed number of decimals."""
+    return f'{decimals(float(low), places)} to {decimals(float(high), places)}'
 
 
 def count(value: int) -> str:
@@ -122,7 +138,9 @@ def moment(time_ns: int) -> str:
     return f'{at:%Y-%m-%d %H:%M:%S} UTC'
 
 
-_DATED = ('t0_days',)  # parameters that are moments
+def period(start_ns: int, end_ns: int) -> str:
+    """Write two times as 'from to'."""
+    return f'{moment(int(start_ns))} to {moment(int(end_ns))}'
 
 
 def exponent(value: float) -> str:
@@ -146,14 +164,10 @@ def input_unit_plain(value: float) -> str:
     return f'% MPa^({power})' if '/' in power else f'% MPa^{power}'
 
 
-def input_title(value: float) -> str:
-    """Return the title of an axis of u as HTML."""
-    return f'integrated input u = V p<sup>{exponent(value)}</sup> ({input_unit(value)})'
-
-
 def input_axis(value: float) -> dict[str, str]:
     """Return the title of an axis of u, and a short one for narrow pictures, as HTML."""
-    return {'text': input_title(value), 'short': f'u ({input_unit(value)})'}
+    long = f'integrated input u = V p<sup>{exponent(value)}</sup> ({input_unit(value)})'
+    return {'text': long, 'short': f'u ({input_unit(value)})'}
 
 
 # Causes whose change is counted from the mean of the record, see `diagnosis.causes`.
@@ -167,7 +181,9 @@ def held_words(held: tuple[HeldCause, ...]) -> str:
     """Say which causes were taken out of the rows; nothing where none were."""
     if not held:
         return ''
-    names = ', '.join(_held(h) for h in held)
+    # When a cause began stands as a date in its sentence; a number of days says nothing.
+    told = [(h, ', '.join(f'{n} = {v:.4g}' for n, v in h.values if n != 't0_days')) for h in held]
+    names = ', '.join(f'{h.name} ({values})' if values else h.name for h, values in told)
     if any(h.name in _FROM_THE_MEAN for h in held):
         curve = (
             'What changes with time is counted from its mean over the record it was found in: the '
@@ -179,9 +195,3 @@ def held_words(held: tuple[HeldCause, ...]) -> str:
         f'Held, and taken out of opening and power before anything else: {names}. {curve}'
         + ' '.join(h.sentence for h in held)
     )
-
-
-def _held(h: HeldCause) -> str:
-    # When a cause began stands as a date in its sentence; a number of days says nothing.
-    values = ', '.join(f'{n} = {value:.4g}' for n, value in h.values if n not in _DATED)
-    return f'{h.name} ({values})' if values else h.name

@@ -1,4 +1,4 @@
-"""Keeps what a terminal view needs of a monitor's messages, and no more than that."""
+"""The messages of a monitor decoded, and what a terminal view keeps of them."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ PREDICTION = 'valveflow_msgs/msg/Prediction'
 ALARM = 'valveflow_msgs/msg/Alarm'
 DIAGNOSIS = 'valveflow_msgs/msg/Diagnosis'
 HEALTH = 'diagnostic_msgs/msg/DiagnosticArray'
+MESSAGES = (CURVE, PREDICTION, ALARM, DIAGNOSIS)
 AGE = 'Age of the curve (s)'
 # A quarter of an hour at one sample a second: more than fits on any terminal.
 KEPT = 900
@@ -57,23 +58,30 @@ class Board:
 
     def take(self, type_name: str, fields: Fields) -> None:
         """Take a message; one of another type changes nothing."""
-        if type_name == PREDICTION:
-            self._sample(fields)
-        elif type_name == CURVE:
-            self._head(fields)
-            self._curve = _curve(fields)
-            self.at(self._curve.window[1])
-        elif type_name == ALARM:
-            self._alarm(fields)
-        elif type_name == DIAGNOSIS:
-            self._head(fields)
-            self._diagnosis = DiagnosisView(
-                int(fields['verdict']), str(fields['sentence']).strip(),
-                tuple(str(cause['name']) for cause in fields['causes']),
-                stamp_ns(fields['header']['stamp']),
-            )  # fmt: skip
-        elif type_name == HEALTH:
+        if type_name == HEALTH:
             self._health(fields)
+        elif type_name in MESSAGES:
+            time_ns, view = decoded(type_name, fields)
+            self._tag = str(fields['header']['frame_id'])
+            if self._health_tag not in (None, self._tag):
+                # It came before it was known which monitor of several this is.
+                self.inputs, self.recorder, self._health_tag = (), None, None
+            self._unit = self._tag or self._unit
+            if isinstance(view, SampleView):
+                if time_ns < self._now_ns and self._samples:
+                    # The clock went back: what was drawn before does not belong beside it.
+                    self._samples.clear()
+                # An alarm is never later than the sample that brought it.
+                self._now_ns = time_ns
+                self._samples.append(view)
+            elif isinstance(view, CurveView):
+                self._curve = view
+                self.at(view.window[1])
+            elif isinstance(view, AlarmView):
+                self._alarms[view.name] = view
+                self.at(time_ns)
+            else:
+                self._diagnosis = view
 
     def frame(self, source: str, note: str = '') -> Frame:
         """Return what is known now."""
@@ -85,41 +93,8 @@ class Board:
         )  # fmt: skip
 
     def at(self, time_ns: int) -> None:
-        """Take note of the plant's time where no prediction tells it."""
+        """Set the plant's time where no prediction tells it."""
         self._now_ns = max(self._now_ns, time_ns)
-
-    def _head(self, fields: Fields) -> int:
-        self._tag = str(fields['header']['frame_id'])
-        if self._health_tag not in (None, self._tag):
-            # It came before it was known which monitor of several this is.
-            self.inputs, self.recorder, self._health_tag = (), None, None
-        self._unit = self._tag or self._unit
-        return stamp_ns(fields['header']['stamp'])
-
-    def _sample(self, fields: Fields) -> None:
-        time_ns = self._head(fields)
-        if time_ns < self._now_ns and self._samples:
-            # The clock went back: what was drawn before does not belong beside it.
-            self._samples.clear()
-        # An alarm is never later than the sample that brought it.
-        self._now_ns = time_ns
-        measured, residual = float(fields['measured_mw']), float(fields['residual_mw'])
-        expected = measured - residual
-        self._samples.append(
-            SampleView(
-                time_ns, int(fields['state']), float(fields['integrated_input']), measured,
-                residual, float(fields['average_mw']), float(fields['limit_low_mw']) - expected,
-                float(fields['limit_high_mw']) - expected,
-                float(fields.get('alarm_evidence', math.nan)),
-            )
-        )  # fmt: skip
-
-    def _alarm(self, fields: Fields) -> None:
-        self.at(self._head(fields))
-        name = str(fields['name'])
-        self._alarms[name] = AlarmView(
-            name, int(fields['state']), str(fields['sentence']).strip(), stamp_ns(fields['raised'])
-        )
 
     def _health(self, fields: Fields) -> None:
         ours = [s for s in fields['status'] if str(s['name']).startswith('valveflow: ')]
@@ -141,20 +116,48 @@ class Board:
             self.at(self._curve.window[1] + _age_ns(fit))
 
 
-def stamp_ns(stamp: Fields) -> int:
-    """Return a message's stamp in ns since the epoch."""
-    return int(stamp['sec']) * NS_PER_S + int(stamp['nanosec'])
+def decoded(
+    type_name: str, fields: Fields
+) -> tuple[int, CurveView | SampleView | AlarmView | DiagnosisView]:
+    """Return a message of one of `MESSAGES`: its stamp in ns, and what it says.
 
-
-def _curve(fields: Fields) -> CurveView:
-    return CurveView(
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        A field is missing, or holds something else.
+    """
+    time_ns = _ns(fields['header']['stamp'])
+    if type_name == PREDICTION:
+        measured, residual = float(fields['measured_mw']), float(fields['residual_mw'])
+        expected = measured - residual
+        return time_ns, SampleView(
+            time_ns, int(fields['state']), float(fields['integrated_input']), measured,
+            residual, float(fields['average_mw']), float(fields['limit_low_mw']) - expected,
+            float(fields['limit_high_mw']) - expected,
+            float(fields.get('alarm_evidence', math.nan)),
+        )  # fmt: skip
+    if type_name == ALARM:
+        return time_ns, AlarmView(
+            str(fields['name']), int(fields['state']), str(fields['sentence']).strip(),
+            _ns(fields['raised']), int(fields.get('previous_state', -1)),
+        )  # fmt: skip
+    if type_name == DIAGNOSIS:
+        causes = tuple(str(cause['name']) for cause in fields['causes'])
+        said = str(fields['sentence']).strip()
+        return time_ns, DiagnosisView(int(fields['verdict']), said, causes, time_ns)
+    return time_ns, CurveView(
         _floats(fields['breakpoints']), _floats(fields['values']), int(fields['status']),
         str(fields['cause']).strip(), str(fields['model_id']),
-        (stamp_ns(fields['window_start']), stamp_ns(fields['window_end'])),
+        (_ns(fields['window_start']), _ns(fields['window_end'])),
         int(fields['samples']), float(fields['rmse_mw']),
         str(fields.get('shift_sentence', '')).strip(),
         float(fields.get('pressure_exponent', math.nan)),
+        _floats(fields.get('breakpoint_low', ())), _floats(fields.get('breakpoint_high', ())),
     )  # fmt: skip
+
+
+def _ns(stamp: Fields) -> int:
+    return int(stamp['sec']) * NS_PER_S + int(stamp['nanosec'])
 
 
 def _floats(values: Iterable[Any]) -> tuple[float, ...]:

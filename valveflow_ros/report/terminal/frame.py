@@ -1,12 +1,12 @@
-"""What the terminal view shows at one moment, as plain records."""
+"""What the terminal view shows at one moment: plain records, and the sentences for them."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from valveflow_ros.records import NS_PER_S
-from valveflow_ros.report.words import counted, decimals, duration, moment
+from valveflow_ros.report.words import counted, decimals, duration, moment, signed
 
 # The words of the messages' numbers, as a person says them.
 CURVE_STATES = ('no curve yet', 'fresh', 'stale', 'refused')
@@ -54,6 +54,8 @@ class CurveView:
         The judgement against the reference; empty: none.
     exponent : float
         The m of u = V p^m; NaN: not told.
+    low, high : tuple of float
+        Where the inner breakpoints lie with 95 % confidence; empty or NaN: not told.
     """
 
     breakpoints: tuple[float, ...]
@@ -66,6 +68,8 @@ class CurveView:
     rmse_mw: float
     shift: str
     exponent: float = math.nan
+    low: tuple[float, ...] = field(default=(), compare=False)
+    high: tuple[float, ...] = field(default=(), compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,16 +101,20 @@ class SampleView:
 
 @dataclass(frozen=True, slots=True)
 class AlarmView:
-    """One alarm: its name, its place in `ALARM_STATES`, what it says, since when (0: never)."""
+    """One alarm: its name, its place in `ALARM_STATES`, what it says, since when (0: never).
+
+    ``previous`` is the state before; -1: not told.
+    """
 
     name: str
     state: int
     sentence: str
     raised_ns: int
+    previous: int = field(default=-1, compare=False)
 
     @property
     def standing(self) -> bool:
-        """Tell whether somebody has to know of it."""
+        """Return True if somebody has to know of it."""
         return self.state != NORMAL
 
 
@@ -158,15 +166,12 @@ class Frame:
     diagnosis: DiagnosisView | None = None
 
 
-def word(words: tuple[str, ...], number: int) -> str:
+def _word(words: tuple[str, ...], number: int) -> str:
     """Return the word for a number of a message; one of a later version is said as it is."""
     return words[number] if 0 <= number < len(words) else f'state {number}'
 
 
-# The sentences of a terminal view.
-
-
-# A word and its tone, see `terminal_text`.
+# A sentence and its tone, one of `text.TONES` or '' for plain.
 Said = tuple[str, str]
 NONE_YET = 'None yet.'
 _SHORT = {
@@ -187,7 +192,7 @@ def curve_words(curve: CurveView | None, now_ns: int) -> Said:
         return curve.cause or NONE_YET, 'warn'
     first, last = curve.window
     told = [
-        f'{word(CURVE_STATES, curve.state)}, {counted(len(curve.breakpoints) - 1, "piece")}',
+        f'{_word(CURVE_STATES, curve.state)}, {counted(len(curve.breakpoints) - 1, "piece")}',
         f'{counted(curve.samples, "sample")} of {duration((last - first) / NS_PER_S)} '
         f'until {moment(last).removesuffix(" UTC")[:-3]}',
     ]
@@ -205,7 +210,7 @@ def sample_words(sample: SampleView | None) -> Said:
     """Say how the last sample lies to the curve."""
     if sample is None:
         return NONE_YET, 'dim'
-    state = word(SAMPLE_STATES, sample.state)
+    state = _word(SAMPLE_STATES, sample.state)
     if not math.isfinite(sample.residual_mw):
         return f'{state}.', 'bad' if sample.state == BAD_DATA else 'dim'
     text = f'{signed(sample.residual_mw)} MW ({state})'
@@ -225,7 +230,7 @@ def alarm_words(alarm: AlarmView) -> Said:
     if not (alarm.standing and alarm.raised_ns):
         raised = ''
     tone = {UNACKNOWLEDGED: 'bad', ACKNOWLEDGED: 'bad'}.get(alarm.state, 'warn')
-    text = f'{alarm.name}: {word(ALARM_STATES, alarm.state)}{raised}. {alarm.sentence}'
+    text = f'{alarm.name}: {_word(ALARM_STATES, alarm.state)}{raised}. {alarm.sentence}'
     return text, tone
 
 
@@ -247,16 +252,16 @@ def inputs_words(frame: Frame) -> list[Said]:
         if item.level != OK:
             groups.setdefault((item.level, item.sentence), []).append(item.name)
     wrong = [
-        (f'{", ".join(map(short, names))}: {sentence}', _TONES.get(level, 'bad'))
+        (f'{", ".join(map(_short, names))}: {sentence}', _TONES.get(level, 'bad'))
         for (level, sentence), names in groups.items()
     ]
-    fine = [f'{short(i.name)} {i.sentence.rstrip(".")}' for i in frame.inputs if i.level == OK]
+    fine = [f'{_short(i.name)} {i.sentence.rstrip(".")}' for i in frame.inputs if i.level == OK]
     return [*wrong, *([(', '.join(fine), '')] if fine else [])]
 
 
 def health_words(item: HealthView) -> Said:
     """Say how one thing is."""
-    return f'{short(item.name)}: {item.sentence}', _TONES.get(item.level, 'bad')
+    return f'{_short(item.name)}: {item.sentence}', _TONES.get(item.level, 'bad')
 
 
 def recorder_words(frame: Frame) -> Said:
@@ -274,16 +279,10 @@ def diagnosis_words(diagnosis: DiagnosisView | None) -> Said:
         return diagnosis.sentence, 'dim'
     names = f' ({", ".join(diagnosis.causes)})' if diagnosis.causes else ''
     until = f' in the data until {moment(diagnosis.until_ns)[:16]}' if diagnosis.until_ns else ''
-    text = f'{word(VERDICTS, diagnosis.verdict)}{names}{until}. {diagnosis.sentence}'
+    text = f'{_word(VERDICTS, diagnosis.verdict)}{names}{until}. {diagnosis.sentence}'
     return text, 'warn' if diagnosis.verdict in (2, 3) else ''
 
 
-def short(name: str) -> str:
+def _short(name: str) -> str:
     """Return a signal's name as it is said in a narrow place."""
     return _SHORT.get(name, name)
-
-
-def signed(value: float, places: int = 1) -> str:
-    """Write a number with its sign."""
-    text = decimals(value, places)
-    return f'+{text}' if value > 0.0 and float(f'{value:.{places}f}') else text

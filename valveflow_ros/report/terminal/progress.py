@@ -1,4 +1,4 @@
-"""Shows how far long work has come: a bar on a terminal, a line now and then anywhere else."""
+"""Progress of long work: a bar on a terminal, a line now and then anywhere else."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import threading
 import time
 from collections.abc import Callable
 from typing import TextIO
+
+from valveflow_ros.report.words import duration
 
 _BAR = 20
 _REDRAW_S = 0.1
@@ -26,8 +28,8 @@ class Progress:
     err : text stream
     bar : bool
         Draw a bar; else write lines, few of them.
-    pace : callable, optional
-        Turns the share that is told, and what is done, into a share of the time.
+    share_of_time : callable, optional
+        Turns the share of the work that is told, and what is done, into a share of the time.
     clock : callable
         Time in s that never goes back.
     """
@@ -36,12 +38,13 @@ class Progress:
         self,
         err: TextIO,
         bar: bool,
-        pace: Callable[[float, str], float] = lambda share, _what: share,
+        share_of_time: Callable[[float, str], float] = lambda share, _what: share,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._err, self._bar, self._pace, self._clock = err, bar, pace, clock
+        self._err, self._bar, self._clock = err, bar, clock
+        self._share_of_time = share_of_time
         wide = (getattr(err, 'encoding', None) or 'utf-8').lower().startswith('utf')
-        self._letters = '█░' if wide else '#.'
+        self._blocks = '█░' if wide else '#.'
         self._lock = threading.RLock()
         self._begun_s: float | None = None
         self._share, self._what = 0.0, ''
@@ -54,7 +57,7 @@ class Progress:
         self._ticker: threading.Thread | None = None
 
     def at(self, share: float, what: str) -> None:
-        """Take note of how far it has come, as a share of 1, and what is done now."""
+        """Report progress as a share of 1, and what is done now."""
         with self._lock:
             if self._done.is_set():
                 return
@@ -65,7 +68,7 @@ class Progress:
                 self._start()
             new = what != self._what
             # What is behind us does not come back.
-            self._share = max(self._share, min(max(self._pace(share, what), 0.0), 1.0))
+            self._share = max(self._share, min(max(self._share_of_time(share, what), 0.0), 1.0))
             self._what = what
             self._estimate(now)
             if new or now - self._drawn_s >= _REDRAW_S:
@@ -123,7 +126,7 @@ class Progress:
 
     def _draw(self, now: float) -> None:
         full = round(_BAR * self._share)
-        bar = self._letters[0] * full + self._letters[1] * (_BAR - full)
+        bar = self._blocks[0] * full + self._blocks[1] * (_BAR - full)
         when = self._left(now) or self._gone(now)
         text = f'{bar} {100.0 * self._share:3.0f} %  {when}{self._what}'
         # A line that is broken could not be taken back.
@@ -157,12 +160,5 @@ class Progress:
 
 
 def in_words(seconds: float) -> str:
-    """Return '8 s', '2 min 10 s', '1 h 5 min', no finer than is worth saying."""
-    whole = round(seconds) if seconds < 60.0 else round(seconds / 5.0) * 5
-    if whole < 60:
-        return f'{whole} s'
-    minutes, rest = divmod(whole, 60)
-    if minutes < 60:
-        return f'{minutes} min {rest} s' if rest else f'{minutes} min'
-    hours, minutes = divmod(minutes, 60)
-    return f'{hours} h {minutes} min' if minutes else f'{hours} h'
+    """Return '8 s', '2 min 10 s', '1 h 5 min': above a minute in steps of five seconds."""
+    return duration(round(seconds) if seconds < 60.0 else round(seconds / 5.0) * 5)

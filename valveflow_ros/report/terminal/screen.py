@@ -1,42 +1,263 @@
-"""A terminal, or whatever stands in its place, and how a frame is put on it."""
+"""The terminal view: a frame drawn as lines, and put on a terminal or told change by change."""
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import signal
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import pairwise
 from types import FrameType, TracebackType
 from typing import TextIO
 
-from valveflow_ros.report.terminal.draw import screen
+from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.terminal.frame import (
     Frame,
-    HealthView,
+    SampleView,
     alarm_words,
+    alarms_words,
     curve_words,
     diagnosis_words,
     health_words,
+    inputs_words,
+    recorder_words,
+    sample_words,
 )
-from valveflow_ros.report.terminal.text import clean
-from valveflow_ros.report.words import moment
+from valveflow_ros.report.terminal.text import Line, cells, clean, cut, labelled, painted
+from valveflow_ros.report.words import duration, input_unit_plain, moment, signed
 
-# What changed between two frames, a sentence each: the view of whoever has no terminal.
+_ENTER = '\x1b[?1049h\x1b[?25l'  # the other screen, no cursor
+_LEAVE = '\x1b[?25h\x1b[?1049l'
+_USUAL = (80, 24)
+# A grid of dots, eight to a character in braille.
+_BRAILLE = 0x2800
+# Which bit of a braille character each of its dots is, by row and column.
+_BITS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
+DOTS_X, DOTS_Y = 2, 4
+_MARGIN = 8  # left of the pictures: a number and its tick
+_LEAST_CURVE, _LEAST_RESIDUAL = 4, 3
+_MOST_RESIDUAL = 9
+_LONGEST_TEXT = 3
+
+
+class Canvas:
+    """A rectangle of characters that lines and marks are put on.
+
+    Parameters
+    ----------
+    width, height : int
+        In characters, at least 1 each.
+    low, high : tuple of float
+        The lower left and the upper right corner, in the drawing's own units.
+    unicode : bool
+        Whether braille may be used; without it a dot is an asterisk.
+    """
+
+    def __init__(
+        self, width: int, height: int, low: tuple[float, float], high: tuple[float, float],
+        unicode: bool = True,
+    ) -> None:  # fmt: skip
+        self.width, self.height, self._unicode = width, height, unicode
+        self._low = low
+        self._scale = (
+            (width * DOTS_X - 1) / ((high[0] - low[0]) or 1.0),
+            (height * DOTS_Y - 1) / ((high[1] - low[1]) or 1.0),
+        )
+        self._bits = [[0] * width for _ in range(height)]
+        self._marks: dict[tuple[int, int], str] = {}
+
+    def place(self, x: float, y: float) -> tuple[int, int]:
+        """Return the dot of a point, counted from the upper left; it may lie outside."""
+        across = round((x - self._low[0]) * self._scale[0])
+        up = round((y - self._low[1]) * self._scale[1])
+        return across, self.height * DOTS_Y - 1 - up
+
+    def dot(self, x: float, y: float) -> None:
+        """Put a dot; one outside the rectangle is left out."""
+        self._put(*self.place(x, y))
+
+    def line(self, points: Sequence[tuple[float, float]]) -> None:
+        """Put straight lines from point to point."""
+        for (x0, y0), (x1, y1) in pairwise(points):
+            a, b = self.place(x0, y0), self.place(x1, y1)
+            steps = min(max(abs(b[0] - a[0]), abs(b[1] - a[1]), 1), 10_000)
+            for k in range(steps + 1):
+                self._put(
+                    round(a[0] + (b[0] - a[0]) * k / steps),
+                    round(a[1] + (b[1] - a[1]) * k / steps),
+                )
+
+    def level(self, y: float, character: str) -> None:
+        """Put a character along a level wherever nothing else is drawn."""
+        row = self.place(0.0, y)[1] // DOTS_Y
+        if 0 <= row < self.height:
+            for column in range(self.width):
+                self._marks.setdefault((row, -1 - column), character)
+
+    def mark(self, x: float, y: float, character: str) -> None:
+        """Put a character over everything; outside, it stands at the border."""
+        across, down = self.place(x, y)
+        column = min(max(across // DOTS_X, 0), self.width - 1)
+        row = min(max(down // DOTS_Y, 0), self.height - 1)
+        self._marks[row, column] = character
+
+    def rows(self) -> list[str]:
+        """Return the lines of characters, from above, each as long as the canvas is wide."""
+        return [
+            ''.join(self._character(row, column) for column in range(self.width))
+            for row in range(self.height)
+        ]
+
+    def _put(self, across: int, down: int) -> None:
+        column, row = across // DOTS_X, down // DOTS_Y
+        if 0 <= column < self.width and 0 <= row < self.height:
+            self._bits[row][column] |= _BITS[down % DOTS_Y][across % DOTS_X]
+
+    def _character(self, row: int, column: int) -> str:
+        if (row, column) in self._marks:
+            return self._marks[row, column]
+        bits = self._bits[row][column]
+        if bits:
+            return chr(_BRAILLE + bits) if self._unicode else '*'
+        return self._marks.get((row, -1 - column), ' ')
+
+
+def screen(
+    frame: Frame, width: int, height: int, *, colour: bool = False, unicode: bool = True
+) -> list[str]:
+    """Return a frame as the lines that a terminal is sent.
+
+    Parameters
+    ----------
+    frame : Frame
+    width, height : int
+        The terminal's size; there are never more lines, nor longer ones.
+    colour, unicode : bool
+        What the terminal can do.
+    """
+    lines = _lines(frame, max(20, width), max(5, height), unicode)
+    return [painted(line, width, colour, unicode) for line in lines[: max(1, height)]]
+
+
+def _lines(frame: Frame, width: int, height: int, unicode: bool) -> list[Line]:
+    head = [_title(frame, width)]
+    if frame.note:
+        head += labelled('         ', frame.note, 'warn', width, 2)
+    head += labelled('Curve    ', *curve_words(frame.curve, frame.now_ns), width, 2)
+    text = _text(frame, width, 1)
+    residual = list(labelled('Residual ', *sample_words(frame.last), width, 2))
+    left = height - len(head) - len(residual) - len(text)
+    curve_rows, residual_rows = _shares(left, frame)
+    spare = left - (curve_rows + 1 if curve_rows else 0) - residual_rows
+    if spare > 0:
+        longer = _text(frame, width, _LONGEST_TEXT)
+        text = longer if len(longer) <= len(text) + spare else text
+    curve = _curve(frame, width, curve_rows, unicode) if curve_rows else []
+    strip = _strip(frame.samples, width, residual_rows, unicode) if residual_rows else []
+    return [*head, *curve, *residual, *strip, *text]
+
+
+def _shares(left: int, frame: Frame) -> tuple[int, int]:
+    """Return how many rows the curve and the residuals get, without the axis of the curve."""
+    # Room for sentences that need more than one line comes first.
+    left -= 3 if left > _LEAST_CURVE + _LEAST_RESIDUAL + 4 else 0
+    if frame.curve is None or not frame.curve.breakpoints:
+        return 0, min(left, _MOST_RESIDUAL) if left >= _LEAST_RESIDUAL and frame.samples else 0
+    if left < _LEAST_CURVE + 1:
+        return 0, 0
+    residual = min(_MOST_RESIDUAL, max(_LEAST_RESIDUAL, (left - 1) // 3))
+    if left - 1 - residual < _LEAST_CURVE or not frame.samples:
+        residual = 0
+    return left - 1 - residual, residual
+
+
+def _title(frame: Frame, width: int) -> Line:
+    unit = clean(frame.unit) or 'valveflow'
+    when = moment(frame.now_ns) if frame.now_ns else 'no data yet'
+    left = f'{unit}   {when}'
+    source = cut(clean(frame.source), max(0, width - cells(left) - 3))
+    gap = ' ' * max(1, width - cells(left) - cells(source))
+    return ((left, 'strong'), (gap, ''), (source, 'dim'))
+
+
+def _text(frame: Frame, width: int, most: int) -> list[Line]:
+    """Return alarms, inputs, recorder and diagnosis, each in at most so many lines."""
+    lines: list[Line] = []
+    for label, told in (
+        ('Alarms   ', alarms_words(frame)),
+        ('Inputs   ', inputs_words(frame)),
+        ('Recorder ', [recorder_words(frame)]),
+        ('Diagnosis', [diagnosis_words(frame.diagnosis)]),
+    ):
+        for k, (text, tone) in enumerate(told):
+            lines += labelled(label if k == 0 else ' ' * len(label), text, tone, width, most)
+    return lines
+
+
+def _curve(frame: Frame, width: int, rows: int, unicode: bool) -> list[Line]:
+    """Return the curve with its breakpoints and the operating point, and the axis below."""
+    curve, last = frame.curve, frame.last
+    pairs = zip(curve.breakpoints, curve.values, strict=False) if curve else ()
+    points = [pair for pair in pairs if all(map(math.isfinite, pair))]
+    if curve is None or not points:
+        return []
+    known = last is not None and math.isfinite(last.u) and math.isfinite(last.measured_mw)
+    now = (last.u, last.measured_mw) if last is not None and known else None
+    us, mws = zip(*points, *([now] if now else []), strict=True)
+    low, high = (min(us), min(mws)), (max(us), max(mws))
+    canvas = Canvas(width - _MARGIN, rows, low, high, unicode)
+    canvas.line(points)
+    for u, power in points[1:-1]:
+        canvas.mark(u, power, 'o')
+    if now is not None:
+        canvas.mark(*now, '●')
+    marks = {0: f'{high[1]:.0f} MW', rows - 1: f'{low[1]:.0f} MW'}
+    legend = f'u ({input_unit_plain(curve.exponent)})   o knee' + ('   ● now' if now else '')
+    first, end = f'{low[0]:.0f}', f'{high[0]:.0f}'
+    room = width - _MARGIN - len(first) - len(end)
+    axis = f'{first}{cut(legend, max(0, room - 4)):^{max(0, room)}}{end}'
+    return [*_picture(canvas, marks, 'curve'), ((' ' * _MARGIN + axis, 'dim'),)]
+
+
+def _strip(samples: Sequence[SampleView], width: int, rows: int, unicode: bool) -> list[Line]:
+    """Return the last residuals over time with their limits."""
+    known = [s for s in samples if math.isfinite(s.residual_mw)]
+    if not known:
+        return []
+    ends = [known[-1].low_mw, known[-1].high_mw]
+    reach = max(abs(v) for v in [*(s.residual_mw for s in known), *ends] if math.isfinite(v))
+    reach = 1.08 * reach or 1.0
+    first, last = samples[0].time_ns / NS_PER_S, samples[-1].time_ns / NS_PER_S
+    canvas = Canvas(width - _MARGIN, rows, (0.0, -reach), (last - first, reach), unicode)
+    for sample in known:
+        canvas.dot(sample.time_ns / NS_PER_S - first, sample.residual_mw)
+    for level in ends:
+        if math.isfinite(level):
+            canvas.level(level, '┄')
+    canvas.level(0.0, '·')
+    places = 0 if reach >= 10.0 else 1
+    marks = {0: f'{signed(reach, places)} MW', rows - 1: signed(-reach, places)}
+    if rows >= _LEAST_RESIDUAL:
+        span = duration(round(last - first)).split(' ')
+        marks[rows // 2] = ' '.join(span[:2]) if last > first else ''
+    return _picture(canvas, marks, '')
+
+
+def _picture(canvas: Canvas, marks: dict[int, str], tone: str) -> list[Line]:
+    return [
+        ((f'{cut(marks.get(k, ""), _MARGIN - 1):>{_MARGIN - 1}} ', 'dim'), (row, tone))
+        for k, row in enumerate(canvas.rows())
+    ]
 
 
 def changes(before: Frame, now: Frame) -> list[tuple[str, str]]:
     """Return what changed: curve, alarm, input, recorder, diagnosis or note, and a sentence.
 
-    Values that move all the time are no changes.
+    This is the view of whoever has no terminal. Values that move all the time are no changes.
     """
     return [(what, clean(told)) for what, told in _changes(before, now)]
-
-
-def line(now_ns: int, what: str, told: str) -> str:
-    """Return a change as one line."""
-    when = moment(now_ns) if now_ns else 'no data yet'
-    return f'{when}  {what}: {told}'
 
 
 def _changes(before: Frame, now: Frame) -> Iterator[tuple[str, str]]:
@@ -53,19 +274,11 @@ def _changes(before: Frame, now: Frame) -> Iterator[tuple[str, str]]:
     for item in now.inputs:
         if levels.get(item.name) != item.level:
             yield 'input', health_words(item)[0]
-    if now.recorder is not None and _differs(before.recorder, now.recorder):
+    old_level = None if before.recorder is None else before.recorder.level
+    if now.recorder is not None and now.recorder.level != old_level:
         yield 'recorder', now.recorder.sentence
     if now.diagnosis is not None and now.diagnosis != before.diagnosis:
         yield 'diagnosis', diagnosis_words(now.diagnosis)[0]
-
-
-def _differs(before: HealthView | None, now: HealthView) -> bool:
-    return before is None or before.level != now.level
-
-
-_ENTER = '\x1b[?1049h\x1b[?25l'  # the other screen, no cursor
-_LEAVE = '\x1b[?25h\x1b[?1049l'
-_USUAL = (80, 24)
 
 
 class Screen:
@@ -120,8 +333,10 @@ class Screen:
             body = '\x1b[K\r\n'.join(rows)
             self._out.write(f'\x1b[H{body}\x1b[K\x1b[J')
         else:
-            for what, told in changes(self._before, frame):
-                self._out.write(self._plain(line(frame.now_ns, what, told)) + '\n')
+            when = moment(frame.now_ns) if frame.now_ns else 'no data yet'
+            lines = [f'{when}  {w}: {told}\n' for w, told in changes(self._before, frame)]
+            said = ''.join(lines)
+            self._out.write(said if self._unicode else said.encode('ascii', 'replace').decode())
         self._before = frame
         self._out.flush()
 
@@ -132,9 +347,6 @@ class Screen:
     def _rows(self, frame: Frame) -> list[str]:
         size = shutil.get_terminal_size(_USUAL)
         return screen(frame, size.columns, size.lines, colour=self._colour, unicode=self._unicode)
-
-    def _plain(self, text: str) -> str:
-        return text if self._unicode else text.encode('ascii', 'replace').decode()
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

@@ -8,13 +8,12 @@ import unicodedata
 from argparse import ArgumentTypeError
 from collections.abc import Callable, Iterator
 
-# A piece of a line: the text, and one of the tones below or '' for plain.
-Span = tuple[str, str]
-Line = tuple[Span, ...]
+# Pieces of a line: the text of each, and one of the tones below or '' for plain.
+Line = tuple[tuple[str, str], ...]
 
 # Colour-blind safe: bad differs from good in weight and brightness too, and in the words.
-_SGR = {'strong': '1', 'dim': '2', 'curve': '36', 'good': '32', 'warn': '33', 'bad': '1;31'}
-# One letter for one, so that a line stays as long as it was.
+TONES = {'strong': '1', 'dim': '2', 'curve': '36', 'good': '32', 'warn': '33', 'bad': '1;31'}
+# One character for one, so that a line stays as long as it was.
 _PLAIN = str.maketrans('…·●┄─−\u202f±│°', '~|@--- ~| ')
 # More than any terminal shows of a sentence: what comes from others may be of any length.
 _LONGEST = 4096
@@ -38,8 +37,8 @@ def cells(text: str) -> int:
 def cut(text: str, width: int) -> str:
     """Return a text, shortened to a width."""
     taken, kept = 0, 0
-    for place, letter in enumerate(text):
-        taken += cells(letter)
+    for place, character in enumerate(text):
+        taken += cells(character)
         if taken > width:
             return f'{text[:kept].rstrip()}…' if width > 0 else ''
         if taken <= width - 1:
@@ -77,17 +76,12 @@ def painted(line: Line, width: int, colour: bool, unicode: bool = True) -> str:
         shown = cut(text, left)
         left -= cells(shown)
         if not unicode:
-            shown = _ascii(shown)
-        parts.append(f'\x1b[{_SGR[tone]}m{shown}\x1b[0m' if colour and tone else shown)
+            bare = ''.join(c for c in shown.translate(_PLAIN) if not unicodedata.combining(c))
+            shown = bare.encode('ascii', 'replace').decode()
+        parts.append(f'\x1b[{TONES[tone]}m{shown}\x1b[0m' if colour and tone else shown)
         if left <= 0:
             break
     return ''.join(parts).rstrip(' ')
-
-
-def _ascii(text: str) -> str:
-    """Return a text for a terminal that knows no other letters, no longer than it was."""
-    bare = ''.join(c for c in text.translate(_PLAIN) if not unicodedata.combining(c))
-    return bare.encode('ascii', 'replace').decode()
 
 
 # Numbers that a person types behind an option: read, or refused in words.
