@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from damage import records
 from log_files import FLOAT64, START_NS, STOCK, float64, write_chunks
+from mcap.opcode import Opcode
 
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.logs import (
@@ -28,7 +29,6 @@ from valveflow_ros.logs import (
     part_file,
     recover_leftovers,
 )
-from valveflow_ros.logs.mcap.layout import Op
 from valveflow_ros.logs.mcap.recorder_loop import Ledger, RecorderLoop
 from valveflow_ros.logs.mcap.recover import recover
 from valveflow_ros.logs.mcap.writer import Message
@@ -298,7 +298,7 @@ def test_progress_comes_to_the_end_of_each_chunk(tmp_path: Path) -> None:
     steps: list[tuple[int, int]] = []
     recover(part, tmp_path / 'whole.mcap', progress=lambda *step: steps.append(step))
     raw = part.read_bytes()
-    ends = [end for op, _, end in records(raw) if op == Op.CHUNK]
+    ends = [end for op, _, end in records(raw) if op == Opcode.CHUNK]
     assert [done for done, _ in steps] == ends
     assert {total for _, total in steps} == {len(raw)}
 

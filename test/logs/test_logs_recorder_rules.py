@@ -15,6 +15,7 @@ from damage import records
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_files import FLOAT64, START_NS, STOCK, float64
+from mcap.opcode import Opcode
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import (
@@ -26,9 +27,10 @@ from valveflow_ros.logs import (
     open_log,
 )
 from valveflow_ros.logs.mcap import recorder_loop
-from valveflow_ros.logs.mcap.chunk_file import ChunkBuilder
-from valveflow_ros.logs.mcap.layout import CHUNK_HEAD, RECORD_HEAD, ZSTD, Op, Unpacker
+from valveflow_ros.logs.mcap.chunk_file import ZSTD, ChunkBuilder
 from valveflow_ros.logs.mcap.recorder_loop import DROPS_SHOWN_S, Ledger, NewTopic, RecorderLoop
+from valveflow_ros.logs.mcap.records import RECORD_HEAD, Unpacker
+from valveflow_ros.logs.mcap.scan import CHUNK_HEAD_SIZE
 from valveflow_ros.logs.mcap.writer import Qos
 
 STEP_S = 7.0
@@ -560,11 +562,11 @@ def test_a_chunk_is_its_table_and_its_messages_one_after_the_other(
         np.testing.assert_array_equal(first.log_time, [row[2] for row in content])
         assert (first.unpacked_size, first.compression) == (len(expected), ZSTD)
         op, length = struct.unpack_from('<BQ', first.record)
-        assert (op, length) == (Op.CHUNK, len(first.record) - RECORD_HEAD.size)
+        assert (op, length) == (Opcode.CHUNK, len(first.record) - RECORD_HEAD.size)
         start, end, size = struct.unpack_from('<QQQ', first.record, RECORD_HEAD.size)
         logs = [row[2] for row in content] or [0]
         assert (start, end, size) == (min(logs), max(logs), len(expected))
-        head = RECORD_HEAD.size + CHUNK_HEAD.size + 4 + len(ZSTD) + 8
+        head = RECORD_HEAD.size + CHUNK_HEAD_SIZE + 4 + len(ZSTD) + 8
         assert Unpacker().unpack(ZSTD, first.record[head:], len(expected)) == expected
         builder.clear()
         assert (len(builder), builder.size) == (0, 0)
@@ -578,7 +580,7 @@ def test_a_chunk_is_closed_by_the_message_that_fills_64_kib(tmp_path: Path, size
         for k in range(250_000 // (31 + size)):
             writer.write('/a', bytes(size), START_NS + k, START_NS + k)
     raw = (tmp_path / 'log' / 'log_0.mcap').read_bytes()
-    heads = [begin for op, begin, _ in records(raw) if op == Op.CHUNK]
+    heads = [begin for op, begin, _ in records(raw) if op == Opcode.CHUNK]
     sizes = [struct.unpack_from('<Q', raw, begin + 9 + 16)[0] for begin in heads]
     assert len(sizes) > 2
     # The tables of topics stand in some of them, too; they are small.

@@ -11,7 +11,7 @@ _LARGE_BYTES = 20_000_000  # less than this is read before anybody has to wait
 
 def first_facts(path: Path) -> str:
     """Return a sentence from the summary of a large finished recording, else nothing."""
-    from valveflow_ros.logs.mcap.summary import read_summary
+    from valveflow_ros.logs.mcap.records import read_summary
     from valveflow_ros.logs.source import Source
     from valveflow_ros.report.words import count, duration, moment
 

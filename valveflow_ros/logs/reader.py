@@ -16,8 +16,8 @@ except ImportError:  # PyYAML was built without libyaml
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.contents import LogContents
 from valveflow_ros.logs.mcap.folder import METADATA_NAME, in_order
-from valveflow_ros.logs.mcap.layout import MAGIC
 from valveflow_ros.logs.mcap.reading import read_recording
+from valveflow_ros.logs.mcap.records import MAGIC
 from valveflow_ros.logs.part_file import PART_SUFFIX
 from valveflow_ros.logs.source import Source, os_problem
 from valveflow_ros.logs.tables.refusal import AS_SEEN, TableOptions

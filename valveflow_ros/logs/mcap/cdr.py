@@ -22,8 +22,7 @@ from valveflow_ros.logs.mcap.definitions import (
     full_name,
     parse_all,
 )
-from valveflow_ros.logs.mcap.layout import LayoutError
-from valveflow_ros.logs.mcap.walk import HEAD_SIZE, MessageTable, rows
+from valveflow_ros.logs.mcap.records import HEAD_SIZE, LayoutError, MessageTable, rows
 from valveflow_ros.logs.names import PLANT_SAMPLE
 from valveflow_ros.records import (
     N_SIGNALS,

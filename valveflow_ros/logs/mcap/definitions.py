@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs.mcap.layout import LayoutError
+from valveflow_ros.logs.mcap.records import LayoutError
 
 # Definitions of the stock messages that are written and read where no ROS is installed.
 #

@@ -12,7 +12,7 @@ from pathlib import Path
 from valveflow_ros import __version__
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.mcap.chunk_file import ChunkFile
-from valveflow_ros.logs.mcap.summary import TopicTable, read_summary
+from valveflow_ros.logs.mcap.records import TopicTable, read_summary
 from valveflow_ros.logs.part_file import write_whole
 from valveflow_ros.logs.source import Source
 
@@ -70,7 +70,7 @@ class Split:
             topics[channel.topic] = TopicInfoLine(
                 channel.topic,
                 table.type_of(channel),
-                channel.encoding,
+                channel.message_encoding,
                 channel.metadata.get('offered_qos_profiles', ''),
                 channel.metadata.get('topic_type_hash', ''),
             )

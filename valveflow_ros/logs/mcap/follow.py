@@ -14,23 +14,25 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from mcap.opcode import Opcode
+from mcap.well_known import MessageEncoding
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.mcap.cdr import Decoder, PlantSampleReader
 from valveflow_ros.logs.mcap.folder import Split, in_order
 from valveflow_ros.logs.mcap.gather import Rows, float_rows, sample_rows
-from valveflow_ros.logs.mcap.layout import (
-    CHUNK_HEAD,
-    FOOTER_RECORD_SIZE,
+from valveflow_ros.logs.mcap.records import (
+    FOOTER_SIZE,
     MAGIC,
     RECORD_HEAD,
-    Attachment,
     LayoutError,
-    Op,
+    MessageTable,
+    TopicTable,
+    ends_well,
+    unpack_attachment,
+    walk,
 )
-from valveflow_ros.logs.mcap.scan import Scanner, candidates, ends_well
-from valveflow_ros.logs.mcap.summary import TopicTable
-from valveflow_ros.logs.mcap.walk import MessageTable, walk
+from valveflow_ros.logs.mcap.scan import CHUNK_HEAD_SIZE, Scanner, candidates
 from valveflow_ros.logs.names import FLOAT64, PLANT_SAMPLE, last_part, signal_of
 from valveflow_ros.logs.part_file import PART_SUFFIX, is_held
 from valveflow_ros.logs.source import DEFAULT_LIMITS, OverBudgetError, Source
@@ -85,9 +87,9 @@ def first_in(folder: Path) -> Path | None:
 _MOST_ATTACHED = 1 << 20
 _GROUP_BYTES = 1 << 20
 _NEAR = 1 << 12
-_KINDS = frozenset(int(op) for op in Op)
+_KINDS = frozenset(int(op) for op in Opcode)
 # Of these the length is known; it tells them from a chunk with a damaged first byte.
-_LAST = {int(Op.DATA_END): 4, int(Op.FOOTER): 20}
+_LAST = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,19 +252,19 @@ class Follower:
         op, length = RECORD_HEAD.unpack(head)
         after = start + RECORD_HEAD.size + length
         if _LAST.get(op) == length:
-            whole = source.size >= after + FOOTER_RECORD_SIZE
+            whole = source.size >= after + FOOTER_SIZE
             self._ended = whole and source.read(source.size - len(MAGIC), len(MAGIC)) == MAGIC
             return None
-        if op not in _KINDS or op in _LAST or (op == Op.CHUNK and length < CHUNK_HEAD.size):
+        if op not in _KINDS or op in _LAST or (op == Opcode.CHUNK and length < CHUNK_HEAD_SIZE):
             return self._beyond_damage(source)
         if after > source.size:
             if self.written and length <= DEFAULT_LIMITS.record_bytes:
                 return None
             return self._beyond_damage(source, sure=False)
-        if op == Op.CHUNK:
+        if op == Opcode.CHUNK:
             return self._chunk(source, scanner, after)
         self._position = after
-        if op == Op.ATTACHMENT:
+        if op == Opcode.ATTACHMENT:
             self._attach(source, start, length)
         return b''
 
@@ -301,7 +303,7 @@ class Follower:
         if length > _MOST_ATTACHED:
             return
         try:
-            found = Attachment.unpack(source.read(start + RECORD_HEAD.size, length))
+            found = unpack_attachment(source.read(start + RECORD_HEAD.size, length))
         except LayoutError:
             self.damaged += 1
             return
@@ -432,6 +434,6 @@ def _channels(batch: Batch) -> Iterator[tuple[int, str, str]]:
     """Yield the channels that occur and are known: id, type, definition."""
     for number in np.unique(batch.messages.channel).tolist():
         channel = batch.topics.channels.get(number)
-        if channel is not None and channel.encoding == 'cdr':
+        if channel is not None and channel.message_encoding == MessageEncoding.CDR:
             definition = batch.topics.definition_of(channel)
             yield number, batch.topics.type_of(channel), definition

@@ -14,10 +14,16 @@ from numpy.typing import NDArray
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.mcap.cdr import PlantSampleReader, Samples
-from valveflow_ros.logs.mcap.layout import LayoutError
+from valveflow_ros.logs.mcap.records import (
+    HEAD_SIZE,
+    LayoutError,
+    MessageTable,
+    TopicTable,
+    read_summary,
+    rows,
+    walk,
+)
 from valveflow_ros.logs.mcap.scan import Chunk, Findings, Scanner
-from valveflow_ros.logs.mcap.summary import TopicTable, read_summary
-from valveflow_ros.logs.mcap.walk import HEAD_SIZE, MessageTable, rows, walk
 from valveflow_ros.logs.names import FLOAT64, PLANT_SAMPLE, TopicChoice
 from valveflow_ros.logs.source import DEFAULT_LIMITS, Limits, Source
 from valveflow_ros.records import SIGNALS, ByteArray, FloatArray, IntArray
@@ -274,7 +280,9 @@ class _Collector:
                 continue
             self.known.add(number)
             type_name = table.type_of(channel)
-            if channel.encoding != 'cdr' or not self._choice.may_matter(channel.topic, type_name):
+            if channel.message_encoding != 'cdr' or not self._choice.may_matter(
+                channel.topic, type_name
+            ):
                 continue
             if type_name == FLOAT64:
                 self._floats[number] = True

@@ -13,10 +13,17 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from valveflow_ros.errors import DataError, RecordingError
-from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES, ChunkFile, pack_content
+from valveflow_ros.logs.mcap.chunk_file import (
+    CHUNK_BYTES,
+    ChunkFile,
+    attachment,
+    compressor,
+    pack_content,
+)
 from valveflow_ros.logs.mcap.definitions import Definitions
 from valveflow_ros.logs.mcap.folder import (
     LIBRARY,
@@ -25,7 +32,7 @@ from valveflow_ros.logs.mcap.folder import (
     information_text,
     write_metadata,
 )
-from valveflow_ros.logs.mcap.layout import RECORD_HEAD, Attachment, Op, Packer, media_type
+from valveflow_ros.logs.mcap.records import RECORD_HEAD
 from valveflow_ros.logs.mcap.writer import Metadata, TableSchedule, TopicBook
 from valveflow_ros.logs.names import FLOAT64
 from valveflow_ros.logs.part_file import PartFile, make_folder
@@ -146,7 +153,7 @@ def write_readings(
         try:
             file = ChunkFile(out, LIBRARY)
             for name, data in (attachments or {}).items():
-                file.put_attachment(Attachment(name, media_type(name), data))
+                file.put_attachment(attachment(name, data))
             for name, items in (metadata or {}).items():
                 file.put_metadata(name, items)
             _put_chunks(file, chain([first], parts), book)
@@ -182,7 +189,7 @@ class _Records:
         if int(readings.time_ns[0]) < 0:
             raise DataError('The samples begin before 1970, which a recording cannot hold.')
         records: NDArray[np.void] = np.zeros(len(readings), dtype=_RECORD)
-        records['op'] = int(Op.MESSAGE)
+        records['op'] = int(Opcode.MESSAGE)
         records['length'] = _RECORD.itemsize - RECORD_HEAD.size
         records['channel'] = self._channels[readings.signal]
         log_time = strictly_increasing(np.r_[self._last_ns, readings.time_ns])[1:]
@@ -225,7 +232,7 @@ def strictly_increasing(times: IntArray) -> IntArray:
 
 
 def _put_chunks(file: ChunkFile, parts: Iterable[NDArray[np.void]], book: TopicBook) -> None:
-    schedule, packer, topics = TableSchedule(), Packer(), len(book.ids)
+    schedule, packer, topics = TableSchedule(), compressor(), len(book.ids)
     for part in parts:
         due = schedule.due(topics)
         table = book.packed() if due else b''

@@ -13,9 +13,8 @@ from valveflow_ros.errors import RecordingError, counted
 from valveflow_ros.logs.contents import LogContents, LoggedMessage, TopicInfo
 from valveflow_ros.logs.mcap.folder import Split, in_order
 from valveflow_ros.logs.mcap.gather import FileContents, Group, Rows, gather
-from valveflow_ros.logs.mcap.layout import LayoutError
+from valveflow_ros.logs.mcap.records import HEAD_SIZE, LayoutError, MessageTable, walk
 from valveflow_ros.logs.mcap.scan import Findings, Scanner, scan_warnings
-from valveflow_ros.logs.mcap.walk import HEAD_SIZE, MessageTable, walk
 from valveflow_ros.logs.names import PLANT_SAMPLE_TOPIC, TopicChoice, misfits
 from valveflow_ros.logs.part_file import PART_SUFFIX
 from valveflow_ros.logs.source import DEFAULT_LIMITS, Limits, OverBudgetError, Source

@@ -9,7 +9,6 @@ from pathlib import Path
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.logs.mcap.definitions import Definitions, full_name, parse_all
 from valveflow_ros.logs.mcap.definitions import type_hash as hash_of
-from valveflow_ros.logs.mcap.layout import LayoutError
 from valveflow_ros.logs.mcap.recorder_loop import (
     HeadMessages,
     Ledger,
@@ -18,6 +17,7 @@ from valveflow_ros.logs.mcap.recorder_loop import (
     RecorderSettings,
     RecorderStatus,
 )
+from valveflow_ros.logs.mcap.records import LayoutError
 from valveflow_ros.logs.mcap.writer import Message, Metadata, OpenFile, Qos, RecordingWriter
 from valveflow_ros.logs.part_file import PartFile, make_folder
 

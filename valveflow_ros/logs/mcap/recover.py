@@ -19,10 +19,8 @@ from valveflow_ros.logs.mcap.folder import (
     information_text,
     write_metadata,
 )
-from valveflow_ros.logs.mcap.layout import CHUNK_HEAD, RECORD_HEAD, Cursor, LayoutError
+from valveflow_ros.logs.mcap.records import LayoutError, TopicTable, read_summary, walk
 from valveflow_ros.logs.mcap.scan import SHAPE_SIZE, Chunk, Scanner, candidates, scan_warnings
-from valveflow_ros.logs.mcap.summary import TopicTable, read_summary
-from valveflow_ros.logs.mcap.walk import walk
 from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, make_folder, taken
 from valveflow_ros.logs.source import Source
 
@@ -212,15 +210,13 @@ def _described(chunk: Chunk, table: TopicTable) -> PackedChunk:
     messages, others = walk(chunk.content)
     for op, content in others:
         table.add(op, content)
-    cursor = Cursor(chunk.record)
-    cursor.position = RECORD_HEAD.size + CHUNK_HEAD.size
     return PackedChunk(
         chunk.record,
         messages.channel,
         messages.log_time,
         messages.offset,
         len(chunk.content),
-        cursor.text(),
+        chunk.compression,
     )
 
 

@@ -8,8 +8,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
+from mcap.records import Channel, Schema
+from mcap.well_known import MessageEncoding, SchemaEncoding
+
 from valveflow_ros.errors import InputError, RecordingError
-from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES, ChunkBuilder, ChunkFile
+from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES, ChunkBuilder, ChunkFile, attachment
 from valveflow_ros.logs.mcap.definitions import Definitions, parse_all, type_hash
 from valveflow_ros.logs.mcap.folder import (
     LIBRARY,
@@ -19,8 +22,7 @@ from valveflow_ros.logs.mcap.folder import (
     information_text,
     split_number,
 )
-from valveflow_ros.logs.mcap.layout import Attachment, Channel, LayoutError, Schema, media_type
-from valveflow_ros.logs.mcap.summary import TopicTable
+from valveflow_ros.logs.mcap.records import LayoutError, TopicTable, pack
 from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, Writable, make_folder
 
 # Quality of service as rosbag2 writes it down (metadata version 9).
@@ -101,14 +103,23 @@ class TopicBook:
             return self.ids[topic]
         if type_name not in self._schema_ids:
             text = self.definitions.text(type_name) if definition is None else definition
-            schema = Schema(len(self._schema_ids) + 1, type_name, 'ros2msg', text.encode())
+            number = len(self._schema_ids) + 1
+            schema = Schema(
+                id=number, name=type_name, encoding=SchemaEncoding.ROS2, data=text.encode()
+            )
             self._schema_ids[type_name] = schema.id
             self.table.schemas[schema.id] = schema
         if hash_text is None:
             hash_text = self._hash(type_name, definition)
         metadata = {'offered_qos_profiles': (qos or Qos()).text(), 'topic_type_hash': hash_text}
         number = len(self.ids) + 1
-        channel = Channel(number, self._schema_ids[type_name], topic, 'cdr', metadata)
+        channel = Channel(
+            id=number,
+            topic=topic,
+            message_encoding=MessageEncoding.CDR,
+            metadata=metadata,
+            schema_id=self._schema_ids[type_name],
+        )
         self.table.channels[number] = channel
         self.ids[topic] = number
         self._packed = b''
@@ -126,9 +137,7 @@ class TopicBook:
     def packed(self) -> bytes:
         """Return the records of all topics."""
         if not self._packed:
-            schemas = [schema.pack() for schema in self.table.schemas.values()]
-            channels = [channel.pack() for channel in self.table.channels.values()]
-            self._packed = b''.join(schemas + channels)
+            self._packed = pack(*self.table.schemas.values(), *self.table.channels.values())
         return self._packed
 
 
@@ -372,7 +381,7 @@ class RecordingWriter:
             try:
                 file = ChunkFile(out, LIBRARY)
                 for name, data in self.attachments.items():
-                    file.put_attachment(Attachment(name, media_type(name), data))
+                    file.put_attachment(attachment(name, data))
                 for name, items in self.metadata.items():
                     file.put_metadata(name, items)
                 if self._begun:
