@@ -146,7 +146,7 @@ def _healthy(days: int, folder: Path) -> Any:
     from valveflow_ros.cli.identification import found_in
     from valveflow_ros.cli.log_input import open_input
     from valveflow_ros.cli.options import read_mapping
-    from valveflow_ros.logs.tables.write import write_table
+    from valveflow_ros.logs import write_table
     from valveflow_ros.plant.simulator import simulate
 
     path = folder / 'healthy.parquet'
@@ -163,7 +163,7 @@ def gather(name: str) -> dict[str, Any]:
     from valveflow_ros.cli.log_input import open_input
     from valveflow_ros.cli.options import read_mapping
     from valveflow_ros.diagnosis.result import to_json
-    from valveflow_ros.logs.tables.write import write_table
+    from valveflow_ros.logs import write_table
     from valveflow_ros.plant.simulator import simulate
     from valveflow_ros.plant.spec import EffectSpec
 
@@ -197,7 +197,7 @@ def curve() -> dict[str, Any]:
     from valveflow_ros.cli.log_input import open_input
     from valveflow_ros.cli.options import read_mapping
     from valveflow_ros.curve.characteristic_json import to_json
-    from valveflow_ros.logs.tables.write import write_table
+    from valveflow_ros.logs import write_table
     from valveflow_ros.plant.simulator import simulate
     from valveflow_ros.report.curve import band
 

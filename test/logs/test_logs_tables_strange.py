@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import open_log, read_table
 from valveflow_ros.logs.tables.cells import foreign_quality
-from valveflow_ros.logs.tables.file import LONGEST_LINE
+from valveflow_ros.logs.tables.text import LONGEST_LINE
 from valveflow_ros.records import Quality, Signal
 
 HEAD = 'time,valve position,ms pressure [MPa],ms temperature,MW'
@@ -121,6 +121,13 @@ def test_a_row_that_no_sheet_has_ends_the_reading(tmp_path):
     near = read_table(changed(path, tmp_path / 'near.xlsx', row.format(30_000).encode()))
     assert len(near.time_ns) == len(read_table(path).time_ns)
     assert near.bad_times == 1
+
+
+def test_a_sheet_of_two_cells_far_apart_is_refused(tmp_path):
+    path = book_of(tmp_path / 'x.xlsx')
+    cells = b'<row r="900000"><c r="XFD900000" t="n"><v>1</v></c></row>'
+    with pytest.raises(RecordingError, match='900000 rows and 16384 columns, most of them empty'):
+        read_table(changed(path, tmp_path / 'far.xlsx', cells))
 
 
 def test_a_workbook_that_unpacks_beyond_measure_is_refused(tmp_path):

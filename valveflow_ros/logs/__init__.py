@@ -10,8 +10,7 @@ from valveflow_ros.logs.mcap.recorder_loop import RecorderSettings, RecorderStat
 from valveflow_ros.logs.mcap.recover import RecoveryReport, recover, recover_leftovers
 from valveflow_ros.logs.mcap.writer import LATCHED, Message, Qos, RecordingWriter
 from valveflow_ros.logs.reader import open_log
-from valveflow_ros.logs.tables.table import RawTable, read_table
-from valveflow_ros.logs.tables.write import write_table
+from valveflow_ros.logs.tables.table import RawTable, read_table, write_table
 
 __all__ = [
     'LATCHED',

@@ -165,7 +165,6 @@ def _month(word: str) -> str:
 # Turns local times into UTC, and says what the change of the clocks did to them.
 
 _OFFSET = re.compile(r'(?:UTC|GMT)?\s*([+-])(\d{1,2})(?::?(\d{2}))?')
-_NEVER = np.iinfo(np.int64).min
 _HOUR_NS = 3_600_000_000_000
 
 
