@@ -79,61 +79,62 @@ def parquet_blocks(path: Path, places: list[int]) -> Iterator[pd.DataFrame]:
             yield batch.to_pandas(ignore_metadata=True)
 
 
-def look_at_sheet(path: Path, wanted: str, most: int) -> tuple[str, list[list[str]]]:
-    """Return the sheet to be read and its first rows as texts.
+def look_at_sheet(path: Path, wanted: str, most: int) -> tuple[Any, list[list[str]]]:
+    """Return the sheet to be read, for `sheet_blocks`, and its first rows as texts.
 
     Raises
     ------
     InputError
         If the sheet is not there, or several could be meant.
     """
-    found: dict[str, list[list[str]]] = {}
+    names: list[str] = []
+    tables: list[str] = []
+    found: tuple[Any, list[list[str]]] | None = None
     with _book(path) as book:
         from python_calamine import SheetTypeEnum, SheetVisibleEnum
 
         for sheet in book.sheets_metadata:
-            if (sheet.visible, sheet.typ) == (SheetVisibleEnum.Visible, SheetTypeEnum.WorkSheet):
-                cells = book.get_sheet_by_name(sheet.name)
-                rows = cells.to_python(skip_empty_area=False, nrows=most)
-                rows = [[_text(_plain(cell)) for cell in row] for row in rows]
-                while rows and not any(rows[-1]):
-                    rows.pop()
-                found[sheet.name] = rows
-    names = ', '.join(f"'{name}'" for name in found)
+            if (sheet.visible, sheet.typ) != (SheetVisibleEnum.Visible, SheetTypeEnum.WorkSheet):
+                continue
+            names.append(f"'{sheet.name}'")
+            cells = book.get_sheet_by_name(sheet.name)
+            head = cells.to_python(skip_empty_area=False, nrows=most)
+            rows = [[_text(_plain(cell)) for cell in row] for row in head]
+            while rows and not any(rows[-1]):
+                rows.pop()
+            if sheet.name == wanted:
+                return cells, rows
+            if len(rows) > 1 and len(rows[0]) > 1:
+                tables.append(sheet.name)
+                # One sheet is held at a time, and only what may be read in the end.
+                found = found or (cells, rows)
     if wanted:
-        if wanted not in found:
-            raise InputError(f"{path} has no sheet '{wanted}'; it has {names}.")
-        return wanted, found[wanted]
-    tables = [name for name, rows in found.items() if len(rows) > 1 and max(map(len, rows)) > 1]
-    if not tables:
+        raise InputError(f"{path} has no sheet '{wanted}'; it has {', '.join(names)}.")
+    if found is None:
         raise RecordingError(path, 'is a workbook without a table')
     if len(tables) > 1:
         several = ' and '.join(f"'{name}'" for name in tables)
         choice = Remedy('sheet', tables[0])
         problem = f'there are tables in the sheets {several}; choose with {choice}'
         raise RefusedError(path, problem, [choice])
-    return tables[0], found[tables[0]]
+    return found
 
 
-def sheet_blocks(
-    path: Path, sheet: str, first_row: int, places: list[int]
-) -> Iterator[pd.DataFrame]:
-    """Yield the cells at these places, from a row on."""
-    with _book(path) as book:
-        cells = book.get_sheet_by_name(sheet)
-        top, left = cells.start or (0, 0)
-        block: list[list[Any]] = []
-        for number, row in enumerate(cells.iter_rows(), top):
-            if number < first_row:
-                continue
-            picked = [_plain(row[k - left]) if 0 <= k - left < len(row) else None for k in places]
-            if any(cell is not None for cell in picked):
-                block.append(picked)
-            if len(block) == _SHEET_BLOCK:
-                yield _frame(block)
-                block = []
-        if block:
+def sheet_blocks(sheet: Any, first_row: int, places: list[int]) -> Iterator[pd.DataFrame]:
+    """Yield the cells of a sheet at these places, from a row on."""
+    top, left = sheet.start or (0, 0)
+    block: list[list[Any]] = []
+    for number, row in enumerate(sheet.iter_rows(), top):
+        if number < first_row:
+            continue
+        picked = [_plain(row[k - left]) if 0 <= k - left < len(row) else None for k in places]
+        if any(cell is not None for cell in picked):
+            block.append(picked)
+        if len(block) == _SHEET_BLOCK:
             yield _frame(block)
+            block = []
+    if block:
+        yield _frame(block)
 
 
 def _frame(block: list[list[Any]]) -> pd.DataFrame:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.logs.source import Source
@@ -93,7 +93,7 @@ class TableFile:
     encoding: str = ''
     separator: str = ''
     skip: tuple[int, ...] = ()
-    sheet: str = ''
+    sheet: Any = None
     notes: list[str] = field(default_factory=list)
     share: float = 0.0
 
@@ -123,8 +123,8 @@ class TableFile:
 
     def _frames(self, places: list[int]) -> Iterator[pd.DataFrame]:
         if not self.separator:
-            if self.sheet:
-                yield from sheet_blocks(self.path, self.sheet, self.heading.below, places)
+            if self.sheet is not None:
+                yield from sheet_blocks(self.sheet, self.heading.below, places)
             else:
                 yield from parquet_blocks(self.path, places)
             return
