@@ -51,7 +51,6 @@ _STATE = (
 )
 TESTS: Mapping[str, tuple[str, ...]] = {
     'valveflow_ros/logs/mcap/recorder.py': _RECORDER,
-    'valveflow_ros/logs/mcap/recorder_loop.py': _RECORDER,
     'valveflow_ros/logs/mcap/recover.py': _RECOVER,
     'valveflow_ros/logs/part_file.py': (*_RECOVER, _RECORDER[-1]),
     'valveflow_ros/logs/mcap/chunk_file.py': (*_RECORDER, _RECOVER[-1]),

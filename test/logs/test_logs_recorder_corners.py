@@ -29,7 +29,7 @@ from valveflow_ros.logs import (
     part_file,
     recover_leftovers,
 )
-from valveflow_ros.logs.mcap.recorder_loop import Ledger, RecorderLoop
+from valveflow_ros.logs.mcap.recorder import RecorderCounters, RecorderLoop
 from valveflow_ros.logs.mcap.recover import recover
 from valveflow_ros.logs.mcap.writer import Message
 from valveflow_ros.logs.part_file import PartFile, taken
@@ -104,7 +104,9 @@ def test_a_few_waiting_messages_wake_nobody_and_a_burst_or_a_wish_for_a_split_do
     """The loop as its owner sees it; the thread does not run."""
     asked = RecorderSettings(flush_period_s=3600.0)
     loop, other = (
-        RecorderLoop(tmp_path, asked, lambda _: pytest.fail('begun'), Ledger(9), lambda _: 0)
+        RecorderLoop(
+            tmp_path, asked, lambda **_: pytest.fail('begun'), RecorderCounters(9), lambda _: 0
+        )
         for _ in range(2)
     )
     woken = loop._wake.is_set
@@ -202,9 +204,11 @@ def test_an_old_file_that_cannot_be_removed_is_said_and_recording_goes_on(
     recorder = recorder_of(tmp_path, settings)
     stuck = [True]
     said: list[str] = []
-    unlink, ill = Path.unlink, Ledger.ill
+    unlink, ill = Path.unlink, RecorderCounters.failing
     # It is said for two milliseconds, which is long enough only for who listens.
-    monkeypatch.setattr(Ledger, 'ill', lambda ledger, why: (said.append(why), ill(ledger, why)))
+    monkeypatch.setattr(
+        RecorderCounters, 'failing', lambda counters, why: (said.append(why), ill(counters, why))
+    )
 
     def sticky(path: Path, missing_ok: bool = False) -> None:
         if stuck and path.name.endswith('_0.mcap'):

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from ros_helpers import Processes, wait_until
 
 from valveflow_ros.logs import Recorder, RecorderSettings, RecorderState, RecorderStatus
-from valveflow_ros.logs.mcap.recorder_loop import Ledger
+from valveflow_ros.logs.mcap.recorder import RecorderCounters
 from valveflow_ros.logs.part_file import PartFile
 from valveflow_ros.ros.node.monitor_loop import Watchdog, recorder_lives
 
@@ -224,16 +224,16 @@ def test_who_counts_as_alive(
 
 def test_the_account_tells_how_long_a_step_takes() -> None:
     clock = Clock()
-    ledger = Ledger(10, clock)
-    assert ledger.status().stalled_s == 0.0
-    ledger.at_work()
+    counters = RecorderCounters(10, clock)
+    assert counters.status().stalled_s == 0.0
+    counters.working()
     clock.now_s += 3.0
-    assert ledger.status().stalled_s == 3.0
-    ledger.at_work()
-    assert ledger.status().stalled_s == 0.0
+    assert counters.status().stalled_s == 3.0
+    counters.working()
+    assert counters.status().stalled_s == 0.0
     clock.now_s += 3.0
-    ledger.at_rest()
-    assert ledger.status().stalled_s == 0.0
+    counters.resting()
+    assert counters.status().stalled_s == 0.0
 
 
 @pytest.mark.parametrize('place', ['write', 'sync', 'publish'])

@@ -13,8 +13,8 @@ from valveflow_ros import __version__
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.mcap.chunk_file import ChunkFile
 from valveflow_ros.logs.mcap.records import TopicTable, read_summary
-from valveflow_ros.logs.part_file import write_whole
-from valveflow_ros.logs.source import Source
+from valveflow_ros.logs.part_file import PART_SUFFIX, write_whole
+from valveflow_ros.logs.source import Source, os_errors
 
 METADATA_NAME = 'metadata.yaml'
 METADATA_VERSION = 9
@@ -78,11 +78,6 @@ class Split:
         return cls(name, times[0], times[1], sum(counts.values()), topics, by_topic)
 
     @classmethod
-    def of_file(cls, name: str, file: ChunkFile, table: TopicTable) -> Split:
-        """Describe a file that was just written."""
-        return cls.of(name, table, file.counts, (file.start_ns, file.end_ns))
-
-    @classmethod
     def read(cls, path: Path) -> Split | None:
         """Describe a finished file by its summary, ``None`` if it has none to be believed."""
         try:
@@ -113,9 +108,30 @@ def in_order(paths: Iterable[Path]) -> list[Path]:
     return sorted(paths, key=lambda path: (split_number(path), path.name))
 
 
+def recording_files(folder: Path) -> list[Path]:
+    """Return all files of a recording in their order, finished or not.
+
+    While a ``.part`` is made whole, both may stand there for a moment; then it is left out.
+    """
+    with os_errors(folder, 'cannot be read'):
+        names = {entry.name for entry in folder.iterdir()}
+    whole = {name for name in names if name.endswith('.mcap')}
+    parts = {name for name in names if name.endswith(f'.mcap{PART_SUFFIX}')}
+    kept = {name for name in parts if name.removesuffix(PART_SUFFIX) not in whole}
+    return in_order(folder / name for name in whole | kept)
+
+
 def finished_files(folder: Path) -> list[Path]:
     """Return the finished splits of a folder in their order."""
     return in_order(path for path in folder.glob('*.mcap') if path.is_file())
+
+
+def finish_split(file: ChunkFile, name: str, table: TopicTable) -> Split:
+    """Finish a file that stands, or will stand, under a name; raises `OSError`."""
+    split = Split.of(name, table, file.counts, (file.start_ns, file.end_ns))
+    file.put_metadata('rosbag2', {'serialized_metadata': information_text([split])})
+    file.finish(table)
+    return split
 
 
 def write_metadata(folder: Path, splits: list[Split]) -> None:

@@ -19,7 +19,7 @@ from mcap.well_known import MessageEncoding
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.mcap.cdr import Decoder, PlantSampleReader
-from valveflow_ros.logs.mcap.folder import Split, in_order
+from valveflow_ros.logs.mcap.folder import Split, in_order, recording_files
 from valveflow_ros.logs.mcap.gather import Rows, float_rows, sample_rows
 from valveflow_ros.logs.mcap.records import (
     FOOTER_SIZE,
@@ -55,23 +55,14 @@ def final_of(path: Path) -> Path:
     return path.with_suffix('') if path.suffix == PART_SUFFIX else path
 
 
-def files_in(folder: Path) -> set[Path]:
-    """Return the files of a folder by their final names; raises `RecordingError`."""
-    try:
-        names = [entry.name for entry in folder.iterdir()]
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RecordingError(folder, f'cannot be read ({reason})') from None
-    return {
-        folder / name.removesuffix(PART_SUFFIX)
-        for name in names
-        if name.endswith(('.mcap', f'.mcap{PART_SUFFIX}'))
-    }
+def files_in(folder: Path) -> list[Path]:
+    """Return the files of a folder by their final names, in order; raises `RecordingError`."""
+    return in_order({final_of(path) for path in recording_files(folder)})
 
 
 def first_in(folder: Path) -> Path | None:
     """Return the file to begin with: the first that holds something of the last day."""
-    files = in_order(files_in(folder))
+    files = files_in(folder)
     begin: Path | None = None
     newest = 0
     for path in reversed(files):

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from valveflow_ros.errors import RecordingError, counted
 from valveflow_ros.logs.contents import LogContents, LoggedMessage, TopicInfo
-from valveflow_ros.logs.mcap.folder import Split, in_order
+from valveflow_ros.logs.mcap.folder import Split, recording_files
 from valveflow_ros.logs.mcap.gather import FileContents, Group, Rows, gather
 from valveflow_ros.logs.mcap.records import HEAD_SIZE, LayoutError, MessageTable, walk
 from valveflow_ros.logs.mcap.scan import Findings, Scanner, scan_warnings
 from valveflow_ros.logs.names import PLANT_SAMPLE_TOPIC, TopicChoice, misfits
-from valveflow_ros.logs.part_file import PART_SUFFIX
 from valveflow_ros.logs.source import DEFAULT_LIMITS, Limits, OverBudgetError, Source
 from valveflow_ros.records import IntArray, Readings, Signal
 
@@ -445,25 +444,10 @@ def _read(home: Path, after_ns: int) -> LogContents:
 
 def _wanted(home: Path, after_ns: int) -> list[Path]:
     wanted: list[Path] = []
-    for path in reversed(in_order(_files(home))):
+    for path in reversed([p for p in recording_files(home) if p.is_file()]):
         wanted.insert(0, path)
         split = Split.read(path) if path.suffix == '.mcap' else None
         # Splits follow each other in time; one that begins before the moment is the first needed.
         if split is not None and split.messages and split.start_ns <= after_ns:
             break
     return wanted
-
-
-def _files(home: Path) -> list[Path]:
-    try:
-        names = {entry.name for entry in home.iterdir() if entry.is_file()}
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RecordingError(home, f'cannot be read ({reason})') from None
-    whole = {name for name in names if name.endswith('.mcap')}
-    parts = {
-        name
-        for name in names
-        if name.endswith(f'.mcap{PART_SUFFIX}') and name[: -len(PART_SUFFIX)] not in whole
-    }
-    return [home / name for name in whole | parts]

@@ -12,14 +12,14 @@ from mcap.records import Channel, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from valveflow_ros.errors import InputError, RecordingError
-from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES, ChunkBuilder, ChunkFile, attachment
+from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES, ChunkBuilder, ChunkFile
 from valveflow_ros.logs.mcap.definitions import Definitions, parse_all, type_hash
 from valveflow_ros.logs.mcap.folder import (
     LIBRARY,
     Listing,
     Split,
+    finish_split,
     finished_files,
-    information_text,
     split_number,
 )
 from valveflow_ros.logs.mcap.records import LayoutError, TopicTable, pack
@@ -380,10 +380,7 @@ class RecordingWriter:
             out = self._open_file(self.path)
             try:
                 file = ChunkFile(out, LIBRARY)
-                for name, data in self.attachments.items():
-                    file.put_attachment(attachment(name, data))
-                for name, items in self.metadata.items():
-                    file.put_metadata(name, items)
+                file.put_all(self.attachments, self.metadata)
                 if self._begun:
                     self._repeat(file)
             except OSError:
@@ -419,10 +416,8 @@ class RecordingWriter:
             if self._listing.due:
                 self._list()
             return
-        split = Split.of_file(self.path.name, self._file, self._topics.table)
         try:
-            self._file.put_metadata('rosbag2', {'serialized_metadata': information_text([split])})
-            self._file.finish(self._topics.table)
+            split = finish_split(self._file, self.path.name, self._topics.table)
             self.bytes_finished += self._file.position
             self.files_finished += 1
             self._listing.add(split)

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from valveflow_ros.errors import InputError, RecordingError
+from valveflow_ros.errors import InputError
 from valveflow_ros.logs.contents import LogContents
 from valveflow_ros.logs.names import signal_of
 from valveflow_ros.logs.part_file import make_folder
+from valveflow_ros.logs.source import os_errors
 from valveflow_ros.logs.tables.binary import check_parquet
 from valveflow_ros.logs.tables.cells import QUALITY_SUFFIX
 from valveflow_ros.logs.tables.match import TIME
@@ -225,18 +225,14 @@ def write_table(table: SampleTable, path: str | Path) -> None:
     if kind == '.parquet':
         check_parquet(place)
     draft = place.with_name(f'.{place.name}.part')
-    try:
+    with os_errors(path, 'cannot be written'):
         make_folder(place.parent)
-        if kind == '.csv':
-            _write_csv(table, draft)
-        else:
-            _write_parquet(table, draft)
-        draft.replace(place)
-    except OSError as error:
-        with suppress(OSError):
-            draft.unlink()
-        reason = (error.strerror or str(error)).lower()
-        raise RecordingError(path, f'cannot be written ({reason})') from None
+        try:
+            (_write_csv if kind == '.csv' else _write_parquet)(table, draft)
+            draft.replace(place)
+        except OSError:
+            draft.unlink(missing_ok=True)
+            raise
 
 
 def _columns(table: SampleTable) -> Iterator[tuple[str, FloatArray, ByteArray | None]]:
