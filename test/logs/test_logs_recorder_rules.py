@@ -9,7 +9,6 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pytest
 from damage import records
 from hypothesis import given, settings
@@ -27,15 +26,12 @@ from valveflow_ros.logs import (
     open_log,
 )
 from valveflow_ros.logs.mcap import recorder
-from valveflow_ros.logs.mcap.chunk_file import ZSTD, ChunkBuilder
 from valveflow_ros.logs.mcap.recorder import (
     DROPS_SHOWN_S,
     NewTopic,
     RecorderCounters,
     RecorderLoop,
 )
-from valveflow_ros.logs.mcap.records import RECORD_HEAD, Unpacker
-from valveflow_ros.logs.mcap.scan import CHUNK_HEAD_SIZE
 from valveflow_ros.logs.mcap.writer import Qos
 
 STEP_S = 7.0
@@ -261,62 +257,6 @@ def test_the_disk_is_asked_as_often_as_the_period_says_and_never_without_one(
         assert stage.writer.at('sync') == expected
 
 
-@pytest.mark.parametrize('limits', [{'rotate_s': 10.0}, {'rotate_bytes': 300}])
-def test_a_split_ends_at_its_limit_counted_from_its_own_beginning(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limits: dict[str, Any]
-) -> None:
-    """A flush a second, each of 100 bytes: every split of ten seconds, or of 300 bytes."""
-    stage = Stage(tmp_path, monkeypatch, **limits)
-    for _ in range(35):
-        stage.put()
-        stage.cycle()
-        stage.clock.now += 1.0
-    at = stage.writer.at('rotate')
-    every = 11.0 if 'rotate_s' in limits else 3.0
-    assert [b - a for a, b in itertools.pairwise(at)] == [every] * (len(at) - 1)
-    assert at[0] - 1000.0 == every - 1.0
-    assert stage.counters.status().bytes_written == 35 * 100
-
-
-def test_a_wish_for_a_split_is_granted_once_and_not_kept_for_later(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stage = Stage(tmp_path, monkeypatch)
-    stage.loop.ask_rotation()
-    stage.cycle()
-    assert not stage.loop.rotation_asked
-    stage.put()
-    stage.cycle()
-    assert stage.writer.at('rotate') == []
-    stage.loop.ask_rotation()
-    stage.cycle()
-    stage.put()
-    stage.cycle()
-    assert len(stage.writer.at('rotate')) == 1
-
-
-@pytest.mark.parametrize('keep', [None, 0, 1, 3])
-def test_of_its_own_files_the_newest_stay_and_of_others_all(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, keep: int | None
-) -> None:
-    stage = Stage(tmp_path, monkeypatch, rotate_s=0.0, keep_files=keep)
-    other = tmp_path / 'other_0.mcap'
-    other.write_bytes(b'')
-    stage.writer.finished.append(Finished(other.name))
-    for k in range(5):
-        stage.put()
-        stage.cycle()
-        left = sorted(p.name for p in tmp_path.glob('log_*.mcap'))
-        first = 0 if keep is None else max(0, k + 1 - keep)
-        assert left == [f'log_{n}.mcap' for n in range(first, k + 1)]
-        assert [s.name for s in stage.writer.finished] == [other.name, *left]
-        if k == 2 and keep:
-            # Somebody has removed one by hand.
-            (tmp_path / left[0]).unlink()
-            stage.writer.forget(left[0])
-    assert other.exists()
-
-
 def test_a_file_that_somebody_else_removed_first_is_as_good_as_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -347,63 +287,6 @@ def test_a_latched_message_is_a_repetition_only_once_it_is_on_disk(
     topic, _, more = stage.writer.took[0]
     assert (topic, more['type_hash'], more['definition']) == ('/curve', 'hash', 'float64 data')
     assert more['qos'] == Qos()
-
-
-def test_too_little_space_is_told_in_mebibytes_and_ends_the_split_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stage = Stage(tmp_path, monkeypatch, free_floor_bytes=5 << 20, retry_s=1.0, retry_max_s=1.0)
-    stage.put()
-    stage.cycle()
-    stage.free = (5 << 20) - 1
-    for _ in range(4):
-        stage.put()
-        stage.cycle()
-        stage.clock.now += 1.0
-    status = stage.counters.status()
-    assert 'only 4 MiB are free, 5 MiB must stay free' in status.reason
-    assert len(stage.writer.at('close')) == 1
-    assert (status.written, status.queued) == (1, 4)
-    stage.free = 5 << 20
-    stage.cycle()
-    assert stage.counters.status().written == 5
-
-
-class Waiting:
-    """Stands for the event the thread sleeps on."""
-
-    def __init__(self, loop: RecorderLoop, clock: Clock, count: int) -> None:
-        self.waits: list[float] = []
-        self.asleep: list[float] = []
-        self.log: list[str] = []
-        self._loop, self._clock, self._count = loop, clock, count
-
-    def wait(self, seconds: float) -> None:
-        self.log.append('wait')
-        self._clock.now += seconds
-        self.waits.append(seconds)
-        self.asleep.append(self._loop._counters.status().stalled_s)
-        if len(self.waits) == self._count:
-            self._loop._stopping = True
-
-    def clear(self) -> None:
-        self.log.append('clear')
-
-
-@pytest.mark.parametrize('takes_s', [0.0, 0.125, 0.5, 2.0])
-def test_the_thread_sleeps_what_its_work_leaves_of_the_period(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, takes_s: float
-) -> None:
-    stage = Stage(tmp_path, monkeypatch, takes_s, flush_period_s=0.5)
-    event = Waiting(stage.loop, stage.clock, 4)
-    stage.loop._wake = event  # type: ignore[assignment]
-    stage.loop._run()
-    assert event.waits == [max(0.0, 0.5 - takes_s)] * 4
-    assert event.asleep == [0.0] * 4
-    assert event.log == ['wait', 'clear'] * 4
-    # One more after it was told to stop, and then the end.
-    assert len(stage.writer.at('flush')) == 5
-    assert stage.counters.status().state == RecorderState.STOPPED
 
 
 @pytest.mark.parametrize('bad', ['', 'note', 'close'])
@@ -439,13 +322,6 @@ def test_what_never_began_says_that_nothing_could_be_recorded(
     status = stage.counters.status()
     assert (status.reason, status.lost) == ('nothing could be recorded', 1)
     assert status.stalled_s == 0.0
-
-
-def test_a_stuck_thread_keeps_no_process_alive_and_is_known_by_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    thread = Stage(tmp_path, monkeypatch).loop._thread
-    assert (thread.name, thread.daemon) == ('recorder', True)
 
 
 # --- the account ----------------------------------------------------------------------------
@@ -519,19 +395,6 @@ def test_every_message_is_in_exactly_one_column_whatever_happens(
     assert told == {f'dropped {t}': str(n) for t, n in counters.status().dropped.items()}
 
 
-def test_what_is_on_disk_is_told_as_it_was_given() -> None:
-    counters = RecorderCounters(5)
-    fresh = counters.status()
-    assert (fresh.state, fresh.reason, fresh.file) == (RecorderState.RECORDING, '', '')
-    assert (fresh.files_finished, fresh.bytes_written, fresh.recovered) == (0, 0, ())
-    counters.on_disk(0, 'a file', 3, 700)
-    status = counters.status()
-    assert (status.file, status.files_finished, status.bytes_written) == ('a file', 3, 700)
-    counters.stopped()
-    status = counters.status()
-    assert (status.file, status.files_finished, status.reason) == ('', 3, '')
-
-
 # --- chunks ---------------------------------------------------------------------------------
 
 times_ns = st.integers(0, 2**63 - 1)
@@ -541,42 +404,6 @@ rows = st.lists(
     ),
     max_size=20,
 )
-
-
-@given(rows, st.binary(max_size=20), rows)
-@settings(max_examples=50)
-def test_a_chunk_is_its_table_and_its_messages_one_after_the_other(
-    given_rows: list[Any], table: bytes, later: list[Any]
-) -> None:
-    """The slow truth packs each record as the format's specification draws it."""
-    builder = ChunkBuilder()
-    for content in (given_rows, later):
-        for row in content:
-            builder.add(*row)
-        expected, places = table, []
-        for channel, sequence, log_ns, publish_ns, data in content:
-            places.append(len(expected))
-            body = struct.pack('<HIQQ', channel, sequence % 2**32, log_ns, publish_ns) + data
-            expected += b'\x05' + struct.pack('<Q', len(body)) + body
-        assert (len(builder), builder.size) == (len(content), len(expected) - len(table))
-        if content:
-            assert builder.first_log_ns == content[0][2]
-        first, again = builder.build(table), builder.build(table)
-        assert first.record == again.record
-        assert len(first) == len(content)
-        np.testing.assert_array_equal(first.offset, np.array(places, dtype=np.int64))
-        np.testing.assert_array_equal(first.channel, [row[0] for row in content])
-        np.testing.assert_array_equal(first.log_time, [row[2] for row in content])
-        assert (first.unpacked_size, first.compression) == (len(expected), ZSTD)
-        op, length = struct.unpack_from('<BQ', first.record)
-        assert (op, length) == (Opcode.CHUNK, len(first.record) - RECORD_HEAD.size)
-        start, end, size = struct.unpack_from('<QQQ', first.record, RECORD_HEAD.size)
-        logs = [row[2] for row in content] or [0]
-        assert (start, end, size) == (min(logs), max(logs), len(expected))
-        head = RECORD_HEAD.size + CHUNK_HEAD_SIZE + 4 + len(ZSTD) + 8
-        assert Unpacker().unpack(ZSTD, first.record[head:], len(expected)) == expected
-        builder.clear()
-        assert (len(builder), builder.size) == (0, 0)
 
 
 @pytest.mark.parametrize('size', [1, 1000, 70_000])

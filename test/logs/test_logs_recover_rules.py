@@ -308,18 +308,6 @@ def mode(path: Path) -> int:
     return stat.S_IMODE(path.stat().st_mode)
 
 
-@pytest.mark.usefixtures('umask')
-def test_whatever_the_umask_its_owner_reads_and_writes_and_nobody_else(tmp_path: Path) -> None:
-    file = PartFile(tmp_path / 'a.mcap')
-    assert mode(file.part) == 0o600
-    file.write(b'x')
-    file.publish()
-    file.close()
-    assert mode(tmp_path / 'a.mcap') == 0o600
-    write_whole(tmp_path / 'small', b'x')
-    assert mode(tmp_path / 'small') == 0o600
-
-
 def test_every_folder_that_is_made_is_its_owners_and_others_stay(tmp_path: Path) -> None:
     (tmp_path / 'there').mkdir()
     (tmp_path / 'there').chmod(0o755)
@@ -486,13 +474,6 @@ def test_a_whole_file_is_on_the_disk_before_it_has_its_name(
 def _is_folder(descriptor: object) -> bool:
     assert isinstance(descriptor, int)
     return stat.S_ISDIR(os.fstat(descriptor).st_mode)
-
-
-def test_only_a_folder_is_synced_as_one(tmp_path: Path) -> None:
-    (tmp_path / 'file').write_bytes(b'')
-    with pytest.raises(NotADirectoryError):
-        sync_folder(tmp_path / 'file')
-    sync_folder(tmp_path)
 
 
 def test_a_short_write_of_a_recording_is_gone_on_with(tmp_path: Path) -> None:

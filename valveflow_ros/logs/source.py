@@ -95,8 +95,6 @@ class Source:
         self.close()
 
 
-# How much a file may cost before it is given up.
-
 MIB = 1 << 20
 
 

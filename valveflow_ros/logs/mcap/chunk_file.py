@@ -39,6 +39,7 @@ from valveflow_ros.records import IntArray
 CHUNK_BYTES = 64 * 1024
 ZSTD = 'zstd'
 _ZSTD_LEVEL = 3
+REPEAT_CHUNKS = 256
 _HEAD = struct.Struct('<BQHIQQ')
 _INDEX_ROW = np.dtype([('log_time', '<i8'), ('offset', '<i8')])
 
@@ -59,20 +60,8 @@ def compressor() -> zstandard.ZstdCompressor:
 class PackedChunk:
     """A chunk record ready to be written, and what an index says about it.
 
-    Attributes
-    ----------
-    record : bytes
-        The whole record.
-    channel : uint16 (n,)
-        Channel of each message.
-    log_time : int64 (n,)
-        Receipt time of each message, ns since the epoch.
-    offset : int64 (n,)
-        Where each message begins in the unpacked content.
-    unpacked_size : int
-        Bytes of the content.
-    compression : str
-        How the record is compressed.
+    Arrays of n messages: ``channel`` uint16, ``log_time`` int64 in ns since the epoch, ``offset``
+    int64 where each begins in the unpacked content, which has ``unpacked_size`` bytes.
     """
 
     record: bytes
@@ -195,6 +184,7 @@ class ChunkFile:
         self.position = 0
         self._out = out
         self._crc = 0
+        self._topics_known = self._since_table = 0
         # Packed at once: a recording of months has a million chunks.
         self._index: dict[Opcode, list[bytes]] = {
             Opcode.CHUNK_INDEX: [], Opcode.ATTACHMENT_INDEX: [], Opcode.METADATA_INDEX: [],
@@ -229,6 +219,20 @@ class ChunkFile:
         self._append(packed)
         index = MetadataIndex(offset=start, length=len(packed), name=name)
         self._index[Opcode.METADATA_INDEX].append(pack(index))
+
+    def table_due(self, topics: int) -> bool:
+        """Tell whether the records of so many topics are to stand in the next chunk.
+
+        A chunk may be lost, and with it the only mention of a topic; so they stand in the first
+        two chunks that could hold a new one, and then in one of `REPEAT_CHUNKS`.
+        """
+        due = topics > self._topics_known or self._since_table in (0, REPEAT_CHUNKS)
+        if topics > self._topics_known:
+            # The next chunk repeats what is new.
+            self._topics_known, self._since_table = topics, 0
+        else:
+            self._since_table = 1 if due else self._since_table + 1
+        return due
 
     def put_chunk(self, chunk: PackedChunk) -> None:
         """Write a chunk and its message indexes."""

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from mcap.records import Channel
+
 from valveflow_ros import __version__
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.mcap.chunk_file import ChunkFile
@@ -24,39 +26,17 @@ _NUMBERED = re.compile(r'(.*)_([0-9]{1,9})\.mcap(?:\.part)?\Z', re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True)
-class TopicInfoLine:
-    """What `metadata.yaml` says about a topic."""
-
-    topic: str
-    type: str
-    encoding: str
-    qos: str
-    type_hash: str
-
-
-@dataclass(frozen=True, slots=True)
 class Split:
-    """One finished file of a recording.
+    """One finished file of a recording: its first and last log time are 0 without messages.
 
-    Attributes
-    ----------
-    name : str
-        File name within the folder.
-    start_ns, end_ns : int
-        First and last log time; 0 without messages.
-    messages : int
-        Number of messages.
-    topics : dict[str, TopicInfoLine]
-        The topics by name.
-    counts : dict[str, int]
-        Messages of each.
+    ``topics`` holds type and channel, ``counts`` the messages of each topic by its name.
     """
 
     name: str
     start_ns: int
     end_ns: int
     messages: int
-    topics: dict[str, TopicInfoLine] = field(default_factory=dict)
+    topics: dict[str, tuple[str, Channel]] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
 
     @classmethod
@@ -64,16 +44,10 @@ class Split:
         cls, name: str, table: TopicTable, counts: Mapping[int, int], times: tuple[int, int]
     ) -> Split:
         """Describe a file by its topics, the messages of each channel, and its times."""
-        topics: dict[str, TopicInfoLine] = {}
+        topics: dict[str, tuple[str, Channel]] = {}
         by_topic: dict[str, int] = {}
         for number, channel in table.channels.items():
-            topics[channel.topic] = TopicInfoLine(
-                channel.topic,
-                table.type_of(channel),
-                channel.message_encoding,
-                channel.metadata.get('offered_qos_profiles', ''),
-                channel.metadata.get('topic_type_hash', ''),
-            )
+            topics[channel.topic] = (table.type_of(channel), channel)
             by_topic[channel.topic] = by_topic.get(channel.topic, 0) + counts.get(number, 0)
         return cls(name, times[0], times[1], sum(counts.values()), topics, by_topic)
 
@@ -140,24 +114,10 @@ def write_metadata(folder: Path, splits: list[Split]) -> None:
 
 
 class Listing:
-    """The finished splits of a folder, and the `metadata.yaml` that names them.
+    """The finished splits of a folder in order, and the `metadata.yaml` that names them.
 
-    Parameters
-    ----------
-    folder : Path
-        The recording's folder.
-
-    Attributes
-    ----------
-    splits : list of Split
-        In their order.
-    due : bool
-        `metadata.yaml` could not be written as it should be.
-
-    Raises
-    ------
-    OSError
-        If the folder cannot be read.
+    ``due`` is true while `metadata.yaml` could not be written as it should be. Raises `OSError` if
+    the folder cannot be read.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -225,26 +185,27 @@ def _span(splits: list[Split]) -> tuple[int, int]:
 
 
 def _topic_lines(splits: list[Split]) -> list[str]:
-    topics: dict[str, TopicInfoLine] = {}
+    topics: dict[str, tuple[str, Channel]] = {}
     counts: dict[str, int] = {}
     for split in splits:
         topics.update(split.topics)
         for topic, count in split.counts.items():
             counts[topic] = counts.get(topic, 0) + count
-    return [_topic_line(line, counts[line.topic]) for line in topics.values()]
-
-
-def _topic_line(line: TopicInfoLine, count: int) -> str:
-    qos = f'\n{textwrap.indent(line.qos, " " * 8)}' if line.qos else ' []'
-    return (
-        '  - topic_metadata:\n'
-        f'      name: {_quoted(line.topic)}\n'
-        f'      type: {_quoted(line.type)}\n'
-        f'      serialization_format: {_quoted(line.encoding)}\n'
-        f'      offered_qos_profiles:{qos}\n'
-        f'      type_description_hash: {_quoted(line.type_hash)}\n'
-        f'    message_count: {count}'
-    )
+    lines = []
+    for topic, (kind, channel) in topics.items():
+        qos = channel.metadata.get('offered_qos_profiles', '')
+        told = f'\n{textwrap.indent(qos, " " * 8)}' if qos else ' []'
+        lines.append(
+            '  - topic_metadata:\n'
+            f'      name: {_quoted(topic)}\n'
+            f'      type: {_quoted(kind)}\n'
+            f'      serialization_format: {_quoted(channel.message_encoding)}\n'
+            f'      offered_qos_profiles:{told}\n'
+            '      type_description_hash: '
+            f'{_quoted(channel.metadata.get("topic_type_hash", ""))}\n'
+            f'    message_count: {counts[topic]}'
+        )
+    return lines
 
 
 def _file_lines(split: Split) -> str:

@@ -7,7 +7,7 @@ attachments, so a recording may grow for months.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -37,9 +37,6 @@ from valveflow_ros.logs.names import FLOAT64, PLANT_SAMPLE, last_part, signal_of
 from valveflow_ros.logs.part_file import PART_SUFFIX, is_held
 from valveflow_ros.logs.source import DEFAULT_LIMITS, OverBudgetError, Source
 from valveflow_ros.records import NS_PER_S, SIGNALS, Signal
-
-# The files of a recording that is followed: their names, and with which to begin.
-
 
 # What stands is announced again within a day, so nothing older is needed to know it.
 LOOK_BACK_NS = 25 * 3600 * NS_PER_S
@@ -85,18 +82,9 @@ _LAST = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Messages that were added.
+    """Messages that were added: records of some chunks, the messages in them, their topics.
 
-    Attributes
-    ----------
-    content : bytes
-        The records of some chunks.
-    messages : MessageTable
-        The messages in them.
-    topics : TopicTable
-        What their channels stand for.
-    share : float
-        How much of the files that are there has been read by now, 0 to 1.
+    ``share`` says how much of the files that are there has been read by now, 0 to 1.
     """
 
     content: bytes
@@ -325,8 +313,6 @@ class Follower:
         return min(1.0, (done + inside) / max(1, len(self._order) - begun))
 
 
-# Takes out of followed batches what a view needs: the last messages, and the readings.
-
 _INPUTS = {info.topic for info in SIGNALS}
 
 
@@ -353,8 +339,7 @@ class Picker:
 
     def __init__(self) -> None:
         self.misfits = 0
-        self._decoders: dict[tuple[str, str], Decoder | None] = {}
-        self._readers: dict[str, PlantSampleReader | None] = {}
+        self._decoders: dict[tuple[str, ...], Any] = {}
 
     def last(self, batch: Batch, wanted: dict[str, int]) -> Iterator[Raw]:
         """Yield messages, not decoded yet, in the order of the file.
@@ -369,7 +354,7 @@ class Picker:
         for channel, type_name, definition in _channels(batch):
             if type_name not in wanted:
                 continue
-            decoder = self._decoder(type_name, definition)
+            decoder: Decoder | None = self._made(Decoder, type_name, definition)
             mine = np.flatnonzero(batch.messages.channel == channel)[-wanted[type_name] :]
             if decoder is not None:
                 picked += [(row, decoder) for row in mine.tolist()]
@@ -394,7 +379,10 @@ class Picker:
                 (_, found), wrong = float_rows(batch.content, messages, mine)
                 self.misfits += len(wrong)
                 yield signal_of(last_part(topic)), topic, found
-            elif type_name == PLANT_SAMPLE and (reader := self._reader(definition)) is not None:
+            elif type_name == PLANT_SAMPLE:
+                reader: PlantSampleReader | None = self._made(PlantSampleReader, definition)
+                if reader is None:
+                    continue
                 samples = reader.read(batch.content, messages, mine)
                 self.misfits += int((~samples.good).sum())
                 _, found = sample_rows(messages, mine, samples)
@@ -403,22 +391,14 @@ class Picker:
                     columns = (getattr(found, name)[keep] for name in Rows.__dataclass_fields__)
                     yield Signal(number), topic, Rows(*columns)
 
-    def _decoder(self, type_name: str, definition: str) -> Decoder | None:
-        key = type_name, definition
+    def _made(self, make: Callable[..., Any], *key: str) -> Any:
+        """Return a decoder of one definition, made once; None where it is not understood."""
         if key not in self._decoders:
             try:
-                self._decoders[key] = Decoder(type_name, definition)
-            except RecordingError:
+                self._decoders[key] = make(*key)
+            except (RecordingError, LayoutError):
                 self._decoders[key] = None
         return self._decoders[key]
-
-    def _reader(self, definition: str) -> PlantSampleReader | None:
-        if definition not in self._readers:
-            try:
-                self._readers[definition] = PlantSampleReader(definition)
-            except LayoutError:
-                self._readers[definition] = None
-        return self._readers[definition]
 
 
 def _channels(batch: Batch) -> Iterator[tuple[int, str, str]]:

@@ -28,8 +28,6 @@ from valveflow_ros.logs.names import FLOAT64, PLANT_SAMPLE, TopicChoice
 from valveflow_ros.logs.source import DEFAULT_LIMITS, Limits, Source
 from valveflow_ros.records import SIGNALS, ByteArray, FloatArray, IntArray
 
-# What is found in a file: rows of values, groups of chunks, counts.
-
 _PAYLOAD = np.dtype([('mark', '>u2'), ('options', '<u2'), ('value', '<f8')])
 # A Float64 takes 12 bytes; some middlewares pad to a multiple of 8.
 _SIZES = (12, 16)
@@ -39,18 +37,9 @@ _SIZES = (12, 16)
 class Rows:
     """Values found in a group of chunks, in the order of the file.
 
-    Attributes
-    ----------
-    log_time, time_ns : int64 (n,)
-        Receipt time and the value's own time.
-    channel : uint16 (n,)
-        Where it was found.
-    signal : int8 (n,)
-        Which signal it is, -1 where the topic has yet to be chosen.
-    value : float64 (n,)
-        As it stands there.
-    quality : uint8 (n,)
-        As it stands there; good where nothing stands.
+    Arrays of n: ``log_time`` and ``time_ns`` int64, receipt and the value's own time; ``channel``
+    uint16; ``signal`` int8, -1 where the topic has yet to be chosen; ``value`` float64;
+    ``quality`` uint8, good where the file says nothing.
     """
 
     log_time: IntArray

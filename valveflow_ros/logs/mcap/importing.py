@@ -31,7 +31,7 @@ from valveflow_ros.logs.mcap.folder import (
     write_metadata,
 )
 from valveflow_ros.logs.mcap.records import RECORD_HEAD
-from valveflow_ros.logs.mcap.writer import Metadata, TableSchedule, TopicBook
+from valveflow_ros.logs.mcap.writer import Metadata, TopicBook
 from valveflow_ros.logs.names import FLOAT64
 from valveflow_ros.logs.part_file import new_file
 from valveflow_ros.logs.source import os_errors
@@ -150,16 +150,14 @@ def write_readings(
         with new_file(target) as out:
             file = ChunkFile(out, LIBRARY)
             file.put_all(attachments or {}, metadata or {})
-            schedule, packer, topics = TableSchedule(), compressor(), len(book.ids)
+            packer = compressor()
             for part in chain([first], parts):
-                due = schedule.due(topics)
-                table = book.packed() if due else b''
+                table = book.packed() if file.table_due(len(book.ids)) else b''
                 offset = len(table) + _RECORD.itemsize * np.arange(len(part), dtype=np.int64)
                 content = table + part.tobytes()
                 file.put_chunk(
                     pack_content(content, part['channel'], part['log_time'], offset, packer)
                 )
-                schedule.done(topics, due)
             split = finish_split(file, target.name, book.table)
         path = target.parent / METADATA_NAME
         # A file by itself needs none, so that of another recording stays.

@@ -9,7 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -72,7 +72,7 @@ class RecorderSettings:
     retry_max_s: float = 10.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class RecorderStatus:
     """What a recorder counted: ``received == written + queued + lost + sum of dropped``, always.
 
@@ -131,12 +131,8 @@ class RecorderCounters:
         self._lock = threading.Lock()
         self._limit = limit
         self._open = True
-        self._received = self._written = self._queued = self._lost = 0
-        self._dropped: dict[str, int] = {}
+        self._now = RecorderStatus(RecorderState.RECORDING)
         self._drops = 0
-        self._state, self._reason = RecorderState.RECORDING, ''
-        self._file, self._files, self._bytes = '', 0, 0
-        self._recovered: tuple[RecoveryReport, ...] = ()
         self._working_since_s: float | None = None
 
     def working(self) -> None:
@@ -151,11 +147,12 @@ class RecorderCounters:
     def admit(self, topic: str) -> bool:
         """Count a message in; False if it must be dropped."""
         with self._lock:
-            self._received += 1
-            if self._open and self._queued < self._limit:
-                self._queued += 1
+            now = self._now
+            now.received += 1
+            if self._open and now.queued < self._limit:
+                now.queued += 1
                 return True
-            self._dropped[topic] = self._dropped.get(topic, 0) + 1
+            now.dropped[topic] = now.dropped.get(topic, 0) + 1
             self._drops += 1
             self._dropped_at = self._clock()
             return False
@@ -168,37 +165,38 @@ class RecorderCounters:
     def on_disk(self, written: int, file: str, files: int, size: int) -> None:
         """Set how many messages are on disk in all, and in which file."""
         with self._lock:
-            self._queued -= written - self._written
-            self._written = written
-            self._file, self._files, self._bytes = file, files, size
+            now = self._now
+            now.queued -= written - now.written
+            now.written, now.file, now.files_finished, now.bytes_written = (
+                written, file, files, size,
+            )  # fmt: skip
 
     def healthy(self) -> None:
         """Set the state after all that waited was written."""
         with self._lock:
+            self._now.state, self._now.reason = RecorderState.RECORDING, ''
             if self._clock() - self._dropped_at < DROPS_SHOWN_S:
-                self._state = RecorderState.DEGRADED
-                self._reason = f'{self._drops} messages were dropped, too many were waiting'
-            else:
-                self._state, self._reason = RecorderState.RECORDING, ''
+                self._now.state = RecorderState.DEGRADED
+                self._now.reason = f'{self._drops} messages were dropped, too many were waiting'
 
     def failing(self, reason: str) -> None:
         """Set the state while nothing can be written."""
         with self._lock:
-            self._state, self._reason = RecorderState.DEGRADED, reason
+            self._now.state, self._now.reason = RecorderState.DEGRADED, reason
 
     def recovered(self, reports: tuple[RecoveryReport, ...]) -> None:
         """Set the leftovers that were finished."""
         with self._lock:
-            self._recovered = reports
+            self._now.recovered = reports
 
     def stopped(self, reason: str = '') -> None:
         """Count what waits now as lost, for good."""
         self.resting()
         with self._lock:
             self._open = False
-            self._lost += self._queued
-            self._queued = 0
-            self._state, self._reason, self._file = RecorderState.STOPPED, reason, ''
+            now = self._now
+            now.lost, now.queued = now.lost + now.queued, 0
+            now.state, now.reason, now.file = RecorderState.STOPPED, reason, ''
 
     def as_metadata(self) -> dict[str, str]:
         """Return the counters as they are written into the recording."""
@@ -211,20 +209,7 @@ class RecorderCounters:
         since_s = self._working_since_s
         stalled_s = 0.0 if since_s is None else max(0.0, self._clock() - since_s)
         with self._lock:
-            return RecorderStatus(
-                self._state,
-                self._reason,
-                self._file,
-                self._received,
-                self._written,
-                self._queued,
-                self._lost,
-                dict(self._dropped),
-                self._files,
-                self._bytes,
-                self._recovered,
-                stalled_s,
-            )
+            return replace(self._now, dropped=dict(self._now.dropped), stalled_s=stalled_s)
 
 
 class NewTopic(NamedTuple):

@@ -268,18 +268,9 @@ MAX_TOPIC_RECORDS = 1 << 16
 class MessageTable:
     """The messages of one run of records, in the order in which they stand there.
 
-    Attributes
-    ----------
-    channel : uint16 (n,)
-        Channel ids.
-    sequence : uint32 (n,)
-        As the writer counted them.
-    log_time, publish_time : int64 (n,)
-        Nanoseconds since the epoch.
-    offset : int64 (n,)
-        Where each message record begins.
-    size : int64 (n,)
-        Bytes of each payload, which begins `HEAD_SIZE` after the offset.
+    Arrays of n: ``channel`` uint16, ``sequence`` uint32 as the writer counted, ``log_time`` and
+    ``publish_time`` int64 in ns since the epoch, ``offset`` int64 where each record begins,
+    ``size`` int64 bytes of each payload, which begins `HEAD_SIZE` after the offset.
     """
 
     channel: NDArray[np.uint16]

@@ -30,18 +30,8 @@ from valveflow_ros.logs.source import Source, os_errors
 class RecoveryReport:
     """What a recovery kept and what it had to leave.
 
-    Attributes
-    ----------
-    source, out : Path
-        The broken file and the whole one.
-    messages, chunks : int
-        Copied.
-    damaged_chunks : int
-        Places where something was lost, apart from a cut-off end.
-    bytes_read, bytes_written : int
-        Sizes of both files.
-    warnings : tuple of str
-        Sentences about what was met.
+    ``messages`` and ``chunks`` were copied; ``damaged_chunks`` counts the places where something
+    was lost, apart from a cut-off end; ``warnings`` are sentences about what was met.
     """
 
     source: Path

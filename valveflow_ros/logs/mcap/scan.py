@@ -328,9 +328,6 @@ class Scanner:
         return next(candidates(self._source, position, position + 1), None) is not None
 
 
-# Says in sentences what a scan met.
-
-
 def scan_warnings(findings: Findings, what: str) -> tuple[str, ...]:
     """Return one sentence for each thing a reader of the file should know; none if all is well."""
     sentences = []

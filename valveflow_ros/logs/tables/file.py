@@ -45,14 +45,9 @@ BOOKS = ('.xlsx', '.xlsm')
 class Heading:
     """The rows above the data.
 
-    Attributes
-    ----------
-    row : int
-        Row of the names, counted from 0.
-    others : tuple of int
-        Rows between the names and the first row of data: units, descriptions.
-    names, units, about : tuple of str
-        One a column, empty where nothing stands; the names as they stand in the file.
+    ``row`` is that of the names, from 0; ``others`` those between the names and the data: units,
+    descriptions. ``names``, ``units`` and ``about`` have an entry for each column, empty where
+    nothing stands; the names as they stand in the file.
     """
 
     row: int
@@ -71,19 +66,9 @@ class Heading:
 class TableFile:
     """A table that was looked at and not yet read.
 
-    Attributes
-    ----------
-    path : Path
-    heading : Heading
-        Its columns.
-    rows : list of list of str
-        Rows of data from its beginning, from places on the way, and from its end.
-    marks : Marks or None
-        How numbers are written; ``None`` where a comma may be either mark.
-    notes : list of str
-        Sentences; complete when all blocks were read.
-    share : float
-        How much of a text was read so far, 0 to 1.
+    ``rows`` are some of its data from its beginning, from places on the way, and from its end;
+    ``marks`` is ``None`` where a comma may be either mark; ``notes`` are complete when all blocks
+    were read; ``share`` is how much of a text was read so far, 0 to 1.
     """
 
     path: Path

@@ -45,18 +45,9 @@ _GROUNDS = {EXACT: '', CLEAR: 'by its name', LIKELY: 'by its name', TAG: 'by its
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """A column that stands for a signal.
+    """A column that stands for a signal: its place from 0, its name and unit in the file.
 
-    Attributes
-    ----------
-    place : int
-        Which column, from 0.
-    theirs : str
-        What it is called in the file.
-    unit : Spelling or None
-        The unit the file names.
-    ground : str
-        Why it was chosen; empty where nothing had to be guessed.
+    ``ground`` says why it was chosen; it is empty where nothing had to be guessed.
     """
 
     place: int

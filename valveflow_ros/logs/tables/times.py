@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-# Makes nanoseconds of the stamps of pandas.
-
 _WHOLE_LIMIT = 2.0**63
 # Zones that stand behind a time: German ones tell summer from winter themselves.
 _ABBREVIATED = (
@@ -74,9 +72,6 @@ def with_offsets(text: pd.Series[Any]) -> pd.Series[Any]:
     for words, offset in _ABBREVIATED:
         text = text.str.replace(words, offset, regex=True)
     return text
-
-
-# Tells from samples what kind of times a column of numbers holds.
 
 
 # Numbers above these cannot be seconds (year 5138), milliseconds, microseconds of our age.
