@@ -1,4 +1,4 @@
-"""What holds of a recorder's loop, account and chunks at any pace, on a clock moved by hand."""
+"""What holds of a recorder's loop, account and chunks at any speed, on a clock moved by hand."""
 
 from __future__ import annotations
 

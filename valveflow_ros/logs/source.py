@@ -136,12 +136,12 @@ class Budget:
         self.failed_left = limits.failed_floor_bytes + limits.failed_per_byte * file_bytes
 
     def spend(self, size: int) -> None:
-        """Count work before it is done; raises `OverBudgetError` when the purse is empty."""
+        """Count work before it is done; raises `OverBudgetError` when nothing is left."""
         self.left -= size
         if self.left < 0:
             raise OverBudgetError
 
-    def regret(self, size: int) -> None:
+    def spend_in_vain(self, size: int) -> None:
         """Count work that turned out to be in vain."""
         self.failed_left -= size
         if self.failed_left < 0:

@@ -203,7 +203,7 @@ class _Collector:
         try:
             self._group([chunk])
         except LayoutError as error:
-            self.contents.findings.blame(f'the chunk at byte {chunk.offset}: {error}')
+            self.contents.findings.add_damage(f'the chunk at byte {chunk.offset}: {error}')
 
     def _group(self, chunks: list[Chunk]) -> None:
         content = b''.join(chunk.content for chunk in chunks)

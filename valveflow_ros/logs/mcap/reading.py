@@ -49,7 +49,7 @@ def _columns(batch: _Batch) -> tuple[NDArray[np.generic], ...]:
     )
 
 
-class Journal:
+class MessageReader:
     """The raw messages of one or several files; holds only what overlaps in time.
 
     Parameters
@@ -216,7 +216,7 @@ def read_recording(
         min(group.first_ns for group in groups),
         max(group.last_ns for group in groups),
         sum(file.findings.damaged for file in files),
-        Journal(files, unchecked).messages,
+        MessageReader(files, unchecked).messages,
     )
 
 

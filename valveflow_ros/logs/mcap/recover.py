@@ -183,7 +183,7 @@ def _intact(
             for op, content in others:
                 table.add(op, content)
         except LayoutError as error:
-            scanner.findings.blame(f'the chunk at byte {chunk.offset}: {error}')
+            scanner.findings.add_damage(f'the chunk at byte {chunk.offset}: {error}')
             continue
         yield PackedChunk(
             chunk.record,

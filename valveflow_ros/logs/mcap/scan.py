@@ -106,7 +106,7 @@ class Findings:
     attachments: dict[str, Attachment] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
 
-    def blame(self, reason: str) -> None:
+    def add_damage(self, reason: str) -> None:
         """Count a damaged chunk or stretch; the first few reasons are kept."""
         self.damaged += 1
         if len(self.reasons) < 8:
@@ -200,12 +200,12 @@ class Scanner:
                 return self._accept(position, length), after
             except LayoutError as error:
                 if after <= self._source.size:
-                    self._budget.regret(length)
+                    self._budget.spend_in_vain(length)
                     problem = f'the chunk at byte {position}: {error}'
                 # A length is believed if the fields within say the same.
                 agreed = next(candidates(self._source, position, position + 1), None) is not None
                 if agreed and self._plausible(after):
-                    self.findings.blame(problem)
+                    self.findings.add_damage(problem)
                     return None, after
         elif op in _KINDS and after <= self._source.size and self._plausible(after):
             hidden = self._inside(op, position, length)
@@ -217,7 +217,7 @@ class Scanner:
         if chunk is None and not problem and not self.findings.finished:
             self.findings.cut_off_at = position
             return None, self._source.size
-        self.findings.blame(problem or f'the chain of records breaks at byte {position}')
+        self.findings.add_damage(problem or f'the chain of records breaks at byte {position}')
         return chunk, (self._source.size if chunk is None else chunk.end)
 
     def _seek(self, start: int, end: int) -> Chunk | None:
@@ -227,7 +227,7 @@ class Scanner:
             try:
                 return self._accept(position, length)
             except LayoutError:
-                self._budget.regret(length)
+                self._budget.spend_in_vain(length)
         return None
 
     def _accept(self, position: int, length: int) -> Chunk:
@@ -281,14 +281,16 @@ class Scanner:
 
     def _attachment(self, position: int, length: int) -> None:
         if length > self._attachment_bytes_left:
-            self.findings.blame(f'the attachment at byte {position} is larger than can be read')
+            self.findings.add_damage(
+                f'the attachment at byte {position} is larger than can be read'
+            )
             return
         self._attachment_bytes_left -= length
         content = self._source.read(position + RECORD_HEAD.size, length)
         try:
             attachment = unpack_attachment(content)
         except LayoutError as error:
-            self.findings.blame(str(error))
+            self.findings.add_damage(str(error))
             return
         self.findings.attachments[attachment.name] = attachment
 
@@ -297,7 +299,7 @@ class Scanner:
         try:
             found = unpack(Metadata.read, content)
         except LayoutError as error:
-            self.findings.blame(f'the metadata at byte {position}: {error}')
+            self.findings.add_damage(f'the metadata at byte {position}: {error}')
             return
         if len(self.findings.metadata) < self._limits.channels:
             self.findings.metadata[found.name] = found.metadata

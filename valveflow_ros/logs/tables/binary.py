@@ -218,23 +218,23 @@ def _copy_within_bounds(path: Path, copy: IO[bytes]) -> None:
                 'as CSV or Parquet',
             )
         for name, part in parts.items():
-            letters, rows, rest = set(), 0, b''
+            columns_met, rows, rest = set(), 0, b''
             with archive.open(part) as source, out.open(name, 'w') as target:
                 while piece := source.read(_PIECE):
                     target.write(piece)
                     places = set(_PLACE.findall(rest + piece))
-                    letters |= {column.upper() for column, _ in places}
+                    columns_met |= {column.upper() for column, _ in places}
                     rows = max([rows, *(int(row) for _, row in places)])
                     rest = piece[-_LONGEST_PLACE:]
-            _check_size(path, rows, letters, part.file_size)
+            _check_size(path, rows, columns_met, part.file_size)
 
 
-def _check_size(path: Path, rows: int, letters: set[bytes], size: int) -> None:
+def _check_size(path: Path, rows: int, columns_met: set[bytes], size: int) -> None:
     """Refuse a sheet whose cells span a rectangle out of proportion to the bytes of the sheet."""
     if rows > _SHEET_ROWS:
         raise RecordingError(path, f'has more than the {_SHEET_ROWS} rows of a sheet')
     columns = 0
-    for word in letters:
+    for word in columns_met:
         number = 0
         for letter in word:
             number = 26 * number + letter - 64

@@ -30,6 +30,8 @@ from valveflow_ros.records import (
     table_to_readings,
 )
 
+_BLOCK_ROWS = 100_000
+
 
 @dataclass(frozen=True, slots=True)
 class RawTable:
@@ -246,21 +248,27 @@ def _columns(table: SampleTable) -> Iterator[tuple[str, FloatArray, ByteArray | 
 
 
 def _write_csv(table: SampleTable, path: Path) -> None:
-    columns = {TIME: _iso(table.time_ns)}
-    for name, values, quality in _columns(table):
-        columns[name] = _numbers(values)
-        if quality is not None:
-            columns[name + QUALITY_SUFFIX] = [str(code) for code in quality.tolist()]
-    with path.open('w', encoding='utf-8', newline='') as stream:
-        stream.write(','.join(columns) + '\n')
-        stream.writelines(f'{",".join(row)}\n' for row in zip(*columns.values(), strict=True))
-
-
-def _numbers(values: FloatArray) -> list[str]:
-    """Return numbers with all digits that tell them apart; empty for NaN."""
-    cells = list(map(repr, values.tolist()))
+    times, columns, names = _iso(table.time_ns), list(_columns(table)), [TIME]
+    for name, _, quality in columns:
+        names += [name] if quality is None else [name, name + QUALITY_SUFFIX]
     # Among whole numbers a reader takes ``-0`` for 0.
-    if not (np.signbit(values) & (values == 0.0)).any():
+    signed = [bool((np.signbit(values) & (values == 0.0)).any()) for _, values, _ in columns]
+    with path.open('w', encoding='utf-8', newline='') as stream:
+        stream.write(','.join(names) + '\n')
+        for start in range(0, len(times), _BLOCK_ROWS):
+            part = slice(start, start + _BLOCK_ROWS)
+            cells = [times[part]]
+            for (_, values, quality), sign in zip(columns, signed, strict=True):
+                cells.append(_numbers(values[part], sign))
+                if quality is not None:
+                    cells.append([str(code) for code in quality[part].tolist()])
+            stream.writelines(f'{",".join(row)}\n' for row in zip(*cells, strict=True))
+
+
+def _numbers(values: FloatArray, signed: bool) -> list[str]:
+    """Return numbers with all digits that tell them apart; empty for NaN."""
+    cells = [repr(value) for value in values.tolist()]
+    if not signed:
         cells = [cell.removesuffix('.0') for cell in cells]
     return ['' if cell == 'nan' else cell for cell in cells] if np.isnan(values).any() else cells
 
