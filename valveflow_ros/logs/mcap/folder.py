@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -108,53 +108,26 @@ def finish_split(file: ChunkFile, name: str, table: TopicTable) -> Split:
     return split
 
 
-def write_metadata(folder: Path, splits: list[Split]) -> None:
+def write_metadata(folder: Path, splits: Collection[Split]) -> None:
     """Write `metadata.yaml` for these splits; raises `OSError`."""
     write_whole(folder / METADATA_NAME, metadata_text(splits).encode())
 
 
-class Listing:
-    """The finished splits of a folder in order, and the `metadata.yaml` that names them.
+def finished_splits(folder: Path, known: Mapping[str, Split] = {}) -> dict[str, Split]:
+    """Describe the finished files of a folder by their names, in order; raises `OSError`.
 
-    ``due`` is true while `metadata.yaml` could not be written as it should be. Raises `OSError` if
-    the folder cannot be read.
+    Those that are known are not read again.
     """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self.due = False
-        self.splits: list[Split] = []
-        self._look()
-
-    def add(self, split: Split) -> None:
-        """Take note of a split that was just finished, without reading it again."""
-        self.splits.append(split)
-
-    def forget(self, name: str) -> None:
-        """Take note that a split was removed."""
-        self.splits = [split for split in self.splits if split.name != name]
-
-    def write(self) -> None:
-        """Write `metadata.yaml` for what is whole on the disk; raises `OSError`."""
-        self.due = True
-        # A file may have got its name although finishing it failed after that.
-        self._look()
-        write_metadata(self._folder, self.splits)
-        self.due = False
-
-    def _look(self) -> None:
-        known = {split.name: split for split in self.splits}
-        paths = finished_files(self._folder)
-        found = [known.get(path.name) or Split.read(path) for path in paths]
-        self.splits = [split for split in found if split is not None]
+    found = {p.name: known.get(p.name) or Split.read(p) for p in finished_files(folder)}
+    return {name: split for name, split in found.items() if split is not None}
 
 
-def metadata_text(splits: list[Split]) -> str:
+def metadata_text(splits: Collection[Split]) -> str:
     """Return the text of `metadata.yaml`."""
     return 'rosbag2_bagfile_information:\n' + textwrap.indent(information_text(splits), '  ')
 
 
-def information_text(splits: list[Split]) -> str:
+def information_text(splits: Collection[Split]) -> str:
     """Return what stands under the first key of `metadata.yaml`, and in the file's own record."""
     start, duration = _span([s for s in splits if s.messages])
     lines = [
@@ -184,7 +157,7 @@ def _span(splits: list[Split]) -> tuple[int, int]:
     return start, max(split.end_ns for split in splits) - start
 
 
-def _topic_lines(splits: list[Split]) -> list[str]:
+def _topic_lines(splits: Collection[Split]) -> list[str]:
     topics: dict[str, tuple[str, Channel]] = {}
     counts: dict[str, int] = {}
     for split in splits:

@@ -15,9 +15,8 @@ from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.mcap.chunk_file import ChunkFile, PackedChunk
 from valveflow_ros.logs.mcap.folder import (
     LIBRARY,
-    Split,
     finish_split,
-    finished_files,
+    finished_splits,
     write_metadata,
 )
 from valveflow_ros.logs.mcap.records import LayoutError, TopicTable, read_summary, walk
@@ -89,8 +88,7 @@ def recover_leftovers(folder: str | Path) -> tuple[RecoveryReport, ...]:
         parts = sorted(home.glob(f'*.mcap{PART_SUFFIX}'))
         reports = [report for part in parts if (report := _leftover(part)) is not None]
         if reports:
-            splits = [split for path in finished_files(home) if (split := Split.read(path))]
-            write_metadata(home, splits)
+            write_metadata(home, finished_splits(home).values())
     return tuple(reports)
 
 

@@ -17,11 +17,12 @@ from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES, ChunkBuilder, ChunkF
 from valveflow_ros.logs.mcap.definitions import Definitions, parse_all, type_hash
 from valveflow_ros.logs.mcap.folder import (
     LIBRARY,
-    Listing,
     Split,
     finish_split,
     finished_files,
+    finished_splits,
     split_number,
+    write_metadata,
 )
 from valveflow_ros.logs.mcap.records import LayoutError, TopicTable, pack
 from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, Writable, make_folder
@@ -209,7 +210,8 @@ class RecordingWriter:
         self._on_disk: dict[int, int] = {}  # the same, without what waits
         with os_errors(self.folder, 'cannot be written'):
             make_folder(self.folder)
-            self._listing = Listing(self.folder)
+            self._splits = finished_splits(self.folder)
+        self._list_due = False
         # Numbers in a folder that is continued are others than before: by them a repetition is
         # known. No split holds so many messages that they could meet.
         self._before = (self._next_number() % _SPLITS_APART) * _NUMBERS_APART
@@ -251,7 +253,7 @@ class RecordingWriter:
     @property
     def finished(self) -> list[Split]:
         """The finished splits of the folder."""
-        return list(self._listing.splits)
+        return list(self._splits.values())
 
     @property
     def file_bytes(self) -> int:
@@ -294,9 +296,8 @@ class RecordingWriter:
 
     def forget(self, name: str) -> None:
         """Strike a split that was deleted from `metadata.yaml`."""
-        self._listing.forget(name)
-        with os_errors(self.path or self.folder, 'cannot be written'):
-            self._listing.write()
+        self._splits.pop(name, None)
+        self._list()
 
     def __enter__(self) -> RecordingWriter:
         """Return itself."""
@@ -362,16 +363,24 @@ class RecordingWriter:
         if self._file is not None and self.path is not None:
             with self._writing():
                 # Until this is done, a file may have its name that the list does not name.
-                self._listing.due = True
+                self._list_due = True
                 split = finish_split(self._file, self.path.name, self._topics.table)
             self.bytes_finished += self._file.position
             self.files_finished += 1
-            self._listing.add(split)
+            self._splits[split.name] = split
             self._file = self.path = None
-        elif not self._listing.due:
+        elif not self._list_due:
             return
+        self._list()
+
+    def _list(self) -> None:
+        """Write `metadata.yaml` for what is whole on the disk."""
+        self._list_due = True
         with os_errors(self.path or self.folder, 'cannot be written'):
-            self._listing.write()
+            # A file may have got its name although finishing it failed after that.
+            self._splits = finished_splits(self.folder, self._splits)
+            write_metadata(self.folder, self._splits.values())
+        self._list_due = False
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
