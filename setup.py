@@ -68,13 +68,16 @@ setup(
         'numpy',
         'pandas',
         'plotly',
-        'pyarrow',
         'pyyaml',
         'scipy',
         'zstandard',
     ],
     # What only some need: reading .xlsx, and pictures as files.
-    extras_require={'excel': ['openpyxl'], 'figures': ['matplotlib']},
+    extras_require={
+        'excel': ['python-calamine'],
+        'figures': ['matplotlib'],
+        'parquet': ['pyarrow'],
+    },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),

@@ -143,7 +143,7 @@ def _record(name: str, faulty: Any, sound: Any) -> dict[str, Any]:
 def _healthy(days: int, folder: Path) -> Any:
     """Return the curve of the same unit in other, healthy days."""
     from valveflow_ros.interface.identify import identify
-    from valveflow_ros.logs.tables.write import write_table
+    from valveflow_ros.logs import write_table
     from valveflow_ros.plant.simulator import simulate
 
     path = folder / 'healthy.parquet'
@@ -155,7 +155,7 @@ def gather(name: str) -> dict[str, Any]:
     """Simulate, diagnose, and return what is shown and what the program said."""
     from valveflow_ros.diagnosis.result import to_json
     from valveflow_ros.interface.diagnose import diagnose
-    from valveflow_ros.logs.tables.write import write_table
+    from valveflow_ros.logs import write_table
     from valveflow_ros.plant.simulator import simulate
     from valveflow_ros.plant.spec import EffectSpec
 
@@ -184,7 +184,7 @@ def curve() -> dict[str, Any]:
     """Identify a healthy plant, and return curve, band and density of the special samples."""
     from valveflow_ros.curve.characteristic_json import to_json
     from valveflow_ros.interface.identify import identify
-    from valveflow_ros.logs.tables.write import write_table
+    from valveflow_ros.logs import write_table
     from valveflow_ros.plant.simulator import simulate
     from valveflow_ros.report.curve import band
 

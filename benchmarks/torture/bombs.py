@@ -9,39 +9,40 @@ from collections.abc import Iterator
 import lz4.frame
 import zstandard
 from log_files import FLOAT64, START_NS, STOCK, float64
+from mcap.opcode import Opcode
+from mcap.records import Channel, Header, Metadata, Schema
 
-from valveflow_ros.logs.mcap.layout import (
-    MAGIC,
-    RECORD_HEAD,
-    Op,
-    pack_header,
-    pack_map,
-    pack_metadata,
-    pack_text,
-    record,
-)
+from valveflow_ros.logs.mcap.records import MAGIC, RECORD_HEAD, pack
 
 GIB = 1 << 30
 HUGE = (1 << 64) - 1
 
 
+def record(op: int, content: bytes) -> bytes:
+    """Return a record of any kind and content."""
+    return RECORD_HEAD.pack(op, len(content)) + content
+
+
+def pack_header(library: str) -> bytes:
+    """Return the first record of a file."""
+    return pack(Header('ros2', library))
+
+
 def message(channel: int = 1, number: int = 0, data: bytes | None = None) -> bytes:
     """Return a message record."""
     head = struct.pack('<HIQQ', channel, number, START_NS + number, START_NS + number)
-    return record(Op.MESSAGE, head + (float64(number) if data is None else data))
+    return record(Opcode.MESSAGE, head + (float64(number) if data is None else data))
 
 
 def schema(number: int = 1, name: str = FLOAT64, text: str | None = None) -> bytes:
     """Return a schema record."""
     body = (STOCK.text(FLOAT64) if text is None else text).encode()
-    head = struct.pack('<H', number) + pack_text(name) + pack_text('ros2msg')
-    return record(Op.SCHEMA, head + struct.pack('<I', len(body)) + body)
+    return pack(Schema(id=number, name=name, encoding='ros2msg', data=body))
 
 
 def channel(number: int = 1, topic: str = '/valve_opening', schema_id: int = 1) -> bytes:
     """Return a channel record."""
-    head = struct.pack('<HH', number, schema_id)
-    return record(Op.CHANNEL, head + pack_text(topic) + pack_text('cdr') + pack_map({}))
+    return pack(Channel(number, topic, 'cdr', {}, schema_id))
 
 
 def chunk(
@@ -58,14 +59,15 @@ def chunk(
     size = len(content) if size is None else size
     crc = zlib.crc32(content) if crc is None else crc
     head = struct.pack('<QQQI', START_NS, START_NS, size, crc)
-    tail = pack_text(compression) + struct.pack('<Q', len(packed)) + packed
-    return record(Op.CHUNK, head + tail)
+    name = struct.pack('<I', len(compression)) + compression.encode()
+    tail = name + struct.pack('<Q', len(packed)) + packed
+    return record(Opcode.CHUNK, head + tail)
 
 
 def file_of(*parts: bytes) -> bytes:
     """Return a file, ended as a finished one."""
-    footer = record(Op.FOOTER, struct.pack('<QQI', 0, 0, 0))
-    end = record(Op.DATA_END, struct.pack('<I', 0))
+    footer = record(Opcode.FOOTER, struct.pack('<QQI', 0, 0, 0))
+    end = record(Opcode.DATA_END, struct.pack('<I', 0))
     return MAGIC + pack_header('hostile') + b''.join(parts) + end + footer + MAGIC
 
 
@@ -111,7 +113,7 @@ def _bombs() -> Iterator[tuple[str, bytes, int]]:
 
 def _lengths() -> Iterator[tuple[str, bytes, int]]:
     good = chunk(GOOD)
-    for op in Op:
+    for op in Opcode:
         for length in (HUGE, 1 << 63, (1 << 32) - 1, 0):
             lying = RECORD_HEAD.pack(op, length)
             yield f'{op.name} of {length} bytes', file_of(good, lying, good), -1
@@ -119,12 +121,12 @@ def _lengths() -> Iterator[tuple[str, bytes, int]]:
     yield 'magic alone', MAGIC, 0
     yield 'magic twice', MAGIC * 2, 0
     yield 'footer without data', file_of(), 0
-    short = file_of(chunk(schema() + channel() + RECORD_HEAD.pack(Op.MESSAGE, 3) + b'abc'))
+    short = file_of(chunk(schema() + channel() + RECORD_HEAD.pack(Opcode.MESSAGE, 3) + b'abc'))
     yield 'a message shorter than its head', short, 0
-    inner = chunk(schema() + channel() + RECORD_HEAD.pack(Op.MESSAGE, HUGE))
+    inner = chunk(schema() + channel() + RECORD_HEAD.pack(Opcode.MESSAGE, HUGE))
     yield 'a message of 2^64 bytes in a sound chunk', file_of(inner), 0
     half = struct.pack('<QQI', 9, 9, 0)
-    pointing = MAGIC + pack_header('x') + good + record(Op.FOOTER, half) + MAGIC
+    pointing = MAGIC + pack_header('x') + good + record(Opcode.FOOTER, half) + MAGIC
     yield 'a summary that points into the header', pointing, 100
     cut = chunk(GOOD)[:-1]
     yield 'chunks overlapping', file_of(cut, *[cut] * 2000), -1
@@ -150,7 +152,7 @@ def _contradictions() -> Iterator[tuple[str, bytes, int]]:
     bare = MAGIC + pack_header('x') + GOOD + message() * 50_000
     yield 'messages without chunks', bare, 0
     late = struct.pack('<HIQQ', 1, 0, HUGE, HUGE) + float64(1)
-    yield 'a time in the year 2554', file_of(chunk(GOOD + record(Op.MESSAGE, late))), -1
+    yield 'a time in the year 2554', file_of(chunk(GOOD + record(Opcode.MESSAGE, late))), -1
     odd = chunk(GOOD, 'brotli', b'x' * 100)
     yield 'an unknown compression', file_of(odd, chunk(GOOD)), 100
     yield 'a chunk without a checksum', file_of(chunk(GOOD, crc=0)), 0
@@ -176,10 +178,10 @@ def _texts() -> Iterator[tuple[str, bytes, int]]:
     yield 'a topic of 100,000 letters', file_of(chunk(schema() + long_topic + message())), -1
     odd_topic = channel(topic='/../../etc/passwd\n\x1b[31m\0')
     yield 'a topic of control characters', file_of(chunk(schema() + odd_topic + message())), -1
-    wrong = record(Op.CHANNEL, struct.pack('<HHI', 1, 1, 4) + b'\xff\xfe\xfd\xfc')
+    wrong = record(Opcode.CHANNEL, struct.pack('<HHI', 1, 1, 4) + b'\xff\xfe\xfd\xfc')
     yield 'a topic that is no text', file_of(chunk(schema() + wrong + message())), -1
-    notes = b''.join(pack_metadata(f'n{k}', {'k': 'v' * 100}) for k in range(20_000))
+    notes = b''.join(pack(Metadata(f'n{k}', {'k': 'v' * 100})) for k in range(20_000))
     yield '20,000 metadata records', file_of(chunk(GOOD), notes), 100
-    big = record(Op.ATTACHMENT, struct.pack('<QQ', 0, 0) + pack_text('a') + pack_text('b')
+    big = record(Opcode.ATTACHMENT, struct.pack('<QQ', 0, 0) + b'\1\0\0\0a' * 2
                  + struct.pack('<Q', 1 << 62))  # fmt: skip
     yield 'an attachment of 2^62 bytes', file_of(chunk(GOOD), big), 100

@@ -9,9 +9,11 @@ from collections.abc import Callable
 
 import lz4.frame
 import zstandard
+from mcap.opcode import Opcode
 
 from benchmarks.torture.bombs import chunk
-from valveflow_ros.logs.mcap.layout import CHUNK_HEAD, MAGIC, RECORD_HEAD, Op
+from valveflow_ros.logs.mcap.records import MAGIC, RECORD_HEAD
+from valveflow_ros.logs.mcap.scan import CHUNK_HEAD_SIZE
 
 ODD = (0, 1, 2, 7, 8, 255, 256, 0x7FFF, 0xFFFF, 1 << 31, (1 << 32) - 1, 1 << 63, (1 << 64) - 1)
 LARGEST = 4 << 20
@@ -151,7 +153,7 @@ class Mutator:
 
     def _inside(self, records: Records, place: int) -> None:
         """Change what is in a chunk and give it a right checksum again."""
-        chunks = [k for k, (op, _) in enumerate(records) if op == Op.CHUNK]
+        chunks = [k for k, (op, _) in enumerate(records) if op == Opcode.CHUNK]
         if not chunks:
             return
         place = self._generator.choice(chunks)
@@ -166,16 +168,16 @@ class Mutator:
         else:
             content = self.bytes_of(opened)
         packing = self._generator.choice(('', 'zstd', 'lz4'))
-        records[place] = Op.CHUNK, chunk(content[:LARGEST], packing)[RECORD_HEAD.size :]
+        records[place] = Opcode.CHUNK, chunk(content[:LARGEST], packing)[RECORD_HEAD.size :]
 
 
 def _opened(content: bytes) -> bytes | None:
     """Return what is in a chunk, None if it is damaged already."""
     try:
-        _, _, size, crc = CHUNK_HEAD.unpack_from(content)
-        length = int.from_bytes(content[CHUNK_HEAD.size : CHUNK_HEAD.size + 4], 'little')
-        name = content[CHUNK_HEAD.size + 4 : CHUNK_HEAD.size + 4 + length]
-        packed = content[CHUNK_HEAD.size + 4 + length + 8 :]
+        size, crc = struct.unpack_from('<QI', content, 16)
+        length = int.from_bytes(content[CHUNK_HEAD_SIZE : CHUNK_HEAD_SIZE + 4], 'little')
+        name = content[CHUNK_HEAD_SIZE + 4 : CHUNK_HEAD_SIZE + 4 + length]
+        packed = content[CHUNK_HEAD_SIZE + 4 + length + 8 :]
         if size > LARGEST:
             return None
         if name == b'zstd':

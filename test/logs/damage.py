@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from valveflow_ros.logs.mcap.layout import MAGIC, RECORD_HEAD, Op
+from mcap.opcode import Opcode
+
+from valveflow_ros.logs.mcap.records import MAGIC, RECORD_HEAD
 
 
 def records(raw: bytes) -> list[tuple[int, int, int]]:
@@ -21,7 +23,7 @@ def records(raw: bytes) -> list[tuple[int, int, int]]:
 
 def chunk_ends(raw: bytes) -> list[int]:
     """Return where each chunk ends."""
-    return [end for op, _, end in records(raw) if op == Op.CHUNK]
+    return [end for op, _, end in records(raw) if op == Opcode.CHUNK]
 
 
 def record_heads(raw: bytes) -> list[int]:

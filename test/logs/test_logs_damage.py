@@ -6,10 +6,11 @@ import struct
 import pytest
 from damage import against_chunks, chunk_ends, record_heads, records
 from log_files import START_NS, Reading, read_back, write_chunks
+from mcap.opcode import Opcode
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import open_log
-from valveflow_ros.logs.mcap.layout import RECORD_HEAD, Op
+from valveflow_ros.logs.mcap.records import RECORD_HEAD
 from valveflow_ros.logs.mcap.recover import recover
 from valveflow_ros.logs.mcap.scan import Scanner
 from valveflow_ros.logs.source import Source
@@ -63,7 +64,7 @@ def test_a_cut_file_says_so_in_one_sentence(tmp_path, small):
 
 def test_what_stands_before_a_cut_chunk_is_kept(tmp_path, small):
     raw, _ = small
-    begin = next(begin for op, begin, _ in records(raw) if op == Op.CHUNK)
+    begin = next(begin for op, begin, _ in records(raw) if op == Opcode.CHUNK)
     end = chunk_ends(raw)[0]
     path = tmp_path / 'cut.mcap'
     for size in range(end, end + 400):
@@ -160,7 +161,7 @@ def test_a_chunk_hidden_by_a_wrong_kind_is_missed_in_the_count(tmp_path, small):
     raw, wanted = small
     damaged = bytearray(raw)
     position = raw.rindex(struct.pack('<Q', START_NS + 50 * 10**9 + 1000), 0, chunk_ends(raw)[10])
-    damaged[position - RECORD_HEAD.size] = Op.METADATA
+    damaged[position - RECORD_HEAD.size] = Opcode.METADATA
     path = tmp_path / 'hidden.mcap'
     path.write_bytes(damaged)
     contents = open_log(path)

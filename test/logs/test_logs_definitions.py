@@ -22,7 +22,7 @@ from valveflow_ros.logs.mcap.definitions import (
     parse_fields,
     type_hash,
 )
-from valveflow_ros.logs.mcap.layout import LayoutError
+from valveflow_ros.logs.mcap.records import LayoutError
 
 MESSAGES = Path(__file__).parents[2] / 'msg'
 OWN = sorted(f'valveflow_msgs/msg/{path.stem}' for path in MESSAGES.glob('*.msg'))

@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from monitor_recording import START_NS, STOCK, TYPES, Monitor, cdr, diagnosis, recording, stamp
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import open_log
 from valveflow_ros.logs.mcap.cdr import Decoder
 from valveflow_ros.logs.mcap.follow import Follower
-from valveflow_ros.logs.mcap.layout import Op
 from valveflow_ros.logs.mcap.scan import candidates
 from valveflow_ros.logs.source import Source
 
@@ -117,7 +117,7 @@ def test_a_chunk_that_looks_like_the_end_does_not_end_the_file(tmp_path):
     with Source.open(path) as source:
         start = next(candidates(source, 0, source.size))
     raw = bytearray(path.read_bytes())
-    raw[start] = Op.FOOTER  # one bit from that of a chunk
+    raw[start] = Opcode.FOOTER  # one bit from that of a chunk
     path.write_bytes(raw)
     follower = Follower(path)
     assert times(follower)

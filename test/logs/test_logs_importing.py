@@ -3,15 +3,12 @@ import stat
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from log_files import START_NS, STOCK, same_readings, wander, write_chunks
+from log_files import STOCK, same_readings, wander, write_chunks
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from valveflow_ros.errors import DataError, RecordingError
 from valveflow_ros.logs import open_log, write_samples
-from valveflow_ros.logs.mcap.importing import strictly_increasing
 from valveflow_ros.logs.tables.words import of_gauge, spelling
 from valveflow_ros.records import SIGNALS, SampleTable, table_to_readings
 
@@ -99,16 +96,6 @@ def test_what_cannot_be_written_is_one_sentence(tmp_path):
     with pytest.raises(RecordingError, match='cannot be written'):
         write_samples(wander(3, seed=1), tmp_path / 'file' / 'log.mcap', definitions=STOCK)
     assert [p.name for p in tmp_path.iterdir()] == ['file']
-
-
-@settings(max_examples=200, deadline=None)
-@given(st.lists(st.integers(0, 20), min_size=1, max_size=40))
-def test_log_times_increase_as_little_as_they_can(steps):
-    times = START_NS + np.sort(np.array(steps, dtype=np.int64))
-    expected = []
-    for time_ns in times.tolist():
-        expected.append(max(time_ns, expected[-1] + 1) if expected else time_ns)
-    assert strictly_increasing(times).tolist() == expected
 
 
 def test_readings_are_the_same_from_any_kind_of_file(tmp_path):

@@ -19,7 +19,6 @@ from valveflow_ros.logs import (
     RecorderState,
     open_log,
 )
-from valveflow_ros.logs.mcap.recorder_loop import DROPS_SHOWN_S, Ledger
 from valveflow_ros.logs.part_file import PartFile, is_held
 
 QUICK = RecorderSettings(
@@ -268,21 +267,6 @@ def test_too_many_waiting_messages_are_dropped_by_topic_and_counted(tmp_path):
         'dropped /generated_power': '5',
         'dropped /valve_opening': '8',
     }
-
-
-def test_dropping_is_a_degraded_state_for_a_while():
-    now = [100.0]
-    ledger = Ledger(1, clock=lambda: now[0])
-    assert [ledger.admit('/x') for _ in range(3)] == [True, False, False]
-    ledger.settle(1, '', 0, 0)
-    ledger.well()
-    status = ledger.status()
-    assert status.state == RecorderState.DEGRADED
-    assert status.reason == '2 messages were dropped, too many were waiting'
-    now[0] += DROPS_SHOWN_S
-    ledger.well()
-    assert (ledger.status().state, ledger.status().reason) == (RecorderState.RECORDING, '')
-    assert is_balanced(ledger.status())
 
 
 def test_asking_for_a_split_of_nothing_does_nothing(tmp_path):

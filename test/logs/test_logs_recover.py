@@ -7,12 +7,12 @@ import pytest
 import yaml
 from damage import records
 from log_files import FLOAT64, START_NS, STOCK, float64, read_back, write_chunks
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import RecordingWriter, open_log, recover_leftovers
-from valveflow_ros.logs.mcap.layout import Op
 from valveflow_ros.logs.mcap.recover import recover
 from valveflow_ros.logs.part_file import is_held
 
@@ -169,7 +169,7 @@ def test_a_part_whose_only_chunk_was_begun_goes(folder):
     """What was never whole was never counted as written; a damaged chunk stays for its owner."""
     part = left_in(folder)
     raw = part.read_bytes()
-    first = next(begin for op, begin, _ in records(raw + bytes(8)) if op == Op.CHUNK)
+    first = next(begin for op, begin, _ in records(raw + bytes(8)) if op == Opcode.CHUNK)
     for size in (9, 40, first, first + 5, first + 60, first + 300):
         part.write_bytes(raw[:size])
         assert recover_leftovers(folder) == ()

@@ -17,13 +17,14 @@ import yaml
 from damage import records
 from fault_points import SHORT, Faults
 from log_files import FLOAT64, START_NS, STOCK, float64, read_back, write_chunks
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import RecordingWriter, open_log, part_file, recover_leftovers
 from valveflow_ros.logs.mcap.chunk_file import ChunkBuilder, ChunkFile, PackedChunk
-from valveflow_ros.logs.mcap.layout import RECORD_HEAD, Channel, Op, Schema
+from valveflow_ros.logs.mcap.records import RECORD_HEAD, TopicTable, pack
 from valveflow_ros.logs.mcap.recover import recover
-from valveflow_ros.logs.mcap.summary import TopicTable
 from valveflow_ros.logs.part_file import (
     PartFile,
     is_held,
@@ -144,7 +145,7 @@ def test_a_damaged_chunk_costs_itself_and_is_counted(
 ) -> None:
     """Whole minus recovered is exactly what stood in the chunk that was hit."""
     raw = bytearray(left.read_bytes())
-    chunks = [(begin, end) for op, begin, end in records(raw + bytes(8)) if op == Op.CHUNK]
+    chunks = [(begin, end) for op, begin, end in records(raw + bytes(8)) if op == Opcode.CHUNK]
     begin, end = chunks[lost]
     raw[(begin + end) // 2] ^= 4
     bad = tmp_path / 'bad.mcap'
@@ -167,9 +168,7 @@ def chunk(number: int, topic: str, log_ns: int) -> PackedChunk:
     """Return a chunk of one message, with the tables it needs."""
     builder = ChunkBuilder()
     builder.add(1, number, log_ns, log_ns, float64(number))
-    table = (
-        Schema(1, FLOAT64, 'ros2msg', b'float64 data').pack() + Channel(1, 1, topic, 'cdr').pack()
-    )
+    table = pack(Schema(1, b'float64 data', 'ros2msg', FLOAT64), Channel(1, topic, 'cdr', {}, 1))
     return builder.build(table)
 
 
@@ -197,10 +196,10 @@ def test_a_summary_adds_the_topics_that_no_chunk_names_or_the_file_is_refused(
     file = ChunkFile(PartFile(tmp_path / 'a.mcap'), 'test')
     file.put_chunk(chunk(0, '/valve_opening', START_NS))
     summary = TopicTable()
-    for known in (Schema(1, FLOAT64, 'ros2msg', b'float64 data'), Channel(1, 1, topic, 'cdr'),
-                  Channel(2, 1, '/silent', 'cdr')):  # fmt: skip
-        op = Op.SCHEMA if isinstance(known, Schema) else Op.CHANNEL
-        summary.add(op, known.pack()[RECORD_HEAD.size :])
+    for known in (Schema(1, b'float64 data', 'ros2msg', FLOAT64), Channel(1, topic, 'cdr', {}, 1),
+                  Channel(2, '/silent', 'cdr', {}, 1)):  # fmt: skip
+        op = Opcode.SCHEMA if isinstance(known, Schema) else Opcode.CHANNEL
+        summary.add(op, pack(known)[RECORD_HEAD.size :])
     file.finish(summary)
     before = open_descriptors()
     if topic == '/other':
@@ -307,18 +306,6 @@ def umask(request: pytest.FixtureRequest) -> Iterator[None]:
 
 def mode(path: Path) -> int:
     return stat.S_IMODE(path.stat().st_mode)
-
-
-@pytest.mark.usefixtures('umask')
-def test_whatever_the_umask_its_owner_reads_and_writes_and_nobody_else(tmp_path: Path) -> None:
-    file = PartFile(tmp_path / 'a.mcap')
-    assert mode(file.part) == 0o600
-    file.write(b'x')
-    file.publish()
-    file.close()
-    assert mode(tmp_path / 'a.mcap') == 0o600
-    write_whole(tmp_path / 'small', b'x')
-    assert mode(tmp_path / 'small') == 0o600
 
 
 def test_every_folder_that_is_made_is_its_owners_and_others_stay(tmp_path: Path) -> None:
@@ -487,13 +474,6 @@ def test_a_whole_file_is_on_the_disk_before_it_has_its_name(
 def _is_folder(descriptor: object) -> bool:
     assert isinstance(descriptor, int)
     return stat.S_ISDIR(os.fstat(descriptor).st_mode)
-
-
-def test_only_a_folder_is_synced_as_one(tmp_path: Path) -> None:
-    (tmp_path / 'file').write_bytes(b'')
-    with pytest.raises(NotADirectoryError):
-        sync_folder(tmp_path / 'file')
-    sync_folder(tmp_path)
 
 
 def test_a_short_write_of_a_recording_is_gone_on_with(tmp_path: Path) -> None:

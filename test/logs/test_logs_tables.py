@@ -325,9 +325,9 @@ def test_pandas_is_loaded_only_for_a_table():
     )
     home = str(Path(__file__).parents[2])
     found = subprocess.run(
-        [sys.executable, '-c', code, 'pandas', 'pyarrow', 'numba', 'mcap'],
+        [sys.executable, '-c', code, 'pandas', 'pyarrow', 'numba'],
         check=True,
         capture_output=True,
         cwd=home,
     )
-    assert json.loads(found.stdout) == [False, False, False, False]
+    assert json.loads(found.stdout) == [False, False, False]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import datetime as dt
+import subprocess
+import sys
 import zoneinfo
 
 import numpy as np
@@ -10,9 +12,10 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from log_files import wander
 
 from valveflow_ros.errors import InputError, RecordingError
-from valveflow_ros.logs import open_log, read_table
+from valveflow_ros.logs import open_log, read_table, write_table
 from valveflow_ros.logs.tables import file
 from valveflow_ros.logs.tables.refusal import TableOptions
 from valveflow_ros.records import SIGNALS, Signal
@@ -148,13 +151,31 @@ def test_a_workbook_and_a_parquet_file_give_the_same_values(tmp_path):
     check(read_table(tmp_path / 'x.parquet'))
 
 
-def test_without_openpyxl_a_workbook_says_what_to_install(tmp_path, monkeypatch):
-    import sys
-
-    monkeypatch.setitem(sys.modules, 'openpyxl', None)
+def test_without_the_library_of_a_format_it_says_what_to_install(tmp_path, monkeypatch):
+    for library in ('python_calamine', 'pyarrow'):
+        monkeypatch.setitem(sys.modules, library, None)
     (tmp_path / 'x.xlsx').write_bytes(b'PK\x03\x04')
-    with pytest.raises(RecordingError, match='pip install openpyxl'):
+    (tmp_path / 'x.parquet').write_bytes(b'PAR1')
+    with pytest.raises(RecordingError, match='pip install python-calamine'):
         read_table(tmp_path / 'x.xlsx')
+    with pytest.raises(RecordingError, match='pip install pyarrow'):
+        read_table(tmp_path / 'x.parquet')
+    with pytest.raises(RecordingError, match='pip install pyarrow'):
+        write_table(wander(9, seed=1), tmp_path / 'y.parquet')
+    assert not (tmp_path / 'y.parquet').exists()
+
+
+def test_csv_needs_neither_library(tmp_path):
+    """In a process of its own, because pandas looks for pyarrow when it is loaded."""
+    path = tmp_path / 'x.csv'
+    write_table(wander(50, seed=1), path)
+    code = (
+        'import sys; sys.modules.update(pyarrow=None, python_calamine=None)\n'
+        'from valveflow_ros.logs import read_table\n'
+        f'raw = read_table({str(path)!r}); print(repr([c.tolist() for c in raw.columns.values()]))'
+    )
+    done = subprocess.run([sys.executable, '-c', code], check=True, capture_output=True, text=True)
+    assert done.stdout.strip() == repr([c.tolist() for c in read_table(path).columns.values()])
 
 
 def test_a_row_for_each_value(tmp_path):

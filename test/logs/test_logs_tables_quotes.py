@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import open_log, read_table
-from valveflow_ros.logs.tables.file import LONGEST_CELL, Quotes
+from valveflow_ros.logs.tables.text import LONGEST_CELL, Quotes
 
 HEAD = 'time,valve position,ms pressure [MPa],ms temperature,MW,comment'
 WHERE = Path('x.csv')

@@ -8,13 +8,13 @@ import zipfile
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from valveflow_ros.errors import RecordingError
+from valveflow_ros.errors import RecordingError, ValveflowError
 from valveflow_ros.logs import open_log, read_table
 from valveflow_ros.logs.tables.cells import foreign_quality
-from valveflow_ros.logs.tables.file import LONGEST_LINE
+from valveflow_ros.logs.tables.text import LONGEST_LINE
 from valveflow_ros.records import Quality, Signal
 
 HEAD = 'time,valve position,ms pressure [MPa],ms temperature,MW'
@@ -121,6 +121,30 @@ def test_a_row_that_no_sheet_has_ends_the_reading(tmp_path):
     near = read_table(changed(path, tmp_path / 'near.xlsx', row.format(30_000).encode()))
     assert len(near.time_ns) == len(read_table(path).time_ns)
     assert near.bad_times == 1
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 10**6), st.integers(32, 126)), min_size=1, max_size=6))
+def test_a_damaged_workbook_is_read_or_is_one_sentence(tmp_path_factory, hits):
+    folder = tmp_path_factory.mktemp('damaged')
+    with zipfile.ZipFile(book_of(folder / 'x.xlsx')) as old:
+        parts = {name: bytearray(old.read(name)) for name in old.namelist()}
+    with zipfile.ZipFile(folder / 'y.xlsx', 'w') as new:
+        for name, data in parts.items():
+            for place, letter in hits if name.startswith('xl/wor') else ():
+                data[place % len(data)] = letter
+            new.writestr(name, bytes(data))
+    try:
+        assert len(read_table(folder / 'y.xlsx').time_ns) <= len(ROWS)
+    except ValveflowError as error:
+        assert '\n' not in str(error)
+
+
+def test_a_sheet_of_two_cells_far_apart_is_refused(tmp_path):
+    path = book_of(tmp_path / 'x.xlsx')
+    cells = b'<row r="900000"><c r="XFD900000" t="n"><v>1</v></c></row>'
+    with pytest.raises(RecordingError, match='900000 rows and 16384 columns, most of them empty'):
+        read_table(changed(path, tmp_path / 'far.xlsx', cells))
 
 
 def test_a_workbook_that_unpacks_beyond_measure_is_refused(tmp_path):

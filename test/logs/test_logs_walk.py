@@ -5,9 +5,9 @@ import struct
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 
-from valveflow_ros.logs.mcap.layout import LayoutError, Op
-from valveflow_ros.logs.mcap.walk import walk
+from valveflow_ros.logs.mcap.records import LayoutError, walk
 
 
 def naive_walk(content):
@@ -19,14 +19,14 @@ def naive_walk(content):
         body = content[position + 9 : position + 9 + length]
         if len(body) < length:
             return None
-        if op == Op.MESSAGE:
+        if op == Opcode.MESSAGE:
             if length < 22:
                 return None
             channel, _, log_ns, publish_ns = struct.unpack_from('<HIqq', body)
             if log_ns < 0 or publish_ns < 0:
                 return None
             messages.append((channel, log_ns, publish_ns, position, body[22:]))
-        elif op in (Op.SCHEMA, Op.CHANNEL):
+        elif op in (Opcode.SCHEMA, Opcode.CHANNEL):
             others.append((op, body))
         else:
             return None
@@ -35,7 +35,7 @@ def naive_walk(content):
 
 
 def message(channel, log_ns, data):
-    head = struct.pack('<BQHIqq', Op.MESSAGE, 22 + len(data), channel, 0, log_ns, log_ns + 1)
+    head = struct.pack('<BQHIqq', Opcode.MESSAGE, 22 + len(data), channel, 0, log_ns, log_ns + 1)
     return head + data
 
 
@@ -55,7 +55,7 @@ RECORD = st.one_of(
     st.tuples(
         st.integers(0, 9), st.integers(0, 2**62), st.sampled_from([b'', bytes(8), bytes(30)])
     ).map(lambda parts: message(*parts)),
-    st.binary(max_size=20).map(lambda body: struct.pack('<BQ', Op.CHANNEL, len(body)) + body),
+    st.binary(max_size=20).map(lambda body: struct.pack('<BQ', Opcode.CHANNEL, len(body)) + body),
 )
 
 

@@ -147,7 +147,7 @@ def _text(data: dict[str, Any], signals: dict[str, dict[str, Any]]) -> str:
 
 def _summary(path: Path) -> str:
     """Return a sentence from the summary of a large finished recording, else nothing."""
-    from valveflow_ros.logs.mcap.summary import read_summary
+    from valveflow_ros.logs.mcap.records import read_summary
     from valveflow_ros.logs.source import Source
     from valveflow_ros.report.words import count, duration, moment
 

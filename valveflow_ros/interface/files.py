@@ -172,6 +172,10 @@ def check_output(
     """
     if path.suffix.lower() not in suffixes:
         raise RecordingError(path, f'must end in {" or ".join(suffixes)}')
+    if path.suffix.lower() == '.parquet':
+        from valveflow_ros.logs.tables.binary import check_parquet
+
+        check_parquet(path)
     if path.is_dir():
         raise RecordingError(path, 'is a folder; name a file')
     if not path.absolute().parent.is_dir():

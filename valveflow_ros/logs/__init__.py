@@ -5,13 +5,16 @@ from valveflow_ros.logs.mcap.cdr import Decoder
 from valveflow_ros.logs.mcap.definitions import Definitions
 from valveflow_ros.logs.mcap.importing import WrittenLog, write_samples
 from valveflow_ros.logs.mcap.reading import messages_since
-from valveflow_ros.logs.mcap.recorder import Recorder
-from valveflow_ros.logs.mcap.recorder_loop import RecorderSettings, RecorderState, RecorderStatus
+from valveflow_ros.logs.mcap.recorder import (
+    Recorder,
+    RecorderSettings,
+    RecorderState,
+    RecorderStatus,
+)
 from valveflow_ros.logs.mcap.recover import RecoveryReport, recover, recover_leftovers
 from valveflow_ros.logs.mcap.writer import LATCHED, Message, Qos, RecordingWriter
 from valveflow_ros.logs.reader import open_log
-from valveflow_ros.logs.tables.table import RawTable, read_table
-from valveflow_ros.logs.tables.write import write_table
+from valveflow_ros.logs.tables.table import RawTable, read_table, write_table
 
 __all__ = [
     'LATCHED',

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from valveflow_ros.errors import InputError
 from valveflow_ros.logs.mcap.cdr import Decoder
@@ -47,19 +47,12 @@ class TopicInfo:
     type_hash: str = ''
 
 
-class MessageSource(Protocol):
-    """Goes through the raw messages of a log."""
-
-    def messages(self, topics: Collection[str] | None) -> Iterator[LoggedMessage]:
-        """Yield the messages of some or of all topics in the order of their log times."""
+Messages = Callable[[Collection[str] | None], Iterator[LoggedMessage]]
 
 
-class NoMessages:
-    """A log without raw messages: a table."""
-
-    def messages(self, topics: Collection[str] | None) -> Iterator[LoggedMessage]:
-        """Yield nothing."""
-        return iter(())
+def no_messages(topics: Collection[str] | None) -> Iterator[LoggedMessage]:
+    """Yield nothing: a table has no raw messages."""
+    return iter(())
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +82,9 @@ class LogContents:
         First and last log time of any message.
     damaged_chunks : int
         Places where something was lost.
+    messages : callable
+        Gives the raw messages of some or of all topics in the order of their log times; see
+        `iter_messages`.
     units : dict[Signal, str]
         The unit the log names for a signal, as a table's column does.
     grounds : dict[Signal, str]
@@ -108,7 +104,7 @@ class LogContents:
     start_ns: int | None = None
     end_ns: int | None = None
     damaged_chunks: int = 0
-    source: MessageSource = field(default_factory=NoMessages)
+    messages: Messages = no_messages
     units: dict[Signal, str] = field(default_factory=dict)
     grounds: dict[Signal, str] = field(default_factory=dict)
     understood: list[str] = field(default_factory=list)
@@ -133,7 +129,7 @@ class LogContents:
         """
         for topic in topics or ():
             self._topic(topic)
-        return self.source.messages(topics)
+        return self.messages(topics)
 
     def decoder(self, topic: str) -> Decoder:
         """Return a decoder for a topic by the definition in the file itself.

@@ -115,6 +115,18 @@ def _made(part: Path) -> int:
     raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(part))
 
 
+@contextmanager
+def new_file(path: Path) -> Iterator[PartFile]:
+    """Give a file to be written and published; whatever fails meanwhile, nothing of it stays."""
+    make_folder(path.parent)
+    out = PartFile(path, replace=True)
+    try:
+        yield out
+    except BaseException:
+        out.discard()
+        raise
+
+
 def sync_folder(folder: Path) -> None:
     """Bring a folder's names to the disk."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)

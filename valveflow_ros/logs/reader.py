@@ -15,11 +15,11 @@ except ImportError:  # PyYAML was built without libyaml
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.contents import LogContents
-from valveflow_ros.logs.mcap.folder import METADATA_NAME, in_order
-from valveflow_ros.logs.mcap.layout import MAGIC
+from valveflow_ros.logs.mcap.folder import METADATA_NAME, recording_files
 from valveflow_ros.logs.mcap.reading import read_recording
+from valveflow_ros.logs.mcap.records import MAGIC
 from valveflow_ros.logs.part_file import PART_SUFFIX
-from valveflow_ros.logs.source import Source, os_problem
+from valveflow_ros.logs.source import Source, os_errors
 from valveflow_ros.logs.tables.refusal import AS_SEEN, TableOptions
 from valveflow_ros.logs.tables.table import open_table
 
@@ -83,25 +83,17 @@ def open_log(
 
 def _files_of(folder: Path) -> tuple[list[Path], list[str]]:
     """Return the splits of a folder in their order, and sentences about the choice."""
-    try:
+    with os_errors(folder, 'cannot be opened'):
         names = {entry.name for entry in folder.iterdir()}
-    except OSError as error:
-        raise RecordingError(folder, os_problem(error)) from None
-    whole = {name for name in names if name.endswith('.mcap')}
-    # While a .part is made whole, both may stand there for a moment.
-    parts = {
-        name
-        for name in names
-        if name.endswith(f'.mcap{PART_SUFFIX}') and name[: -len(PART_SUFFIX)] not in whole
-    }
+    found = recording_files(folder)
+    whole = {path.name for path in found if path.suffix == '.mcap'}
     listed = _listed(folder) if METADATA_NAME in names else []
-    if not whole | parts:
+    if not found:
         if any(name.endswith('.db3') for name in names):
             raise RecordingError(folder, _sqlite_problem())
         raise RecordingError(folder, 'has no .mcap file in it')
     missing = [name for name in listed if name not in whole]
     warnings = [f"'{name}' is named in {METADATA_NAME} and is not there." for name in missing]
-    found = in_order(folder / name for name in whole | parts)
     if not listed:
         return found, warnings
     stems = {_stem(name) for name in listed}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -14,10 +16,14 @@ from valveflow_ros.errors import RecordingError
 BUFFER_BYTES = 1 << 20
 
 
-def os_problem(error: OSError) -> str:
-    """Return what the operating system said, as the end of a sentence."""
-    reason = (error.strerror or str(error)).lower()
-    return f'cannot be opened ({reason})'
+@contextmanager
+def os_errors(path: object, problem: str) -> Iterator[None]:
+    """Turn an `OSError` into a `RecordingError`: the problem, and what the system says of it."""
+    try:
+        yield
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(path, f'{problem} ({reason})') from None
 
 
 def printable(name: str) -> str:
@@ -45,9 +51,8 @@ class Source:
         """
         name = str(path)
         try:
-            descriptor = os.open(name, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-        except OSError as error:
-            raise RecordingError(printable(name), os_problem(error)) from None
+            with os_errors(printable(name), 'cannot be opened'):
+                descriptor = os.open(name, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         except ValueError:
             raise RecordingError(printable(name), 'is not a name of a file') from None
         status = os.fstat(descriptor)
@@ -68,13 +73,9 @@ class Source:
         """
         if position >= self.size:
             return b''
-        try:
+        with os_errors(self.path, f'cannot be read at byte {position}'):
             self.stream.seek(position)
             return self.stream.read(min(size, self.size - position))
-        except OSError as error:
-            reason = (error.strerror or str(error)).lower()
-            problem = f'cannot be read at byte {position} ({reason})'
-            raise RecordingError(self.path, problem) from None
 
     def close(self) -> None:
         """Close the file."""
@@ -93,8 +94,6 @@ class Source:
         """Close the file."""
         self.close()
 
-
-# How much a file may cost before it is given up.
 
 MIB = 1 << 20
 
@@ -137,12 +136,12 @@ class Budget:
         self.failed_left = limits.failed_floor_bytes + limits.failed_per_byte * file_bytes
 
     def spend(self, size: int) -> None:
-        """Count work before it is done; raises `OverBudgetError` when the purse is empty."""
+        """Count work before it is done; raises `OverBudgetError` when nothing is left."""
         self.left -= size
         if self.left < 0:
             raise OverBudgetError
 
-    def regret(self, size: int) -> None:
+    def spend_in_vain(self, size: int) -> None:
         """Count work that turned out to be in vain."""
         self.failed_left -= size
         if self.failed_left < 0:

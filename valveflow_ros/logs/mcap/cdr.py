@@ -22,8 +22,7 @@ from valveflow_ros.logs.mcap.definitions import (
     full_name,
     parse_all,
 )
-from valveflow_ros.logs.mcap.layout import LayoutError
-from valveflow_ros.logs.mcap.walk import HEAD_SIZE, MessageTable, rows
+from valveflow_ros.logs.mcap.records import HEAD_SIZE, LayoutError, MessageTable, rows
 from valveflow_ros.logs.names import PLANT_SAMPLE
 from valveflow_ros.records import (
     N_SIGNALS,
@@ -161,13 +160,6 @@ class _Reader:
         return raw
 
 
-# Reads many stamped samples at once, by the definition that stands in the file.
-
-_NUMPY = {
-    'bool': 'u1', 'byte': 'u1', 'char': 'u1', 'uint8': 'u1', 'int8': 'i1',
-    'uint16': 'u2', 'int16': 'i2', 'uint32': 'u4', 'int32': 'i4',
-    'uint64': 'u8', 'int64': 'i8', 'float32': 'f4', 'float64': 'f8',
-}  # fmt: skip
 _SEC, _NANOSEC = 'header.stamp.sec', 'header.stamp.nanosec'
 _NEEDED = {_SEC: 'int32', _NANOSEC: 'uint32'} | {
     name: kind
@@ -258,7 +250,7 @@ class PlantSampleReader:
         alive = np.ones(len(body), dtype=np.bool_)
         found: dict[str, NDArray[np.generic]] = {}
         for name, kind in self._steps:
-            code = 'u4' if kind == 'string' else _NUMPY[kind]
+            code = 'I' if kind == 'string' else _CODES[kind]
             dtype = np.dtype([('value', order + code)])
             place += -place % dtype.itemsize
             alive &= body + place + dtype.itemsize <= end

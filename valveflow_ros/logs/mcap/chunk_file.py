@@ -11,53 +11,57 @@ import struct
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import PurePath
 
 import numpy as np
+import zstandard
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    Metadata,
+    MetadataIndex,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.well_known import Profile
 from numpy.typing import NDArray
 
-from valveflow_ros.logs.mcap.layout import (
-    MAGIC,
-    MESSAGE_HEAD,
-    RECORD_HEAD,
-    ZSTD,
-    Attachment,
-    Op,
-    Packer,
-    pack_chunk,
-    pack_footer,
-    pack_header,
-    pack_metadata,
-    pack_text,
-    record,
-)
-from valveflow_ros.logs.mcap.summary import TopicTable
+from valveflow_ros.logs.mcap.records import MAGIC, MESSAGE_HEAD, RECORD_HEAD, TopicTable, pack
 from valveflow_ros.logs.part_file import Writable
 from valveflow_ros.records import IntArray
 
-# Gathers messages until they are worth a chunk.
-
 CHUNK_BYTES = 64 * 1024
+ZSTD = 'zstd'
+_ZSTD_LEVEL = 3
+REPEAT_CHUNKS = 256
 _HEAD = struct.Struct('<BQHIQQ')
+_INDEX_ROW = np.dtype([('log_time', '<i8'), ('offset', '<i8')])
+
+
+def attachment(name: str, data: bytes) -> Attachment:
+    """Return the record of an attached file; its media type is that of its suffix."""
+    kinds = {'.json': 'application/json', '.yaml': 'application/yaml'}
+    kind = kinds.get(PurePath(name).suffix, 'application/octet-stream')
+    return Attachment(create_time=0, log_time=0, name=name, media_type=kind, data=data)
+
+
+def compressor() -> zstandard.ZstdCompressor:
+    """Return what compresses chunks; one for each thread, because its library keeps state."""
+    return zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
 
 
 @dataclass(frozen=True, slots=True)
 class PackedChunk:
     """A chunk record ready to be written, and what an index says about it.
 
-    Attributes
-    ----------
-    record : bytes
-        The whole record.
-    channel : uint16 (n,)
-        Channel of each message.
-    log_time : int64 (n,)
-        Receipt time of each message, ns since the epoch.
-    offset : int64 (n,)
-        Where each message begins in the unpacked content.
-    unpacked_size : int
-        Bytes of the content.
-    compression : str
-        How the record is compressed.
+    Arrays of n messages: ``channel`` uint16, ``log_time`` int64 in ns since the epoch, ``offset``
+    int64 where each begins in the unpacked content, which has ``unpacked_size`` bytes.
     """
 
     record: bytes
@@ -77,12 +81,19 @@ def pack_content(
     channel: NDArray[np.uint16],
     log_time: IntArray,
     offset: IntArray,
-    packer: Packer,
+    packer: zstandard.ZstdCompressor,
 ) -> PackedChunk:
     """Compress records, of which the messages are described by the arrays, into a chunk."""
     start, end = (int(log_time.min()), int(log_time.max())) if len(log_time) else (0, 0)
-    record = pack_chunk(start, end, content, ZSTD, packer.pack(content))
-    return PackedChunk(record, channel, log_time, offset, len(content), ZSTD)
+    chunk = Chunk(
+        compression=ZSTD,
+        data=packer.compress(content),
+        message_start_time=start,
+        message_end_time=end,
+        uncompressed_crc=zlib.crc32(content),
+        uncompressed_size=len(content),
+    )
+    return PackedChunk(pack(chunk), channel, log_time, offset, len(content), ZSTD)
 
 
 class ChunkBuilder:
@@ -93,7 +104,7 @@ class ChunkBuilder:
         self._channels: list[int] = []
         self._log_times: list[int] = []
         self._offsets: list[int] = []
-        self._packer = Packer()
+        self._packer = compressor()
 
     def __len__(self) -> int:
         """Return the number of waiting messages."""
@@ -114,7 +125,7 @@ class ChunkBuilder:
     ) -> None:
         """Append a message."""
         head = _HEAD.pack(
-            Op.MESSAGE,
+            Opcode.MESSAGE,
             MESSAGE_HEAD.size + len(data),
             channel,
             sequence & 0xFFFFFFFF,
@@ -146,19 +157,6 @@ class ChunkBuilder:
         self._offsets = []
 
 
-_INDEX_ROW = np.dtype([('log_time', '<i8'), ('offset', '<i8')])
-_CHUNK_INDEX_HEAD = struct.Struct('<QQQQ')
-_STATISTICS = struct.Struct('<QHIIIIQQ')
-_GROUPS = (
-    Op.SCHEMA,
-    Op.CHANNEL,
-    Op.STATISTICS,
-    Op.CHUNK_INDEX,
-    Op.ATTACHMENT_INDEX,
-    Op.METADATA_INDEX,
-)
-
-
 class ChunkFile:
     """One file being written.
 
@@ -186,46 +184,93 @@ class ChunkFile:
         self.position = 0
         self._out = out
         self._crc = 0
-        self._index: dict[Op, list[bytes]] = {op: [] for op in _GROUPS}
-        self._append(MAGIC + pack_header(library))
+        self._topics_known = self._since_table = 0
+        # Packed at once: a recording of months has a million chunks.
+        self._index: dict[Opcode, list[bytes]] = {
+            Opcode.CHUNK_INDEX: [], Opcode.ATTACHMENT_INDEX: [], Opcode.METADATA_INDEX: [],
+        }  # fmt: skip
+        self._append(MAGIC + pack(Header(profile=Profile.ROS2, library=library)))
 
     def put_attachment(self, attachment: Attachment) -> None:
         """Write a file into the file."""
-        start, packed = self.position, attachment.pack()
+        start, packed = self.position, pack(attachment)
         self._append(packed)
-        times = struct.pack('<QQQQ', start, len(packed), attachment.log_time_ns, 0)
-        size = struct.pack('<Q', len(attachment.data))
-        names = pack_text(attachment.name) + pack_text(attachment.media_type)
-        self._index[Op.ATTACHMENT_INDEX].append(record(Op.ATTACHMENT_INDEX, times + size + names))
+        index = AttachmentIndex(
+            offset=start,
+            length=len(packed),
+            log_time=attachment.log_time,
+            create_time=attachment.create_time,
+            data_size=len(attachment.data),
+            name=attachment.name,
+            media_type=attachment.media_type,
+        )
+        self._index[Opcode.ATTACHMENT_INDEX].append(pack(index))
+
+    def put_all(self, files: Mapping[str, bytes], notes: Mapping[str, Mapping[str, str]]) -> None:
+        """Write attachments and metadata by their names."""
+        for name, data in files.items():
+            self.put_attachment(attachment(name, data))
+        for name, items in notes.items():
+            self.put_metadata(name, items)
 
     def put_metadata(self, name: str, items: Mapping[str, str]) -> None:
         """Write a metadata record."""
-        start, packed = self.position, pack_metadata(name, items)
+        start, packed = self.position, pack(Metadata(name=name, metadata=dict(items)))
         self._append(packed)
-        place = struct.pack('<QQ', start, len(packed)) + pack_text(name)
-        self._index[Op.METADATA_INDEX].append(record(Op.METADATA_INDEX, place))
+        index = MetadataIndex(offset=start, length=len(packed), name=name)
+        self._index[Opcode.METADATA_INDEX].append(pack(index))
+
+    def table_due(self, topics: int) -> bool:
+        """Tell whether the records of so many topics are to stand in the next chunk.
+
+        A chunk may be lost, and with it the only mention of a topic; so they stand in the first
+        two chunks that could hold a new one, and then in one of `REPEAT_CHUNKS`.
+        """
+        due = topics > self._topics_known or self._since_table in (0, REPEAT_CHUNKS)
+        if topics > self._topics_known:
+            # The next chunk repeats what is new.
+            self._topics_known, self._since_table = topics, 0
+        else:
+            self._since_table = 1 if due else self._since_table + 1
+        return due
 
     def put_chunk(self, chunk: PackedChunk) -> None:
         """Write a chunk and its message indexes."""
         start = self.position
         self._append(chunk.record)
         # From here on its messages can be found again, whatever happens next.
+        # The library would pack an index in one Python step per message.
         rows = np.empty(len(chunk), dtype=_INDEX_ROW)
         rows['log_time'], rows['offset'] = chunk.log_time, chunk.offset
-        indexes: list[bytes] = []
-        places: list[bytes] = []
-        index_at = self.position
+        indexes, places, index_at = b'', {}, self.position
         # Not np.unique: its first call loads a part of numpy for half a second, in which a
         # recorder would write nothing.
         for channel in np.flatnonzero(np.bincount(chunk.channel)).tolist():
             mine = rows[chunk.channel == channel].tobytes()
             self.counts[channel] = self.counts.get(channel, 0) + len(mine) // _INDEX_ROW.itemsize
-            places.append(struct.pack('<HQ', channel, index_at))
-            head = struct.pack('<HI', channel, len(mine))
-            indexes.append(record(Op.MESSAGE_INDEX, head + mine))
-            index_at += len(indexes[-1])
-        self._account(chunk, start, b''.join(places), index_at - self.position)
-        self._append(b''.join(indexes))
+            places[channel] = index_at + len(indexes)
+            head = struct.pack('<BQHI', Opcode.MESSAGE_INDEX, len(mine) + 6, channel, len(mine))
+            indexes += head + mine
+        first = last = 0
+        if len(chunk):
+            first, last = int(chunk.log_time.min()), int(chunk.log_time.max())
+            self.start_ns = min(self.start_ns, first) if self.messages else first
+            self.end_ns = max(self.end_ns, last) if self.messages else last
+        self.messages += len(chunk)
+        self.chunks += 1
+        index = ChunkIndex(
+            chunk_length=len(chunk.record),
+            chunk_start_offset=start,
+            compression=chunk.compression,
+            compressed_size=len(chunk.record) - RECORD_HEAD.size - 40 - len(chunk.compression),
+            message_start_time=first,
+            message_end_time=last,
+            message_index_length=len(indexes),
+            message_index_offsets=places,
+            uncompressed_size=chunk.unpacked_size,
+        )
+        self._index[Opcode.CHUNK_INDEX].append(pack(index))
+        self._append(indexes)
 
     def sync(self) -> None:
         """Bring what was written to the disk."""
@@ -233,9 +278,8 @@ class ChunkFile:
 
     def finish(self, table: TopicTable) -> None:
         """Write the summary and give the file its own name."""
-        self._append(record(Op.DATA_END, struct.pack('<I', self._crc)))
-        summary = self._summary(table)
-        self._write(summary)
+        self._append(pack(DataEnd(data_section_crc=self._crc)))
+        self._write(self._summary(table))
         self._out.publish()
         self._out.close()
 
@@ -246,49 +290,38 @@ class ChunkFile:
         else:
             self._out.discard()
 
-    def _account(self, chunk: PackedChunk, start: int, places: bytes, index_size: int) -> None:
-        if len(chunk):
-            first, last = int(chunk.log_time.min()), int(chunk.log_time.max())
-            self.start_ns = min(self.start_ns, first) if self.messages else first
-            self.end_ns = max(self.end_ns, last) if self.messages else last
-        else:
-            first = last = 0
-        self.messages += len(chunk)
-        self.chunks += 1
-        head = _CHUNK_INDEX_HEAD.pack(first, last, start, len(chunk.record))
-        packed_size = len(chunk.record) - RECORD_HEAD.size - 40 - len(chunk.compression)
-        tail = pack_text(chunk.compression) + struct.pack('<QQ', packed_size, chunk.unpacked_size)
-        middle = struct.pack('<I', len(places)) + places + struct.pack('<Q', index_size)
-        self._index[Op.CHUNK_INDEX].append(record(Op.CHUNK_INDEX, head + middle + tail))
-
     def _summary(self, table: TopicTable) -> bytes:
-        index = self._index
-        index[Op.SCHEMA] = [schema.pack() for schema in table.schemas.values()]
-        index[Op.CHANNEL] = [channel.pack() for channel in table.channels.values()]
-        index[Op.STATISTICS] = [self._statistics(table)]
-        start, groups, offsets = self.position, b'', b''
-        for op in _GROUPS:
-            group = b''.join(index[op])
-            if group:
-                place = struct.pack('<BQQ', op, start + len(groups), len(group))
-                offsets += record(Op.SUMMARY_OFFSET, place)
-            groups += group
-        crc = zlib.crc32(offsets, zlib.crc32(groups))
-        return groups + offsets + pack_footer(start, start + len(groups), crc)
-
-    def _statistics(self, table: TopicTable) -> bytes:
-        counts = b''.join(struct.pack('<HQ', *item) for item in sorted(self.counts.items()))
-        head = _STATISTICS.pack(
-            self.messages,
-            len(table.schemas),
-            len(table.channels),
-            len(self._index[Op.ATTACHMENT_INDEX]),
-            len(self._index[Op.METADATA_INDEX]),
-            self.chunks,
-            self.start_ns,
-            self.end_ns,
+        statistics = Statistics(
+            attachment_count=len(self._index[Opcode.ATTACHMENT_INDEX]),
+            channel_count=len(table.channels),
+            channel_message_counts=dict(sorted(self.counts.items())),
+            chunk_count=self.chunks,
+            message_count=self.messages,
+            message_start_time=self.start_ns,
+            message_end_time=self.end_ns,
+            metadata_count=len(self._index[Opcode.METADATA_INDEX]),
+            schema_count=len(table.schemas),
         )
-        return record(Op.STATISTICS, head + struct.pack('<I', len(counts)) + counts)
+        groups = {
+            Opcode.SCHEMA: pack(*table.schemas.values()),
+            Opcode.CHANNEL: pack(*table.channels.values()),
+            Opcode.STATISTICS: pack(statistics),
+            **{op: b''.join(records) for op, records in self._index.items()},
+        }
+        start, summary, offsets = self.position, b'', b''
+        for op, group in groups.items():
+            if group:
+                place = start + len(summary)
+                offsets += pack(
+                    SummaryOffset(group_opcode=op, group_start=place, group_length=len(group))
+                )
+                summary += group
+        footer = Footer(
+            summary_start=start, summary_offset_start=start + len(summary), summary_crc=0
+        )
+        summary += offsets
+        footer.summary_crc = zlib.crc32(pack(footer)[:-4], zlib.crc32(summary))
+        return summary + pack(footer) + MAGIC
 
     def _append(self, data: bytes) -> None:
         self._write(data)

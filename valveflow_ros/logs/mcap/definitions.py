@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs.mcap.layout import LayoutError
+from valveflow_ros.logs.mcap.records import LayoutError
 
 # Definitions of the stock messages that are written and read where no ROS is installed.
 #
@@ -100,18 +100,9 @@ _BREAK = re.compile(r'^={20,}[ \t]*$', re.MULTILINE)
 class Field:
     """A field of a message.
 
-    Attributes
-    ----------
-    name : str
-        Its name.
-    type : str
-        One of `PRIMITIVES`, or a full name ``package/msg/Type``.
-    array : str
-        ``''`` for one value, ``'fixed'``, ``'bounded'`` or ``'unbounded'``.
-    length : int
-        How many elements (fixed), or at most how many (bounded).
-    text_bound : int
-        Longest string, 0 if not bounded.
+    ``type`` is one of `PRIMITIVES` or ``package/msg/Type``; ``array`` is ``''`` for one value,
+    ``'fixed'``, ``'bounded'`` or ``'unbounded'`` with ``length`` elements, or at most so many;
+    ``text_bound`` is the longest string, 0 if not bounded.
     """
 
     name: str

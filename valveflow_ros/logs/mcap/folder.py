@@ -5,16 +5,18 @@ from __future__ import annotations
 import json
 import re
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from mcap.records import Channel
 
 from valveflow_ros import __version__
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.mcap.chunk_file import ChunkFile
-from valveflow_ros.logs.mcap.summary import TopicTable, read_summary
-from valveflow_ros.logs.part_file import write_whole
-from valveflow_ros.logs.source import Source
+from valveflow_ros.logs.mcap.records import TopicTable, read_summary
+from valveflow_ros.logs.part_file import PART_SUFFIX, write_whole
+from valveflow_ros.logs.source import Source, os_errors
 
 METADATA_NAME = 'metadata.yaml'
 METADATA_VERSION = 9
@@ -24,39 +26,17 @@ _NUMBERED = re.compile(r'(.*)_([0-9]{1,9})\.mcap(?:\.part)?\Z', re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True)
-class TopicInfoLine:
-    """What `metadata.yaml` says about a topic."""
-
-    topic: str
-    type: str
-    encoding: str
-    qos: str
-    type_hash: str
-
-
-@dataclass(frozen=True, slots=True)
 class Split:
-    """One finished file of a recording.
+    """One finished file of a recording: its first and last log time are 0 without messages.
 
-    Attributes
-    ----------
-    name : str
-        File name within the folder.
-    start_ns, end_ns : int
-        First and last log time; 0 without messages.
-    messages : int
-        Number of messages.
-    topics : dict[str, TopicInfoLine]
-        The topics by name.
-    counts : dict[str, int]
-        Messages of each.
+    ``topics`` holds type and channel, ``counts`` the messages of each topic by its name.
     """
 
     name: str
     start_ns: int
     end_ns: int
     messages: int
-    topics: dict[str, TopicInfoLine] = field(default_factory=dict)
+    topics: dict[str, tuple[str, Channel]] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
 
     @classmethod
@@ -64,23 +44,12 @@ class Split:
         cls, name: str, table: TopicTable, counts: Mapping[int, int], times: tuple[int, int]
     ) -> Split:
         """Describe a file by its topics, the messages of each channel, and its times."""
-        topics: dict[str, TopicInfoLine] = {}
+        topics: dict[str, tuple[str, Channel]] = {}
         by_topic: dict[str, int] = {}
         for number, channel in table.channels.items():
-            topics[channel.topic] = TopicInfoLine(
-                channel.topic,
-                table.type_of(channel),
-                channel.encoding,
-                channel.metadata.get('offered_qos_profiles', ''),
-                channel.metadata.get('topic_type_hash', ''),
-            )
+            topics[channel.topic] = (table.type_of(channel), channel)
             by_topic[channel.topic] = by_topic.get(channel.topic, 0) + counts.get(number, 0)
         return cls(name, times[0], times[1], sum(counts.values()), topics, by_topic)
-
-    @classmethod
-    def of_file(cls, name: str, file: ChunkFile, table: TopicTable) -> Split:
-        """Describe a file that was just written."""
-        return cls.of(name, table, file.counts, (file.start_ns, file.end_ns))
 
     @classmethod
     def read(cls, path: Path) -> Split | None:
@@ -113,72 +82,52 @@ def in_order(paths: Iterable[Path]) -> list[Path]:
     return sorted(paths, key=lambda path: (split_number(path), path.name))
 
 
+def recording_files(folder: Path) -> list[Path]:
+    """Return all files of a recording in their order, finished or not.
+
+    While a ``.part`` is made whole, both may stand there for a moment; then it is left out.
+    """
+    with os_errors(folder, 'cannot be read'):
+        names = {entry.name for entry in folder.iterdir()}
+    whole = {name for name in names if name.endswith('.mcap')}
+    parts = {name for name in names if name.endswith(f'.mcap{PART_SUFFIX}')}
+    kept = {name for name in parts if name.removesuffix(PART_SUFFIX) not in whole}
+    return in_order(folder / name for name in whole | kept)
+
+
 def finished_files(folder: Path) -> list[Path]:
     """Return the finished splits of a folder in their order."""
     return in_order(path for path in folder.glob('*.mcap') if path.is_file())
 
 
-def write_metadata(folder: Path, splits: list[Split]) -> None:
+def finish_split(file: ChunkFile, name: str, table: TopicTable) -> Split:
+    """Finish a file that stands, or will stand, under a name; raises `OSError`."""
+    split = Split.of(name, table, file.counts, (file.start_ns, file.end_ns))
+    file.put_metadata('rosbag2', {'serialized_metadata': information_text([split])})
+    file.finish(table)
+    return split
+
+
+def write_metadata(folder: Path, splits: Collection[Split]) -> None:
     """Write `metadata.yaml` for these splits; raises `OSError`."""
     write_whole(folder / METADATA_NAME, metadata_text(splits).encode())
 
 
-class Listing:
-    """The finished splits of a folder, and the `metadata.yaml` that names them.
+def finished_splits(folder: Path, known: Mapping[str, Split] = {}) -> dict[str, Split]:
+    """Describe the finished files of a folder by their names, in order; raises `OSError`.
 
-    Parameters
-    ----------
-    folder : Path
-        The recording's folder.
-
-    Attributes
-    ----------
-    splits : list of Split
-        In their order.
-    due : bool
-        `metadata.yaml` could not be written as it should be.
-
-    Raises
-    ------
-    OSError
-        If the folder cannot be read.
+    Those that are known are not read again.
     """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self.due = False
-        self.splits: list[Split] = []
-        self._look()
-
-    def add(self, split: Split) -> None:
-        """Take note of a split that was just finished, without reading it again."""
-        self.splits.append(split)
-
-    def forget(self, name: str) -> None:
-        """Take note that a split was removed."""
-        self.splits = [split for split in self.splits if split.name != name]
-
-    def write(self) -> None:
-        """Write `metadata.yaml` for what is whole on the disk; raises `OSError`."""
-        self.due = True
-        # A file may have got its name although finishing it failed after that.
-        self._look()
-        write_metadata(self._folder, self.splits)
-        self.due = False
-
-    def _look(self) -> None:
-        known = {split.name: split for split in self.splits}
-        paths = finished_files(self._folder)
-        found = [known.get(path.name) or Split.read(path) for path in paths]
-        self.splits = [split for split in found if split is not None]
+    found = {p.name: known.get(p.name) or Split.read(p) for p in finished_files(folder)}
+    return {name: split for name, split in found.items() if split is not None}
 
 
-def metadata_text(splits: list[Split]) -> str:
+def metadata_text(splits: Collection[Split]) -> str:
     """Return the text of `metadata.yaml`."""
     return 'rosbag2_bagfile_information:\n' + textwrap.indent(information_text(splits), '  ')
 
 
-def information_text(splits: list[Split]) -> str:
+def information_text(splits: Collection[Split]) -> str:
     """Return what stands under the first key of `metadata.yaml`, and in the file's own record."""
     start, duration = _span([s for s in splits if s.messages])
     lines = [
@@ -208,27 +157,28 @@ def _span(splits: list[Split]) -> tuple[int, int]:
     return start, max(split.end_ns for split in splits) - start
 
 
-def _topic_lines(splits: list[Split]) -> list[str]:
-    topics: dict[str, TopicInfoLine] = {}
+def _topic_lines(splits: Collection[Split]) -> list[str]:
+    topics: dict[str, tuple[str, Channel]] = {}
     counts: dict[str, int] = {}
     for split in splits:
         topics.update(split.topics)
         for topic, count in split.counts.items():
             counts[topic] = counts.get(topic, 0) + count
-    return [_topic_line(line, counts[line.topic]) for line in topics.values()]
-
-
-def _topic_line(line: TopicInfoLine, count: int) -> str:
-    qos = f'\n{textwrap.indent(line.qos, " " * 8)}' if line.qos else ' []'
-    return (
-        '  - topic_metadata:\n'
-        f'      name: {_quoted(line.topic)}\n'
-        f'      type: {_quoted(line.type)}\n'
-        f'      serialization_format: {_quoted(line.encoding)}\n'
-        f'      offered_qos_profiles:{qos}\n'
-        f'      type_description_hash: {_quoted(line.type_hash)}\n'
-        f'    message_count: {count}'
-    )
+    lines = []
+    for topic, (kind, channel) in topics.items():
+        qos = channel.metadata.get('offered_qos_profiles', '')
+        told = f'\n{textwrap.indent(qos, " " * 8)}' if qos else ' []'
+        lines.append(
+            '  - topic_metadata:\n'
+            f'      name: {_quoted(topic)}\n'
+            f'      type: {_quoted(kind)}\n'
+            f'      serialization_format: {_quoted(channel.message_encoding)}\n'
+            f'      offered_qos_profiles:{told}\n'
+            '      type_description_hash: '
+            f'{_quoted(channel.metadata.get("topic_type_hash", ""))}\n'
+            f'    message_count: {counts[topic]}'
+        )
+    return lines
 
 
 def _file_lines(split: Split) -> str:

@@ -7,37 +7,36 @@ attachments, so a recording may grow for months.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from mcap.opcode import Opcode
+from mcap.well_known import MessageEncoding
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.mcap.cdr import Decoder, PlantSampleReader
-from valveflow_ros.logs.mcap.folder import Split, in_order
+from valveflow_ros.logs.mcap.folder import Split, in_order, recording_files
 from valveflow_ros.logs.mcap.gather import Rows, float_rows, sample_rows
-from valveflow_ros.logs.mcap.layout import (
-    CHUNK_HEAD,
-    FOOTER_RECORD_SIZE,
+from valveflow_ros.logs.mcap.records import (
+    FOOTER_SIZE,
     MAGIC,
     RECORD_HEAD,
-    Attachment,
     LayoutError,
-    Op,
+    MessageTable,
+    TopicTable,
+    ends_well,
+    unpack_attachment,
+    walk,
 )
-from valveflow_ros.logs.mcap.scan import Scanner, candidates, ends_well
-from valveflow_ros.logs.mcap.summary import TopicTable
-from valveflow_ros.logs.mcap.walk import MessageTable, walk
+from valveflow_ros.logs.mcap.scan import CHUNK_HEAD_SIZE, Scanner, candidates
 from valveflow_ros.logs.names import FLOAT64, PLANT_SAMPLE, last_part, signal_of
 from valveflow_ros.logs.part_file import PART_SUFFIX, is_held
 from valveflow_ros.logs.source import DEFAULT_LIMITS, OverBudgetError, Source
 from valveflow_ros.records import NS_PER_S, SIGNALS, Signal
-
-# The files of a recording that is followed: their names, and with which to begin.
-
 
 # What stands is announced again within a day, so nothing older is needed to know it.
 LOOK_BACK_NS = 25 * 3600 * NS_PER_S
@@ -53,23 +52,14 @@ def final_of(path: Path) -> Path:
     return path.with_suffix('') if path.suffix == PART_SUFFIX else path
 
 
-def files_in(folder: Path) -> set[Path]:
-    """Return the files of a folder by their final names; raises `RecordingError`."""
-    try:
-        names = [entry.name for entry in folder.iterdir()]
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RecordingError(folder, f'cannot be read ({reason})') from None
-    return {
-        folder / name.removesuffix(PART_SUFFIX)
-        for name in names
-        if name.endswith(('.mcap', f'.mcap{PART_SUFFIX}'))
-    }
+def files_in(folder: Path) -> list[Path]:
+    """Return the files of a folder by their final names, in order; raises `RecordingError`."""
+    return in_order({final_of(path) for path in recording_files(folder)})
 
 
 def first_in(folder: Path) -> Path | None:
     """Return the file to begin with: the first that holds something of the last day."""
-    files = in_order(files_in(folder))
+    files = files_in(folder)
     begin: Path | None = None
     newest = 0
     for path in reversed(files):
@@ -85,25 +75,16 @@ def first_in(folder: Path) -> Path | None:
 _MOST_ATTACHED = 1 << 20
 _GROUP_BYTES = 1 << 20
 _NEAR = 1 << 12
-_KINDS = frozenset(int(op) for op in Op)
+_KINDS = frozenset(int(op) for op in Opcode)
 # Of these the length is known; it tells them from a chunk with a damaged first byte.
-_LAST = {int(Op.DATA_END): 4, int(Op.FOOTER): 20}
+_LAST = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}
 
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Messages that were added.
+    """Messages that were added: records of some chunks, the messages in them, their topics.
 
-    Attributes
-    ----------
-    content : bytes
-        The records of some chunks.
-    messages : MessageTable
-        The messages in them.
-    topics : TopicTable
-        What their channels stand for.
-    share : float
-        How much of the files that are there has been read by now, 0 to 1.
+    ``share`` says how much of the files that are there has been read by now, 0 to 1.
     """
 
     content: bytes
@@ -250,19 +231,19 @@ class Follower:
         op, length = RECORD_HEAD.unpack(head)
         after = start + RECORD_HEAD.size + length
         if _LAST.get(op) == length:
-            whole = source.size >= after + FOOTER_RECORD_SIZE
+            whole = source.size >= after + FOOTER_SIZE
             self._ended = whole and source.read(source.size - len(MAGIC), len(MAGIC)) == MAGIC
             return None
-        if op not in _KINDS or op in _LAST or (op == Op.CHUNK and length < CHUNK_HEAD.size):
+        if op not in _KINDS or op in _LAST or (op == Opcode.CHUNK and length < CHUNK_HEAD_SIZE):
             return self._beyond_damage(source)
         if after > source.size:
             if self.written and length <= DEFAULT_LIMITS.record_bytes:
                 return None
             return self._beyond_damage(source, sure=False)
-        if op == Op.CHUNK:
+        if op == Opcode.CHUNK:
             return self._chunk(source, scanner, after)
         self._position = after
-        if op == Op.ATTACHMENT:
+        if op == Opcode.ATTACHMENT:
             self._attach(source, start, length)
         return b''
 
@@ -301,7 +282,7 @@ class Follower:
         if length > _MOST_ATTACHED:
             return
         try:
-            found = Attachment.unpack(source.read(start + RECORD_HEAD.size, length))
+            found = unpack_attachment(source.read(start + RECORD_HEAD.size, length))
         except LayoutError:
             self.damaged += 1
             return
@@ -332,8 +313,6 @@ class Follower:
         return min(1.0, (done + inside) / max(1, len(self._order) - begun))
 
 
-# Takes out of followed batches what a view needs: the last messages, and the readings.
-
 _INPUTS = {info.topic for info in SIGNALS}
 
 
@@ -360,8 +339,7 @@ class Picker:
 
     def __init__(self) -> None:
         self.misfits = 0
-        self._decoders: dict[tuple[str, str], Decoder | None] = {}
-        self._readers: dict[str, PlantSampleReader | None] = {}
+        self._decoders: dict[tuple[str, ...], Any] = {}
 
     def last(self, batch: Batch, wanted: dict[str, int]) -> Iterator[Raw]:
         """Yield messages, not decoded yet, in the order of the file.
@@ -376,7 +354,7 @@ class Picker:
         for channel, type_name, definition in _channels(batch):
             if type_name not in wanted:
                 continue
-            decoder = self._decoder(type_name, definition)
+            decoder: Decoder | None = self._made(Decoder, type_name, definition)
             mine = np.flatnonzero(batch.messages.channel == channel)[-wanted[type_name] :]
             if decoder is not None:
                 picked += [(row, decoder) for row in mine.tolist()]
@@ -401,7 +379,10 @@ class Picker:
                 (_, found), wrong = float_rows(batch.content, messages, mine)
                 self.misfits += len(wrong)
                 yield signal_of(last_part(topic)), topic, found
-            elif type_name == PLANT_SAMPLE and (reader := self._reader(definition)) is not None:
+            elif type_name == PLANT_SAMPLE:
+                reader: PlantSampleReader | None = self._made(PlantSampleReader, definition)
+                if reader is None:
+                    continue
                 samples = reader.read(batch.content, messages, mine)
                 self.misfits += int((~samples.good).sum())
                 _, found = sample_rows(messages, mine, samples)
@@ -410,28 +391,20 @@ class Picker:
                     columns = (getattr(found, name)[keep] for name in Rows.__dataclass_fields__)
                     yield Signal(number), topic, Rows(*columns)
 
-    def _decoder(self, type_name: str, definition: str) -> Decoder | None:
-        key = type_name, definition
+    def _made(self, make: Callable[..., Any], *key: str) -> Any:
+        """Return a decoder of one definition, made once; None where it is not understood."""
         if key not in self._decoders:
             try:
-                self._decoders[key] = Decoder(type_name, definition)
-            except RecordingError:
+                self._decoders[key] = make(*key)
+            except (RecordingError, LayoutError):
                 self._decoders[key] = None
         return self._decoders[key]
-
-    def _reader(self, definition: str) -> PlantSampleReader | None:
-        if definition not in self._readers:
-            try:
-                self._readers[definition] = PlantSampleReader(definition)
-            except LayoutError:
-                self._readers[definition] = None
-        return self._readers[definition]
 
 
 def _channels(batch: Batch) -> Iterator[tuple[int, str, str]]:
     """Yield the channels that occur and are known: id, type, definition."""
     for number in np.unique(batch.messages.channel).tolist():
         channel = batch.topics.channels.get(number)
-        if channel is not None and channel.encoding == 'cdr':
+        if channel is not None and channel.message_encoding == MessageEncoding.CDR:
             definition = batch.topics.definition_of(channel)
             yield number, batch.topics.type_of(channel), definition

@@ -14,15 +14,19 @@ from numpy.typing import NDArray
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.mcap.cdr import PlantSampleReader, Samples
-from valveflow_ros.logs.mcap.layout import LayoutError
+from valveflow_ros.logs.mcap.records import (
+    HEAD_SIZE,
+    LayoutError,
+    MessageTable,
+    TopicTable,
+    read_summary,
+    rows,
+    walk,
+)
 from valveflow_ros.logs.mcap.scan import Chunk, Findings, Scanner
-from valveflow_ros.logs.mcap.summary import TopicTable, read_summary
-from valveflow_ros.logs.mcap.walk import HEAD_SIZE, MessageTable, rows, walk
 from valveflow_ros.logs.names import FLOAT64, PLANT_SAMPLE, TopicChoice
 from valveflow_ros.logs.source import DEFAULT_LIMITS, Limits, Source
 from valveflow_ros.records import SIGNALS, ByteArray, FloatArray, IntArray
-
-# What is found in a file: rows of values, groups of chunks, counts.
 
 _PAYLOAD = np.dtype([('mark', '>u2'), ('options', '<u2'), ('value', '<f8')])
 # A Float64 takes 12 bytes; some middlewares pad to a multiple of 8.
@@ -33,18 +37,9 @@ _SIZES = (12, 16)
 class Rows:
     """Values found in a group of chunks, in the order of the file.
 
-    Attributes
-    ----------
-    log_time, time_ns : int64 (n,)
-        Receipt time and the value's own time.
-    channel : uint16 (n,)
-        Where it was found.
-    signal : int8 (n,)
-        Which signal it is, -1 where the topic has yet to be chosen.
-    value : float64 (n,)
-        As it stands there.
-    quality : uint8 (n,)
-        As it stands there; good where nothing stands.
+    Arrays of n: ``log_time`` and ``time_ns`` int64, receipt and the value's own time; ``channel``
+    uint16; ``signal`` int8, -1 where the topic has yet to be chosen; ``value`` float64;
+    ``quality`` uint8, good where the file says nothing.
     """
 
     log_time: IntArray
@@ -208,7 +203,7 @@ class _Collector:
         try:
             self._group([chunk])
         except LayoutError as error:
-            self.contents.findings.blame(f'the chunk at byte {chunk.offset}: {error}')
+            self.contents.findings.add_damage(f'the chunk at byte {chunk.offset}: {error}')
 
     def _group(self, chunks: list[Chunk]) -> None:
         content = b''.join(chunk.content for chunk in chunks)
@@ -274,7 +269,9 @@ class _Collector:
                 continue
             self.known.add(number)
             type_name = table.type_of(channel)
-            if channel.encoding != 'cdr' or not self._choice.may_matter(channel.topic, type_name):
+            if channel.message_encoding != 'cdr' or not self._choice.may_matter(
+                channel.topic, type_name
+            ):
                 continue
             if type_name == FLOAT64:
                 self._floats[number] = True

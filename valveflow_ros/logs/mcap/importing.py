@@ -13,22 +13,28 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from valveflow_ros.errors import DataError, RecordingError
-from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES, ChunkFile, pack_content
+from valveflow_ros.logs.mcap.chunk_file import (
+    CHUNK_BYTES,
+    ChunkFile,
+    compressor,
+    pack_content,
+)
 from valveflow_ros.logs.mcap.definitions import Definitions
 from valveflow_ros.logs.mcap.folder import (
     LIBRARY,
     METADATA_NAME,
-    Split,
-    information_text,
+    finish_split,
     write_metadata,
 )
-from valveflow_ros.logs.mcap.layout import RECORD_HEAD, Attachment, Op, Packer, media_type
-from valveflow_ros.logs.mcap.writer import Metadata, TableSchedule, TopicBook
+from valveflow_ros.logs.mcap.records import RECORD_HEAD
+from valveflow_ros.logs.mcap.writer import Metadata, TopicBook
 from valveflow_ros.logs.names import FLOAT64
-from valveflow_ros.logs.part_file import PartFile, make_folder
+from valveflow_ros.logs.part_file import new_file
+from valveflow_ros.logs.source import os_errors
 from valveflow_ros.records import (
     SIGNALS,
     IntArray,
@@ -140,27 +146,23 @@ def write_readings(
     records = _Records(channels)
     parts = _parts(blocks, records)
     first = next(parts)
-    try:
-        make_folder(target.parent)
-        out = PartFile(target, replace=True)
-        try:
+    with os_errors(target, 'cannot be written'):
+        with new_file(target) as out:
             file = ChunkFile(out, LIBRARY)
-            for name, data in (attachments or {}).items():
-                file.put_attachment(Attachment(name, media_type(name), data))
-            for name, items in (metadata or {}).items():
-                file.put_metadata(name, items)
-            _put_chunks(file, chain([first], parts), book)
-            split = Split.of_file(target.name, file, book.table)
-            information = information_text([split])
-            file.put_metadata('rosbag2', {'serialized_metadata': information})
-            file.finish(book.table)
-        except BaseException:
-            out.discard()
-            raise
-        _describe_beside(target, split)
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RecordingError(target, f'cannot be written ({reason})') from None
+            file.put_all(attachments or {}, metadata or {})
+            packer = compressor()
+            for part in chain([first], parts):
+                table = book.packed() if file.table_due(len(book.ids)) else b''
+                offset = len(table) + _RECORD.itemsize * np.arange(len(part), dtype=np.int64)
+                content = table + part.tobytes()
+                file.put_chunk(
+                    pack_content(content, part['channel'], part['log_time'], offset, packer)
+                )
+            split = finish_split(file, target.name, book.table)
+        path = target.parent / METADATA_NAME
+        # A file by itself needs none, so that of another recording stays.
+        if not path.exists() or _tells_of(path, target.name):
+            write_metadata(target.parent, [split])
     return WrittenLog(target, records.count)
 
 
@@ -182,7 +184,7 @@ class _Records:
         if int(readings.time_ns[0]) < 0:
             raise DataError('The samples begin before 1970, which a recording cannot hold.')
         records: NDArray[np.void] = np.zeros(len(readings), dtype=_RECORD)
-        records['op'] = int(Op.MESSAGE)
+        records['op'] = int(Opcode.MESSAGE)
         records['length'] = _RECORD.itemsize - RECORD_HEAD.size
         records['channel'] = self._channels[readings.signal]
         log_time = strictly_increasing(np.r_[self._last_ns, readings.time_ns])[1:]
@@ -224,27 +226,8 @@ def strictly_increasing(times: IntArray) -> IntArray:
     return np.maximum.accumulate(times - steps) + steps
 
 
-def _put_chunks(file: ChunkFile, parts: Iterable[NDArray[np.void]], book: TopicBook) -> None:
-    schedule, packer, topics = TableSchedule(), Packer(), len(book.ids)
-    for part in parts:
-        due = schedule.due(topics)
-        table = book.packed() if due else b''
-        offset = len(table) + _RECORD.itemsize * np.arange(len(part), dtype=np.int64)
-        file.put_chunk(
-            pack_content(table + part.tobytes(), part['channel'], part['log_time'], offset, packer)
-        )
-        schedule.done(topics, due)
-
-
-def _describe_beside(target: Path, split: Split) -> None:
-    """Write `metadata.yaml`, unless one that tells of other files stands there."""
-    path = target.parent / METADATA_NAME
-    # A file by itself needs none: whoever writes several into one folder is not troubled by it.
-    if not path.exists() or _tells_of(path, target.name):
-        write_metadata(target.parent, [split])
-
-
 def _tells_of(path: Path, name: str) -> bool:
+    """Tell whether a `metadata.yaml` is that of this file alone."""
     try:
         top = yaml.safe_load(path.read_text(encoding='utf-8'))
         return bool(top['rosbag2_bagfile_information']['relative_file_paths'] == [name])

@@ -11,17 +11,13 @@ from numpy.typing import NDArray
 
 from valveflow_ros.errors import RecordingError, counted
 from valveflow_ros.logs.contents import LogContents, LoggedMessage, TopicInfo
-from valveflow_ros.logs.mcap.folder import Split, in_order
+from valveflow_ros.logs.mcap.folder import Split, recording_files
 from valveflow_ros.logs.mcap.gather import FileContents, Group, Rows, gather
-from valveflow_ros.logs.mcap.layout import LayoutError
+from valveflow_ros.logs.mcap.records import HEAD_SIZE, LayoutError, MessageTable, walk
 from valveflow_ros.logs.mcap.scan import Findings, Scanner, scan_warnings
-from valveflow_ros.logs.mcap.walk import HEAD_SIZE, MessageTable, walk
 from valveflow_ros.logs.names import PLANT_SAMPLE_TOPIC, TopicChoice, misfits
-from valveflow_ros.logs.part_file import PART_SUFFIX
 from valveflow_ros.logs.source import DEFAULT_LIMITS, Limits, OverBudgetError, Source
 from valveflow_ros.records import IntArray, Readings, Signal
-
-# Goes through the raw messages of a recording again, in the order of their log times.
 
 _END = np.iinfo(np.int64).max
 _BLOCK = 1 << 14
@@ -53,7 +49,7 @@ def _columns(batch: _Batch) -> tuple[NDArray[np.generic], ...]:
     )
 
 
-class Journal:
+class MessageReader:
     """The raw messages of one or several files; holds only what overlaps in time.
 
     Parameters
@@ -70,7 +66,6 @@ class Journal:
 
     def messages(self, topics: Collection[str] | None) -> Iterator[LoggedMessage]:
         """Yield messages; see `LogContents.iter_messages`."""
-        repeats = _Repeats()
         plan = sorted(
             (group.first_ns, number, place)
             for number, file in enumerate(self._files)
@@ -78,11 +73,24 @@ class Journal:
             if group.channels & _channels(file, topics).keys()
         )
         waiting: list[_Batch] = []
+        last: dict[str, tuple[int, LoggedMessage]] = {}
+        met: set[tuple[int, str]] = set()
         for index, (_, number, place) in enumerate(plan):
             waiting.append(self._load(number, place, topics))
             # Nothing that is still to be read can come before this.
             until = plan[index + 1][0] if index + 1 < len(plan) else _END
-            yield from self._release(waiting, until, repeats)
+            due = self._release(waiting, until)
+            if len(self._files) == 1:
+                yield from (message for _, _, message in due)
+                continue
+            for file, sequence, message in due:
+                # The first message of a topic in a split may be the last of those before, which a
+                # recorder wrote again. The number it gave it tells that from an equal message.
+                before, first = last.get(message.topic), (file, message.topic) not in met
+                last[message.topic] = (sequence, message)
+                met.add((file, message.topic))
+                if not (before is not None and first and _repeats(before, sequence, message)):
+                    yield message
 
     def _load(self, number: int, place: int, topics: Collection[str] | None) -> _Batch:
         file = self._files[number]
@@ -92,9 +100,9 @@ class Journal:
         return _Batch(number, place, content, table, np.flatnonzero(wanted))
 
     def _release(
-        self, waiting: list[_Batch], until: int, repeats: _Repeats
-    ) -> Iterator[LoggedMessage]:
-        """Yield what comes before ``until`` and keep the rest waiting."""
+        self, waiting: list[_Batch], until: int
+    ) -> Iterator[tuple[int, int, LoggedMessage]]:
+        """Yield file, sequence number and message of what comes before ``until``, in order."""
         waiting.sort(key=lambda batch: (batch.file, batch.place))
         due = [batch.table.log_time[batch.rows] < until for batch in waiting]
         out = [replace(b, rows=b.rows[part]) for b, part in zip(waiting, due, strict=True)]
@@ -106,13 +114,6 @@ class Journal:
         if sum(len(batch.content) for batch in waiting) > MAX_WAITING_BYTES:
             problem = 'holds too much of the same time side by side to be put in order'
             raise RecordingError(self._files[out[0].file].path, problem)
-        single = len(self._files) == 1
-        for file, sequence, message in self._in_order(out):
-            if single or not repeats.seen(file, sequence, message):
-                yield message
-
-    def _in_order(self, out: list[_Batch]) -> Iterator[tuple[int, int, LoggedMessage]]:
-        """Yield file, sequence number and message; payloads are cut out one at a time."""
         names = [_channels(self._files[batch.file], None) for batch in out]
         columns = [np.concatenate(parts) for parts in zip(*map(_columns, out), strict=True)]
         sizes = [len(batch.rows) for batch in out]
@@ -137,31 +138,12 @@ class Journal:
             raise RecordingError(file.path, 'has changed while it was read') from None
 
 
-class _Repeats:
-    """Knows the latched messages that a recorder wrote again at the head of a split."""
-
-    def __init__(self) -> None:
-        self._last: dict[str, tuple[int, LoggedMessage]] = {}
-        self._met: set[tuple[int, str]] = set()
-
-    def seen(self, file: int, sequence: int, message: LoggedMessage) -> bool:
-        """Tell whether the first message of a topic in a split is the last of those before.
-
-        The number that the writer gave it tells a repetition from a message
-        that happens to be equal.
-        """
-        last = self._last.get(message.topic)
-        self._last[message.topic] = (sequence, message)
-        if last is None or (file, message.topic) in self._met:
-            self._met.add((file, message.topic))
-            return False
-        self._met.add((file, message.topic))
-        before = last[1]
-        return (
-            sequence == last[0]
-            and message.publish_time_ns == before.publish_time_ns
-            and message.data == before.data
-        )
+def _repeats(before: tuple[int, LoggedMessage], sequence: int, message: LoggedMessage) -> bool:
+    return (
+        sequence == before[0]
+        and message.publish_time_ns == before[1].publish_time_ns
+        and message.data == before[1].data
+    )
 
 
 def _channels(file: FileContents, topics: Collection[str] | None) -> dict[int, tuple[str, str]]:
@@ -194,7 +176,11 @@ def read_recording(
     warnings: list[str] = []
     for path in paths:
         try:
-            files.append(_read_file(path, choice, unchecked, limits))
+            with Source.open(path) as source:
+                contents = gather(source, choice, limits, unchecked)
+            if not contents.messages:
+                raise RecordingError(path, _why_empty(contents.findings))
+            files.append(contents)
         except RecordingError as error:
             if len(paths) == 1:
                 raise
@@ -209,19 +195,6 @@ def read_recording(
         warnings += [*scan_warnings(file.findings, what), *_file_warnings(file, what)]
     warnings += _choice_warnings(types, chosen, stamped, name)
     found, told = _timed(_readings(files, chosen))
-    return _contents(name, files, types, chosen, stamped, found, warnings + told, unchecked)
-
-
-def _contents(
-    name: str,
-    files: list[FileContents],
-    types: dict[str, str],
-    chosen: dict[str, Signal],
-    stamped: str | None,
-    found: tuple[Readings, IntArray],
-    warnings: list[str],
-    unchecked: bool,
-) -> LogContents:
     groups = [group for file in files for group in file.groups]
     signals = {signal: topic for topic, signal in chosen.items()}
     if stamped is not None:
@@ -237,22 +210,14 @@ def _contents(
         *found,
         _topics(files, types, chosen),
         signals,
-        tuple(warnings),
+        (*warnings, *told),
         attachments,
         metadata,
         min(group.first_ns for group in groups),
         max(group.last_ns for group in groups),
         sum(file.findings.damaged for file in files),
-        Journal(files, unchecked),
+        MessageReader(files, unchecked).messages,
     )
-
-
-def _read_file(path: Path, choice: TopicChoice, unchecked: bool, limits: Limits) -> FileContents:
-    with Source.open(path) as source:
-        contents = gather(source, choice, limits, unchecked)
-        if not contents.messages:
-            raise RecordingError(path, _why_empty(contents.findings))
-    return contents
 
 
 def _why_empty(findings: Findings) -> str:
@@ -402,8 +367,6 @@ def _readings(files: list[FileContents], chosen: dict[str, Signal]) -> tuple[Rea
     return Readings(*picked[:4]), picked[4]
 
 
-# The end of a recording: what was logged after a moment, without reading all before it.
-
 _TRIES = 3
 
 
@@ -446,25 +409,10 @@ def _read(home: Path, after_ns: int) -> LogContents:
 
 def _wanted(home: Path, after_ns: int) -> list[Path]:
     wanted: list[Path] = []
-    for path in reversed(in_order(_files(home))):
+    for path in reversed([p for p in recording_files(home) if p.is_file()]):
         wanted.insert(0, path)
         split = Split.read(path) if path.suffix == '.mcap' else None
         # Splits follow each other in time; one that begins before the moment is the first needed.
         if split is not None and split.messages and split.start_ns <= after_ns:
             break
     return wanted
-
-
-def _files(home: Path) -> list[Path]:
-    try:
-        names = {entry.name for entry in home.iterdir() if entry.is_file()}
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RecordingError(home, f'cannot be read ({reason})') from None
-    whole = {name for name in names if name.endswith('.mcap')}
-    parts = {
-        name
-        for name in names
-        if name.endswith(f'.mcap{PART_SUFFIX}') and name[: -len(PART_SUFFIX)] not in whole
-    }
-    return [home / name for name in whole | parts]

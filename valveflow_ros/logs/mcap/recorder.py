@@ -2,24 +2,420 @@
 
 from __future__ import annotations
 
+import enum
+import math
 import shutil
+import threading
+import time
+from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.logs.mcap.definitions import Definitions, full_name, parse_all
 from valveflow_ros.logs.mcap.definitions import type_hash as hash_of
-from valveflow_ros.logs.mcap.layout import LayoutError
-from valveflow_ros.logs.mcap.recorder_loop import (
-    HeadMessages,
-    Ledger,
-    NewTopic,
-    RecorderLoop,
-    RecorderSettings,
-    RecorderStatus,
-)
+from valveflow_ros.logs.mcap.folder import is_split_of
+from valveflow_ros.logs.mcap.records import LayoutError
+from valveflow_ros.logs.mcap.recover import RecoveryReport, recover_leftovers
 from valveflow_ros.logs.mcap.writer import Message, Metadata, OpenFile, Qos, RecordingWriter
 from valveflow_ros.logs.part_file import PartFile, make_folder
+from valveflow_ros.logs.source import os_errors
+
+# So long after the last drop the state says so, for those who look once a second.
+DROPS_SHOWN_S = 2.0
+# More waiting messages than this wake the thread before its time.
+_WAKE_AT = 4000
+MIB = 1 << 20
+
+
+class RecorderState(enum.Enum):
+    """How a recorder is doing."""
+
+    RECORDING = 'recording'
+    DEGRADED = 'degraded'
+    STOPPED = 'stopped'
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderSettings:
+    """How a recorder works; every time is in seconds.
+
+    Attributes
+    ----------
+    queue_limit : int
+        Messages held at most while they are not on disk; newer ones are dropped, and counted.
+    flush_period_s : float
+        A killed process loses at most what came in this time.
+    sync_period_s : float
+        A power cut loses at most what came in this time; 0: left to the system.
+    rotate_s, rotate_bytes : float, int
+        A new split is begun after this time or size.
+    free_floor_bytes : int
+        Below so much free space on the disk nothing is written.
+    keep_files : int or None
+        Finished splits that stay in the folder; the oldest go. None: all stay.
+    retry_s, retry_max_s : float
+        First and longest wait after a failure; it doubles.
+    """
+
+    queue_limit: int = 200_000
+    flush_period_s: float = 0.5
+    sync_period_s: float = 5.0
+    rotate_s: float = 3600.0
+    rotate_bytes: int = 256 * MIB
+    free_floor_bytes: int = 500 * MIB
+    keep_files: int | None = None
+    retry_s: float = 1.0
+    retry_max_s: float = 10.0
+
+
+@dataclass(slots=True)
+class RecorderStatus:
+    """What a recorder counted: ``received == written + queued + lost + sum of dropped``, always.
+
+    Attributes
+    ----------
+    state : RecorderState
+        How it is doing.
+    reason : str
+        Why it is not recording; empty if it is.
+    file : str
+        The split at hand, empty if none.
+    received : int
+        Messages handed in.
+    written : int
+        Of these, in whole chunks on disk.
+    queued : int
+        Of these, waiting.
+    lost : int
+        Of these, waiting when the recorder had to stop.
+    dropped : dict[str, int]
+        Of these, refused because too many were waiting, by topic.
+    files_finished : int
+        Splits finished since the start.
+    bytes_written : int
+        Bytes written since the start.
+    recovered : tuple of RecoveryReport
+        Leftovers of an earlier recorder that were finished at the start.
+    stalled_s : float
+        How long the thread has been at one and the same step; 0 while it waits for work. A disk
+        that refuses keeps it small, one that does not answer lets it grow.
+    """
+
+    state: RecorderState
+    reason: str = ''
+    file: str = ''
+    received: int = 0
+    written: int = 0
+    queued: int = 0
+    lost: int = 0
+    dropped: dict[str, int] = field(default_factory=dict)
+    files_finished: int = 0
+    bytes_written: int = 0
+    recovered: tuple[RecoveryReport, ...] = ()
+    stalled_s: float = 0.0
+
+
+class RecorderCounters:
+    """Counts every message in exactly one column of `RecorderStatus`.
+
+    Shared by the recorder's thread and everyone who asks; nobody holds its lock for long.
+    """
+
+    def __init__(self, limit: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._dropped_at = -math.inf
+        self._lock = threading.Lock()
+        self._limit = limit
+        self._open = True
+        self._now = RecorderStatus(RecorderState.RECORDING)
+        self._drops = 0
+        self._working_since_s: float | None = None
+
+    def working(self) -> None:
+        """Note that the thread has come to its next step; called for every message."""
+        # One assignment, which needs no lock: a stuck thread must not be able to hold one either.
+        self._working_since_s = self._clock()
+
+    def resting(self) -> None:
+        """Note that the thread waits, or does what takes as long as it takes."""
+        self._working_since_s = None
+
+    def admit(self, topic: str) -> bool:
+        """Count a message in; False if it must be dropped."""
+        with self._lock:
+            now = self._now
+            now.received += 1
+            if self._open and now.queued < self._limit:
+                now.queued += 1
+                return True
+            now.dropped[topic] = now.dropped.get(topic, 0) + 1
+            self._drops += 1
+            self._dropped_at = self._clock()
+            return False
+
+    def refuse(self) -> None:
+        """Drop whatever comes from now on."""
+        with self._lock:
+            self._open = False
+
+    def on_disk(self, written: int, file: str, files: int, size: int) -> None:
+        """Set how many messages are on disk in all, and in which file."""
+        with self._lock:
+            now = self._now
+            now.queued -= written - now.written
+            now.written, now.file, now.files_finished, now.bytes_written = (
+                written, file, files, size,
+            )  # fmt: skip
+
+    def healthy(self) -> None:
+        """Set the state after all that waited was written."""
+        with self._lock:
+            self._now.state, self._now.reason = RecorderState.RECORDING, ''
+            if self._clock() - self._dropped_at < DROPS_SHOWN_S:
+                self._now.state = RecorderState.DEGRADED
+                self._now.reason = f'{self._drops} messages were dropped, too many were waiting'
+
+    def failing(self, reason: str) -> None:
+        """Set the state while nothing can be written."""
+        with self._lock:
+            self._now.state, self._now.reason = RecorderState.DEGRADED, reason
+
+    def recovered(self, reports: tuple[RecoveryReport, ...]) -> None:
+        """Set the leftovers that were finished."""
+        with self._lock:
+            self._now.recovered = reports
+
+    def stopped(self, reason: str = '') -> None:
+        """Count what waits now as lost, for good."""
+        self.resting()
+        with self._lock:
+            self._open = False
+            now = self._now
+            now.lost, now.queued = now.lost + now.queued, 0
+            now.state, now.reason, now.file = RecorderState.STOPPED, reason, ''
+
+    def as_metadata(self) -> dict[str, str]:
+        """Return the counters as they are written into the recording."""
+        status = self.status()
+        items = {f'dropped {topic}': str(count) for topic, count in status.dropped.items()}
+        return {'received': str(status.received), **items}
+
+    def status(self) -> RecorderStatus:
+        """Return all counters at one moment."""
+        since_s = self._working_since_s
+        stalled_s = 0.0 if since_s is None else max(0.0, self._clock() - since_s)
+        with self._lock:
+            return replace(self._now, dropped=dict(self._now.dropped), stalled_s=stalled_s)
+
+
+class NewTopic(NamedTuple):
+    """A topic on its way to the writer, in line with the messages."""
+
+    topic: str
+    type_name: str
+    qos: Qos
+    type_hash: str
+    definition: str
+    latched: bool
+
+
+class RecorderLoop:
+    """Runs the writer; `put`, `ask_rotation` and `stop` may be called from other threads."""
+
+    def __init__(
+        self,
+        folder: Path,
+        settings: RecorderSettings,
+        make_writer: Callable[..., RecordingWriter],
+        counters: RecorderCounters,
+        free_bytes: Callable[[Path], int],
+    ) -> None:
+        self._folder = folder
+        self._settings = settings
+        self._make_writer = make_writer
+        self._counters = counters
+        self._free_bytes = free_bytes
+        self._queue: deque[NewTopic | Message] = deque()
+        self._latching: set[str] = set()
+        self._fresh: dict[str, Message] = {}
+        self._latched: dict[str, Message] = {}
+        self._writer: RecordingWriter | None = None
+        self._path: Path | None = None
+        self._begun_at = self._synced_at = self._retry_at = 0.0
+        self._retry_wait = settings.retry_s
+        self.rotation_asked = False
+        self._stopping = False
+        self._wake = threading.Event()
+        self._thread = threading.Thread(target=self._run, name='recorder', daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def latched(self) -> list[Message]:
+        """Return the latched messages that a new split begins with."""
+        return list(self._latched.values())
+
+    def put(self, item: NewTopic | Message) -> None:
+        """Hand in a topic or a message."""
+        self._queue.append(item)
+        if len(self._queue) >= _WAKE_AT:
+            self._wake.set()
+
+    def ask_rotation(self) -> None:
+        """Begin a new split at the next opportunity."""
+        self.rotation_asked = True
+        self._wake.set()
+
+    def stop(self, timeout_s: float) -> None:
+        """Finish, and wait for it so long."""
+        self._stopping = True
+        self._wake.set()
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        try:
+            stopping = False
+            while not stopping:
+                # Read before the cycle: what was put before `stop` is then in the queue.
+                stopping = self._stopping
+                begun = time.monotonic()
+                self._cycle(stopping)
+                if not stopping:
+                    self._counters.resting()
+                    # What came while the disk was busy has waited long enough.
+                    left = begun + self._settings.flush_period_s - time.monotonic()
+                    self._wake.wait(max(0.0, left))
+                    self._wake.clear()
+            self._counters.stopped(self._finish())
+        except Exception as error:  # noqa: BLE001
+            # Whatever it is, a dead thread must not look alive.
+            self._counters.stopped(f'the recorder failed: {type(error).__name__}: {error}')
+
+    def _cycle(self, stopping: bool) -> None:
+        now = time.monotonic()
+        if now < self._retry_at and not stopping:
+            return
+        try:
+            writer = self._ready()
+            self._counters.working()
+            self._check_space(writer)
+            self._drain(writer)
+            self._counters.working()
+            writer.flush()
+            # Only what stands in a split already is a repetition in the next.
+            self._latched.update(self._fresh)
+            self._fresh = {}
+            self._counters.working()
+            self._sync(writer, now)
+            self._counters.working()
+            self._rotate(writer, now)
+        except RecordingError as error:
+            self._counters.failing(str(error))
+            self._retry_at = time.monotonic() + self._retry_wait
+            self._retry_wait = min(2 * self._retry_wait, self._settings.retry_max_s)
+        else:
+            self._retry_at, self._retry_wait = 0.0, self._settings.retry_s
+            self._counters.healthy()
+        finally:
+            self._count()
+
+    def _ready(self) -> RecordingWriter:
+        if self._writer is None:
+            # A leftover takes as long as it is large; to be ended for that, again at each start,
+            # would mean never to get past it.
+            self._counters.resting()
+            self._counters.recovered(recover_leftovers(self._folder))
+            self._writer = self._make_writer(head_messages=self.latched)
+        return self._writer
+
+    def _check_space(self, writer: RecordingWriter) -> None:
+        floor = self._settings.free_floor_bytes
+        try:
+            free = self._free_bytes(self._folder)
+        except OSError as error:
+            raise RecordingError(self._folder, f'cannot be asked for space ({error})') from None
+        if free < floor:
+            # What is there becomes a whole file as long as that is possible.
+            if writer.file_bytes:
+                writer.close()
+            problem = f'only {free // MIB} MiB are free, {floor // MIB} MiB must stay free'
+            raise RecordingError(self._folder, problem)
+
+    def _drain(self, writer: RecordingWriter) -> None:
+        for _ in range(len(self._queue)):
+            self._counters.working()
+            item = self._queue.popleft()
+            if isinstance(item, NewTopic):
+                writer.add_topic(
+                    item.topic,
+                    item.type_name,
+                    qos=item.qos,
+                    type_hash=item.type_hash,
+                    definition=item.definition,
+                )
+                if item.latched:
+                    self._latching.add(item.topic)
+                continue
+            if item.topic in self._latching:
+                self._fresh[item.topic] = item
+            writer.write(item.topic, item.data, item.log_time_ns, item.publish_time_ns)
+
+    def _sync(self, writer: RecordingWriter, now: float) -> None:
+        period = self._settings.sync_period_s
+        if period > 0 and now - self._synced_at >= period:
+            writer.sync()
+            self._synced_at = now
+
+    def _rotate(self, writer: RecordingWriter, now: float) -> None:
+        if writer.path != self._path:
+            self._path, self._begun_at = writer.path, now
+        old = now - self._begun_at >= self._settings.rotate_s
+        large = writer.file_bytes >= self._settings.rotate_bytes
+        asked, self.rotation_asked = self.rotation_asked, False
+        if writer.file_bytes and (old or large or asked):
+            writer.rotate()
+            self._remove_old(writer)
+
+    def _remove_old(self, writer: RecordingWriter) -> None:
+        keep = self._settings.keep_files
+        if keep is None:
+            return
+        # A recording of another name in the same folder is not ours to remove.
+        own = [split for split in writer.finished if is_split_of(split.name, writer.name)]
+        for split in own[: max(0, len(own) - keep)]:
+            try:
+                (self._folder / split.name).unlink(missing_ok=True)
+            except OSError as error:
+                problem = f'cannot be removed ({error.strerror})'
+                raise RecordingError(self._folder / split.name, problem) from None
+            writer.forget(split.name)
+
+    def _count(self) -> None:
+        writer = self._writer
+        if writer is not None:
+            file = writer.path.name if writer.path is not None else ''
+            size = writer.bytes_finished + writer.file_bytes
+            self._counters.on_disk(writer.written, file, writer.files_finished, size)
+
+    def _finish(self) -> str:
+        """Finish the file; return what kept it from being finished, empty if nothing did."""
+        writer = self._writer
+        if writer is None:
+            return 'nothing could be recorded'
+        try:
+            writer.note('valveflow_recorder', self._counters.as_metadata())
+            writer.close()
+        except RecordingError as error:
+            writer.abandon()
+            return str(error)
+        finally:
+            self._count()
+        return ''
 
 
 def free_bytes_of(folder: Path) -> int:
@@ -65,29 +461,23 @@ class Recorder:
         free_bytes: Callable[[Path], int] = free_bytes_of,
     ) -> None:
         self.folder = Path(folder)
-        try:
+        with os_errors(self.folder, 'cannot be made'):
             make_folder(self.folder)
-        except OSError as error:
-            reason = (error.strerror or str(error)).lower()
-            raise RecordingError(self.folder, f'cannot be made ({reason})') from None
         self._settings = settings or RecorderSettings()
         self._definitions = definitions or Definitions()
         self._topics: dict[str, str] = {}
-        self._ledger = Ledger(self._settings.queue_limit)
-
-        def make_writer(head_messages: HeadMessages) -> RecordingWriter:
-            return RecordingWriter(
-                self.folder,
-                name=name,
-                definitions=self._definitions,
-                attachments=attachments,
-                metadata=metadata,
-                head_messages=head_messages,
-                open_file=open_file,
-            )
-
+        self._counters = RecorderCounters(self._settings.queue_limit)
+        make_writer = partial(
+            RecordingWriter,
+            self.folder,
+            name=name,
+            definitions=self._definitions,
+            attachments=attachments,
+            metadata=metadata,
+            open_file=open_file,
+        )
         self._loop = RecorderLoop(
-            self.folder, self._settings, make_writer, self._ledger, free_bytes
+            self.folder, self._settings, make_writer, self._counters, free_bytes
         )
         self._loop.start()
 
@@ -153,7 +543,7 @@ class Recorder:
             raise InputError(f"Topic '{topic}' was not made known to the recorder.")
         if not (0 <= log_time_ns < 1 << 63 and 0 <= publish_time_ns < 1 << 63):
             raise InputError(f"A message on '{topic}' has an impossible time.")
-        if not self._ledger.admit(topic):
+        if not self._counters.admit(topic):
             return False
         self._loop.put(Message(topic, data, log_time_ns, publish_time_ns))
         return True
@@ -168,8 +558,8 @@ class Recorder:
         return self._loop.rotation_asked
 
     def status(self) -> RecorderStatus:
-        """Return the account as it is now."""
-        return self._ledger.status()
+        """Return all counters at one moment."""
+        return self._counters.status()
 
     def close(self, timeout_s: float = 2.0) -> RecorderStatus:
         """Write what is waiting and finish the file, within a bound.
@@ -177,6 +567,6 @@ class Recorder:
         If the disk does not let it finish in time, the thread is left behind
         and the status says how many messages are still waiting.
         """
-        self._ledger.refuse()
+        self._counters.refuse()
         self._loop.stop(timeout_s)
-        return self._ledger.status()
+        return self._counters.status()

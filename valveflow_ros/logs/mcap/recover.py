@@ -8,41 +8,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.mcap.chunk_file import ChunkFile, PackedChunk
 from valveflow_ros.logs.mcap.folder import (
     LIBRARY,
-    Split,
-    finished_files,
-    information_text,
+    finish_split,
+    finished_splits,
     write_metadata,
 )
-from valveflow_ros.logs.mcap.layout import CHUNK_HEAD, RECORD_HEAD, Cursor, LayoutError
-from valveflow_ros.logs.mcap.scan import SHAPE_SIZE, Chunk, Scanner, candidates, scan_warnings
-from valveflow_ros.logs.mcap.summary import TopicTable, read_summary
-from valveflow_ros.logs.mcap.walk import walk
-from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, make_folder, taken
-from valveflow_ros.logs.source import Source
+from valveflow_ros.logs.mcap.records import LayoutError, TopicTable, read_summary, walk
+from valveflow_ros.logs.mcap.scan import SHAPE_SIZE, Scanner, candidates, scan_warnings
+from valveflow_ros.logs.part_file import PART_SUFFIX, new_file, taken
+from valveflow_ros.logs.source import Source, os_errors
 
 
 @dataclass(frozen=True, slots=True)
 class RecoveryReport:
     """What a recovery kept and what it had to leave.
 
-    Attributes
-    ----------
-    source, out : Path
-        The broken file and the whole one.
-    messages, chunks : int
-        Copied.
-    damaged_chunks : int
-        Places where something was lost, apart from a cut-off end.
-    bytes_read, bytes_written : int
-        Sizes of both files.
-    warnings : tuple of str
-        Sentences about what was met.
+    ``messages`` and ``chunks`` were copied; ``damaged_chunks`` counts the places where something
+    was lost, apart from a cut-off end; ``warnings`` are sentences about what was met.
     """
 
     source: Path
@@ -96,35 +84,27 @@ def recover_leftovers(folder: str | Path) -> tuple[RecoveryReport, ...]:
         If the folder cannot be read.
     """
     home = Path(folder)
-    try:
+    with os_errors(home, 'leftovers cannot be recovered'):
         parts = sorted(home.glob(f'*.mcap{PART_SUFFIX}'))
         reports = [report for part in parts if (report := _leftover(part)) is not None]
         if reports:
-            splits = [split for path in finished_files(home) if (split := Split.read(path))]
-            write_metadata(home, splits)
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RecordingError(home, f'leftovers cannot be recovered ({reason})') from None
+            write_metadata(home, finished_splits(home).values())
     return tuple(reports)
 
 
 def _leftover(part: Path) -> RecoveryReport | None:
     """Finish one; what cannot be read or finished now stays, and nobody has to wait for it."""
+    if part.is_symlink() or not part.is_file():
+        return None
     try:
-        return _finished(part)
+        # It is held meanwhile, so that no other recovery works on it at the same time.
+        with taken(part) as free:
+            return _made_whole(part) if free else None
     except (OSError, RecordingError):
         return None
 
 
-def _finished(part: Path) -> RecoveryReport | None:
-    if part.is_symlink() or not part.is_file():
-        return None
-    with taken(part) as free:
-        return _made_whole(part) if free else None
-
-
 def _made_whole(part: Path) -> RecoveryReport | None:
-    """Finish one that is held, so that no other recovery works on it at the same time."""
     if part.stat().st_size == 0:
         part.unlink()
         return None
@@ -161,23 +141,21 @@ def _recover(path: Path, target: Path, name: str, progress: Progress | None) -> 
     with Source.open(path) as source:
         scanner = Scanner(source)
         table = TopicTable()
-        chunks = _taken(scanner, table, progress, source.size)
+        chunks = _intact(scanner, table, progress, source.size)
         first = next(chunks, None)
         if first is None:
             raise RecordingError(path, 'holds no intact chunk of messages, nothing to recover')
-        try:
-            make_folder(target.parent)
-            out = PartFile(target, replace=True)
-            try:
-                file = _copy(out, first, chunks)
-                _complete(table, source)
-                _finish(file, scanner, table, name)
-            except BaseException:
-                out.discard()
-                raise
-        except OSError as error:
-            reason = (error.strerror or str(error)).lower()
-            raise RecordingError(target, f'cannot be written ({reason})') from None
+        with os_errors(target, 'cannot be written'), new_file(target) as out:
+            file = ChunkFile(out, LIBRARY)
+            for chunk in chain([first], chunks):
+                file.put_chunk(chunk)
+            _complete(table, source)
+            for attachment in scanner.findings.attachments.values():
+                file.put_attachment(attachment)
+            for key, items in scanner.findings.metadata.items():
+                if key != 'rosbag2':
+                    file.put_metadata(key, items)
+            finish_split(file, name, table)
         findings = scanner.findings
         warnings = scan_warnings(findings, 'file')
     return RecoveryReport(
@@ -192,44 +170,29 @@ def _recover(path: Path, target: Path, name: str, progress: Progress | None) -> 
     )
 
 
-def _taken(
+def _intact(
     scanner: Scanner, table: TopicTable, progress: Progress | None, size: int
 ) -> Iterator[PackedChunk]:
     for chunk in scanner.chunks():
         if not chunk.content:
             continue
         try:
-            packed = _described(chunk, table)
+            messages, others = walk(chunk.content)
+            for op, content in others:
+                table.add(op, content)
         except LayoutError as error:
-            scanner.findings.blame(f'the chunk at byte {chunk.offset}: {error}')
+            scanner.findings.add_damage(f'the chunk at byte {chunk.offset}: {error}')
             continue
-        yield packed
+        yield PackedChunk(
+            chunk.record,
+            messages.channel,
+            messages.log_time,
+            messages.offset,
+            len(chunk.content),
+            chunk.compression,
+        )
         if progress is not None:
             progress(chunk.end, size)
-
-
-def _described(chunk: Chunk, table: TopicTable) -> PackedChunk:
-    messages, others = walk(chunk.content)
-    for op, content in others:
-        table.add(op, content)
-    cursor = Cursor(chunk.record)
-    cursor.position = RECORD_HEAD.size + CHUNK_HEAD.size
-    return PackedChunk(
-        chunk.record,
-        messages.channel,
-        messages.log_time,
-        messages.offset,
-        len(chunk.content),
-        cursor.text(),
-    )
-
-
-def _copy(out: PartFile, first: PackedChunk, rest: Iterator[PackedChunk]) -> ChunkFile:
-    file = ChunkFile(out, LIBRARY)
-    file.put_chunk(first)
-    for chunk in rest:
-        file.put_chunk(chunk)
-    return file
 
 
 def _complete(table: TopicTable, source: Source) -> None:
@@ -240,14 +203,3 @@ def _complete(table: TopicTable, source: Source) -> None:
             table.take_over(summary.table)
         except LayoutError as error:
             raise RecordingError(source.path, f'contradicts itself: {error}') from None
-
-
-def _finish(file: ChunkFile, scanner: Scanner, table: TopicTable, split_name: str) -> None:
-    for attachment in scanner.findings.attachments.values():
-        file.put_attachment(attachment)
-    for name, items in scanner.findings.metadata.items():
-        if name != 'rosbag2':
-            file.put_metadata(name, items)
-    split = Split.of_file(split_name, file, table)
-    file.put_metadata('rosbag2', {'serialized_metadata': information_text([split])})
-    file.finish(table)

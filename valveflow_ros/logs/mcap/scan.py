@@ -15,22 +15,21 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Metadata
+from mcap.records import Chunk as ChunkRecord
+
 from valveflow_ros.errors import counted
-from valveflow_ros.logs.mcap.layout import (
-    CHUNK_HEAD,
-    FOOTER_RECORD_SIZE,
+from valveflow_ros.logs.mcap.records import (
     MAGIC,
     RECORD_HEAD,
-    Attachment,
-    Cursor,
     LayoutError,
-    Op,
     Unpacker,
+    ends_well,
+    unpack,
+    unpack_attachment,
 )
 from valveflow_ros.logs.source import DEFAULT_LIMITS, Budget, Limits, OverBudgetError, Source
-
-# Finds places in a file that look like the head of a chunk, and the end of a finished one.
-
 
 # A chunk's record: kind 6, a length below 64 GiB, four fixed fields, then the
 # compression by name. The length is checked against the fields afterwards.
@@ -39,6 +38,8 @@ _SHAPE = re.compile(
 )
 # More than the head of a chunk takes.
 SHAPE_SIZE = 64
+# Times, size and checksum; the name of the compression and the packed bytes follow.
+CHUNK_HEAD_SIZE = 28
 _WINDOW = 1 << 22
 
 
@@ -65,23 +66,13 @@ def _fields_agree(window: bytes, position: int, names_end: int) -> bool:
     return bool(packed_at - position - RECORD_HEAD.size + packed == length)
 
 
-def ends_well(source: Source) -> bool:
-    """Tell whether a file was finished: it ends in a footer and the magic."""
-    start = source.size - len(MAGIC) - FOOTER_RECORD_SIZE
-    if start < len(MAGIC):
-        return False
-    raw = source.read(start, FOOTER_RECORD_SIZE + len(MAGIC))
-    op, length = RECORD_HEAD.unpack_from(raw)
-    return op == Op.FOOTER and length == 20 and raw.endswith(MAGIC)
-
-
 _INDEX_HEAD = struct.Struct('<BQHI')
 _INDEX_BLOCK = 4096
-_KINDS = frozenset(int(op) for op in Op)
+_KINDS = frozenset(int(op) for op in Opcode)
 # So many messages outside of chunks before the first chunk: there will be none.
 _BARE_ENOUGH = 1000
 # Shorter records cannot hide a chunk.
-_SMALLEST_CHUNK = RECORD_HEAD.size + CHUNK_HEAD.size + 12
+_SMALLEST_CHUNK = RECORD_HEAD.size + CHUNK_HEAD_SIZE + 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +82,7 @@ class Chunk:
     offset: int
     record: bytes
     content: bytes
+    compression: str
 
     @property
     def end(self) -> int:
@@ -114,7 +106,7 @@ class Findings:
     attachments: dict[str, Attachment] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
 
-    def blame(self, reason: str) -> None:
+    def add_damage(self, reason: str) -> None:
         """Count a damaged chunk or stretch; the first few reasons are kept."""
         self.damaged += 1
         if len(self.reasons) < 8:
@@ -192,7 +184,7 @@ class Scanner:
                     return position
             op, length, _, inner = _INDEX_HEAD.unpack_from(block, place)
             after = place + RECORD_HEAD.size + length
-            if op != Op.MESSAGE_INDEX or inner != length - 6:
+            if op != Opcode.MESSAGE_INDEX or inner != length - 6:
                 return position + place
             if position + after > self._source.size:
                 return position + place
@@ -203,17 +195,17 @@ class Scanner:
         op, length = self._head(position)
         after = position + RECORD_HEAD.size + length
         problem = ''
-        if op == Op.CHUNK:
+        if op == Opcode.CHUNK:
             try:
                 return self._accept(position, length), after
             except LayoutError as error:
                 if after <= self._source.size:
-                    self._budget.regret(length)
+                    self._budget.spend_in_vain(length)
                     problem = f'the chunk at byte {position}: {error}'
                 # A length is believed if the fields within say the same.
                 agreed = next(candidates(self._source, position, position + 1), None) is not None
                 if agreed and self._plausible(after):
-                    self.findings.blame(problem)
+                    self.findings.add_damage(problem)
                     return None, after
         elif op in _KINDS and after <= self._source.size and self._plausible(after):
             hidden = self._inside(op, position, length)
@@ -225,7 +217,7 @@ class Scanner:
         if chunk is None and not problem and not self.findings.finished:
             self.findings.cut_off_at = position
             return None, self._source.size
-        self.findings.blame(problem or f'the chain of records breaks at byte {position}')
+        self.findings.add_damage(problem or f'the chain of records breaks at byte {position}')
         return chunk, (self._source.size if chunk is None else chunk.end)
 
     def _seek(self, start: int, end: int) -> Chunk | None:
@@ -235,7 +227,7 @@ class Scanner:
             try:
                 return self._accept(position, length)
             except LayoutError:
-                self._budget.regret(length)
+                self._budget.spend_in_vain(length)
         return None
 
     def _accept(self, position: int, length: int) -> Chunk:
@@ -250,39 +242,33 @@ class Scanner:
         if len(raw) < RECORD_HEAD.size + length:
             raise LayoutError('it is cut off')
         self._budget.spend(length)
-        cursor = Cursor(raw)
-        cursor.position = RECORD_HEAD.size
-        _, _, size, crc = CHUNK_HEAD.unpack(cursor.take(CHUNK_HEAD.size))
-        compression = cursor.text()
-        packed = cursor.take(cursor.u64())
-        if cursor.position != len(raw):
+        found = unpack(ChunkRecord.read, raw[RECORD_HEAD.size :])
+        size, crc, name = found.uncompressed_size, found.uncompressed_crc, found.compression
+        if CHUNK_HEAD_SIZE + 12 + len(name.encode()) + len(found.data) != length:
             raise LayoutError('its length disagrees with its content')
         if size > self._limits.chunk_bytes:
             raise LayoutError(f'it claims to unpack to {size} bytes, which is beyond all bounds')
         self._budget.spend(size)
-        content = self._unpacker.unpack(compression, packed, size)
+        content = self._unpacker.unpack(name, found.data, size)
         if zlib.crc32(content) != crc:
-            self._refuse_checksum(crc)
-        return Chunk(position, raw, content)
-
-    def _refuse_checksum(self, crc: int) -> None:
-        if crc != 0:
-            raise LayoutError('its checksum is wrong')
-        self.findings.unchecked += 1
-        if not self._unchecked:
-            raise LayoutError('it was written without a checksum')
+            if crc != 0:
+                raise LayoutError('its checksum is wrong')
+            self.findings.unchecked += 1
+            if not self._unchecked:
+                raise LayoutError('it was written without a checksum')
+        return Chunk(position, raw, content, name)
 
     def _inside(self, op: int, position: int, length: int) -> Chunk | None:
         """Look into a record that is no chunk, and for a chunk that a wrong length would hide."""
-        if op == Op.MESSAGE:
+        if op == Opcode.MESSAGE:
             self.findings.bare_messages += 1
-        if op == Op.ATTACHMENT:
+        if op == Opcode.ATTACHMENT:
             self._attachment(position, length)
             return None
-        if op == Op.METADATA and length <= self._limits.definition_bytes:
+        if op == Opcode.METADATA and length <= self._limits.definition_bytes:
             self._metadata(position, length)
         if length < _SMALLEST_CHUNK or (
-            op == Op.MESSAGE_INDEX and self._is_index(position, length)
+            op == Opcode.MESSAGE_INDEX and self._is_index(position, length)
         ):
             return None
         start = position + RECORD_HEAD.size
@@ -295,27 +281,28 @@ class Scanner:
 
     def _attachment(self, position: int, length: int) -> None:
         if length > self._attachment_bytes_left:
-            self.findings.blame(f'the attachment at byte {position} is larger than can be read')
+            self.findings.add_damage(
+                f'the attachment at byte {position} is larger than can be read'
+            )
             return
         self._attachment_bytes_left -= length
         content = self._source.read(position + RECORD_HEAD.size, length)
         try:
-            attachment = Attachment.unpack(content)
+            attachment = unpack_attachment(content)
         except LayoutError as error:
-            self.findings.blame(str(error))
+            self.findings.add_damage(str(error))
             return
         self.findings.attachments[attachment.name] = attachment
 
     def _metadata(self, position: int, length: int) -> None:
-        cursor = Cursor(self._source.read(position + RECORD_HEAD.size, length))
+        content = self._source.read(position + RECORD_HEAD.size, length)
         try:
-            name = cursor.text()
-            items = cursor.text_map()
+            found = unpack(Metadata.read, content)
         except LayoutError as error:
-            self.findings.blame(f'the metadata at byte {position}: {error}')
+            self.findings.add_damage(f'the metadata at byte {position}: {error}')
             return
         if len(self.findings.metadata) < self._limits.channels:
-            self.findings.metadata[name] = items
+            self.findings.metadata[found.name] = found.metadata
 
     def _head(self, position: int) -> tuple[int, int]:
         raw = self._source.read(position, RECORD_HEAD.size)
@@ -341,9 +328,6 @@ class Scanner:
             return op in _KINDS
         # The last chunk of an unfinished file may be cut off, with a head that agrees.
         return next(candidates(self._source, position, position + 1), None) is not None
-
-
-# Says in sentences what a scan met.
 
 
 def scan_warnings(findings: Findings, what: str) -> tuple[str, ...]:

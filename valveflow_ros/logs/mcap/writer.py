@@ -2,29 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
-from valveflow_ros.errors import InputError, RecordingError
+from mcap.records import Channel, Schema
+from mcap.well_known import MessageEncoding, SchemaEncoding
+
+from valveflow_ros.errors import InputError
 from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES, ChunkBuilder, ChunkFile
 from valveflow_ros.logs.mcap.definitions import Definitions, parse_all, type_hash
 from valveflow_ros.logs.mcap.folder import (
     LIBRARY,
-    Listing,
     Split,
+    finish_split,
     finished_files,
-    information_text,
+    finished_splits,
     split_number,
+    write_metadata,
 )
-from valveflow_ros.logs.mcap.layout import Attachment, Channel, LayoutError, Schema, media_type
-from valveflow_ros.logs.mcap.summary import TopicTable
+from valveflow_ros.logs.mcap.records import LayoutError, TopicTable, pack
 from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, Writable, make_folder
-
-# Quality of service as rosbag2 writes it down (metadata version 9).
-
+from valveflow_ros.logs.source import os_errors
 
 # The longest duration that ROS 2 can express stands for "no limit".
 _NO_LIMIT = ('sec: 9223372036', 'nsec: 854775807')
@@ -56,14 +58,6 @@ class Qos:
 
 
 LATCHED = Qos(durability='transient_local', depth=1)
-
-
-# The topics a writer knows: fixed channel ids, complete definitions, repeated where it helps.
-
-
-# A chunk may be lost, and with it the only mention of a topic; so the table stands in the
-# first two chunks that could hold it and then in every so-manieth.
-REPEAT_CHUNKS = 256
 
 
 @dataclass(slots=True)
@@ -101,14 +95,23 @@ class TopicBook:
             return self.ids[topic]
         if type_name not in self._schema_ids:
             text = self.definitions.text(type_name) if definition is None else definition
-            schema = Schema(len(self._schema_ids) + 1, type_name, 'ros2msg', text.encode())
+            number = len(self._schema_ids) + 1
+            schema = Schema(
+                id=number, name=type_name, encoding=SchemaEncoding.ROS2, data=text.encode()
+            )
             self._schema_ids[type_name] = schema.id
             self.table.schemas[schema.id] = schema
         if hash_text is None:
             hash_text = self._hash(type_name, definition)
         metadata = {'offered_qos_profiles': (qos or Qos()).text(), 'topic_type_hash': hash_text}
         number = len(self.ids) + 1
-        channel = Channel(number, self._schema_ids[type_name], topic, 'cdr', metadata)
+        channel = Channel(
+            id=number,
+            topic=topic,
+            message_encoding=MessageEncoding.CDR,
+            metadata=metadata,
+            schema_id=self._schema_ids[type_name],
+        )
         self.table.channels[number] = channel
         self.ids[topic] = number
         self._packed = b''
@@ -126,32 +129,8 @@ class TopicBook:
     def packed(self) -> bytes:
         """Return the records of all topics."""
         if not self._packed:
-            schemas = [schema.pack() for schema in self.table.schemas.values()]
-            channels = [channel.pack() for channel in self.table.channels.values()]
-            self._packed = b''.join(schemas + channels)
+            self._packed = pack(*self.table.schemas.values(), *self.table.channels.values())
         return self._packed
-
-
-class TableSchedule:
-    """Says for each chunk of a file whether the table of topics stands in it."""
-
-    def __init__(self) -> None:
-        self._known = 0
-        self._since = 0
-
-    def due(self, topics: int) -> bool:
-        """Tell whether the next chunk needs the table of so many topics."""
-        return topics > self._known or self._since in (0, REPEAT_CHUNKS)
-
-    def done(self, topics: int, with_table: bool) -> None:
-        """Take note of a chunk that was written."""
-        if topics > self._known:
-            # The next chunk repeats what is new.
-            self._known, self._since = topics, 0
-        elif with_table:
-            self._since = 1
-        else:
-            self._since += 1
 
 
 _SPLITS_APART, _NUMBERS_APART = 64, 1 << 26
@@ -227,14 +206,12 @@ class RecordingWriter:
         self._topics = TopicBook(definitions or Definitions())
         self._builder = ChunkBuilder()
         self._file: ChunkFile | None = None
-        self._schedule = TableSchedule()
         self._sequences: dict[int, int] = {}
         self._on_disk: dict[int, int] = {}  # the same, without what waits
-        try:
+        with os_errors(self.folder, 'cannot be written'):
             make_folder(self.folder)
-            self._listing = Listing(self.folder)
-        except OSError as error:
-            raise self._failed(error) from None
+            self._splits = finished_splits(self.folder)
+        self._list_due = False
         # Numbers in a folder that is continued are others than before: by them a repetition is
         # known. No split holds so many messages that they could meet.
         self._before = (self._next_number() % _SPLITS_APART) * _NUMBERS_APART
@@ -276,7 +253,7 @@ class RecordingWriter:
     @property
     def finished(self) -> list[Split]:
         """The finished splits of the folder."""
-        return list(self._listing.splits)
+        return list(self._splits.values())
 
     @property
     def file_bytes(self) -> int:
@@ -285,33 +262,21 @@ class RecordingWriter:
 
     def flush(self) -> None:
         """Hand waiting messages to the operating system; a killed process loses them no more."""
-        if not len(self._builder):
-            return
-        try:
-            self._put(self._begin())
-        except OSError as error:
-            self.abandon()
-            raise self._failed(error) from None
+        if len(self._builder):
+            with self._writing():
+                self._put(self._begin())
 
     def sync(self) -> None:
         """Bring what was flushed to the disk itself; a power cut loses it no more."""
-        if self._file is None:
-            return
-        try:
-            self._file.sync()
-        except OSError as error:
-            self.abandon()
-            raise self._failed(error) from None
+        if self._file is not None:
+            with self._writing():
+                self._file.sync()
 
     def note(self, name: str, items: Mapping[str, str]) -> None:
         """Write a metadata record into the split at hand, if there is one."""
-        if self._file is None:
-            return
-        try:
-            self._file.put_metadata(name, items)
-        except OSError as error:
-            self.abandon()
-            raise self._failed(error) from None
+        if self._file is not None:
+            with self._writing():
+                self._file.put_metadata(name, items)
 
     def rotate(self) -> None:
         """Finish the split at hand; the next flush begins a new one."""
@@ -331,7 +296,7 @@ class RecordingWriter:
 
     def forget(self, name: str) -> None:
         """Strike a split that was deleted from `metadata.yaml`."""
-        self._listing.forget(name)
+        self._splits.pop(name, None)
         self._list()
 
     def __enter__(self) -> RecordingWriter:
@@ -351,8 +316,7 @@ class RecordingWriter:
             self.abandon()
 
     def _put(self, file: ChunkFile) -> None:
-        topics = len(self._topics.ids)
-        due = self._schedule.due(topics)
+        due = file.table_due(len(self._topics.ids))
         chunk = self._builder.build(self._topics.packed() if due else b'')
         before = file.messages
         try:
@@ -363,7 +327,6 @@ class RecordingWriter:
                 self.written += self.waiting
                 self._on_disk = dict(self._sequences)
                 self._builder.clear()
-        self._schedule.done(topics, due)
 
     def _begin(self) -> ChunkFile:
         if self._file is None:
@@ -371,16 +334,13 @@ class RecordingWriter:
             out = self._open_file(self.path)
             try:
                 file = ChunkFile(out, LIBRARY)
-                for name, data in self.attachments.items():
-                    file.put_attachment(Attachment(name, media_type(name), data))
-                for name, items in self.metadata.items():
-                    file.put_metadata(name, items)
+                file.put_all(self.attachments, self.metadata)
                 if self._begun:
                     self._repeat(file)
             except OSError:
                 out.discard()
                 raise
-            self._begun, self._file, self._schedule = self._begun + 1, file, TableSchedule()
+            self._begun, self._file = self._begun + 1, file
         return self._file
 
     def _repeat(self, file: ChunkFile) -> None:
@@ -399,31 +359,35 @@ class RecordingWriter:
         parts = self.folder.glob(f'*.mcap{PART_SUFFIX}')
         return max(map(split_number, [*finished_files(self.folder), *parts]), default=-1) + 1
 
-    def _list(self) -> None:
-        try:
-            self._listing.write()
-        except OSError as error:
-            raise self._failed(error) from None
-
     def _finish(self) -> None:
-        if self._file is None or self.path is None:
-            if self._listing.due:
-                self._list()
-            return
-        split = Split.of_file(self.path.name, self._file, self._topics.table)
-        try:
-            self._file.put_metadata('rosbag2', {'serialized_metadata': information_text([split])})
-            self._file.finish(self._topics.table)
+        if self._file is not None and self.path is not None:
+            with self._writing():
+                # Until this is done, a file may have its name that the list does not name.
+                self._list_due = True
+                split = finish_split(self._file, self.path.name, self._topics.table)
             self.bytes_finished += self._file.position
             self.files_finished += 1
-            self._listing.add(split)
+            self._splits[split.name] = split
             self._file = self.path = None
-        except OSError as error:
-            self._listing.due = True
-            self.abandon()
-            raise self._failed(error) from None
+        elif not self._list_due:
+            return
         self._list()
 
-    def _failed(self, error: OSError) -> RecordingError:
-        reason = (error.strerror or str(error)).lower()
-        return RecordingError(self.path or self.folder, f'cannot be written ({reason})')
+    def _list(self) -> None:
+        """Write `metadata.yaml` for what is whole on the disk."""
+        self._list_due = True
+        with os_errors(self.path or self.folder, 'cannot be written'):
+            # A file may have got its name although finishing it failed after that.
+            self._splits = finished_splits(self.folder, self._splits)
+            write_metadata(self.folder, self._splits.values())
+        self._list_due = False
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Abandon the split at hand after an `OSError`, which becomes a `RecordingError`."""
+        try:
+            yield
+        except OSError as error:
+            self.abandon()
+            with os_errors(self.path or self.folder, 'cannot be written'):
+                raise error

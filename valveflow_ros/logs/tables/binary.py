@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import datetime
+import re
+import tempfile
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.logs.tables.refusal import RefusedError, Remedy
@@ -23,10 +25,37 @@ _SHEET_ROWS = 1_048_576  # a sheet has no more
 _UNPACKED_BYTES = 1 << 30
 _UNPACKED_FREELY = 64 << 20
 _UNPACKED_TIMES = 200
+# The library holds a sheet as a full rectangle, so two cells far apart would fill the memory. A
+# cell takes at least 16 bytes of XML, so a sheet that is a table stays below.
+_CELLS_FREELY = 8 << 20
+_BYTES_PER_CELL = 16
+_PLACE = re.compile(rb'\br\s*=\s*["\']\s*([A-Za-z]{0,9})([0-9]{1,10})')
+_LONGEST_PLACE = 64
+_PIECE = 1 << 20
+_STAMPS = (datetime.date, datetime.time)  # and so datetime.datetime
+
+
+def check_parquet(path: Path) -> None:
+    """Refuse a Parquet file where the library for it is missing, before any work is done.
+
+    Raises
+    ------
+    RecordingError
+        If pyarrow, an extra of this package, is not installed.
+    """
+    try:
+        import pyarrow  # noqa: F401
+    except ImportError:
+        raise RecordingError(
+            path,
+            "is a Parquet file, and pyarrow that reads and writes those is not installed; 'pip "
+            "install pyarrow', or use CSV",
+        ) from None
 
 
 def look_at_parquet(path: Path) -> tuple[tuple[str, ...], list[list[str]]]:
     """Return the names of the columns and rows from the first and the last group."""
+    check_parquet(path)
     from pyarrow import parquet
 
     with parquet.ParquetFile(path) as file:
@@ -50,83 +79,90 @@ def parquet_blocks(path: Path, places: list[int]) -> Iterator[pd.DataFrame]:
             yield batch.to_pandas(ignore_metadata=True)
 
 
-def look_at_sheet(path: Path, wanted: str, most: int) -> tuple[str, list[list[str]]]:
-    """Return the sheet to be read and its first rows as texts.
+def look_at_sheet(path: Path, wanted: str, most: int) -> tuple[Any, list[list[str]]]:
+    """Return the sheet to be read, for `sheet_blocks`, and its first rows as texts.
 
     Raises
     ------
     InputError
         If the sheet is not there, or several could be meant.
     """
+    names: list[str] = []
+    tables: list[str] = []
+    found: tuple[Any, list[list[str]]] | None = None
     with _book(path) as book:
-        sheets = [sheet for sheet in book.worksheets if sheet.sheet_state == 'visible']
-        found = {sheet.title: _first_rows(sheet, most) for sheet in sheets}
-    names = ', '.join(f"'{name}'" for name in found)
+        from python_calamine import SheetTypeEnum, SheetVisibleEnum
+
+        for sheet in book.sheets_metadata:
+            if (sheet.visible, sheet.typ) != (SheetVisibleEnum.Visible, SheetTypeEnum.WorkSheet):
+                continue
+            names.append(f"'{sheet.name}'")
+            cells = book.get_sheet_by_name(sheet.name)
+            head = cells.to_python(skip_empty_area=False, nrows=most)
+            rows = [[_text(_plain(cell)) for cell in row] for row in head]
+            while rows and not any(rows[-1]):
+                rows.pop()
+            if sheet.name == wanted:
+                return cells, rows
+            if len(rows) > 1 and len(rows[0]) > 1:
+                tables.append(sheet.name)
+                # One sheet is held at a time, and only what may be read in the end.
+                found = found or (cells, rows)
     if wanted:
-        if wanted not in found:
-            raise InputError(f"{path} has no sheet '{wanted}'; it has {names}.")
-        return wanted, found[wanted]
-    tables = [name for name, rows in found.items() if len(rows) > 1 and max(map(len, rows)) > 1]
-    if not tables:
+        raise InputError(f"{path} has no sheet '{wanted}'; it has {', '.join(names)}.")
+    if found is None:
         raise RecordingError(path, 'is a workbook without a table')
     if len(tables) > 1:
         several = ' and '.join(f"'{name}'" for name in tables)
-        sheet = Remedy('sheet', tables[0])
-        problem = f'there are tables in the sheets {several}; choose with {sheet}'
-        raise RefusedError(path, problem, [sheet])
-    return tables[0], found[tables[0]]
+        choice = Remedy('sheet', tables[0])
+        problem = f'there are tables in the sheets {several}; choose with {choice}'
+        raise RefusedError(path, problem, [choice])
+    return found
 
 
-def sheet_blocks(
-    path: Path, sheet: str, first_row: int, places: list[int]
-) -> Iterator[pd.DataFrame]:
-    """Yield the cells at these places, from a row on.
+def sheet_blocks(sheet: Any, first_row: int, places: list[int]) -> Iterator[pd.DataFrame]:
+    """Yield the cells of a sheet at these places, from a row on."""
+    top, left = sheet.start or (0, 0)
+    block: list[list[Any]] = []
+    for number, row in enumerate(sheet.iter_rows(), top):
+        if number < first_row:
+            continue
+        picked = [_plain(row[k - left]) if 0 <= k - left < len(row) else None for k in places]
+        if any(cell is not None for cell in picked):
+            block.append(picked)
+        if len(block) == _SHEET_BLOCK:
+            yield _frame(block)
+            block = []
+    if block:
+        yield _frame(block)
 
-    Raises
-    ------
-    RecordingError
-        If a row has a number that no row of a sheet can have.
-    """
+
+def _frame(block: list[list[Any]]) -> pd.DataFrame:
+    """Give columns of stamps or of numbers the type that is quick to work with."""
     import pandas as pd
 
-    with _book(path) as book:
-        block: list[list[Any]] = []
-        table = book[sheet]
-        table.reset_dimensions()
-        rows = table.iter_rows(min_row=first_row + 1, max_col=max(places) + 1, values_only=True)
-        # Rows that the file leaves out are given as empty ones, up to whatever number comes next.
-        for number, row in enumerate(rows, first_row + 1):
-            if number > _SHEET_ROWS:
-                raise RecordingError(path, f'has more than the {_SHEET_ROWS} rows of a sheet')
-            picked = [row[k] if k < len(row) else None for k in places]
-            if any(cell is not None for cell in picked):
-                block.append(picked)
-            if len(block) == _SHEET_BLOCK:
-                yield _frame(pd.DataFrame(block, dtype=object))
-                block = []
-        if block:
-            yield _frame(pd.DataFrame(block, dtype=object))
-
-
-def _frame(frame: pd.DataFrame) -> pd.DataFrame:
-    """Give columns of stamps or of numbers the type that is quick to work with."""
-    frame = frame.infer_objects()
+    frame = pd.DataFrame(block, dtype=object).infer_objects()
     for place in frame.columns:
         column = frame[place]
         if column.dtype.kind == 'M':
             # A workbook holds days as a double, which knows a second to about a microsecond.
             frame[place] = column.dt.round('ms')
         elif column.dtype.kind == 'O':
-            frame[place] = column.map(_cell, na_action='ignore')
+            frame[place] = column.map(
+                lambda cell: _text(cell) if isinstance(cell, _STAMPS) else cell, na_action='ignore'
+            )
     return frame
 
 
-def _cell(cell: Any) -> Any:
-    return (
-        _text(cell)
-        if isinstance(cell, datetime.datetime | datetime.date | datetime.time)
-        else cell
-    )
+def _plain(cell: Any) -> Any:
+    """Return an empty cell as None, a whole number as int, midnight as a stamp like others."""
+    if cell == '':
+        return None
+    if isinstance(cell, float) and cell.is_integer() and abs(cell) < 1e18:
+        return int(cell)
+    if type(cell) is datetime.date:
+        return datetime.datetime(cell.year, cell.month, cell.day)
+    return cell
 
 
 def _text(cell: Any) -> str:
@@ -138,51 +174,74 @@ def _text(cell: Any) -> str:
             cell = cell + datetime.timedelta(microseconds=500)
             cell = cell.replace(microsecond=cell.microsecond // 1000 * 1000)
         return str(cell.isoformat(sep=' '))
-    if isinstance(cell, datetime.date | datetime.time):
+    if isinstance(cell, _STAMPS):
         return str(cell.isoformat())
     return str(cell)
-
-
-def _first_rows(sheet: Any, most: int) -> list[list[str]]:
-    # Some tools write a size that leaves out most of the sheet.
-    sheet.reset_dimensions()
-    rows = [
-        [_text(cell) for cell in row] for row in sheet.iter_rows(max_row=most, values_only=True)
-    ]
-    while rows and not any(rows[-1]):
-        rows.pop()
-    width = max(map(len, rows), default=0)
-    return [row + [''] * (width - len(row)) for row in rows]
-
-
-def _check_unpacked(path: Path) -> None:
-    """Refuse a workbook whose parts would fill the memory; raises `RecordingError`."""
-    with zipfile.ZipFile(path) as archive:
-        unpacked = sum(part.file_size for part in archive.infolist())
-    packed = path.stat().st_size
-    most = min(_UNPACKED_BYTES, max(_UNPACKED_FREELY, _UNPACKED_TIMES * packed))
-    if unpacked > most:
-        raise RecordingError(
-            path,
-            f'is a workbook of {packed / 1e6:.1f} MB that unpacks to {unpacked / 1e6:.0f} MB, '
-            f'more than the {most / 1e6:.0f} MB that are read of one its size; save the sheet as '
-            'CSV or Parquet',
-        )
 
 
 @contextmanager
 def _book(path: Path) -> Iterator[Any]:
     try:
-        import openpyxl  # type: ignore[import-untyped]
+        from python_calamine import CalamineWorkbook
     except ImportError:
         raise RecordingError(
             path,
-            "is an Excel workbook, and openpyxl that reads those is not installed; 'pip install "
-            "openpyxl', or save the sheet as CSV",
+            "is an Excel workbook, and python-calamine that reads those is not installed; 'pip "
+            "install python-calamine', or save the sheet as CSV",
         ) from None
-    _check_unpacked(path)
-    book = openpyxl.load_workbook(path, read_only=True, data_only=True)
-    try:
-        yield book
-    finally:
-        book.close()
+    # The library trusts the archive, so it is given a copy of what was counted and measured.
+    with tempfile.NamedTemporaryFile(suffix='.xlsx') as copy:
+        _copy_within_bounds(path, copy)
+        copy.flush()
+        try:
+            with CalamineWorkbook.from_path(copy.name) as book:
+                yield book
+        except BaseException as error:
+            # A panic of the library is no `Exception`.
+            if type(error).__name__ != 'PanicException':
+                raise
+            raise RecordingError(path, 'cannot be read as a table (it is no workbook)') from None
+
+
+def _copy_within_bounds(path: Path, copy: IO[bytes]) -> None:
+    """Copy a workbook whose parts and sheets do not fill the memory; raises `RecordingError`."""
+    with zipfile.ZipFile(path) as archive, zipfile.ZipFile(copy, 'w') as out:
+        parts = {part.filename: part for part in archive.infolist()}
+        unpacked = sum(part.file_size for part in parts.values())
+        packed = path.stat().st_size
+        most = min(_UNPACKED_BYTES, max(_UNPACKED_FREELY, _UNPACKED_TIMES * packed))
+        if unpacked > most:
+            raise RecordingError(
+                path,
+                f'is a workbook of {packed / 1e6:.1f} MB that unpacks to {unpacked / 1e6:.0f} MB, '
+                f'more than the {most / 1e6:.0f} MB that are read of one its size; save the sheet '
+                'as CSV or Parquet',
+            )
+        for name, part in parts.items():
+            columns_met, rows, rest = set(), 0, b''
+            with archive.open(part) as source, out.open(name, 'w') as target:
+                while piece := source.read(_PIECE):
+                    target.write(piece)
+                    places = set(_PLACE.findall(rest + piece))
+                    columns_met |= {column.upper() for column, _ in places}
+                    rows = max([rows, *(int(row) for _, row in places)])
+                    rest = piece[-_LONGEST_PLACE:]
+            _check_size(path, rows, columns_met, part.file_size)
+
+
+def _check_size(path: Path, rows: int, columns_met: set[bytes], size: int) -> None:
+    """Refuse a sheet whose cells span a rectangle out of proportion to the bytes of the sheet."""
+    if rows > _SHEET_ROWS:
+        raise RecordingError(path, f'has more than the {_SHEET_ROWS} rows of a sheet')
+    columns = 0
+    for word in columns_met:
+        number = 0
+        for letter in word:
+            number = 26 * number + letter - 64
+        columns = max(columns, number)
+    if rows * columns > max(_CELLS_FREELY, size // _BYTES_PER_CELL):
+        raise RecordingError(
+            path,
+            f'has a sheet of {rows} rows and {columns} columns, most of them empty; save the '
+            'table in it as CSV or Parquet',
+        )

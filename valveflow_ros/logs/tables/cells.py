@@ -33,19 +33,10 @@ class Marks:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Numbers of a column; ``words`` counts what stands in cells that hold no number.
+    """Numbers of a column, NaN where no number stands, and what stands there instead.
 
-    Attributes
-    ----------
-    values : float64 (n,)
-        NaN where no number stands.
-    words : Counter
-        Texts that are no numbers; cells that are empty, or hold a word that
-        means empty, are not among them.
-    empty : int
-        Such cells.
-    first_bad_row : int
-        Row of the first word, -1 if there is none.
+    ``words`` counts texts that are no numbers, ``empty`` the cells that are empty or hold a word
+    that means so; ``first_bad_row`` is the row of the first word, -1 if there is none.
     """
 
     values: FloatArray
@@ -153,8 +144,6 @@ def to_quality(column: pd.Series[Any]) -> ByteArray:
 _PARTING = ("'", '’', ' ', '\u00a0', '\u202f')
 _EMPTY = frozenset({'', 'nan', 'na', 'n/a', '#n/a', 'null', 'none', '-', '--'})
 
-
-# Reads a historian's column of quality, in words or in the codes of OPC.
 
 _ENDINGS = ('quality', 'qualitaet', 'status', 'qual', 'q', 'quality code', 'guete', 'st')
 _WORDS = {

@@ -48,16 +48,8 @@ MONTHS = {
 class DateStyle:
     """How dates are written.
 
-    Attributes
-    ----------
-    formats : tuple of str
-        In the language of strptime; empty means ISO 8601.
-    words : str
-        What to call it, as ``22.11.2026 14:05:00``.
-    zoned : bool
-        Whether the texts name their zone.
-    named : bool
-        Whether months are written as words.
+    ``formats`` are those of strptime, none for ISO 8601; ``words`` is an example of one; ``zoned``
+    tells whether the texts name their zone, ``named`` whether months are written as words.
     """
 
     formats: tuple[str, ...] = ()
@@ -162,10 +154,7 @@ def _month(word: str) -> str:
     return MONTHS.get(word.lower(), word[:3].lower())
 
 
-# Turns local times into UTC, and says what the change of the clocks did to them.
-
 _OFFSET = re.compile(r'(?:UTC|GMT)?\s*([+-])(\d{1,2})(?::?(\d{2}))?')
-_NEVER = np.iinfo(np.int64).min
 _HOUR_NS = 3_600_000_000_000
 
 

@@ -1,176 +1,38 @@
-"""Opens a table's file, whatever its kind, and gives its rows block by block."""
+"""Opens a table's file of any kind, finds its heading, and gives its rows block by block."""
 
 from __future__ import annotations
 
-import io
 import re
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.logs.source import Source
-from valveflow_ros.logs.tables.cells import Marks
-from valveflow_ros.logs.tables.layout import (
-    Heading,
-    cells_of,
-    decimal_mark,
-    encoding_of,
-    heading,
-    separator_of,
+from valveflow_ros.logs.tables.binary import (
+    look_at_parquet,
+    look_at_sheet,
+    parquet_blocks,
+    sheet_blocks,
 )
+from valveflow_ros.logs.tables.cells import Marks
 from valveflow_ros.logs.tables.refusal import AS_SEEN, TableOptions
+from valveflow_ros.logs.tables.text import Lines, cells_of, decimal_mark, encoding_of, separator_of
+from valveflow_ros.logs.tables.words import is_unit, split_unit
 
 if TYPE_CHECKING:
     import pandas as pd
 
-
-# Refuses a quote that is not closed, before it swallows the rows below it.
-
-
-# What a cell of Excel holds at most, in letters and in line breaks; a comment has far fewer.
-LONGEST_CELL = 32_767
-_MOST_BREAKS = 253
-
-
-class Quotes:
-    """Follows a text that passes by in pieces.
-
-    A quote opens a cell only where the cell begins, and a doubled one within it
-    stands for itself: so do pandas and most programs that write tables.
-
-    Parameters
-    ----------
-    path : Path
-        The file, for the sentence.
-    separator : str
-        What parts its cells.
-    """
-
-    def __init__(self, path: Path, separator: str) -> None:
-        self._path = path
-        ends = f'{re.escape(separator)}\r\n'
-        # Group 1: from a quote on that is not closed in what has passed.
-        self._cell = re.compile(
-            rf'(?:\A|[{ends}]) *"(?:[^"]*(?:""[^"]*)*"(?!")|(.*\Z))', re.DOTALL
-        )
-        # A cell that is closed in its own line: nearly all are, and this is quick.
-        self._closed = re.compile(rf'(?:\A|(?<=[{ends}])) *"[^"\r\n]*(?:""[^"\r\n]*)*"(?!")')
-        self._rest = ''
-        self._line = 1  # of the first letter of the rest
-
-    def follow(self, text: str) -> None:
-        """Look at the next piece.
-
-        Raises
-        ------
-        RecordingError
-            If a cell in quotes is longer than any cell is.
-        """
-        text = self._rest + text
-        end = _last_line(text, [])
-        lines, rest = text[:end], text[end:]
-        long = len(rest) > LONGEST_CELL and '"' in rest
-        if long or ('"' in lines and '"' in self._closed.sub('', lines)):
-            end = self._looked_at(text)
-        self._line += _breaks(text[:end])
-        self._rest = text[end:]
-
-    def _looked_at(self, text: str) -> int:
-        """Judge cell by cell; return where the last line begins."""
-        begun, cells = len(text), []
-        for cell in self._cell.finditer(text):
-            opened = cell.start() + cell[0].index('"')
-            self._judge(text, opened, cell.end())
-            # A quote that ends the piece may be the first of two.
-            if cell.start(1) >= 0 or cell.end() == len(text):
-                begun = opened
-            else:
-                cells.append((opened, cell.end()))
-        # What is kept begins with a line, so that it is known where its cells begin.
-        return _last_line(text[:begun], cells)
-
-    def _judge(self, text: str, opened: int, end: int) -> None:
-        breaks = _breaks(text[opened:end]) if end - opened > _MOST_BREAKS else 0
-        if end - opened <= LONGEST_CELL and breaks <= _MOST_BREAKS:
-            return
-        line = self._line + _breaks(text[:opened])
-        raise RecordingError(
-            self._path,
-            f'has in line {line} a quote that is not closed within {LONGEST_CELL} letters or '
-            f'{_MOST_BREAKS} lines, as the text of a cell would be; close it there, or take it '
-            'away',
-        )
-
-
-def _breaks(text: str) -> int:
-    """Return how many lines end in a text; what is left of Windows' two letters counts once."""
-    return text.count('\n') or text.count('\r')
-
-
-def _last_line(text: str, cells: list[tuple[int, int]]) -> int:
-    """Return where the last line of a text begins; breaks within cells begin none."""
-    # The first of Windows' two letters waits for the second.
-    end = len(text) - text.endswith('\r')
-    for opened, closed in [*reversed(cells), (0, 0)]:
-        found = max(text.rfind('\n', closed, end), text.rfind('\r', closed, end)) + 1
-        if found:
-            return found
-        end = opened
-    return 0
-
-
-# Gives the text of a table and refuses a line or a cell that would fill the memory.
-
-LONGEST_LINE = 1 << 20
-_PIECE = 1 << 18
-
-
-class Lines(io.TextIOWrapper):
-    """A text that is read in pieces, none of whose lines and cells is without end.
-
-    Parameters
-    ----------
-    path : Path
-        The file, for the sentence.
-    stream : BinaryIO
-        Its bytes; closed with this.
-    encoding : str
-        What does not fit it is replaced.
-    separator : str
-        What parts the cells.
-    """
-
-    def __init__(self, path: Path, stream: BinaryIO, encoding: str, separator: str) -> None:
-        super().__init__(stream, encoding=encoding, errors='replace', newline='')
-        self._path = path
-        self._length = 0
-        self._quotes = Quotes(path, separator)
-
-    def read(self, size: int | None = -1, /) -> str:
-        """Return up to so many letters; all in one piece is more than anybody asks for.
-
-        Raises
-        ------
-        RecordingError
-            If a line is longer than `LONGEST_LINE` letters, or a quote is not closed.
-        """
-        text = super().read(_PIECE if size is None or size < 0 else min(size, _PIECE))
-        ends = [place for mark in '\n\r' if (place := text.find(mark)) >= 0]
-        self._length += min(ends, default=len(text))
-        if self._length > LONGEST_LINE:
-            raise RecordingError(
-                self._path, f'has a line of more than {LONGEST_LINE} letters; no table has'
-            )
-        if ends:
-            self._length = len(text) - 1 - max(text.rfind('\n'), text.rfind('\r'))
-        self._quotes.follow(text)
-        return text
-
-
+_LOOK = 60  # rows from which the shape of a table is seen
+_NUMBER = re.compile(r"[+-]?(?:\d[\d.,'’ \u00a0\u202f]*|[.,]\d+)(?:[eE][+-]?\d+)?")
+_STAMP = re.compile(
+    r'\d{1,4}[-./]\d{1,2}[-./]\d{1,4}(?:[T ].*)?|\d{1,2}[-. ][^\W\d]{3,9}[-. ]\d{2,4}.*|'
+    r'\d{1,2}:\d{2}(?::\d{2}.*)?'
+)
 BLOCK_ROWS = 200_000
 _HEAD_BYTES = 256 * 1024
 _HEAD_ROWS = 400
@@ -179,23 +41,34 @@ _PEEK_BYTES = 4096
 BOOKS = ('.xlsx', '.xlsm')
 
 
+@dataclass(frozen=True, slots=True)
+class Heading:
+    """The rows above the data.
+
+    ``row`` is that of the names, from 0; ``others`` those between the names and the data: units,
+    descriptions. ``names``, ``units`` and ``about`` have an entry for each column, empty where
+    nothing stands; the names as they stand in the file.
+    """
+
+    row: int
+    others: tuple[int, ...]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    about: tuple[str, ...]
+
+    @property
+    def below(self) -> int:
+        """Return the first row of data."""
+        return max((self.row, *self.others)) + 1
+
+
 @dataclass
 class TableFile:
     """A table that was looked at and not yet read.
 
-    Attributes
-    ----------
-    path : Path
-    heading : Heading
-        Its columns.
-    rows : list of list of str
-        Rows of data from its beginning, from places on the way, and from its end.
-    marks : Marks or None
-        How numbers are written; ``None`` where a comma may be either mark.
-    notes : list of str
-        Sentences; complete when all blocks were read.
-    share : float
-        How much of a text was read so far, 0 to 1.
+    ``rows`` are some of its data from its beginning, from places on the way, and from its end;
+    ``marks`` is ``None`` where a comma may be either mark; ``notes`` are complete when all blocks
+    were read; ``share`` is how much of a text was read so far, 0 to 1.
     """
 
     path: Path
@@ -205,7 +78,7 @@ class TableFile:
     encoding: str = ''
     separator: str = ''
     skip: tuple[int, ...] = ()
-    sheet: str = ''
+    sheet: Any = None
     notes: list[str] = field(default_factory=list)
     share: float = 0.0
 
@@ -235,11 +108,8 @@ class TableFile:
 
     def _frames(self, places: list[int]) -> Iterator[pd.DataFrame]:
         if not self.separator:
-            from valveflow_ros.logs.tables.binary import parquet_blocks, sheet_blocks
-
-            if self.sheet:
-                below = max((self.heading.row, *self.heading.others)) + 1
-                yield from sheet_blocks(self.path, self.sheet, below, places)
+            if self.sheet is not None:
+                yield from sheet_blocks(self.sheet, self.heading.below, places)
             else:
                 yield from parquet_blocks(self.path, places)
             return
@@ -286,25 +156,16 @@ def look_at(path: Path, options: TableOptions = AS_SEEN) -> TableFile:
         head = source.read(0, _HEAD_BYTES)
         with _translated(path):
             if head[:4] == b'PAR1':
-                from valveflow_ros.logs.tables.binary import look_at_parquet
-
                 names, rows = look_at_parquet(path)
                 blank = ('',) * len(names)
                 units = heading([list(names)]).units
                 return TableFile(path, Heading(0, (), names, units, blank), rows)
             if path.suffix.lower() in BOOKS or head[:4] == b'PK\x03\x04':
-                return _look_at_book(path, options)
+                sheet, rows = look_at_sheet(path, options.sheet, _HEAD_ROWS)
+                top = heading(rows)
+                marks = _marks(rows[top.below :], '\t', options)
+                return TableFile(path, top, rows[top.below :], marks, sheet=sheet)
             return _look_at_text(source, path, head, options)
-
-
-def _look_at_book(path: Path, options: TableOptions) -> TableFile:
-    from valveflow_ros.logs.tables.binary import look_at_sheet
-
-    sheet, rows = look_at_sheet(path, options.sheet, _HEAD_ROWS)
-    top = heading(rows)
-    below = max((top.row, *top.others)) + 1
-    marks = _marks(rows[below:], '\t', options)
-    return TableFile(path, top, rows[below:], marks, sheet=sheet)
 
 
 def _look_at_text(source: Source, path: Path, head: bytes, options: TableOptions) -> TableFile:
@@ -324,8 +185,7 @@ def _look_at_text(source: Source, path: Path, head: bytes, options: TableOptions
     top = heading(rows)
     if not any(name for name in top.names):
         raise RecordingError(path, 'is a table without a header')
-    below = max((top.row, *top.others)) + 1
-    data = [row for row in rows[below:] if any(cell.strip() for cell in row)]
+    data = [row for row in rows[top.below :] if any(cell.strip() for cell in row)]
     data += _peeks(source, encoding, separator, len(head))
     skip = (*range(top.row), *top.others)
     notes = []
@@ -372,7 +232,7 @@ def _marks(rows: list[list[str]], separator: str, options: TableOptions) -> Mark
 
 @contextmanager
 def _translated(path: Path) -> Iterator[None]:
-    """Turn what pandas, pyarrow and openpyxl raise into sentences."""
+    """Turn what pandas, pyarrow and python-calamine raise into sentences."""
     try:
         yield
     except (RecordingError, InputError, GeneratorExit):
@@ -383,3 +243,71 @@ def _translated(path: Path) -> Iterator[None]:
         # They raise what they like for a file they do not understand.
         reason = str(error).strip().split('\n')[0][:160] or type(error).__name__
         raise RecordingError(path, f'cannot be read as a table ({reason})') from None
+
+
+def heading(rows: list[list[str]]) -> Heading:
+    """Find the names of the columns among the first rows of a table.
+
+    A preamble above them is left out; rows of units and descriptions below
+    them are told apart.
+    """
+    usual = Counter(_full_cells(row) for row in rows if _full_cells(row) > 1)
+    least = 0.5 * max(usual, key=lambda size: (usual[size], size), default=0)
+    first = next((k for k, row in enumerate(rows) if _is_data(row, least)), None)
+    filled = [k for k, row in enumerate(rows) if any(cell.strip() for cell in row)]
+    if first is None:
+        at = _first_full(rows, filled) if filled else 0
+        return _heading(rows, at, ())
+    width = len(rows[first])
+    above = [k for k in filled if k < first]
+    # Only rows right above the data and as wide as they belong to the heading.
+    block: list[int] = []
+    for k in reversed(above):
+        if _full_cells(rows[k]) < 2 or len(rows[k]) < 0.6 * width:
+            break
+        block.insert(0, k)
+    if not block:
+        return _heading(rows, above[-1] if above else filled[0], ())
+    named = [k for k in block if not _are_units(rows[k])] or block
+    most = max(_full_cells(rows[k]) for k in named)
+    at = next(k for k in named if _full_cells(rows[k]) >= 0.8 * most)
+    return _heading(rows, at, tuple(k for k in block if k > at))
+
+
+def _is_data(row: list[str], least: float) -> bool:
+    cells = [cell.strip() for cell in row if cell.strip()]
+    if len(cells) < least:
+        return False
+    values = [cell for cell in cells if _NUMBER.fullmatch(cell) or _STAMP.fullmatch(cell)]
+    stamped = any(_STAMP.fullmatch(cell) for cell in cells[:3])
+    # A row of a long table has more words than values: tag, time, value, unit, description.
+    return len(row) > 1 and bool(values) and (2 * len(values) >= len(cells) or stamped)
+
+
+def _are_units(row: list[str]) -> bool:
+    cells = [cell for cell in row if cell.strip()]
+    units = sum(is_unit(cell) for cell in cells)
+    return units >= 1 and units >= len(cells) - 1
+
+
+def _full_cells(row: list[str]) -> int:
+    return sum(bool(cell.strip()) for cell in row)
+
+
+def _first_full(rows: list[list[str]], filled: list[int]) -> int:
+    wide = max(_full_cells(rows[k]) for k in filled[:_LOOK])
+    return next(k for k in filled if _full_cells(rows[k]) >= min(2, wide))
+
+
+def _heading(rows: list[list[str]], at: int, others: tuple[int, ...]) -> Heading:
+    names = [cell.strip() for cell in rows[at]] if rows else []
+    units = [split_unit(name)[1] for name in names]
+    about = [''] * len(names)
+    for k in others:
+        of_units = _are_units(rows[k])
+        for column, cell in enumerate(rows[k][: len(names)]):
+            if of_units and is_unit(cell):
+                units[column] = units[column] or cell.strip()
+            elif not of_units and cell.strip():
+                about[column] = f'{about[column]} {cell.strip()}'.strip()
+    return Heading(at, others, tuple(names), tuple(units), tuple(about))

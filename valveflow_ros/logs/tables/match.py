@@ -6,9 +6,10 @@ import re
 import zoneinfo
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 from valveflow_ros.errors import InputError
-from valveflow_ros.logs.tables.layout import Heading
+from valveflow_ros.logs.tables.file import Heading
 from valveflow_ros.logs.tables.refusal import THEIRS, RefusedError, Remedy
 from valveflow_ros.logs.tables.words import (
     CLEAR,
@@ -44,18 +45,9 @@ _GROUNDS = {EXACT: '', CLEAR: 'by its name', LIKELY: 'by its name', TAG: 'by its
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """A column that stands for a signal.
+    """A column that stands for a signal: its place from 0, its name and unit in the file.
 
-    Attributes
-    ----------
-    place : int
-        Which column, from 0.
-    theirs : str
-        What it is called in the file.
-    unit : Spelling or None
-        The unit the file names.
-    ground : str
-        Why it was chosen; empty where nothing had to be guessed.
+    ``ground`` says why it was chosen; it is empty where nothing had to be guessed.
     """
 
     place: int
@@ -64,42 +56,12 @@ class Chosen:
     ground: str = ''
 
 
-@dataclass(frozen=True, slots=True)
-class Match:
-    """What the columns of a table stand for, and what is open.
-
-    Attributes
-    ----------
-    signals : dict
-        What was found.
-    absent : dict
-        Columns that the person named and that are not there.
-    several : tuple of str
-        A sentence for each signal that several columns could be.
-    missing : tuple of str
-        Contract names of the signals that no column could be.
-    remedies : tuple of Remedy
-        An option for each of `several`.
-    """
-
-    signals: dict[Signal, Chosen]
-    absent: dict[Signal, str]
-    several: tuple[str, ...]
-    missing: tuple[str, ...]
-    remedies: tuple[Remedy, ...]
-
-    @property
-    def open(self) -> bool:
-        """Tell whether something is left to be said."""
-        return bool(self.absent or self.several or self.missing)
-
-
 class Matcher:
     """Chooses among columns (or, in a long table, among tags).
 
     Parameters
     ----------
-    path : str
+    path : Path
         The file, for sentences.
     heading : Heading
         Names, units and descriptions.
@@ -110,7 +72,7 @@ class Matcher:
     """
 
     def __init__(
-        self, path: str, heading: Heading, what: str = 'column', taken: Collection[int] = ()
+        self, path: Path, heading: Heading, what: str = 'column', taken: Collection[int] = ()
     ) -> None:
         self.path = path
         self.names = heading.names
@@ -135,21 +97,43 @@ class Matcher:
             raise InputError(f"{self.path}: there are several {self.what}s called '{wanted}'.")
         return same[0] if same else None
 
-    def match(self, wanted: Mapping[Signal, str], spared: Collection[Signal]) -> Match:
-        """Return what was found for each signal, and what is open about the others.
+    def match(
+        self, wanted: Mapping[Signal, str], spared: Collection[Signal], no_time: bool
+    ) -> dict[Signal, Chosen]:
+        """Return the column of each signal.
+
+        Parameters
+        ----------
+        wanted : mapping
+            Columns that the person named.
+        spared : collection of Signal
+            What need not be there.
+        no_time : bool
+            There is no column of times, which is to be told with the rest.
 
         Raises
         ------
         InputError
-            If several columns have the same name.
+            If several columns have the same name; a `RefusedError` for everything else
+            that is open.
         """
-        chosen, absent = self._named(wanted)
+        chosen: dict[Signal, Chosen] = {}
+        absent: dict[Signal, str] = {}
+        for signal, theirs in wanted.items():
+            place = self.find(theirs)
+            if place is None:
+                absent[signal] = theirs
+            else:
+                chosen[signal] = Chosen(place, self.names[place], self.unit_of(place))
         marked = self._marked({c.place for c in chosen.values()})
-        several, missing, remedies = [], [], []
+        several: list[str] = []
+        missing: list[str] = []
+        remedies: list[Remedy] = []
         for info in SIGNALS:
             if info.signal in chosen or info.signal in absent:
                 continue
-            best, mark = self._best(info.signal, marked)
+            mark = max((m[info.signal] for m in marked if info.signal in m), default=0.0)
+            best = [k for k, m in enumerate(marked) if m.get(info.signal) == mark]
             # A constant is to take the place of the signal, whatever the names suggest.
             if info.signal in spared and mark < EXACT:
                 continue
@@ -162,45 +146,43 @@ class Matcher:
                     f"{self.path}: there are several {self.what}s called '{self.names[best[0]]}'."
                 )
             elif best and info.required:
-                several.append(self._several(info.topic, best))
-                remedies.append(Remedy('column', f'{info.topic}={self.names[best[0]]}'))
+                names = [self.names[k] for k in best]
+                options = ' or '.join(option(info.topic, name) for name in names[:4])
+                listed = ' and '.join(f"'{name}'" for name in names[:8])
+                several.append(f'{listed} could each be {info.topic}: add {options}')
+                remedies.append(choosing(info.topic, names[0]))
             elif info.required and info.signal not in spared:
-                missing.append(info.column)
-        return Match(chosen, absent, tuple(several), tuple(missing), tuple(remedies))
+                missing.append(info.topic)
+        if absent or several or missing or no_time:
+            raise self._refusal(absent, several, missing, remedies, no_time)
+        return chosen
 
-    def _named(
-        self, wanted: Mapping[Signal, str]
-    ) -> tuple[dict[Signal, Chosen], dict[Signal, str]]:
-        """Return the columns that the person named, and those of them that are not there."""
-        chosen: dict[Signal, Chosen] = {}
-        absent: dict[Signal, str] = {}
-        for signal, theirs in wanted.items():
-            place = self.find(theirs)
-            if place is None:
-                absent[signal] = theirs
-            else:
-                chosen[signal] = Chosen(place, self.names[place], self.unit_of(place))
-        return chosen, absent
-
-    def refusal(self, found: Match, no_time: bool) -> RefusedError:
+    def _refusal(
+        self,
+        absent: Mapping[Signal, str],
+        several: list[str],
+        missing: list[str],
+        remedies: list[Remedy],
+        no_time: bool,
+    ) -> RefusedError:
         """Return one error for everything that could not be decided."""
-        topics = {info.column: info.topic for info in SIGNALS}
-        named = [f"'{theirs}'" for theirs in found.absent.values()]
-        missing = [*found.missing, *([TIME] if no_time else [])]
-        parts = list(found.several)
-        remedies = list(found.remedies)
-        absent = [SIGNALS[s].topic for s in found.absent] + [topics.get(n, n) for n in missing]
-        if absent:
-            told = ', '.join([*named, *(f"'{name}'" for name in missing)])
-            unit = '' if absent == [TIME] else '[:unit]'
-            options = ' '.join(f'--column {name}={THEIRS}{unit}' for name in absent)
+        columns = {info.topic: info.column for info in SIGNALS}
+        times = [TIME] if no_time else []
+        topics = [SIGNALS[s].topic for s in absent] + missing + times
+        parts = [*several]
+        if topics:
+            lacking = [*absent.values(), *(columns[topic] for topic in missing), *times]
+            told = ', '.join(f"'{name}'" for name in lacking)
+            unit = '' if topics == [TIME] else '[:unit]'
+            options = ' '.join(f'--column {name}={THEIRS}{unit}' for name in topics)
             constant = ', or give --constant NAME=VALUE for what hardly changes'
             parts.append(
                 f'there is no {self.what} {told}; the {self.what}s are: {self._have()}. Name '
-                f'yours with {options}{constant if found.missing else ""}'
+                f'yours with {options}{constant if missing else ""}'
             )
-            remedies += [Remedy('column', f'{name}={THEIRS}') for name in absent]
-        return RefusedError(self.path, '; '.join(parts), remedies)
+        return RefusedError(
+            self.path, '; '.join(parts), [*remedies, *(choosing(t, THEIRS) for t in topics)]
+        )
 
     def missing(self, theirs: str, name: str) -> RefusedError:
         """Return the error for a column of times that the person named and that is not there."""
@@ -233,16 +215,6 @@ class Matcher:
             most = max(everything.values(), default=0.0)
             found.append({s: m for s, m in everything.items() if m == most})
         return found
-
-    def _best(self, signal: Signal, marked: list[dict[Signal, float]]) -> tuple[list[int], float]:
-        most = max((m[signal] for m in marked if signal in m), default=0.0)
-        return [k for k, m in enumerate(marked) if m.get(signal) == most], most
-
-    def _several(self, topic: str, places: list[int]) -> str:
-        names = [self.names[k] for k in places]
-        options = ' or '.join(option(topic, name) for name in names[:4])
-        listed = ' and '.join(f"'{name}'" for name in names[:8])
-        return f'{listed} could each be {topic}: add {options}'
 
 
 def option(topic: str, theirs: str, unit: str = '') -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -10,20 +11,53 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from valveflow_ros.logs.names import signal_of, signals_of
 from valveflow_ros.logs.tables.cells import (
-    Column,
+    QUALITY_SUFFIX,
+    Marks,
     foreign_quality,
+    quality_column,
+    quality_columns,
     to_numbers,
     to_quality,
     understands,
 )
-from valveflow_ros.logs.tables.plan import LongForm, TablePlan
-from valveflow_ros.logs.tables.refusal import AS_SEEN, TableOptions
-from valveflow_ros.logs.tables.times import never
-from valveflow_ros.records import SIGNALS, BoolArray, ByteArray, FloatArray, IntArray, Quality
+from valveflow_ros.logs.tables.file import Heading, TableFile, look_at
+from valveflow_ros.logs.tables.match import (
+    DATE,
+    TIME,
+    Chosen,
+    Matcher,
+    local_zone_in,
+    time_columns,
+    zone_in,
+)
+from valveflow_ros.logs.tables.refusal import AS_SEEN, RefusedError, Remedy, TableOptions
+from valveflow_ros.logs.tables.text import decimal_mark
+from valveflow_ros.logs.tables.times import NEVER, TimeReader
+from valveflow_ros.logs.tables.words import folded, split_unit
+from valveflow_ros.records import (
+    SIGNALS,
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    IntArray,
+    Quality,
+    Signal,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
+
+# Names of columns in a table with a row for each value, as PI and its kin export them.
+_TAG = re.compile(
+    r'^(?:pi )?(?:tag|point|sensor|item|variable|signal|name|kks|channel)(?: ?(?:name|id))?$|'
+    r'^(?:messstelle|kennzeichen|messstellenname|messgroesse|tag path)$'
+)
+_VALUE = re.compile(r'^(?:value|wert|messwert|val|reading|y|pv|avg|average|mean)$')
+_UNIT = re.compile(r'^(?:unit|units|uom|eng units|engineering units|einheit|eu)$')
+_QUALITY = re.compile(r'^(?:quality|status|qualitaet|quality code|guete|opc quality)$')
+_ABOUT = re.compile(r'^(?:description|descriptor|beschreibung|bezeichnung|comment)$')
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +68,41 @@ class RawBlock:
     columns: dict[str, FloatArray]
     quality: dict[str, ByteArray]
     present: dict[str, BoolArray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class LongForm:
+    """Where the columns of a table with a row for each value stand; -1 where there is none."""
+
+    tag: int
+    value: int
+    unit: int
+    quality: int
+    about: int
+
+    @classmethod
+    def of(cls, heading: Heading) -> LongForm | None:
+        """Return the places of a long table's columns, ``None`` if it is none."""
+        names = [folded(split_unit(name)[0]) for name in heading.names]
+        places = [
+            next((k for k, name in enumerate(names) if pattern.search(name)), -1)
+            for pattern in (_TAG, _VALUE, _UNIT, _QUALITY, _ABOUT)
+        ]
+        return None if min(places[:2]) < 0 else cls(*places)
+
+    def tags(self, file: TableFile) -> Heading:
+        """Return the tags as if they were columns; reads all of their names."""
+        places = sorted({k for k in (self.tag, self.unit, self.about) if k >= 0})
+        found: dict[str, tuple[str, str]] = {}
+        for frame in file.blocks(places):
+            text = frame.astype('string').fillna('')
+            for row in text.drop_duplicates(self.tag).itertuples(index=False):
+                cells = {k: cell.strip() for k, cell in zip(places, row, strict=True)}
+                if cells[self.tag]:
+                    rest = cells.get(self.unit, ''), cells.get(self.about, '')
+                    found.setdefault(cells[self.tag], rest)
+        units = tuple(unit or split_unit(tag)[1] for tag, (unit, _) in found.items())
+        return Heading(0, (), tuple(found), units, tuple(about for _, about in found.values()))
 
 
 class TableReader:
@@ -50,6 +119,8 @@ class TableReader:
     ----------
     names, units, grounds : dict[str, str]
         By contract column name: theirs, the unit the file names, why it was chosen.
+    ignored : tuple of str
+        Columns (of a long table: tags) that are not used.
     words : dict[str, Counter]
         By contract column name: what stands in place of numbers, how often; complete
         when all blocks were read.
@@ -69,13 +140,34 @@ class TableReader:
         absent: Collection[str] = (),
         options: TableOptions = AS_SEEN,
     ) -> None:
-        self._plan = plan = TablePlan(path, columns, absent, options)
+        wanted = dict(columns)
+        times = {name: wanted.pop(name) for name in (TIME, DATE) if name in wanted}
+        by_signal = {signal_of(name): theirs for name, theirs in wanted.items()}
         self.path = path
-        self.long = plan.long
-        self.names = {name: c.theirs for name, c in plan.chosen.items()}
-        self.units = {n: c.unit.unit for n, c in plan.chosen.items() if c.unit is not None}
-        self.grounds = {name: c.ground for name, c in plan.chosen.items() if c.ground}
-        self.ignored = plan.ignored
+        self._options = options
+        self._file = look_at(path, options)
+        time, self._date = self._time_places(times)
+        self.long = self._long_form(by_signal)
+        taken = {k for k in (time, self._date) if k is not None}
+        if self.long is not None:
+            matcher = Matcher(path, self.long.tags(self._file), 'tag')
+        else:
+            heading = self._file.heading
+            matcher = Matcher(path, heading, taken=quality_columns(heading.names) | taken)
+        found = matcher.match(by_signal, signals_of(absent), no_time=time is None)
+        assert time is not None, 'the matcher has refused it'
+        self._time = time
+        self._chosen: dict[str, Chosen] = {SIGNALS[s].column: found[s] for s in sorted(found)}
+        self._quality = {} if self.long is not None else self._quality_places()
+        self._marks = self._decided_marks()
+        self._clock = self._time_reader()
+        used = {c.place for c in self._chosen.values()} | set(self._quality.values())
+        used |= taken if self.long is None else set()
+        named = enumerate(matcher.names)
+        self.ignored = tuple(name for k, name in named if k not in used and name)
+        self.names = {name: c.theirs for name, c in self._chosen.items()}
+        self.units = {n: c.unit.unit for n, c in self._chosen.items() if c.unit is not None}
+        self.grounds = {name: c.ground for name, c in self._chosen.items() if c.ground}
         self.words: dict[str, Counter[str]] = {name: Counter() for name in self.names}
         self.empty: Counter[str] = Counter()
         self._marked_bad: Counter[str] = Counter()
@@ -92,52 +184,55 @@ class TableReader:
     @property
     def share(self) -> float:
         """Return how much of the file was read so far, as far as that is known."""
-        return self._plan.file.share
+        return self._file.share
 
     @property
     def time_zone(self) -> str:
         """Return the zone the times were taken to be in, and why; known when all was read."""
-        return self._plan.clock.told_zone
+        return self._clock.told_zone
 
     @property
     def time_words(self) -> str:
         """Return which column the times are from and how they are written."""
-        names = [
-            self._plan.file.names[k] for k in (self._plan.date, self._plan.time) if k is not None
-        ]
+        names = [self._file.names[k] for k in (self._date, self._time) if k is not None]
         told = ' and '.join(f"'{name}'" for name in names)
-        return f'{told}, {self._plan.clock.words}'
+        return f'{told}, {self._clock.words}'
 
     @property
     def local_guess(self) -> bool:
         """Tell whether the times name no zone and UTC was taken for want of a better word."""
-        return self._plan.clock.told_zone.startswith('UTC (')
+        return self._clock.told_zone.startswith('UTC (')
 
     def blocks(self) -> Iterator[RawBlock]:
         """Yield the rows whose time is known, block by block; raises like `read_table`."""
-        if self.long is not None:
-            yield from self._long_blocks(self.long)
-            return
-        places = [c.place for c in self._plan.chosen.values()] + list(self._plan.quality.values())
-        places += [k for k in (self._plan.time, self._plan.date) if k is not None]
-        for frame in self._plan.file.blocks(places):
+        places = [self._time] + ([] if self._date is None else [self._date])
+        long, coded = self.long, False
+        if long is not None:
+            places += [k for k in (long.tag, long.value, long.quality) if k >= 0]
+            coded = long.quality >= 0 and understands(self._cells(long.quality))
+        else:
+            places += [c.place for c in self._chosen.values()] + list(self._quality.values())
+        for frame in self._file.blocks(places):
             time_ns = self._read_times(frame)
-            values, quality = {}, {}
-            for name, chosen in self._plan.chosen.items():
-                values[name] = self._numbers(name, frame[chosen.place])
-                if name in self._plan.quality:
-                    cells = frame[self._plan.quality[name]]
-                    own = self.names[name] == name
-                    quality[name] = to_quality(cells) if own else self._foreign(name, cells)
+            block = RawBlock(time_ns, {}, {})
+            if long is not None:
+                self._read_long(frame, long, coded, block)
+            else:
+                self._read_wide(frame, block)
             self.rows += len(frame)
-            known = time_ns != never()
-            if known.all():
-                yield RawBlock(time_ns, values, quality)
-            elif known.any():
-                yield RawBlock(
-                    time_ns[known],
-                    {name: column[known] for name, column in values.items()},
-                    {name: codes[known] for name, codes in quality.items()},
+            keep = time_ns != NEVER
+            if block.present:
+                keep &= np.any(list(block.present.values()), axis=0)
+            if keep.any():
+                yield (
+                    block
+                    if keep.all()
+                    else RawBlock(
+                        time_ns[keep],
+                        {name: column[keep] for name, column in block.columns.items()},
+                        {name: codes[keep] for name, codes in block.quality.items()},
+                        {name: there[keep] for name, there in block.present.items()},
+                    )
                 )
 
     def notes(self) -> list[str]:
@@ -148,18 +243,21 @@ class TableReader:
         InputError
             If no row has a time.
         """
-        notes = [*self._plan.file.notes, *self._plan.clock.finish()]
+        notes = [*self._file.notes, *self._clock.finish()]
         for name, theirs in self.names.items():
-            words = self.words[name]
-            if words:
+            if n := self.words[name].total():
                 row, text = self._first_bad[name]
-                n = words.total()
                 are = f"{n} cells of '{theirs}' are no numbers and count"
                 one = f"1 cell of '{theirs}' is no number and counts"
                 notes.append(
                     f"{one if n == 1 else are} as missing; the first is '{text}' in row {row + 1}."
                 )
-        notes += self._quality_notes()
+        for name, n in self._marked_bad.items():
+            place = self._quality[name] if self.long is None else self.long.quality
+            notes.append(
+                f"The quality of '{self.names[name]}' is read from '{self._file.names[place]}', "
+                f'by which {n} of its values {"is" if n == 1 else "are"} bad.'
+            )
         if self.bad_times:
             notes.append(
                 f'{self.bad_times} rows have no readable time and were left out, the first is '
@@ -171,7 +269,7 @@ class TableReader:
         """Return sentences about what had to be found out: which column is which signal."""
         said = []
         for name, ground in self.grounds.items():
-            unit = self._plan.chosen[name].unit
+            unit = self._chosen[name].unit
             known = f'in {unit.written}' if unit else 'unit not named'
             topic = next(i.topic for i in SIGNALS if i.column == name)
             said.append(f"'{self.names[name]}' is read as {topic} ({ground}, {known}).")
@@ -180,73 +278,140 @@ class TableReader:
                 'The times name no zone and are taken as UTC; for local time add --time-zone, '
                 'such as --time-zone Europe/Berlin.'
             )
-        elif self._plan.options.time_zone or self.long is not None:
+        elif self._options.time_zone or self.long is not None:
             said.append(f'Time zone: {self.time_zone}.')
         return said
 
-    def _foreign(self, name: str, cells: pd.Series[Any]) -> ByteArray:
-        codes = foreign_quality(cells)
-        self._marked_bad[name] += int((codes == Quality.BAD).sum())
-        return codes
+    def _time_places(self, named: Mapping[str, str]) -> tuple[int | None, int | None]:
+        time, date = time_columns(self._file.heading)
+        matcher = Matcher(self.path, self._file.heading)
+        places = {TIME: time, DATE: date}
+        for key, theirs in named.items():
+            places[key] = matcher.find(theirs)
+            if places[key] is None:
+                raise matcher.missing(theirs, key)
+        time, date = places[TIME], places[DATE]
+        if time is None:
+            return date, None
+        # Two columns of this name are refused.
+        matcher.find(self._file.names[time])
+        # A date beside it is wanted only where the time is one of the day alone.
+        cells = self._cells(time)
+        clock = sum(c.count(':') >= 1 and not any(m in c for m in '-/T') and len(c) <= 15
+                    and c.find('.') not in range(5) for c in cells)  # fmt: skip
+        return time, (date if date != time and 2 * clock > len(cells) else None)
 
-    def _quality_notes(self) -> Iterator[str]:
-        for name, n in self._marked_bad.items():
-            place = self._plan.quality[name] if self.long is None else self.long.quality
-            column = self._plan.file.names[place]
-            yield (
-                f"The quality of '{self.names[name]}' is read from '{column}', by which "
-                f'{n} of its values {"is" if n == 1 else "are"} bad.'
+    def _cells(self, place: int) -> list[str]:
+        """Return what stands in a column in the rows that were looked at."""
+        rows = self._file.rows
+        return [row[place].strip() for row in rows if place < len(row) and row[place].strip()]
+
+    def _long_form(self, by_signal: Mapping[Signal, str]) -> LongForm | None:
+        form = LongForm.of(self._file.heading)
+        names = self._file.names
+        if any(i.column in names or i.topic in names for i in SIGNALS):
+            return None
+        # A person who names columns of the table means a wide one.
+        return None if any(theirs in names for theirs in by_signal.values()) else form
+
+    def _quality_places(self) -> dict[str, int]:
+        names, places = self._file.names, {}
+        used = {c.place for c in self._chosen.values()}
+        for name, chosen in self._chosen.items():
+            own = f'{name}{QUALITY_SUFFIX}'
+            if chosen.theirs == name and own in names:
+                places[name] = names.index(own)
+                continue
+            place = quality_column(chosen.theirs, names)
+            if place is not None and place not in used and understands(self._cells(place)):
+                places[name] = place
+        return places
+
+    def _decided_marks(self) -> Marks:
+        if self._file.marks is not None:
+            return self._file.marks
+        places = {c.theirs: c.place for c in self._chosen.values()}
+        if self.long is not None:
+            places = {'value': self.long.value}
+        for theirs, place in places.items():
+            cells = self._cells(place)
+            if decimal_mark(cells, self._file.separator) is None:
+                example = next(c for c in cells if ',' in c)
+                raise RefusedError(
+                    self.path,
+                    f"'{example}' in the column '{theirs}' may be a large number or one with "
+                    'decimals; add --decimal comma if the comma is the decimal mark, or '
+                    '--decimal point if it parts the thousands',
+                    [Remedy('decimal', 'comma')],
+                )
+        return Marks()
+
+    def _time_reader(self) -> TimeReader:
+        name = self._file.names[self._time]
+        samples = self._cells(self._time)
+        if self._date is not None:
+            samples = [
+                f'{row[self._date].strip()[:11].strip()} {row[self._time].strip()}'
+                for row in self._file.rows
+                if max(self._date, self._time) < len(row)
+            ]
+        clock = TimeReader(samples, str(self.path), name, self._options, zone_in(name))
+        abbreviated, place = local_zone_in(name)
+        if abbreviated and not clock.zone:
+            raise RefusedError(
+                self.path,
+                f"the times of the column '{name}' are local, and {abbreviated} does not say "
+                'whether the clock is set forward in summer: add --time-zone with the place, such '
+                f'as {place}, or the offset, such as +01:00',
+                [Remedy('time-zone', place)],
             )
+        return clock
 
     def _read_times(self, frame: pd.DataFrame) -> IntArray:
-        column = frame[self._plan.time]
-        if self._plan.date is not None:
-            days = frame[self._plan.date].astype('string').str.strip().str.slice(0, 11)
+        column = frame[self._time]
+        if self._date is not None:
+            days = frame[self._date].astype('string').str.strip().str.slice(0, 11)
             column = days.str.strip() + ' ' + column.astype('string').str.strip()
-        time_ns = self._plan.clock.read(column)
-        bad = time_ns == never()
+        time_ns = self._clock.read(column)
+        bad = time_ns == NEVER
         if bad.any():
             if not self.bad_times:
                 self._first_bad_time = self.rows + int(bad.argmax())
             self.bad_times += int(bad.sum())
         return time_ns
 
-    def _numbers(self, name: str, cells: pd.Series[Any]) -> FloatArray:
-        column = to_numbers(cells, self._plan.marks)
-        self._count(name, column, self.rows, cells)
-        return column.values
+    def _read_wide(self, frame: pd.DataFrame, block: RawBlock) -> None:
+        for name, chosen in self._chosen.items():
+            block.columns[name] = self._numbers(name, frame[chosen.place])
+            if name in self._quality:
+                cells = frame[self._quality[name]]
+                own = self.names[name] == name
+                block.quality[name] = to_quality(cells) if own else self._foreign(name, cells)
 
-    def _count(self, name: str, column: Column, start: int, cells: pd.Series[Any]) -> None:
+    def _read_long(
+        self, frame: pd.DataFrame, form: LongForm, coded: bool, block: RawBlock
+    ) -> None:
+        tags = frame[form.tag].astype('string').str.strip()
+        for name, chosen in self._chosen.items():
+            mine = (tags == chosen.theirs).fillna(False).to_numpy(dtype=bool)
+            block.present[name] = mine
+            block.columns[name] = np.full(len(frame), np.nan)
+            block.columns[name][mine] = self._numbers(name, frame[form.value][mine])
+            if coded:
+                codes = np.full(len(frame), int(Quality.GOOD), dtype=np.uint8)
+                codes[mine] = self._foreign(name, frame[form.quality][mine])
+                block.quality[name] = codes
+
+    def _foreign(self, name: str, cells: pd.Series[Any]) -> ByteArray:
+        codes = foreign_quality(cells)
+        self._marked_bad[name] += int((codes == Quality.BAD).sum())
+        return codes
+
+    def _numbers(self, name: str, cells: pd.Series[Any]) -> FloatArray:
+        column = to_numbers(cells, self._marks)
         self.words[name].update(column.words)
         self.empty[name] += column.empty
         if column.words and name not in self._first_bad:
             text = str(cells.iloc[column.first_bad_row]).strip()[:40]
-            self._first_bad[name] = (start + column.first_bad_row, text)
-
-    def _long_blocks(self, form: LongForm) -> Iterator[RawBlock]:
-        places = [form.tag, form.value, self._plan.time]
-        places += [k for k in (form.quality, self._plan.date) if k is not None and k >= 0]
-        coded = form.quality >= 0 and understands(self._plan.cells(form.quality))
-        for frame in self._plan.file.blocks(places):
-            time_ns = self._read_times(frame)
-            tags = frame[form.tag].astype('string').str.strip()
-            values, quality, present = {}, {}, {}
-            for name, chosen in self._plan.chosen.items():
-                mine = (tags == chosen.theirs).fillna(False).to_numpy(dtype=bool)
-                place = np.flatnonzero(mine)
-                values[name] = np.full(len(frame), np.nan)
-                values[name][place] = self._numbers(name, frame[form.value].iloc[place])
-                present[name] = mine
-                if coded:
-                    codes = np.full(len(frame), int(Quality.GOOD), dtype=np.uint8)
-                    codes[place] = self._foreign(name, frame[form.quality].iloc[place])
-                    quality[name] = codes
-            self.rows += len(frame)
-            keep = (time_ns != never()) & np.any(list(present.values()), axis=0)
-            if keep.any():
-                yield RawBlock(
-                    time_ns[keep],
-                    {name: column[keep] for name, column in values.items()},
-                    {name: codes[keep] for name, codes in quality.items()},
-                    {name: there[keep] for name, there in present.items()},
-                )
+            self._first_bad[name] = (self.rows + column.first_bad_row, text)
+        return column.values

@@ -81,8 +81,6 @@ def quoted(word: str) -> str:
     return word if re.fullmatch(r'[\w.:/=%+@,-]+', word) else shlex.quote(word)
 
 
-# What a person may have to say about a table that the table does not say itself.
-
 DATE_ORDERS = ('dmy', 'mdy', 'ymd')
 DECIMALS = ('point', 'comma')
 

@@ -1,26 +1,36 @@
-"""Reads a historian's table, CSV, Excel or Parquet, into columns of numbers over time."""
+"""Reads a historian's table, CSV, Excel or Parquet, and writes samples as one."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from valveflow_ros.errors import InputError
 from valveflow_ros.logs.contents import LogContents
 from valveflow_ros.logs.names import signal_of
+from valveflow_ros.logs.part_file import make_folder
+from valveflow_ros.logs.source import os_errors
+from valveflow_ros.logs.tables.binary import check_parquet
+from valveflow_ros.logs.tables.cells import QUALITY_SUFFIX
+from valveflow_ros.logs.tables.match import TIME
 from valveflow_ros.logs.tables.reader import TableReader
 from valveflow_ros.logs.tables.refusal import AS_SEEN, TableOptions
 from valveflow_ros.records import (
+    SIGNALS,
     BoolArray,
     ByteArray,
     FloatArray,
     IntArray,
+    Quality,
     Readings,
     SampleTable,
     table_to_readings,
 )
+
+_BLOCK_ROWS = 100_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,3 +196,102 @@ def _ordered(raw: RawTable, notes: list[str]) -> RawTable:
         notes=tuple(notes),
         present={name: there[order] for name, there in raw.present.items()},
     )
+
+
+def write_table(table: SampleTable, path: str | Path) -> None:
+    """Write a table with the contract's columns.
+
+    Times are ISO 8601 in UTC with as many digits as they need, numbers have
+    all digits that tell them apart, a missing value is an empty cell. A signal
+    that is optional and wholly missing gets no column; a column of quality
+    codes stands beside a signal that has doubtful values.
+
+    Parameters
+    ----------
+    table : SampleTable
+        The samples.
+    path : str or Path
+        ``.csv`` or ``.parquet``; replaced if it exists.
+
+    Raises
+    ------
+    InputError
+        If the suffix is neither.
+    RecordingError
+        If the file cannot be written, or is Parquet and pyarrow is not installed.
+    """
+    place = Path(path)
+    kind = place.suffix.lower()
+    if kind not in ('.csv', '.parquet'):
+        raise InputError(f"A table is written as .csv or .parquet, not as '{place.name}'.")
+    if kind == '.parquet':
+        check_parquet(place)
+    draft = place.with_name(f'.{place.name}.part')
+    with os_errors(path, 'cannot be written'):
+        make_folder(place.parent)
+        try:
+            (_write_csv if kind == '.csv' else _write_parquet)(table, draft)
+            draft.replace(place)
+        except OSError:
+            draft.unlink(missing_ok=True)
+            raise
+
+
+def _columns(table: SampleTable) -> Iterator[tuple[str, FloatArray, ByteArray | None]]:
+    """Yield name, values and, where some are doubtful, qualities of the columns to be written."""
+    for info in SIGNALS:
+        values = table.column(info.signal)
+        if info.required or np.isfinite(values).any():
+            quality = table.quality[:, info.signal]
+            doubtful = bool((quality == int(Quality.UNCERTAIN)).any())
+            yield info.column, values, quality if doubtful else None
+
+
+def _write_csv(table: SampleTable, path: Path) -> None:
+    times, columns, names = _iso(table.time_ns), list(_columns(table)), [TIME]
+    for name, _, quality in columns:
+        names += [name] if quality is None else [name, name + QUALITY_SUFFIX]
+    # Among whole numbers a reader takes ``-0`` for 0.
+    signed = [bool((np.signbit(values) & (values == 0.0)).any()) for _, values, _ in columns]
+    with path.open('w', encoding='utf-8', newline='') as stream:
+        stream.write(','.join(names) + '\n')
+        for start in range(0, len(times), _BLOCK_ROWS):
+            part = slice(start, start + _BLOCK_ROWS)
+            cells = [times[part]]
+            for (_, values, quality), sign in zip(columns, signed, strict=True):
+                cells.append(_numbers(values[part], sign))
+                if quality is not None:
+                    cells.append([str(code) for code in quality[part].tolist()])
+            stream.writelines(f'{",".join(row)}\n' for row in zip(*cells, strict=True))
+
+
+def _numbers(values: FloatArray, signed: bool) -> list[str]:
+    """Return numbers with all digits that tell them apart; empty for NaN."""
+    cells = [repr(value) for value in values.tolist()]
+    if not signed:
+        cells = [cell.removesuffix('.0') for cell in cells]
+    return ['' if cell == 'nan' else cell for cell in cells] if np.isnan(values).any() else cells
+
+
+def _write_parquet(table: SampleTable, path: Path) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    columns = {TIME: pa.array(table.time_ns, pa.timestamp('ns', 'UTC'))}
+    for name, values, quality in _columns(table):
+        columns[name] = pa.array(values, mask=np.isnan(values))
+        if quality is not None:
+            columns[name + QUALITY_SUFFIX] = pa.array(quality)
+    with path.open('wb') as stream:
+        parquet.write_table(pa.table(columns), stream)
+
+
+def _iso(time_ns: IntArray) -> list[str]:
+    """Return times as text, all with as many digits of a second as the finest needs."""
+    stamps = time_ns.astype('datetime64[ns]')
+    digits = 9
+    while digits and not (time_ns % 10 ** (12 - digits)).any():
+        digits -= 3
+    # A text of nanoseconds is cut, never rounded: what is cut are zeros.
+    size = len('2000-01-01T00:00:00') + (digits + 1 if digits else 0)
+    return [f'{text[:size]}Z' for text in np.datetime_as_string(stamps).tolist()]

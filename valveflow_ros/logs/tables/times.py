@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-# Makes nanoseconds of the stamps of pandas.
-
 _WHOLE_LIMIT = 2.0**63
 # Zones that stand behind a time: German ones tell summer from winter themselves.
 _ABBREVIATED = (
@@ -74,9 +72,6 @@ def with_offsets(text: pd.Series[Any]) -> pd.Series[Any]:
     for words, offset in _ABBREVIATED:
         text = text.str.replace(words, offset, regex=True)
     return text
-
-
-# Tells from samples what kind of times a column of numbers holds.
 
 
 # Numbers above these cannot be seconds (year 5138), milliseconds, microseconds of our age.
@@ -128,7 +123,8 @@ def descending(samples: list[str]) -> bool:
     return 2 * falling > len(pairs)
 
 
-_NEVER = np.iinfo(np.int64).min
+# The stamp that stands for a time that cannot be read.
+NEVER = int(np.iinfo(np.int64).min)
 # The day 1970-01-01 of a workbook.
 _EXCEL_EPOCH_DAYS = 25569
 _HOUR_NS = 3600 * NS_PER_S
@@ -185,7 +181,7 @@ class TimeReader:
         self._style = None if len(numbers) else date_style(samples, options.date_order, self.where)
 
     def read(self, column: pd.Series[Any]) -> IntArray:
-        """Return int64 nanoseconds; a time that cannot be read is ``never()``.
+        """Return int64 nanoseconds; a time that cannot be read is `NEVER`.
 
         Numbers are Unix seconds unless they are too large for that; texts that
         name no zone are in the zone of this reader.
@@ -199,9 +195,9 @@ class TimeReader:
             stamps = self._from_local(column)
         else:
             stamps = self._from_cells(column)
-        self.any_time = self.any_time or bool((stamps != _NEVER).any())
+        self.any_time = self.any_time or bool((stamps != NEVER).any())
         if self._clock is None and not self._zoned and not self.zone and self.kind != 'seconds':
-            self._look_back(stamps[stamps != _NEVER])
+            self._look_back(stamps[stamps != NEVER])
         return stamps
 
     def _look_back(self, stamps: IntArray) -> None:
@@ -276,7 +272,7 @@ class TimeReader:
         if bool(whole[numbers.notna()].all()) and not self._excel:
             filled = text.where(whole, '0').astype('int64').to_numpy()
             stamps = self._whole(filled)
-            stamps[~whole.to_numpy(dtype=bool)] = _NEVER
+            stamps[~whole.to_numpy(dtype=bool)] = NEVER
             return stamps
         return self._numbers(numbers.to_numpy(dtype=np.float64, na_value=np.nan))
 
@@ -286,11 +282,11 @@ class TimeReader:
         style = self._style or DateStyle()
         self._zoned = self._zoned or style.zoned
         if not style.formats:
-            self._say('ISO 8601')
+            self.kind = 'ISO 8601'
             if style.zoned or self._clock is None:
                 return iso_times(text)
             return self._from_local(pd.to_datetime(text, format='ISO8601', errors='coerce'))
-        self._say(style.words)
+        self.kind = style.words
         return self._styled(text, style)
 
     def _styled(self, text: pd.Series[Any], style: DateStyle) -> IntArray:
@@ -331,7 +327,7 @@ class TimeReader:
 
     def _from_local(self, stamps: pd.Series[Any]) -> IntArray:
         if not self.kind:
-            self._say('stamps of the file')
+            self.kind = 'stamps of the file'
         return from_stamps(stamps if self._clock is None else self._clock.to_utc(stamps))
 
     def _whole(self, numbers: NDArray[np.integer[Any]]) -> IntArray:
@@ -339,13 +335,13 @@ class TimeReader:
         self._say_numbers()
         wide = numbers.astype(np.float64) * self._factor
         near = np.abs(wide) < _WHOLE_LIMIT
-        return np.where(near, numbers.astype(np.int64) * self._factor, _NEVER).astype(np.int64)
+        return np.where(near, numbers.astype(np.int64) * self._factor, NEVER).astype(np.int64)
 
     def _numbers(self, numbers: FloatArray) -> IntArray:
         import pandas as pd
 
         if self._excel:
-            self._say('days of a workbook')
+            self.kind = 'days of a workbook'
             days = np.where(np.isfinite(numbers), numbers, 0.0) - _EXCEL_EPOCH_DAYS
             # A double of days knows a second to about a microsecond, no better.
             milli = np.rint(days * 86_400_000.0).astype(np.int64) * 1_000_000
@@ -359,7 +355,7 @@ class TimeReader:
         whole = np.floor(safe)
         fraction = np.rint((safe - whole) * self._factor).astype(np.int64)
         stamps: IntArray = whole.astype(np.int64) * self._factor + fraction
-        stamps[~usable] = _NEVER
+        stamps[~usable] = NEVER
         return stamps
 
     def _say_numbers(self) -> None:
@@ -369,11 +365,3 @@ class TimeReader:
                 'The numbers in the time column are too large for seconds and were taken as '
                 f'{self._unit}.'
             )
-
-    def _say(self, kind: str) -> None:
-        self.kind = kind
-
-
-def never() -> int:
-    """Return the stamp that stands for a time that cannot be read."""
-    return int(_NEVER)

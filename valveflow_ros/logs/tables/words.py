@@ -13,9 +13,6 @@ from dataclasses import dataclass
 
 from valveflow_ros.records import SIGNALS, Signal
 
-# Reads the unit out of a column's name, however a historian spells it.
-
-
 # What a unit measures.
 OPENING, PRESSURE, TEMPERATURE, POWER = 'opening', 'pressure', 'temperature', 'power'
 DIMENSIONS = {
@@ -29,17 +26,7 @@ DIMENSIONS = {
 
 @dataclass(frozen=True, slots=True)
 class Spelling:
-    """A unit as it was found.
-
-    Attributes
-    ----------
-    dimension : str
-        What it measures.
-    unit : str
-        The name the project knows it by.
-    written : str
-        As it stands in the file.
-    """
+    """A unit as it was found: what it measures, its name in this project, and as written."""
 
     dimension: str
     unit: str

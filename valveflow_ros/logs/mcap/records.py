@@ -1,0 +1,420 @@
+"""The records of an MCAP file: parsed and packed by the library `mcap`, within bounds of our own.
+
+No claim of a file is believed: a length never allocates more than the bytes that are there, and a
+chunk unpacks to the size it claims or is refused. Only two things are not left to the library,
+because it would take one Python step per message: finding the messages of a chunk (`walk`) and
+packing messages with their index (`chunk_file`).
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from io import BytesIO
+from typing import TypeVar
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Footer, McapRecord, Schema, Statistics
+from mcap.well_known import SchemaEncoding
+from numpy.typing import NDArray
+
+from valveflow_ros.logs.source import DEFAULT_LIMITS, Limits, Source
+from valveflow_ros.records import IntArray
+
+MAGIC = b'\x89MCAP0\r\n'
+RECORD_HEAD = struct.Struct('<BQ')
+MESSAGE_HEAD = struct.Struct('<HIQQ')
+FOOTER_SIZE = RECORD_HEAD.size + 20
+Record = TypeVar('Record')
+
+
+class LayoutError(ValueError):
+    """Bytes do not have the layout they claim; never leaves the package."""
+
+
+class _Content(ReadDataStream):
+    """The content of one record; the library itself takes a short read for a whole one."""
+
+    def read(self, length: int) -> bytes:
+        data = super().read(length)
+        if len(data) < length:
+            raise EndOfFile
+        return data
+
+
+def unpack(read: Callable[[ReadDataStream], Record], content: bytes) -> Record:
+    """Return a record, as in ``unpack(Schema.read, content)``; raises `LayoutError`."""
+    try:
+        return read(_Content(BytesIO(content)))
+    except (EndOfFile, OverflowError):
+        raise LayoutError('a record is shorter than what it says it holds') from None
+    except UnicodeDecodeError:
+        raise LayoutError('a name is not UTF-8') from None
+
+
+def unpack_attachment(content: bytes) -> Attachment:
+    """Return an attachment; raises `LayoutError`, also if its checksum is wrong."""
+    found: Attachment = unpack(Attachment.read, content)
+    # The library does not compare the checksum; it writes it, and the same bytes, if all is well.
+    if pack(found)[RECORD_HEAD.size :] != content:
+        raise LayoutError(f"the checksum of the attachment '{found.name}' is wrong")
+    return found
+
+
+def pack(*records: McapRecord) -> bytes:
+    """Return whole records, one after the other."""
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    return bytes(builder.end())
+
+
+class Unpacker:
+    """Decompresses chunks; one for each thread, because its library keeps state."""
+
+    def __init__(self) -> None:
+        self._decompressor = zstandard.ZstdDecompressor()
+
+    def unpack(self, compression: str, packed: bytes, size: int) -> bytes:
+        """Return exactly ``size`` bytes or raise `LayoutError`.
+
+        ``size`` is the chunk's claim, already checked against the limit; no more than that is ever
+        allocated for the result.
+        """
+        try:
+            if compression == 'zstd':
+                # A frame that states its size makes the library allocate that much at once, so
+                # the statement is compared with the chunk's claim first.
+                stated = zstandard.frame_content_size(packed)
+                content = b''
+                if size and stated in (-1, size):
+                    content = bytes(self._decompressor.decompress(packed, max_output_size=size))
+                elif stated not in (-1, size):
+                    raise LayoutError('a chunk unpacks to another size than it claims')
+            elif compression == 'lz4':
+                unpacker = lz4.frame.LZ4FrameDecompressor()
+                content = bytes(unpacker.decompress(packed, max_length=size + 1))
+            elif not compression:
+                content = packed
+            else:
+                raise LayoutError(f"unknown compression '{compression[:16]}'")
+        except LayoutError:
+            raise
+        except (zstandard.ZstdError, RuntimeError, EOFError, ValueError) as error:
+            raise LayoutError(f'a chunk cannot be unpacked ({error})') from None
+        if len(content) != size:
+            if not compression:
+                raise LayoutError('an uncompressed chunk differs from the size it claims')
+            raise LayoutError('a chunk unpacks to another size than it claims')
+        return content
+
+
+@dataclass(slots=True)
+class TopicTable:
+    """Schemas and channels as they are met; the same id never means two things."""
+
+    limits: Limits = DEFAULT_LIMITS
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    definition_bytes: int = 0
+
+    def add(self, op: int, content: bytes) -> None:
+        """Take a schema or a channel record.
+
+        Raises
+        ------
+        LayoutError
+            If it is malformed, contradicts an earlier one, or is one too many.
+        """
+        if op == Opcode.SCHEMA:
+            self._add_schema(unpack(Schema.read, content))
+        elif op == Opcode.CHANNEL:
+            self._add_channel(unpack(Channel.read, content))
+
+    def take_over(self, other: TopicTable) -> None:
+        """Add all that another table knows; raises `LayoutError` like `add`."""
+        for schema in other.schemas.values():
+            self._add_schema(schema)
+        for channel in other.channels.values():
+            self._add_channel(channel)
+
+    def type_of(self, channel: Channel) -> str:
+        """Return the type of a channel, empty if the file does not say."""
+        schema = self.schemas.get(channel.schema_id)
+        return '' if schema is None else schema.name
+
+    def definition_of(self, channel: Channel) -> str:
+        """Return the text of a channel's ros2msg definition, empty if there is none."""
+        schema = self.schemas.get(channel.schema_id)
+        if schema is None or schema.encoding != SchemaEncoding.ROS2:
+            return ''
+        return schema.data.decode(errors='replace')
+
+    def _add_schema(self, schema: Schema) -> None:
+        known = self.schemas.get(schema.id)
+        if known is not None:
+            if known != schema:
+                raise LayoutError(f'it defines schema {schema.id} twice, differently')
+            return
+        self.definition_bytes += len(schema.data)
+        if self.definition_bytes > self.limits.definition_bytes:
+            raise LayoutError('its definitions of messages are larger than can be read')
+        self._check_count(len(self.schemas))
+        self.schemas[schema.id] = schema
+
+    def _add_channel(self, channel: Channel) -> None:
+        known = self.channels.get(channel.id)
+        if known is not None:
+            if known != channel:
+                raise LayoutError(f'it defines channel {channel.id} twice, differently')
+            return
+        self._check_count(len(self.channels))
+        self.channels[channel.id] = channel
+
+    def _check_count(self, count: int) -> None:
+        if count >= self.limits.channels:
+            raise LayoutError(f'it has more than {self.limits.channels} topics')
+
+
+@dataclass(slots=True)
+class Summary:
+    """What a finished file says about itself."""
+
+    table: TopicTable = field(default_factory=TopicTable)
+    messages: int = 0
+    start_ns: int = 0
+    end_ns: int = 0
+    counts: dict[int, int] = field(default_factory=dict)
+
+
+def ends_well(source: Source) -> bool:
+    """Tell whether a file was finished: it ends in a footer and the magic."""
+    start = source.size - len(MAGIC) - FOOTER_SIZE
+    if start < len(MAGIC):
+        return False
+    raw = source.read(start, FOOTER_SIZE + len(MAGIC))
+    return raw.startswith(RECORD_HEAD.pack(Opcode.FOOTER, 20)) and raw.endswith(MAGIC)
+
+
+def read_summary(source: Source) -> Summary | None:
+    """Return the summary, or ``None`` if there is none whose checksum is right."""
+    if not ends_well(source):
+        return None
+    footer_at = source.size - len(MAGIC) - FOOTER_SIZE
+    raw_footer = source.read(footer_at, FOOTER_SIZE)
+    footer = unpack(Footer.read, raw_footer[RECORD_HEAD.size :])
+    size = footer_at - footer.summary_start
+    if footer.summary_start == 0 or not 0 < size <= DEFAULT_LIMITS.record_bytes:
+        return None
+    raw = source.read(footer.summary_start, size)
+    if zlib.crc32(raw_footer[:-4], zlib.crc32(raw)) != footer.summary_crc:
+        return None
+    summary, position = Summary(), 0
+    try:
+        while position < len(raw):
+            op, content = record_at(raw, position)
+            position += RECORD_HEAD.size + len(content)
+            if op == Opcode.STATISTICS:
+                found = unpack(Statistics.read, content)
+                summary.messages, summary.counts = (
+                    found.message_count,
+                    found.channel_message_counts,
+                )
+                summary.start_ns, summary.end_ns = found.message_start_time, found.message_end_time
+            else:
+                summary.table.add(op, content)
+    except LayoutError:
+        return None
+    return summary
+
+
+def record_at(raw: bytes, position: int) -> tuple[int, bytes]:
+    """Return kind and content of the record at a position; raises `LayoutError`."""
+    start = position + RECORD_HEAD.size
+    if start > len(raw):
+        raise LayoutError('a record is shorter than what it says it holds')
+    op, length = RECORD_HEAD.unpack_from(raw, position)
+    if start + length > len(raw):
+        raise LayoutError('a record is shorter than what it says it holds')
+    return op, raw[start : start + length]
+
+
+# Most chunks of a plant are one run of records of equal size (four Float64 topics: 43 bytes each);
+# such a run is found at once. Anything else is walked record by record.
+HEAD_SIZE = RECORD_HEAD.size + MESSAGE_HEAD.size
+HEAD_DTYPE = np.dtype(
+    [
+        ('op', 'u1'),
+        ('length', '<u8'),
+        ('channel', '<u2'),
+        ('sequence', '<u4'),
+        ('log_time', '<i8'),
+        ('publish_time', '<i8'),
+    ]
+)
+RUN_PROBE = 64
+_FEW_BREAKS = 64
+MAX_TOPIC_RECORDS = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class MessageTable:
+    """The messages of one run of records, in the order in which they stand there.
+
+    Arrays of n: ``channel`` uint16, ``sequence`` uint32 as the writer counted, ``log_time`` and
+    ``publish_time`` int64 in ns since the epoch, ``offset`` int64 where each record begins,
+    ``size`` int64 bytes of each payload, which begins `HEAD_SIZE` after the offset.
+    """
+
+    channel: NDArray[np.uint16]
+    sequence: NDArray[np.uint32]
+    log_time: IntArray
+    publish_time: IntArray
+    offset: IntArray
+    size: IntArray
+
+    def __len__(self) -> int:
+        """Return the number of messages."""
+        return len(self.channel)
+
+    def payload(self, content: bytes, row: int) -> bytes:
+        """Return the raw payload of one message."""
+        start = int(self.offset[row]) + HEAD_SIZE
+        return content[start : start + int(self.size[row])]
+
+
+def walk(content: bytes) -> tuple[MessageTable, list[tuple[int, bytes]]]:
+    """Return the messages and the schema and channel records of chunk contents.
+
+    Raises
+    ------
+    LayoutError
+        If a record is cut off or of a kind that has no place in a chunk.
+    """
+    starts, others = _boundaries(content)
+    if not len(starts):
+        return _EMPTY, others
+    heads = rows(content, HEAD_DTYPE, 0, starts)
+    table = MessageTable(
+        np.ascontiguousarray(heads['channel']),
+        np.ascontiguousarray(heads['sequence']),
+        np.ascontiguousarray(heads['log_time']),
+        np.ascontiguousarray(heads['publish_time']),
+        starts,
+        heads['length'].astype(np.int64) - MESSAGE_HEAD.size,
+    )
+    if table.log_time.min() < 0 or table.publish_time.min() < 0:
+        raise LayoutError('a message claims a time after the year 2262')
+    return table, others
+
+
+def rows(
+    content: bytes, dtype: np.dtype[np.void], shift: int, starts: IntArray
+) -> NDArray[np.void]:
+    """Return a structured row for each of ``starts + shift``.
+
+    The caller knows that every row lies within ``content``.
+    """
+    if not len(starts):
+        return np.empty(0, dtype)
+    runs = _evenly(starts)
+    if runs is not None:
+        # Rows at even distances are a view; picking them one by one costs ten times as much.
+        parts: list[NDArray[np.void]] = [
+            np.ndarray((count,), dtype, content, first + shift, (step,))
+            for first, step, count in runs
+        ]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, dtype=dtype)
+    places = len(content) - shift - dtype.itemsize + 1
+    view: NDArray[np.void] = np.ndarray((places,), dtype, content, shift, (1,))
+    return view[starts]
+
+
+def _evenly(starts: IntArray) -> list[tuple[int, int, int]] | None:
+    """Return first, step and length of the few even runs of places, ``None`` if they are many."""
+    if len(starts) < RUN_PROBE:
+        return None
+    steps = np.diff(starts)
+    breaks = np.flatnonzero(steps != steps[0])
+    if len(breaks) > _FEW_BREAKS:
+        return None
+    ends = np.r_[breaks + 1, len(starts)]
+    begins = np.r_[0, ends[:-1]]
+    return [
+        (int(starts[begin]), int(steps[0]), int(end - begin))
+        for begin, end in zip(begins, ends, strict=True)
+        if end > begin
+    ]
+
+
+def _boundaries(content: bytes) -> tuple[IntArray, list[tuple[int, bytes]]]:
+    parts: list[IntArray] = []
+    singles: list[int] = []
+    others: list[tuple[int, bytes]] = []
+    position, end, probe = 0, len(content), True
+    unpack = RECORD_HEAD.unpack_from
+    while position < end:
+        if end - position < RECORD_HEAD.size:
+            raise LayoutError('a chunk ends in the middle of a record')
+        op, length = unpack(content, position)
+        after = position + RECORD_HEAD.size + length
+        if after > end:
+            raise LayoutError('a chunk ends in the middle of a record')
+        if op == 5:
+            if length < MESSAGE_HEAD.size:
+                raise LayoutError('a message is shorter than its own head')
+            count = _run(content, position, after - position) if probe else 1
+            probe = count >= RUN_PROBE
+            if count > 1:
+                parts += [np.array(singles, dtype=np.int64)]
+                parts += [position + (after - position) * np.arange(count, dtype=np.int64)]
+                singles = []
+                position += count * (after - position)
+                continue
+            singles.append(position)
+        elif op in (Opcode.SCHEMA, Opcode.CHANNEL):
+            others.append((op, content[position + RECORD_HEAD.size : after]))
+            if len(others) > MAX_TOPIC_RECORDS:
+                raise LayoutError('a chunk mentions topics without end')
+            probe = True
+        else:
+            raise LayoutError(f'a chunk holds a record of kind {op}')
+        position = after
+    return np.concatenate([*parts, np.array(singles, dtype=np.int64)]), others
+
+
+def _run(content: bytes, position: int, stride: int) -> int:
+    """Return how many records from ``position`` on have the same kind and length.
+
+    The look-ahead doubles, so the work is in proportion to the run that is found.
+    """
+    count = (len(content) - position) // stride
+    op, length = RECORD_HEAD.unpack_from(content, position)
+    known, limit = 0, RUN_PROBE
+    while known < count:
+        taken = min(limit, count) - known
+        first = position + known * stride
+        ops: NDArray[np.uint8] = np.ndarray((taken,), 'u1', content, first, (stride,))
+        lengths: NDArray[np.uint64] = np.ndarray((taken,), '<u8', content, first + 1, (stride,))
+        same = (ops == op) & (lengths == length)
+        if not same.all():
+            return known + int(same.argmin())
+        known, limit = known + taken, 2 * limit
+    return count
+
+
+_EMPTY = MessageTable(
+    np.empty(0, dtype=np.uint16),
+    np.empty(0, dtype=np.uint32),
+    np.empty(0, dtype=np.int64),
+    np.empty(0, dtype=np.int64),
+    np.empty(0, dtype=np.int64),
+    np.empty(0, dtype=np.int64),
+)
