@@ -180,17 +180,9 @@ class Samples:
 
 
 class PlantSampleReader:
-    """Knows where the values stand in messages of one definition.
+    """Knows where the values stand in messages of one ros2msg definition.
 
-    Parameters
-    ----------
-    definition : str
-        The ros2msg text of the type with everything it needs.
-
-    Raises
-    ------
-    LayoutError
-        If a field is missing, of another type, or behind an array.
+    Raises `LayoutError` if a field is missing, of another type, or behind an array.
     """
 
     def __init__(self, definition: str) -> None:

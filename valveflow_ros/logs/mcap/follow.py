@@ -329,13 +329,7 @@ class Raw(NamedTuple):
 
 
 class Picker:
-    """Decodes messages by the definitions that stand in the recording.
-
-    Attributes
-    ----------
-    misfits : int
-        Messages that did not fit their own definition.
-    """
+    """Decodes messages by the definitions in the recording; counts those that do not fit them."""
 
     def __init__(self) -> None:
         self.misfits = 0
@@ -344,11 +338,7 @@ class Picker:
     def last(self, batch: Batch, wanted: dict[str, int]) -> Iterator[Raw]:
         """Yield messages, not decoded yet, in the order of the file.
 
-        Parameters
-        ----------
-        batch : Batch
-        wanted : dict of str to int
-            The types, and how many messages of each topic are enough.
+        ``wanted`` holds the types, and how many messages of each topic are enough.
         """
         picked: list[tuple[int, Decoder]] = []
         for channel, type_name, definition in _channels(batch):

@@ -50,15 +50,7 @@ def _columns(batch: _Batch) -> tuple[NDArray[np.generic], ...]:
 
 
 class MessageReader:
-    """The raw messages of one or several files; holds only what overlaps in time.
-
-    Parameters
-    ----------
-    files : list of FileContents
-        What `gather` found, in the order of the splits.
-    unchecked : bool
-        As when they were found.
-    """
+    """The raw messages of the files that `gather` read; holds only what overlaps in time."""
 
     def __init__(self, files: list[FileContents], unchecked: bool = False) -> None:
         self._files = files

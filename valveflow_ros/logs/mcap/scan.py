@@ -116,14 +116,7 @@ class Findings:
 class Scanner:
     """Goes once through a file; `findings` is complete when `chunks` is exhausted.
 
-    Parameters
-    ----------
-    source : Source
-        The open file.
-    limits : Limits
-        What the file may cost.
-    unchecked : bool
-        Also accept chunks that were written without a checksum.
+    With ``unchecked`` it also accepts chunks that were written without a checksum.
     """
 
     def __init__(

@@ -51,15 +51,7 @@ class Column:
 
 
 def to_numbers(column: pd.Series[Any], marks: Marks = Marks()) -> Column:
-    """Return float64 values; NaN where a cell is empty or no number.
-
-    Parameters
-    ----------
-    column : Series
-        Cells in the order of the file.
-    marks : Marks
-        How its numbers are written.
-    """
+    """Return float64 values of cells in the order of the file; NaN where none stands."""
     import pandas as pd
 
     if column.dtype.kind in 'iufb' and not hasattr(column.dtype, 'na_value'):

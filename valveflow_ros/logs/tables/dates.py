@@ -59,21 +59,10 @@ class DateStyle:
 
 
 def date_style(cells: list[str], order: str, where: str) -> DateStyle | None:
-    """Return how these cells write dates, ``None`` if they are none.
+    """Return how these samples from the whole file write dates, ``None`` if they are none.
 
-    Parameters
-    ----------
-    cells : list of str
-        Samples from the whole file.
-    order : str
-        What the person said: ``dmy``, ``mdy``, ``ymd`` or nothing.
-    where : str
-        File and column, for the sentence.
-
-    Raises
-    ------
-    InputError
-        If day and month cannot be told apart.
+    ``order`` is what the person said, ``dmy``, ``mdy``, ``ymd`` or nothing; ``where`` names file
+    and column. Raises `InputError` if day and month cannot be told apart.
     """
     text = [cell.strip() for cell in cells if cell.strip()]
     if not text:

@@ -59,16 +59,8 @@ class Chosen:
 class Matcher:
     """Chooses among columns (or, in a long table, among tags).
 
-    Parameters
-    ----------
-    path : Path
-        The file, for sentences.
-    heading : Heading
-        Names, units and descriptions.
-    what : str
-        ``column`` or ``tag``.
-    taken : collection of int
-        Columns that stand for something else already: the time.
+    ``what`` is ``column`` or ``tag``; ``taken`` are columns that stand for something else already,
+    as the time.
     """
 
     def __init__(
@@ -102,20 +94,9 @@ class Matcher:
     ) -> dict[Signal, Chosen]:
         """Return the column of each signal.
 
-        Parameters
-        ----------
-        wanted : mapping
-            Columns that the person named.
-        spared : collection of Signal
-            What need not be there.
-        no_time : bool
-            There is no column of times, which is to be told with the rest.
-
-        Raises
-        ------
-        InputError
-            If several columns have the same name; a `RefusedError` for everything else
-            that is open.
+        ``wanted`` are columns that the person named, ``spared`` signals that need not be there;
+        ``no_time`` is told with the rest that is open, in one `RefusedError`. Raises `InputError`
+        if several columns have the same name.
         """
         chosen: dict[Signal, Chosen] = {}
         absent: dict[Signal, str] = {}

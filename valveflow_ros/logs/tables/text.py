@@ -99,17 +99,10 @@ _MOST_BREAKS = 253
 
 
 class Quotes:
-    """Follows a text that passes by in pieces.
+    """Follows a text that passes by in pieces, of the file ``path``, its cells parted as told.
 
-    A quote opens a cell only where the cell begins, and a doubled one within it
-    stands for itself: so do pandas and most programs that write tables.
-
-    Parameters
-    ----------
-    path : Path
-        The file, for the sentence.
-    separator : str
-        What parts its cells.
+    A quote opens a cell only where the cell begins, and a doubled one within it stands for itself:
+    so do pandas and most programs that write tables.
     """
 
     def __init__(self, path: Path, separator: str) -> None:
@@ -192,16 +185,8 @@ _PIECE = 1 << 18
 class Lines(io.TextIOWrapper):
     """A text that is read in pieces, none of whose lines and cells is without end.
 
-    Parameters
-    ----------
-    path : Path
-        The file, for the sentence.
-    stream : BinaryIO
-        Its bytes; closed with this.
-    encoding : str
-        What does not fit it is replaced.
-    separator : str
-        What parts the cells.
+    ``path`` is for sentences; ``stream`` is closed with this; what does not fit the encoding is
+    replaced.
     """
 
     def __init__(self, path: Path, stream: BinaryIO, encoding: str, separator: str) -> None:

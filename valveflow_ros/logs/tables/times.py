@@ -135,23 +135,9 @@ _FEW = 8
 class TimeReader:
     """Reads the column of time block by block, all blocks by the same rule.
 
-    Parameters
-    ----------
-    samples : list of str
-        Texts of the column from the whole file.
-    where : str
-        Name of the file, for sentences.
-    name : str
-        Name of the column, for sentences.
-    options : TableOptions
-        What the person said.
-    zone : str
-        A zone that the file itself names; what the person said goes before it.
-
-    Raises
-    ------
-    InputError
-        If dates can be read in two ways, or the zone is not known.
+    It takes texts of the column from the whole file, names of file and column for sentences, what
+    the person said, and a zone that the file names; what the person said goes before it. Raises
+    `InputError` if dates can be read in two ways, or the zone is not known.
     """
 
     def __init__(

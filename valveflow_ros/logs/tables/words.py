@@ -131,12 +131,7 @@ def spelling(text: str) -> Spelling | None:
 def of_gauge(found: Spelling | None, told: str) -> Spelling | None:
     """Return a unit as that of a gauge where words beside it say so: 'Überdruck [bar]'.
 
-    Parameters
-    ----------
-    found : Spelling or None
-        The unit as it is written, which says neither gauge nor absolute.
-    told : str
-        Name and description of the column.
+    ``told`` is name and description of the column.
     """
     if found is None or _squeezed(found.written) not in _OF_GAUGE:
         return found
@@ -231,14 +226,8 @@ _UMLAUTS = str.maketrans({'ä': 'ae', 'ö': 'oe', 'ü': 'ue', 'ß': 'ss'})
 def marks(name: str, about: str, unit: Spelling | None) -> dict[Signal, float]:
     """Return how well a column suits each signal; signals it does not suit are left out.
 
-    Parameters
-    ----------
-    name : str
-        The column's name without its unit.
-    about : str
-        What else the file says of it, as a row of descriptions under the header.
-    unit : Spelling or None
-        The unit that stands beside it.
+    The name comes without its unit; ``about`` is what else the file says of it, as a row of
+    descriptions under the header.
     """
     plain = name.strip()
     for info in SIGNALS:
