@@ -245,12 +245,12 @@ def choice_figure(choice: Choice, chosen: int) -> Figure:
     def colours(numbers: list[int]) -> list[str]:
         return [token('chosen' if k == chosen else 'data') for k in numbers]
 
-    def values_of(values: dict[int, float], axis: str, name: str, hover: str) -> Spec:
+    def values_of(values: dict[int, float], up: str, name: str, hover: str) -> Spec:
         j = sorted(values)
         sizes = [13 if k == chosen else 7 for k in j]
         return line(
             j, rounded([values[k] for k in j], 8), name, 'data', f'J = %{{x}}<br>{hover}',
-            width=1.5, mode='lines+markers', yaxis=axis, showlegend=False,
+            width=1.5, mode='lines+markers', yaxis=up, showlegend=False,
             marker={'size': sizes, 'color': colours(j)},
         )  # fmt: skip
 

@@ -75,14 +75,14 @@ def curve_figure(data: Identified) -> Figure:
     traces.append(_line(c.pieces, 'flow characteristic', 'curve', 2.6))
     if len(c.pieces) > 1:
         traces.append(_breakpoints(data))
-    layout = {
+    layout: Spec = {
         'xaxis': axis(input_axis(c.pressure_exponent)), 'yaxis': axis('generated power (MW)'),
     }  # fmt: skip
-    if (span := last_range(data)) is not None:
-        layout['shapes'] = [stripe(*span, 'today')]  # type: ignore[assignment]
-        layout['annotations'] = [  # type: ignore[assignment]
+    if (day := last_range(data)) is not None:
+        layout['shapes'] = [stripe(*day, 'today')]
+        layout['annotations'] = [
             {
-                'text': 'last day', 'showarrow': False, 'x': span[1], 'xanchor': 'right',
+                'text': 'last day', 'showarrow': False, 'x': day[1], 'xanchor': 'right',
                 'yref': 'paper', 'y': 0.01, 'yanchor': 'bottom', 'font': {'color': token('muted')},
             }
         ]  # fmt: skip
@@ -111,10 +111,10 @@ def _caption(data: Identified) -> str:
     )
     if data.reference is not None:
         parts.append('The dotted <span class="key reference">line</span> is the reference.')
-    if (span := last_range(data)) is not None:
+    if (day := last_range(data)) is not None:
         parts.append(
-            f'The tinted background is where the unit ran in the last day, u {span[0]:.0f} to '
-            f'{span[1]:.0f}.'
+            f'The tinted background is where the unit ran in the last day, u {day[0]:.0f} to '
+            f'{day[1]:.0f}.'
         )
     if c.pieces != c.partition_pieces:
         parts.append(

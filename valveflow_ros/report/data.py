@@ -291,10 +291,10 @@ def signals_figure(data: Identified) -> Figure:
     return Figure('signals', caption, words, traces, layout, height=560)
 
 
-def _panel(data: Identified, values: FloatArray, axis: str, unit: str, places: int) -> list[Spec]:
+def _panel(data: Identified, values: FloatArray, up: str, unit: str, places: int) -> list[Spec]:
     """Return the measured signal in grey and its special segments in colour."""
     time_ns = data.table.time_ns
-    shown: Spec = {'yaxis': axis, 'showlegend': axis == 'y'}
+    shown: Spec = {'yaxis': up, 'showlegend': up == 'y'}
     start_ns, step_ns, ends = envelope(time_ns, values, _DRAWN_STRETCHES, data.period_ns)
     measured = line(
         None, rounded(ends), 'measured', 'data-soft', width=1, x0=start_ns / 1e6,

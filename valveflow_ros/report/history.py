@@ -122,14 +122,15 @@ def moment_of(type_name: str, fields: Mapping[str, Any]) -> Moment | None:
     """
     time_ns, view = decoded(type_name, fields)
     if isinstance(view, AlarmView):
-        again = view.previous == view.state
+        again = fields.get('previous_state') == view.state
         return AlarmMoment(time_ns, view.name, AlarmState(view.state), view.sentence, again)
     if isinstance(view, DiagnosisView):
         return DiagnosisMoment(time_ns, view.sentence) if view.verdict and view.sentence else None
     if not isinstance(view, CurveView):
         return None
+    bounds = fields.get('breakpoint_low', ()), fields.get('breakpoint_high', ())
     u, power, low, high = (
-        np.array(v, dtype=np.float64) for v in (view.breakpoints, view.values, view.low, view.high)
+        np.array(v, dtype=np.float64) for v in (view.breakpoints, view.values, *bounds)
     )
     finite = np.all(np.isfinite(u)) and np.all(np.isfinite(power))
     if len(u) < 2 or len(power) != len(u) or not finite or np.any(np.diff(u) <= 0.0):

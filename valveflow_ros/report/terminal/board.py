@@ -139,7 +139,7 @@ def decoded(
     if type_name == ALARM:
         return time_ns, AlarmView(
             str(fields['name']), int(fields['state']), str(fields['sentence']).strip(),
-            _ns(fields['raised']), int(fields.get('previous_state', -1)),
+            _ns(fields['raised']),
         )  # fmt: skip
     if type_name == DIAGNOSIS:
         causes = tuple(str(cause['name']) for cause in fields['causes'])
@@ -152,7 +152,6 @@ def decoded(
         int(fields['samples']), float(fields['rmse_mw']),
         str(fields.get('shift_sentence', '')).strip(),
         float(fields.get('pressure_exponent', math.nan)),
-        _floats(fields.get('breakpoint_low', ())), _floats(fields.get('breakpoint_high', ())),
     )  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.words import counted, decimals, duration, moment, signed
@@ -54,8 +54,6 @@ class CurveView:
         The judgement against the reference; empty: none.
     exponent : float
         The m of u = V p^m; NaN: not told.
-    low, high : tuple of float
-        Where the inner breakpoints lie with 95 % confidence; empty or NaN: not told.
     """
 
     breakpoints: tuple[float, ...]
@@ -68,8 +66,6 @@ class CurveView:
     rmse_mw: float
     shift: str
     exponent: float = math.nan
-    low: tuple[float, ...] = field(default=(), compare=False)
-    high: tuple[float, ...] = field(default=(), compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,16 +97,12 @@ class SampleView:
 
 @dataclass(frozen=True, slots=True)
 class AlarmView:
-    """One alarm: its name, its place in `ALARM_STATES`, what it says, since when (0: never).
-
-    ``previous`` is the state before; -1: not told.
-    """
+    """One alarm: its name, its place in `ALARM_STATES`, what it says, since when (0: never)."""
 
     name: str
     state: int
     sentence: str
     raised_ns: int
-    previous: int = field(default=-1, compare=False)
 
     @property
     def standing(self) -> bool:

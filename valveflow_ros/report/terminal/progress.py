@@ -9,8 +9,6 @@ import time
 from collections.abc import Callable
 from typing import TextIO
 
-from valveflow_ros.report.words import duration
-
 _BAR = 20
 _REDRAW_S = 0.1
 _TICK_S = 0.5
@@ -160,5 +158,15 @@ class Progress:
 
 
 def in_words(seconds: float) -> str:
-    """Return '8 s', '2 min 10 s', '1 h 5 min': above a minute in steps of five seconds."""
-    return duration(round(seconds) if seconds < 60.0 else round(seconds / 5.0) * 5)
+    """Return '8 s', '2 min 10 s', '1 h 5 min': above a minute in steps of five seconds.
+
+    Not by `words.duration`: every verb loads this module first, and numpy must not come with it.
+    """
+    whole = round(seconds) if seconds < 60.0 else round(seconds / 5.0) * 5
+    if whole < 60:
+        return f'{whole} s'
+    minutes, rest = divmod(whole, 60)
+    if minutes < 60:
+        return f'{minutes} min {rest} s' if rest else f'{minutes} min'
+    hours, minutes = divmod(minutes, 60)
+    return f'{hours} h {minutes} min' if minutes else f'{hours} h'
