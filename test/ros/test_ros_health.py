@@ -18,6 +18,7 @@ from std_msgs.msg import Float32, Float64
 from valveflow_ros.curve.characteristic import Characteristic, Support
 from valveflow_ros.curve.shift import judge_shift
 from valveflow_ros.fit.result import NOT_REFINED
+from valveflow_ros.monitoring.alarm import AlarmAction
 from valveflow_ros.monitoring.alarms import Judged, ResidualAlarm
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_rows
@@ -408,7 +409,7 @@ def after(values: list[float], shelved: bool = False) -> Item:
     column = np.array(values)
     alarm.feed(time_ns, column, column, 'm')
     if shelved:
-        assert alarm.shelve(int(time_ns[-1]), 'm')[0]
+        assert alarm.operate(AlarmAction.SHELVE, int(time_ns[-1]), 'm')[0]
     monitor: Any = SimpleNamespace(alarm=alarm, judged=Judged(0, values[-1], values[-1]))
     return alarm_item(monitor)
 
