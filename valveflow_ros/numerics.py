@@ -1,4 +1,4 @@
-"""The one place where numba's flags are chosen."""
+"""Flags of the compiler, threads, and long sums whose bits do not depend on either."""
 
 from __future__ import annotations
 

@@ -114,7 +114,7 @@ def put_back(arrays: Mapping[str, NDArray[Any]], saved: State) -> None:
 # A state as bytes that tell by themselves whether they are whole; nothing in them is executed.
 
 FORMAT = b'valveflow-state'
-VERSION = 1
+VERSION = 2
 _ARRAY = '$array'
 _DIGEST = 64
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from valveflow_ros.cli.info import _fates
-from valveflow_ros.interface.observation import align
+from valveflow_ros.interface.alignment import align
 from valveflow_ros.logs import open_log, read_table
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Readings, Signal

@@ -20,7 +20,7 @@ from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
 from valveflow_ros.diagnosis.scene import make_scene
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import NS_PER_S, Quality, SampleTable, Signal
-from valveflow_ros.signals.units import integrated_input
+from valveflow_ros.signals.integrated_input import integrated_input
 from valveflow_ros.state import from_bytes, to_bytes
 
 pytestmark = pytest.mark.skipif(

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from valveflow_ros.errors import DataError
-from valveflow_ros.interface.observation import align, cut_in_two, observe
+from valveflow_ros.interface.alignment import align
+from valveflow_ros.interface.observation import cut_in_two, observe
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, Readings, SampleTable, Signal, table_to_readings
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -177,3 +178,52 @@ def test_a_line_without_end_is_refused(tmp_path, encoding):
         read_table(written(LONGEST_LINE + 1))
     with pytest.raises(RecordingError, match='a line of more than 1048576 letters'):
         read_table(written(9 * LONGEST_LINE))
+
+
+_SPREADSHEET = 'http://schemas.openxmlformats.org/spreadsheetml/2006/main'
+_OFFICE = 'http://schemas.openxmlformats.org/officeDocument/2006/relationships'
+_PACKAGE = 'http://schemas.openxmlformats.org/package/2006'
+_TEXT_CELLS = ''.join(
+    f'<row r="{k}"><c r="A{k}" t="s"><v>0</v></c></row>' for k in range(1, 150_001)
+)
+
+
+def _workbook(path: Path, rows: str, texts: str = '') -> Path:
+    """Write the parts of a workbook as they are given."""
+    sheet = f'<worksheet xmlns="{_SPREADSHEET}"><sheetData>{rows}</sheetData></worksheet>'
+    parts = {
+        '[Content_Types].xml': f'<Types xmlns="{_PACKAGE}/content-types">'
+        '<Default Extension="xml" ContentType="application/xml"/></Types>',
+        '_rels/.rels': f'<Relationships xmlns="{_PACKAGE}/relationships"><Relationship Id="r1" '
+        f'Type="{_OFFICE}/officeDocument" Target="xl/workbook.xml"/></Relationships>',
+        'xl/workbook.xml': f'<workbook xmlns="{_SPREADSHEET}" xmlns:r="{_OFFICE}"><sheets>'
+        '<sheet name="S" sheetId="1" r:id="r1"/></sheets></workbook>',
+        'xl/_rels/workbook.xml.rels': f'<Relationships xmlns="{_PACKAGE}/relationships">'
+        f'<Relationship Id="r1" Type="{_OFFICE}/worksheet" Target="worksheets/sheet1.xml"/>'
+        f'<Relationship Id="r2" Type="{_OFFICE}/sharedStrings" Target="sharedStrings.xml"/>'
+        '</Relationships>',
+        'xl/worksheets/sheet1.xml': sheet,
+        'xl/sharedStrings.xml': f'<sst xmlns="{_SPREADSHEET}">{texts}</sst>',
+    }
+    with zipfile.ZipFile(path, 'w', zipfile.ZIP_DEFLATED) as archive:
+        for name, content in parts.items():
+            archive.writestr(name, content)
+    return path
+
+
+@pytest.mark.parametrize(
+    ('rows', 'texts', 'sentence'),
+    [
+        (
+            f'<row r="1">{"<c/>" * 4000}</row><row r="1048576"><c/></row>', '',
+            '1048576 rows and 4000 columns, most of them empty',
+        ),
+        (f'{"<row><c/></row>" * 3000}<row><c r="XFD1"/></row>', '', '3001 rows and 16384 columns'),
+        (_TEXT_CELLS[:20_000], f'<si><t>{"x" * (1 << 20)}</t></si>', 'texts too long'),
+        (_TEXT_CELLS, f'<si><t>{"x" * 30_000}</t></si>', 'texts too long'),
+    ],
+    ids=['cells without a place', 'rows without a place', 'a text too long', 'a text too often'],
+)  # fmt: skip
+def test_a_small_workbook_that_would_fill_the_memory_is_refused(rows, texts, sentence, tmp_path):
+    with pytest.raises(RecordingError, match=sentence):
+        open_log(_workbook(tmp_path / 'bomb.xlsx', rows, texts))

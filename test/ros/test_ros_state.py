@@ -124,7 +124,7 @@ def test_whole_is_what_its_first_line_says(state: dict[str, Any]) -> None:
     """The slow truth: format, version and SHA-256 of all that follows the line."""
     line, content = to_bytes(state).split(b'\n', 1)
     # What stands on disks already.
-    assert line.startswith(b'valveflow-state 1 ')
+    assert line.startswith(b'valveflow-state 2 ')
     digest = hashlib.sha256(content).hexdigest().encode()
     assert line == FORMAT + b' ' + str(VERSION).encode() + b' ' + digest
 
@@ -173,9 +173,9 @@ def test_nothing_in_a_state_is_executed_however_well_it_is_signed(
         (signed(b'', name=b'other-state'), 'is none, or its beginning is damaged'),
         (FORMAT + b' 1 abc\n', 'is none, or its beginning is damaged'),
         (FORMAT + b' 1 ' + b'0' * 64 + b' more\n', 'is none, or its beginning is damaged'),
-        (FORMAT + b' 1 ' + b'0' * 64 + b'\nwhatever', 'its checksum is another one'),
-        (signed(b'', version=2), 'has version 2, this program reads 1'),
-        (signed(b'', version=0), 'has version 0, this program reads 1'),
+        (FORMAT + b' 2 ' + b'0' * 64 + b'\nwhatever', 'its checksum is another one'),
+        (signed(b'', version=3), 'has version 3, this program reads 2'),
+        (signed(b'', version=1), 'has version 1, this program reads 2'),
         (FORMAT + b' ' + b'9' * 50 + b' ' + b'0' * 64 + b'\n', f'version {"9" * 20}, this'),
         (FORMAT + b' \xff ' + b'0' * 64 + b'\n', 'version \ufffd, this'),
         (signed(b''), r'cannot be read \('),
@@ -578,7 +578,7 @@ def test_a_state_that_is_not_whole_is_a_sentence_and_never_an_exception(
                 'flipped': data[:half] + bytes([data[half] ^ 1]) + data[half + 1 :],
                 'empty': b'',
                 'junk': b'x' * 1000,
-                'newer': data.replace(b'state 1 ', b'state 2 ', 1),
+                'newer': data.replace(b'state 2 ', b'state 3 ', 1),
             }[how]
         )
     store = StateStore(settings(tmp_path))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -370,3 +371,15 @@ def test_memory_is_given_back_by_what_the_c_library_has_or_not_at_all(
     monkeypatch.setattr(worker_module.ctypes, 'CDLL', lambda _name: SimpleNamespace())
     worker_module.release_memory()
     assert asked == [0]
+
+
+def test_a_process_that_gets_no_descriptors_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse() -> None:
+        raise OSError(errno.EMFILE, 'Too many open files')
+
+    monkeypatch.setattr(worker_module.multiprocessing, 'Pipe', refuse)
+    with worker(FIT_JOB) as made:
+        assert made.pid is None
+        made.submit(TASK)
+        (outcome,) = wait_until(made.poll, 'the outcome')
+        assert 'could not be started (Too many open files)' in outcome.result

@@ -35,9 +35,9 @@ def run(options: Namespace, console: Console) -> Outcome:
     """Align and write."""
     mapping = mapping_of(options)
     from valveflow_ros.errors import DataError
+    from valveflow_ros.interface.alignment import align
     from valveflow_ros.interface.files import TABLES, check_output, write_log
     from valveflow_ros.interface.logs import open_log
-    from valveflow_ros.interface.observation import align
     from valveflow_ros.interface.settings import read_parameters, settings_for
     from valveflow_ros.report.words import counted, duration, moment
 

@@ -183,7 +183,7 @@ def _fates(
             info.topic: {'accepted': len(parts[info.signal]) if info.signal in parts else 0}
             for info in SIGNALS
         }
-    from valveflow_ros.interface.observation import align
+    from valveflow_ros.interface.alignment import align
 
     _, _, counts = align(readings, settings)
     return {

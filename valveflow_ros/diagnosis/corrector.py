@@ -39,7 +39,7 @@ from valveflow_ros.records import (
     SampleTable,
     Signal,
 )
-from valveflow_ros.signals.units import integrated_input
+from valveflow_ros.signals.integrated_input import integrated_input
 from valveflow_ros.state import Memory, State, put_back
 
 # What a cause with a memory does to rows as they come.

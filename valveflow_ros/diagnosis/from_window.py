@@ -20,7 +20,7 @@ from valveflow_ros.fit.refine import refine
 from valveflow_ros.monitoring.events import DiagnosisContent, DiagnosisTask
 from valveflow_ros.records import FloatArray, IntArray, Quality, SampleTable, Signal
 from valveflow_ros.segments.window import WindowContents
-from valveflow_ros.signals.units import integrated_input
+from valveflow_ros.signals.integrated_input import integrated_input
 
 # A model to begin with where special segments give none.
 

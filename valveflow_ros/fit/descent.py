@@ -50,11 +50,6 @@ def gauss_newton(
         The best one found.
     cost : float
 
-    Raises
-    ------
-    LinAlgError
-        The normal matrix is not finite.
-
     Notes
     -----
     Parameters are scaled to a normal matrix with a diagonal of one (Marquardt, J. SIAM 11,

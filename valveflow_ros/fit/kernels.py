@@ -1,8 +1,8 @@
 """Derivatives of curve and regional dynamics, a block of rows at a time.
 
-As in `answer_kernel`; what a row adds to each derivative is written down first, and then every row
-takes up what is left of the row before. While derivatives are formed the sequence of regions is
-taken as it is: letting it flip would turn tangents into spikes.
+As in `answer_residual`; what a row adds to each derivative is written down first, and then every
+row takes up what is left of the row before. While derivatives are formed the sequence of regions
+is taken as it is: letting it flip would turn tangents into spikes.
 """
 
 from __future__ import annotations

@@ -20,11 +20,12 @@ from valveflow_ros.diagnosis.result import Diagnosis, model_to_json, to_json
 from valveflow_ros.diagnosis.signature import views
 from valveflow_ros.errors import DataError
 from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface.alignment import align
 from valveflow_ros.interface.files import Result, signed
 from valveflow_ros.interface.logs import Log, as_log
 from valveflow_ros.interface.models import Model, load_model, with_exponent
 from valveflow_ros.interface.monitor import recorded_history
-from valveflow_ros.interface.observation import align, observe_log, settings_of
+from valveflow_ros.interface.observation import observe_log, settings_of
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SIGNALS, IntArray, SampleTable
 from valveflow_ros.report.diagnosis import Diagnosed, diagnosis_page

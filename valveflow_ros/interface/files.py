@@ -255,6 +255,9 @@ class Result:
         InputError
             The report has no picture of that name.
         """
+        from valveflow_ros.report.page import plotly_script
+
+        plotly_script()  # a sentence where plotly is missing
         import plotly.graph_objects as go
 
         from valveflow_ros.report.drawing import palette

@@ -17,11 +17,12 @@ from valveflow_ros.errors import DataError, UsageError
 from valveflow_ros.fit.step_levels import looks_like_step_test
 from valveflow_ros.fit.step_test import identify_step_test
 from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface.alignment import align
 from valveflow_ros.interface.files import Result, signed
 from valveflow_ros.interface.logs import Log, as_log
 from valveflow_ros.interface.models import load_characteristic, load_extended, with_exponent
 from valveflow_ros.interface.monitor import recorded_history
-from valveflow_ros.interface.observation import align, check_signals, observe_log, settings_of
+from valveflow_ros.interface.observation import check_signals, observe_log, settings_of
 from valveflow_ros.records import SampleTable, SpecialSegment
 from valveflow_ros.report.identification import identification_page
 from valveflow_ros.report.identified import Identified

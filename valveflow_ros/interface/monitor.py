@@ -17,10 +17,11 @@ from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.from_window import diagnose_window
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface.alignment import aligned_blocks
 from valveflow_ros.interface.files import Result
 from valveflow_ros.interface.logs import as_log
 from valveflow_ros.interface.models import load_characteristic, load_extended, with_exponent
-from valveflow_ros.interface.observation import aligned_blocks, check_signals
+from valveflow_ros.interface.observation import check_signals
 from valveflow_ros.interface.settings import settings_for
 from valveflow_ros.logs import LogContents
 from valveflow_ros.monitoring.alarm import AlarmChange, AlarmState

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit, outline
 from valveflow_ros.fit.task import FitTask
 from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface.alignment import Counts, aligned_blocks, corrected
 from valveflow_ros.interface.logs import Log
 from valveflow_ros.interface.settings import settings_for
 from valveflow_ros.monitoring.events import FitRequested
@@ -36,12 +37,10 @@ from valveflow_ros.report.data import REASON_WORDS
 from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.report.words import duration
 from valveflow_ros.segments.kernel import WARM_UP, WINDOW
-from valveflow_ros.signals.align import Aligned, Aligner
+from valveflow_ros.signals.align import Aligner
 
 _NEEDED = tuple(i for i in SIGNALS if i.required and i.topic != 'main_steam_temperature')
-_BLOCK = 200_000  # readings between two reports of progress
 LEARN_SHARE = 2.0 / 3.0
-Counts = dict[str, dict[str, int]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +117,7 @@ def observe(
     tables: list[SampleTable] = []
     resets = 0
     blocks = aligned_blocks(aligner, readings, progress, 'finding segments')
-    for aligned in ahead(_corrected(blocks, corrector)):
+    for aligned in ahead(corrected(blocks, corrector)):
         resets += len(aligned.resets)
         tables.append(aligned.table)
         feed_aligned(monitor, aligned)
@@ -143,49 +142,6 @@ def observe_log(
         progress.say(SENTENCE)
     corrector = None if model is None else corrector_of(model, settings.real('sample_period'))
     return observe(log.readings, settings, shown or progress, corrector)
-
-
-def align(
-    readings: Readings,
-    settings: Settings,
-    progress: Callable[[float, str], None] = SILENT,
-    corrector: Corrector | None = None,
-) -> tuple[SampleTable, IntArray, Counts]:
-    """Return all rows, the rows before which the clock was set back, and the counts."""
-    aligner = Aligner(settings)
-    tables: list[SampleTable] = []
-    resets: list[int] = []
-    blocks = aligned_blocks(aligner, readings, progress, 'putting rows together')
-    for aligned in _corrected(blocks, corrector):
-        resets += [sum(map(len, tables)) + int(k) for k in aligned.resets]
-        tables.append(aligned.table)
-    table = SampleTable.concatenate(tables)
-    return table, np.array(resets, dtype=np.int64), aligner.counts()
-
-
-def aligned_blocks(
-    aligner: Aligner, readings: Readings, progress: Callable[[float, str], None], what: str
-) -> Iterator[Aligned]:
-    """Yield the rows block by block, with those that only the end closes."""
-    for start in range(0, len(readings), _BLOCK):
-        progress(0.1 + 0.4 * start / len(readings), what)
-        yield aligner.feed(readings.part(start, min(start + _BLOCK, len(readings))))
-    yield aligner.finish()
-
-
-def _corrected(blocks: Iterator[Aligned], corrector: Corrector | None) -> Iterator[Aligned]:
-    """Yield blocks whose rows are freed of the causes of a corrector, if there is one."""
-    if corrector is None:
-        yield from blocks
-        return
-    for block in blocks:
-        tables, start = [], 0
-        for reset in block.resets.tolist():
-            tables.append(corrector.correct(block.table.part(start, reset)))
-            corrector.restart()
-            start = reset
-        tables.append(corrector.correct(block.table.part(start, len(block.table))))
-        yield Aligned(SampleTable.concatenate(tables), block.resets)
 
 
 def cut_in_two(log: Log, block_s: float) -> tuple[Log, Log]:

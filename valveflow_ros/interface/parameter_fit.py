@@ -11,8 +11,8 @@ from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface.alignment import aligned_blocks
 from valveflow_ros.interface.logs import Log, as_log
-from valveflow_ros.interface.observation import aligned_blocks
 from valveflow_ros.interface.settings import ONE_FIT, fitting
 from valveflow_ros.monitoring.events import FitRequested
 from valveflow_ros.monitoring.monitor import Monitor

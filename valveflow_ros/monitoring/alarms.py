@@ -1,4 +1,4 @@
-"""The residual alarm: whether the plant has left the curve, with delays and a dead band."""
+"""The alarms of the monitor: on the residual, on a shift of the curve, and both in one list."""
 
 from __future__ import annotations
 

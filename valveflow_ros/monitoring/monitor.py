@@ -45,9 +45,9 @@ class Monitor(Memory):
     Notes
     -----
     The state changes by rows and by the calls `adopt`, `refuse`, `operate_alarms`, `request_fit`,
-    `set_reference`, `request_diagnosis`, `restart` and `reconfigure`, and those of `diagnosing`,
-    nothing else, and each such call leaves a `JournalEntry` with the number of rows before it.
-    Rows and journal together give the same events again, bit for bit.
+    `set_reference`, `request_diagnosis`, `restart`, `resume` and `reconfigure`, and those of
+    `diagnosing`, nothing else, and each such call leaves a `JournalEntry` with the number of rows
+    before it. Rows and journal together give the same events again, bit for bit.
     """
 
     REMEMBERED = (

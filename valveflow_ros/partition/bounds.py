@@ -186,7 +186,7 @@ def make_priors(tree: Tree, limit: float) -> NDArray[np.float64]:
 #
 # For a child that ends at ``c`` inside a parent that ends at ``e``, the samples
 # ``[c, e)`` together with the parent's prior are a core in the sense of
-# `partition_bounds`: a quadratic in the line whose minimum lies at a line ``k``
+# `partition.bounds`: a quadratic in the line whose minimum lies at a line ``k``
 # that is an affine function of the line the parent is asked about. So
 #
 #     f_parent(m) >= (least of that quadratic)(m) + f_child(k(m)) ,

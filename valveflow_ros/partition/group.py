@@ -2,7 +2,7 @@
 
 Seen from a break far to the left, the ends of a group differ only in the tail:
 the group's own samples up to each end. The tail's share in the cost of the last
-piece is bounded the same way as the left part's (`partition_bounds`): about a
+piece is bounded the same way as the left part's (`partition.bounds`): about a
 reference line, with a share of the core's Gram matrix as prior, linearly in the
 line, over all ends at once.
 """

@@ -2,9 +2,9 @@
 
 Solves eqs. (19)-(23) of the paper. The samples are sorted by u, equal u are
 merged into one weighted level (a break inside equal u is meaningless), and the
-dynamic programme of `partition_layers` finds, for every J up to the largest,
+dynamic programme of `partition.search` finds, for every J up to the largest,
 the breaks of least cost. Candidates are left out only where a proven lower
-bound (`partition_bounds`) shows that they cannot be better, so the result is
+bound (`partition.bounds`) shows that they cannot be better, so the result is
 the optimum and not an estimate.
 """
 

@@ -4,7 +4,7 @@ Ends are taken a group at a time, from left to right within a run of groups. A
 group first tries the breaks that were best for the group before it, which
 nearly always are best again, and then goes through all candidate breaks from
 right to left, a node of the tree at a time. A node whose lower bound
-(`partition_bounds`) is no better than what is known for any end of the group
+(`partition.bounds`) is no better than what is known for any end of the group
 is passed over; otherwise its children are looked at, and of a leaf every
 single candidate, first by the same kind of bound and only then end by end.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,7 +29,6 @@ from valveflow_ros.report.figure import (
     token,
     upright,
 )
-from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import paragraph, table
 from valveflow_ros.report.words import (
     count,
@@ -40,6 +40,10 @@ from valveflow_ros.report.words import (
     percent,
     plain,
 )
+
+if TYPE_CHECKING:
+    from valveflow_ros.report.identified import Identified
+
 
 # The aligner's reasons as a person would say them, in the order of the table.
 REASON_WORDS = {

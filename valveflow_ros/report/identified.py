@@ -19,7 +19,7 @@ from valveflow_ros.records import (
     SpecialSegment,
 )
 from valveflow_ros.report.history import History
-from valveflow_ros.signals.units import integrated_input
+from valveflow_ros.signals.integrated_input import integrated_input
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,6 +47,7 @@ DIAGNOSIS_JOB = 'valveflow_ros.diagnosis.from_window:diagnose_window'
 Task = FitTask | DiagnosisTask
 
 _FIRST_PAUSE_S = 0.5
+_LAST_ANSWER_S = 1.0  # for what a process that has ended had sent
 _LONGEST_PAUSE_S = 60.0
 _MAX_ANSWER_BYTES = 16 << 20  # a curve takes some ten thousand
 _LONGEST_WARM_UP_S = 600.0
@@ -276,31 +277,41 @@ class Worker:
         The kernel ends the child when the thread that started it ends, so call this from one that
         lives as long as the monitor.
         """
-        ours, theirs = multiprocessing.Pipe()
-        arguments = str(os.getpid()), str(theirs.fileno()), self._job, str(self.nice), self.word
+        ends: list[Any] = []
         try:
+            ours, theirs = ends = list(multiprocessing.Pipe())
+            arguments = (
+                str(os.getpid()),
+                str(theirs.fileno()),
+                self._job,
+                str(self.nice),
+                self.word,
+            )
             process = subprocess.Popen(
                 [sys.executable, '-m', 'valveflow_ros.ros.worker', *arguments],
                 stdin=subprocess.DEVNULL,
+                # What a library prints while it loads is no result of the monitor.
+                stdout=2,
                 pass_fds=[theirs.fileno()],
                 env={**os.environ, **_ONE_THREAD},
                 # Ctrl-C in a terminal is for the monitor to deal with.
                 start_new_session=True,
             )
         except OSError as error:
-            ours.close()
+            for end in ends:
+                end.close()
             sentence = f'The {self.word} process could not be started ({error.strerror}).'
             self._failed(sentence, [] if outcomes is None else outcomes)
             return
-        finally:
-            theirs.close()
+        theirs.close()
         self.starts += 1
         self._process = process
         self._tasks, self._answers = queue.SimpleQueue(), queue.SimpleQueue()
-        threading.Thread(
+        self._exchange = threading.Thread(
             target=_exchange, args=(ours, process, self._tasks, self._answers),
             name=f'{self.word} exchange', daemon=True,
-        ).start()  # fmt: skip
+        )  # fmt: skip
+        self._exchange.start()
 
     def submit(self, task: Task) -> None:
         """Take a task; one that is still running is given up."""
@@ -333,6 +344,9 @@ class Worker:
         if self._process is None:
             pass
         elif self._process.poll() is not None:
+            # What it had said before it ended counts.
+            self._exchange.join(_LAST_ANSWER_S)
+            self._take_answers(outcomes)
             sentence = f'The {self.word} process ended unexpectedly ({self._end()}).'
             self._failed(sentence, outcomes)
         elif self._warming_since_s is not None:

@@ -1,4 +1,4 @@
-"""Four asynchronous signals become one table on a time grid.
+"""Asynchronous signals become one table on a time grid.
 
 A row stands at each multiple of the sample period. It holds, for each signal,
 the newest value whose stamp is not after the row (zero-order hold), as long as
@@ -7,7 +7,7 @@ required signal has spoken after it, or when any signal is `lateness` past it.
 Which rows come out, and what stands in them, depends only on the readings in
 their order, so a recording gives back the rows of the live run.
 
-Nothing is dropped without a count; see `align_kernel.REASONS`.
+Nothing is dropped without a count; see `REASONS`.
 """
 
 from __future__ import annotations

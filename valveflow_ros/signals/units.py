@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from valveflow_ros.errors import InputError
-from valveflow_ros.numerics import jit
 from valveflow_ros.records import SIGNALS, FloatArray, Signal
 
 
@@ -92,31 +91,3 @@ def convert(signal: Signal, name: str, values: FloatArray) -> FloatArray:
     """Convert ``values`` from the unit ``name`` to the engine's unit."""
     unit = unit_of(signal, name)
     return np.asarray(values, dtype=np.float64) * unit.scale + unit.offset
-
-
-# The integrated input u, and the units at the border under their old address.
-
-__all__ = ['UNITS', 'Unit', 'convert', 'integrated_input', 'unit_of']
-
-
-def integrated_input(
-    opening_percent: FloatArray, pressure_mpa: FloatArray, exponent: float = 1.125
-) -> FloatArray:
-    """Return u = V p^m, eq. (1) of the paper with m = 9/8, in % MPa^m.
-
-    NaN where an input is NaN or the pressure is not positive.
-    """
-    opening = np.ascontiguousarray(opening_percent, dtype=np.float64)
-    pressure = np.ascontiguousarray(pressure_mpa, dtype=np.float64)
-    u = np.empty(len(opening))
-    _integrated_input(opening, pressure, exponent, u)
-    return u
-
-
-@jit
-def _integrated_input(
-    opening: FloatArray, pressure: FloatArray, exponent: float, out: FloatArray
-) -> None:
-    """Write u row by row; a loop, so that blocks of any size round alike."""
-    for t in range(opening.size):
-        out[t] = opening[t] * pressure[t] ** exponent if pressure[t] > 0.0 else np.nan

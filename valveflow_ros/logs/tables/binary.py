@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 import re
 import tempfile
 import zipfile
@@ -30,6 +31,13 @@ _UNPACKED_TIMES = 200
 _CELLS_FREELY = 8 << 20
 _BYTES_PER_CELL = 16
 _PLACE = re.compile(rb'\br\s*=\s*["\']\s*([A-Za-z]{0,9})([0-9]{1,10})')
+# A cell or row that does not say where it stands is counted by the library, so by us too.
+_CELL = re.compile(rb'<(?:\w+:)?(c|row)[\s/>]')
+# The library copies a shared text for each cell that shows it.
+_SHARED = re.compile(rb't\s*=\s*["\']s["\']')
+_TEXT_END = re.compile(rb'</(?:\w+:)?si>')
+_LONGEST_TEXT = 32_767  # characters that Excel lets a cell hold, in bytes of XML at most ten times
+_SHARED_BYTES = 4 << 30
 _LONGEST_PLACE = 64
 _PIECE = 1 << 20
 _STAMPS = (datetime.date, datetime.time)  # and so datetime.datetime
@@ -217,28 +225,69 @@ def _copy_within_bounds(path: Path, copy: IO[bytes]) -> None:
                 f'more than the {most / 1e6:.0f} MB that are read of one its size; save the sheet '
                 'as CSV or Parquet',
             )
+        longest, shared = 0, 0
         for name, part in parts.items():
-            columns_met, rows, rest = set(), 0, b''
+            measured = _Measure()
             with archive.open(part) as source, out.open(name, 'w') as target:
                 while piece := source.read(_PIECE):
                     target.write(piece)
-                    places = set(_PLACE.findall(rest + piece))
-                    columns_met |= {column.upper() for column, _ in places}
-                    rows = max([rows, *(int(row) for _, row in places)])
-                    rest = piece[-_LONGEST_PLACE:]
-            _check_size(path, rows, columns_met, part.file_size)
+                    measured.add(piece)
+            _check_size(path, measured.rows, measured.columns, part.file_size)
+            longest, shared = max(longest, measured.longest_text), shared + measured.shared
+        if longest > 10 * _LONGEST_TEXT or longest * shared > _SHARED_BYTES:
+            raise RecordingError(
+                path, 'has texts too long for the cells of a sheet; save the table in it as CSV'
+            )
 
 
-def _check_size(path: Path, rows: int, columns_met: set[bytes], size: int) -> None:
+class _Measure:
+    """How far the cells of a part of a workbook reach, and how long its shared texts are."""
+
+    def __init__(self) -> None:
+        self.rows = self.columns = self.shared = self.longest_text = 0
+        self._unplaced_rows = self._in_row = self._since_text = 0
+        self._rest = b''
+
+    def add(self, piece: bytes) -> None:
+        """Take the next bytes; a mark that lies across two pieces is counted once."""
+        data = self._rest + piece
+        # What may go on in the next piece is looked at with it.
+        end = max(data.rfind(b'<'), 0) if len(piece) == _PIECE else len(data)
+        end = end if len(data) - end <= _LONGEST_PLACE else len(data)
+        data, self._rest = data[:end], data[end:]
+        for letters, row in _PLACE.findall(data):
+            self.rows = max(self.rows, int(row))
+            self.columns = max(self.columns, _column(letters.upper()))
+        for kind in _CELL.findall(data):
+            if kind == b'row':
+                self._unplaced_rows += 1
+                self._in_row = 0
+            else:
+                self._in_row += 1
+                self.columns = max(self.columns, self._in_row)
+        self.rows = max(self.rows, self._unplaced_rows)
+        self.shared += len(_SHARED.findall(data))
+        ends = [match.end() for match in _TEXT_END.finditer(data)]
+        if ends:
+            lengths = [ends[0] + self._since_text, *(b - a for a, b in itertools.pairwise(ends))]
+            self.longest_text = max(self.longest_text, *lengths)
+            self._since_text = len(data) - ends[-1]
+        else:
+            self._since_text += len(data)
+
+
+def _column(letters: bytes) -> int:
+    """Return the number of a column, 1 for A; 0 without letters."""
+    number = 0
+    for letter in letters:
+        number = 26 * number + letter - 64
+    return number
+
+
+def _check_size(path: Path, rows: int, columns: int, size: int) -> None:
     """Refuse a sheet whose cells span a rectangle out of proportion to the bytes of the sheet."""
     if rows > _SHEET_ROWS:
         raise RecordingError(path, f'has more than the {_SHEET_ROWS} rows of a sheet')
-    columns = 0
-    for word in columns_met:
-        number = 0
-        for letter in word:
-            number = 26 * number + letter - 64
-        columns = max(columns, number)
     if rows * columns > max(_CELLS_FREELY, size // _BYTES_PER_CELL):
         raise RecordingError(
             path,
