@@ -11,7 +11,7 @@ from alarm_story import held_in
 from streams import START_NS
 
 from valveflow_ros.errors import DataError
-from valveflow_ros.monitoring.alarm import AlarmAction, AlarmLife
+from valveflow_ros.monitoring.alarm import AlarmAction, AlarmStateMachine
 from valveflow_ros.monitoring.alarms import AlarmState, Priority, ResidualAlarm
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S
@@ -210,7 +210,7 @@ def test_what_does_not_fit_is_not_restored():
 
 
 def test_a_life_without_events_is_normal():
-    life = AlarmLife()
+    life = AlarmStateMachine()
     assert (life.state, life.standing, life.acknowledge(), life.unshelve(), life.shelve(1)) == (
         NORMAL, False, False, False, False,
     )  # fmt: skip

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from partition_kinds import samples, valve
 
 from valveflow_ros.errors import DataError, ParameterError
+from valveflow_ros.partition.paper_rule import paper_rule, select
 from valveflow_ros.partition.partition import partition
-from valveflow_ros.partition.selection import paper_rule, select
 
 COMPILED = not numba.config.DISABLE_JIT
 N = 2000 if COMPILED else 150

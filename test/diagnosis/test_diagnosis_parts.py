@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from valveflow_ros.diagnosis import kernels, record_faults
-from valveflow_ros.diagnosis.cause import Active, Stage, Told
+from valveflow_ros.diagnosis.cause import Active, SentenceValues, Stage
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.evidence import sign_flip
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
@@ -57,7 +57,7 @@ def test_the_catalogue_holds_what_it_promises():
         assert set(cause.confusers) <= NAMES - {name}
         assert cause.experiment.endswith('.')
         keys = [u.name for u in cause.unknowns]
-        said = cause.sentence(Told(zip(keys, TYPICAL[name], strict=True)))
+        said = cause.sentence(SentenceValues(zip(keys, TYPICAL[name], strict=True)))
         assert said.endswith('.')
         assert said[0].isupper()
 

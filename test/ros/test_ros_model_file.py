@@ -16,25 +16,25 @@ from valveflow_ros.errors import ParameterError, RecordingError
 from valveflow_ros.logs import open_log
 from valveflow_ros.parameters import Settings
 from valveflow_ros.ros import verify as verifying
-from valveflow_ros.ros.node import given_files
+from valveflow_ros.ros.node import parameter_files
 from valveflow_ros.ros.node.session import Session
 
 HELD = {'backlash': {'w_percent': 0.5}, 'gain_drift': {'g': 0.05}, 'clock': {'d_s': 3.0}}
 
 
 def test_a_model_is_read_from_its_file(tmp_path: Path) -> None:
-    assert given_files.given_model(Settings()) is None
-    assert given_files.corrector_for(None, Settings()) is None
-    assert given_files.model_attachment(None) == {}
+    assert parameter_files.given_model(Settings()) is None
+    assert parameter_files.corrector_for(None, Settings()) is None
+    assert parameter_files.model_attachment(None) == {}
     path = write_extended(tmp_path / 'extended_model.json', **HELD)
     settings = Settings({'model_file': str(path)})
-    given = given_files.given_model(settings)
+    given = parameter_files.given_model(settings)
     assert given is not None
     assert model_to_json(given) == extended_json(**HELD)
-    corrector = given_files.corrector_for(given, settings)
+    corrector = parameter_files.corrector_for(given, settings)
     assert corrector is not None
     assert [h.name for h in corrector.held] == list(HELD)
-    kept = given_files.model_attachment(given)[given_files.ATTACHMENT]
+    kept = parameter_files.model_attachment(given)[parameter_files.ATTACHMENT]
     assert json.loads(kept) == extended_json(**HELD)
 
 
@@ -58,7 +58,7 @@ def test_a_bad_file_is_refused_with_a_sentence(
     if text is not None:
         path.write_text(text, encoding='utf-8', errors='surrogateescape')
     of_model = parameter == 'model_file'
-    read = given_files.given_model if of_model else given_files.given_reference
+    read = parameter_files.given_model if of_model else parameter_files.given_reference
     with pytest.raises(ParameterError) as caught:
         read(Settings({parameter: str(path)}))
     # An extended model is no curve, whatever is wrong with it.
@@ -97,7 +97,7 @@ def test_the_node_takes_causes_out_and_its_recording_repeats(
     assert result.identical, result.difference
     assert result.compared['prediction'] > 1500
     log = open_log(folder)
-    assert json.loads(log.attachments[given_files.ATTACHMENT]) == extended_json(**HELD)
+    assert json.loads(log.attachments[parameter_files.ATTACHMENT]) == extended_json(**HELD)
     # Rows as measured would have another u from the first one on.
     monkeypatch.setattr(verifying, 'corrector_of_run', lambda *_: None)
     assert 'Prediction number 1 differs' in verifying.verify(folder).difference
@@ -108,7 +108,7 @@ def test_a_recording_without_its_model_is_not_verified(tmp_path: Path) -> None:
     settings = Settings({'model_file': 'gone.json'})
     with pytest.raises(RecordingError, match='lacks the attachment'):
         verifying.corrector_of_run(log, settings)  # type: ignore[arg-type]
-    log.attachments = {given_files.ATTACHMENT: b'{}'}
+    log.attachments = {parameter_files.ATTACHMENT: b'{}'}
     with pytest.raises(RecordingError, match='an extended model that cannot be used'):
         verifying.corrector_of_run(log, settings)  # type: ignore[arg-type]
     assert verifying.corrector_of_run(log, Settings()) is None  # type: ignore[arg-type]

@@ -32,8 +32,8 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.ros import encoding
 from valveflow_ros.ros.decoding import from_time, journal_entry
-from valveflow_ros.ros.node.given_files import given_reference
 from valveflow_ros.ros.node.health import reference_item
+from valveflow_ros.ros.node.parameter_files import given_reference
 from valveflow_ros.ros.outputs import Outputs
 from valveflow_ros.ros.verify import verify
 

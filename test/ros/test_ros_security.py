@@ -25,8 +25,8 @@ from valveflow_ros.logs import Recorder, RecorderSettings, open_log
 from valveflow_ros.parameters import TABLE, Settings
 from valveflow_ros.ros import domain, monitor_main, replay_main, simulator_main
 from valveflow_ros.ros.domain import InsecureError, check_security
-from valveflow_ros.ros.node.given_files import given_model, given_reference
 from valveflow_ros.ros.node.monitor_node import MonitorNode
+from valveflow_ros.ros.node.parameter_files import given_model, given_reference
 from valveflow_ros.ros.node.recording import Recording, new_folder
 from valveflow_ros.ros.node.state_store import LOCK
 

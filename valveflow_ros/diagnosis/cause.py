@@ -162,7 +162,7 @@ class Unknown:
     dated: bool = False
 
 
-class Told(dict[str, float]):
+class SentenceValues(dict[str, float]):
     """Values by name, for a sentence.
 
     Attributes
@@ -208,7 +208,7 @@ class Cause:
     starts : callable
         Takes the `Screening` and returns promising values, none if there are none.
     sentence : callable
-        Takes what is to be told (see `Told`) and says what is wrong, for an operator.
+        Takes what is to be told (see `SentenceValues`) and says what is wrong, for an operator.
     hindered : callable
         Why the record cannot judge this cause; empty if it can.
     confusers : tuple of str
@@ -223,7 +223,7 @@ class Cause:
     unknowns: tuple[Unknown, ...]
     act: Callable[..., Any]
     starts: Callable[[Any], Sequence[Start]]
-    sentence: Callable[[Told], str]
+    sentence: Callable[[SentenceValues], str]
     confusers: tuple[str, ...]
     experiment: str
     hindered: Callable[[Scene], str] = field(default=lambda scene: '')
@@ -296,4 +296,4 @@ class Active:
                 bare = Estimate(values[u.name], math.nan, math.nan, u.unit, start_ns)
                 at, between = dates(estimates[u.name] if estimates else bare)
                 onset = f'{at} on (95 % interval {between})' if between else f'{at} on'
-        return self.cause.sentence(Told(values, onset))
+        return self.cause.sentence(SentenceValues(values, onset))

@@ -9,7 +9,7 @@ import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import actuator
-from valveflow_ros.diagnosis.cause import Estimate, Told
+from valveflow_ros.diagnosis.cause import Estimate, SentenceValues
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.evidence import (
     Certainty,
@@ -101,7 +101,11 @@ def actuator_cause(found: Found) -> tuple[NamedCause, ...]:
         NamedCause(
             fault.name,
             _BETWEEN
-            + (_SLACK.format(**values) if 'w_percent' in values else cause.sentence(Told(values))),
+            + (
+                _SLACK.format(**values)
+                if 'w_percent' in values
+                else cause.sentence(SentenceValues(values))
+            ),
             {k: Estimate(*v, units[k]) for k, v in fault.parameters.items()},
             gain,
             cause.experiment,

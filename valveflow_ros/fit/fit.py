@@ -29,8 +29,8 @@ from valveflow_ros.fit.task import (
     valve_moved,
 )
 from valveflow_ros.fit.whitening import inflation
+from valveflow_ros.partition.paper_rule import select
 from valveflow_ros.partition.partition import Partition, partition
-from valveflow_ros.partition.selection import select
 from valveflow_ros.records import ByteArray, FloatArray, SegmentKind
 from valveflow_ros.segments.window import WindowContents
 

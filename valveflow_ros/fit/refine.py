@@ -17,7 +17,13 @@ import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.errors import TooFewSamplesError
-from valveflow_ros.fit.knots import choose_pieces, confidence, find_jumps, shifted, supported_jumps
+from valveflow_ros.fit.piece_selection import (
+    choose_pieces,
+    confidence,
+    find_jumps,
+    shifted,
+    supported_jumps,
+)
 from valveflow_ros.fit.problem import (
     Problem,
     Samples,

@@ -16,7 +16,7 @@ from valveflow_ros.curve.characteristic import (
 )
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.errors import counted
-from valveflow_ros.fit.knots import evidence_words
+from valveflow_ros.fit.piece_selection import evidence_words
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.fit.refine import Refined
 from valveflow_ros.fit.residual_chart import design_chart

@@ -92,7 +92,7 @@ class Judged(NamedTuple):
     shift_mw: float
 
 
-class AlarmLife(Memory):
+class AlarmStateMachine(Memory):
     """Keep the state of one alarm; know neither why it comes nor who is told.
 
     Three layers lie upon one another: the condition with its acknowledgement, suppression while
@@ -243,7 +243,7 @@ class Content(NamedTuple):
     sentence: str
 
 
-class Alarm(AlarmLife, ABC):
+class Alarm(AlarmStateMachine, ABC):
     """An alarm whose changes are announced.
 
     The state is always true; what is announced follows it, held back by the flood limit. What was
@@ -266,7 +266,7 @@ class Alarm(AlarmLife, ABC):
     NAME = ''
 
     REMEMBERED = (
-        *AlarmLife.REMEMBERED, '_flood', '_told', '_now', '_before', '_waits', '_told_ns',
+        *AlarmStateMachine.REMEMBERED, '_flood', '_told', '_now', '_before', '_waits', '_told_ns',
         '_others',
     )  # fmt: skip
 

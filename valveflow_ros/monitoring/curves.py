@@ -35,7 +35,7 @@ class CurveStatus(enum.IntEnum):
     REFUSED = 3
 
 
-class CurveInForce:
+class RunningCurve:
     """Holds the running curve and its predictor.
 
     Parameters
@@ -271,8 +271,8 @@ class Refits(Memory):
         """Wait no longer for the outcome that was asked for; its segments count as new."""
         if self.pending_ns is not None:
             self.pending_ns = None
-            self.owe()
+            self.count_as_new()
 
-    def owe(self) -> None:
+    def count_as_new(self) -> None:
         """Let the segments of the last request count as new."""
         self._segments_at_request = min(self._segments_at_request, self.segments_seen - 1)

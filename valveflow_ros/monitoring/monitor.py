@@ -11,7 +11,7 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.fit.task import FitTask
 from valveflow_ros.monitoring.alarm import AlarmAction
 from valveflow_ros.monitoring.alarms import Alarms, Judged, ResidualAlarm
-from valveflow_ros.monitoring.curves import CurveInForce, CurveStatus, ReferenceCurve, Refits
+from valveflow_ros.monitoring.curves import CurveStatus, ReferenceCurve, Refits, RunningCurve
 from valveflow_ros.monitoring.diagnosis_requests import DiagnosisRequests
 from valveflow_ros.monitoring.events import (
     CurveAdopted,
@@ -61,7 +61,7 @@ class Monitor(Memory):
         self._segmenter = Segmenter(settings)
         self._window = RollingWindow.of(settings)
         self.alarm = ResidualAlarm(settings)
-        self._force = CurveInForce(settings)
+        self._force = RunningCurve(settings)
         self._rows = 0
         self._last_ns = 0
         self._went_back = False
@@ -237,7 +237,7 @@ class Monitor(Memory):
         pending = self._refits.pending_ns
         events: list[Event] = [] if pending is None else self.refuse(pending, reason)
         # What the curve stands on may have changed, and a fit that was running is lost.
-        self._refits.owe()
+        self._refits.count_as_new()
         self._correction.restart()
         self._went_back = True
         events += self.diagnosing.restart(reason)

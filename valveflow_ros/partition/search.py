@@ -213,7 +213,9 @@ def _descend(tree: Tree, layer: Layer, block: int, group: Group) -> int:
 
 
 @kernel
-def _sow(tree: Tree, layer: Layer, block: int, seeds: IntArray, count: int, group: Group) -> None:
+def _try_breaks(
+    tree: Tree, layer: Layer, block: int, seeds: IntArray, count: int, group: Group
+) -> None:
     """Try the breaks that were best for the group before this one."""
     for q in range(count):
         break_ = seeds[q]
@@ -223,7 +225,7 @@ def _sow(tree: Tree, layer: Layer, block: int, seeds: IntArray, count: int, grou
 
 
 @inlined
-def _harvest(group: Group, seeds: IntArray) -> int:
+def _collect_breaks(group: Group, seeds: IntArray) -> int:
     """Collect the different breaks of a group; return how many."""
     count = 0
     last = -1
@@ -270,14 +272,14 @@ def search_groups(
     for block in range(first, last):
         open_group(tree, block, layer.pieces * layer.shortest, group)
         if block > 0:
-            _sow(tree, layer, block, seeds, count, group)
+            _try_breaks(tree, layer, block, seeds, count, group)
         search_near(
             tree, layer.near, layer.before, block, layer.shortest, layer.slack,
             group.best, group.breaks,
         )  # fmt: skip
         if block > 0:
             leaves += _descend(tree, layer, block, group)
-        count = _harvest(group, seeds)
+        count = _collect_breaks(group, seeds)
         for k in range(LEAF):
             end = LEAF * block + 1 + k
             after[end] = group.best[k] if group.breaks[k] >= 0 else np.inf

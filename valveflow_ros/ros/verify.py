@@ -21,7 +21,7 @@ from valveflow_ros.monitoring.rows import Corrector
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import Readings
 from valveflow_ros.ros.decoding import Decoder, journal_entry
-from valveflow_ros.ros.node import given_files
+from valveflow_ros.ros.node import parameter_files
 from valveflow_ros.ros.node.recording import PARAMETERS, TOPICS
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
 from valveflow_ros.ros.worker import DiagnosisWorker
@@ -90,13 +90,13 @@ def corrector_of_run(log: LogContents, settings: Settings) -> Corrector | None:
     RecordingError
         The model is not in the recording, or cannot be used.
     """
-    if not settings.text(given_files.MODEL_FILE):
+    if not settings.text(parameter_files.MODEL_FILE):
         return None
     try:
-        model = result.model_from_json(json.loads(log.attachments[given_files.ATTACHMENT]))
-        return given_files.corrector_for(model, settings)
+        model = result.model_from_json(json.loads(log.attachments[parameter_files.ATTACHMENT]))
+        return parameter_files.corrector_for(model, settings)
     except KeyError:
-        problem = f"lacks the attachment '{given_files.ATTACHMENT}' that its run was made with"
+        problem = f"lacks the attachment '{parameter_files.ATTACHMENT}' that its run was made with"
         raise RecordingError(log.path, problem) from None
     except (ValueError, ValveflowError) as error:
         problem = f'holds an extended model that cannot be used ({str(error).rstrip(".")})'

@@ -8,7 +8,16 @@ import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import kernels
-from valveflow_ros.diagnosis.cause import Active, Cause, Kind, Stage, Start, Told, Unknown, Values
+from valveflow_ros.diagnosis.cause import (
+    Active,
+    Cause,
+    Kind,
+    SentenceValues,
+    Stage,
+    Start,
+    Unknown,
+    Values,
+)
 from valveflow_ros.diagnosis.scene import DAY_S, Scene
 from valveflow_ros.diagnosis.screening import GAIN, INPUT, OFFSET, Screening
 from valveflow_ros.errors import counted
@@ -114,7 +123,7 @@ def gain_step_starts(screening: Screening) -> Sequence[Start]:
     return screening.best_onset(GAIN_STEP, screening.only(GAIN))
 
 
-def gain_step_sentence(values: Told) -> str:
+def gain_step_sentence(values: SentenceValues) -> str:
     """Say it."""
     return (
         f'From {values.onset} the same flow gives {change(values["g"])} power, at every '
@@ -191,7 +200,7 @@ def input_step_starts(screening: Screening) -> Sequence[Start]:
     return screening.best_onset(INPUT_STEP, screening.only(INPUT))
 
 
-def input_step_sentence(values: Told) -> str:
+def input_step_sentence(values: SentenceValues) -> str:
     """Say it."""
     return (
         f'From {values.onset} the same reading of opening and pressure passes '

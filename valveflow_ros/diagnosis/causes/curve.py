@@ -10,7 +10,15 @@ import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import kernels
-from valveflow_ros.diagnosis.cause import Cause, Kind, Stage, Start, Told, Unknown, Values
+from valveflow_ros.diagnosis.cause import (
+    Cause,
+    Kind,
+    SentenceValues,
+    Stage,
+    Start,
+    Unknown,
+    Values,
+)
 from valveflow_ros.diagnosis.causes.changes import ONSET, a_day, since
 from valveflow_ros.diagnosis.scene import Scene
 from valveflow_ros.diagnosis.screening import CURVE, HATS, Screening
@@ -115,7 +123,7 @@ def curve_step_starts(screening: Screening) -> Sequence[Start]:
     return screening.best(CURVE_STEP, [values])
 
 
-def curve_step_sentence(values: Told) -> str:
+def curve_step_sentence(values: SentenceValues) -> str:
     """Say it."""
     return (
         f'From {values.onset} the curve lacks part of its course: '

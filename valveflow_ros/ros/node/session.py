@@ -16,7 +16,7 @@ from valveflow_ros.logs import RecorderStatus
 from valveflow_ros.monitoring.events import Event
 from valveflow_ros.parameters import Settings
 from valveflow_ros.ros.decoding import INPUTS, Decoder
-from valveflow_ros.ros.node import given_files, health
+from valveflow_ros.ros.node import health, parameter_files
 from valveflow_ros.ros.node.diagnostics import Item, Level, line_of
 from valveflow_ros.ros.node.engine import LiveEngine, warm_up
 from valveflow_ros.ros.node.intake import Intake, LogClock
@@ -63,8 +63,8 @@ class Session:
         self._node = node
         self._log = log
         self._settings = settings
-        self._reference = given_files.given_reference(settings)
-        self._model = given_files.given_model(settings)
+        self._reference = parameter_files.given_reference(settings)
+        self._model = parameter_files.given_model(settings)
         self.inputs = {topic.name: node.resolve_topic_name(topic.name) for topic in INPUTS}
         self.outputs = {name: node.resolve_topic_name(f'~/{name}') for name in OUTPUTS}
         self._store = StateStore(settings)
@@ -244,7 +244,7 @@ class Session:
             self.publish(monitor.set_reference(given))
 
     def _make_engine(self, settings: Settings) -> LiveEngine:
-        corrector = given_files.corrector_for(self._model, settings)
+        corrector = parameter_files.corrector_for(self._model, settings)
         return LiveEngine(settings, self._fit_worker, self._diagnosis_worker, corrector)
 
     def _save_state(self) -> None:
@@ -268,7 +268,7 @@ class Session:
 
     def _open_recording(self) -> Recording:
         topics: dict[str, Any] = {'inputs': self.inputs, 'outputs': self.outputs}
-        attachments = given_files.model_attachment(self._model)
+        attachments = parameter_files.model_attachment(self._model)
         folder, began = self._restart.folder, self._restart.began
         recording = Recording(self._settings, topics, time.time(), attachments, folder, began)
         reliable = self._settings.text('input_reliability') == 'reliable'
