@@ -383,3 +383,33 @@ def test_a_process_that_gets_no_descriptors_is_an_outcome(monkeypatch: pytest.Mo
         made.submit(TASK)
         (outcome,) = wait_until(made.poll, 'the outcome')
         assert 'could not be started (Too many open files)' in outcome.result
+
+
+def killed(made: FitWorker) -> None:
+    """Kill the process of a worker and wait until its end can be seen."""
+    process = made._process
+    assert process is not None
+    process.kill()
+    wait_until(lambda: process.poll() is not None, 'the end of the process')
+
+
+def test_an_answer_that_comes_with_the_end_of_its_process_counts() -> None:
+    with worker('hangs') as made:
+        made.submit(TASK)
+        killed(made)
+        made._exchange.join()
+        while not made._answers.empty():
+            made._answers.get()
+        answer = made._number, result_to_bytes(hurt_jobs.good(TASK))
+        made._exchange = SimpleNamespace(join=lambda _seconds: made._answers.put(answer))
+        (outcome,) = made.poll()
+        assert isinstance(outcome.result, Characteristic)
+        assert made.pid is None
+
+
+def test_nothing_is_waited_for_where_an_idle_process_ends() -> None:
+    with worker('good') as made:
+        killed(made)
+        made._exchange = SimpleNamespace(join=lambda _seconds: pytest.fail('waited'))
+        assert made.poll() == []
+        assert made.pid is None

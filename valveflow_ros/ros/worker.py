@@ -344,11 +344,13 @@ class Worker:
         if self._process is None:
             pass
         elif self._process.poll() is not None:
-            # What it had said before it ended counts.
-            self._exchange.join(_LAST_ANSWER_S)
-            self._take_answers(outcomes)
-            sentence = f'The {self.word} process ended unexpectedly ({self._end()}).'
-            self._failed(sentence, outcomes)
+            if self._running is not None:
+                # What it had said before it ended counts; an idle thread has nothing to say.
+                self._exchange.join(_LAST_ANSWER_S)
+                self._take_answers(outcomes)
+            if self._process is not None:
+                sentence = f'The {self.word} process ended unexpectedly ({self._end()}).'
+                self._failed(sentence, outcomes)
         elif self._warming_since_s is not None:
             # It may be compiling. What waits behind it has not begun.
             if now_s - self._warming_since_s > _LONGEST_WARM_UP_S:
