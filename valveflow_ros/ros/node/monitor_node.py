@@ -308,9 +308,10 @@ class MonitorNode(LifecycleNode):
             return
         status = session.close()
         if status is not None:
-            self.get_logger().info(
-                f'Recorded {counted(status.written, "message")} to {session.recording.folder}.'
-            )
+            told = f'Recorded {counted(status.written, "message")} to {session.recording.folder}.'
+            if status.removed:
+                told += f' {status.removed} more were in files that were removed since.'
+            self.get_logger().info(told)
         if status is not None and session.recording.problem:
             self.get_logger().error(session.recording.problem)
 
