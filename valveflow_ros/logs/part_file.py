@@ -25,11 +25,7 @@ _BLOCK = 1 << 20
 
 
 class AlteredError(OSError):
-    """Another program changed a file that is being written."""
-
-
-class GoneError(AlteredError):
-    """Another program removed, renamed or replaced a file that is being written."""
+    """Another program removed, replaced or changed a file that is being written."""
 
 
 class Writable(Protocol):
@@ -136,13 +132,13 @@ class PartFile:
         self.close()
 
     def _check_name(self, path: Path) -> None:
-        """Raise `GoneError` unless ``path`` names the file that is open."""
+        """Raise `AlteredError` unless ``path`` names the file that is open."""
         try:
             named = path.lstat()
         except (FileNotFoundError, NotADirectoryError):
-            raise GoneError('was removed or renamed by another program') from None
+            raise AlteredError('was removed or renamed by another program') from None
         if not os.path.samestat(named, os.fstat(self._descriptor)):
-            raise GoneError('was replaced by another file')
+            raise AlteredError('was replaced by another file')
 
 
 def _made(part: Path) -> int:

@@ -29,7 +29,6 @@ from valveflow_ros.logs.mcap.recover import intact_messages
 from valveflow_ros.logs.part_file import (
     PART_SUFFIX,
     AlteredError,
-    GoneError,
     PartFile,
     Writable,
     make_folder,
@@ -469,8 +468,8 @@ class RecordingWriter:
         """Let go of the split at hand, which another program altered; count what it took away."""
         file = self._at_hand
         self.abandon()
-        gone = isinstance(error, GoneError)
-        self._lose(file, 0 if gone else intact_messages(file.path), str(error))
+        # Its name may be a link to where it was moved.
+        self._lose(file, intact_messages(file.path), str(error))
 
     def _recount(self, file: _File) -> None:
         """Count the messages of an earlier split again, which another program altered."""
