@@ -83,16 +83,8 @@ def empty_folder(path: Path) -> None:
     path.parent.mkdir()
 
 
-FILE_ACTS = (
-    unlink,
-    move_away,
-    replace_by_link,
-    replace_by_another,
-    empty,
-    halve,
-    append,
-    overwrite,
-)
+GONE = (unlink, move_away, replace_by_another)
+FILE_ACTS = (*GONE, replace_by_link, empty, halve, append, overwrite)
 FOLDER_ACTS = (remove_folder, move_folder, empty_folder)
 Act = Callable[[Path], None]
 
