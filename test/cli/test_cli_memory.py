@@ -22,11 +22,13 @@ def test_a_limited_process_works_or_says_what_it_needs(
     names = 'time,valve_opening,main_steam_pressure,main_steam_temperature,generated_power'
     log.write_text('\n'.join([names, *rows]))
 
+    more = ['-o', str(tmp_path / 'out')] if verb == 'identify' else []
+
     def limited() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (limit_mib * MIB, limit_mib * MIB))
 
     done = subprocess.run(
-        [sys.executable, '-m', 'valveflow_ros.cli.main', verb, str(log)], preexec_fn=limited,
+        [sys.executable, '-m', 'valveflow_ros.cli.main', verb, str(log), *more], preexec_fn=limited,
         capture_output=True, text=True, check=False, cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode in (0, 1), 'it died of a signal'
