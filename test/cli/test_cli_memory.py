@@ -27,10 +27,10 @@ def test_a_limited_process_works_or_says_what_it_needs(
     def limited() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (limit_mib * MIB, limit_mib * MIB))
 
+    command = [sys.executable, '-m', 'valveflow_ros.cli.main', verb, str(log), *more]
     done = subprocess.run(
-        [sys.executable, '-m', 'valveflow_ros.cli.main', verb, str(log), *more], preexec_fn=limited,
-        capture_output=True, text=True, check=False, cwd=tmp_path,
-    )  # fmt: skip
+        command, preexec_fn=limited, capture_output=True, text=True, check=False, cwd=tmp_path
+    )
     assert done.returncode in (0, 1), 'it died of a signal'
     if done.returncode:
         assert f'may use {limit_mib} MiB of address space' in done.stderr
