@@ -27,6 +27,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
@@ -45,6 +46,8 @@ RUNS = 200
 ACTS = (2, 5)
 # Between two acts; the recorder looks twice a second.
 PAUSE_S = (0.0, 1.5)
+# Finished files are looked at each 2 s, and the health comes once a second.
+HEALTH_S = 3.5
 PERIOD_S = 0.01
 PATIENCE_S = 60.0
 END_S = 10.0
@@ -92,10 +95,7 @@ class Gateway:
 
     def __init__(self) -> None:
         self.node = rclpy.create_node('adversary')
-        self._inputs = [
-            (self.node.create_publisher(Float64, info.topic, MANY), VALUES[info.topic])
-            for info in SIGNALS if info.required
-        ]  # fmt: skip
+        self._inputs = self._publishers()
         self.health: dict[str, str] = {}
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._heard, MANY)
         name = '/valveflow_monitor'
@@ -108,9 +108,21 @@ class Gateway:
         )
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
-        self._going = True
+        self._going, self._renew = True, threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
+
+    def _publishers(self) -> list[tuple[Publisher, float]]:
+        return [
+            (self.node.create_publisher(Float64, info.topic, MANY), VALUES[info.topic])
+            for info in SIGNALS if info.required
+        ]  # fmt: skip
+
+    def start_again(self) -> None:
+        """Publish with new publishers, as a gateway that was started again."""
+        self._renew.set()
+        while self._renew.is_set():
+            time.sleep(PERIOD_S)
 
     def _heard(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -120,6 +132,11 @@ class Gateway:
     def _run(self) -> None:
         number = 0
         while self._going:
+            if self._renew.is_set():
+                for publisher, _ in self._inputs:
+                    self.node.destroy_publisher(publisher)
+                self._inputs = self._publishers()
+                self._renew.clear()
             for publisher, value in self._inputs:
                 publisher.publish(Float64(data=value + 0.01 * (number % 100)))
             number += 1
@@ -353,6 +370,12 @@ def step_clock_on(world: World) -> None:
     world.step_clock(world.generator.uniform(0.001, 2.0) * DAY_S)
 
 
+def restart_gateway(world: World) -> None:
+    for _ in range(world.generator.randint(1, 4)):
+        world.gateway.start_again()
+        time.sleep(0.3)
+
+
 def storm_of_requests(world: World) -> None:
     world.storms.append(world.gateway.storm())
 
@@ -361,7 +384,8 @@ ALL_ACTS = (
     delete_file, move_file, link_file, truncate_file, extend_file, overwrite_file,
     delete_recording, move_recording, delete_all_recordings, delete_state, delete_state_file,
     truncate_state_file, delete_lock_and_start_another, fill_disk, stop_process, kill_process,
-    kill_process_and_wait_400_days, step_clock_back, step_clock_on, storm_of_requests,
+    kill_process_and_wait_400_days, step_clock_back, step_clock_on, restart_gateway,
+    storm_of_requests,
 )  # fmt: skip
 
 
@@ -382,12 +406,16 @@ def adversary(options: Options) -> Outcome:
             act(world)
         time.sleep(generator.uniform(*PAUSE_S))
         names = [act.__name__ for act in acts]
+        outcome.count('composed', len(acts))
         before = outcome.failed
-        _judge(world, f'run {run} ({", ".join(names)})', outcome)
+        claimed, found = _judge(world, f'run {run} ({", ".join(names)})', outcome)
         for name in set(names):
-            row = table.setdefault(name, {'runs': 0, 'false_claims': 0})
-            row['runs'] += 1
-            row['false_claims'] += outcome.failed > before
+            row = table.setdefault(name, dict.fromkeys(('runs', 'claimed', 'found', 'false'), 0))
+            for key, value in (
+                ('runs', 1), ('claimed', claimed), ('found', found),
+                ('false', outcome.failed > before),
+            ):  # fmt: skip
+                row[key] += value
         if outcome.failed == before:
             shutil.rmtree(options.folder / str(run))
     gateway.close()
@@ -395,7 +423,7 @@ def adversary(options: Options) -> Outcome:
     outcome.counts['acts'] = dict(sorted(table.items()))
     counts = outcome.counts
     outcome.sentence = (
-        f'{counts["runs"]} runs of {sum(row["runs"] for row in table.values())} acts: '
+        f'{counts["runs"]} runs, {counts["composed"]} acts: '
         f'{counts["claimed"]} messages claimed, {counts["found"]} found, {outcome.failed} false '
         f'claims; {counts.get("answered", 0)} of {counts.get("asked", 0)} requests answered, the '
         f'last of a burst after {outcome.measured.get("longest_answer_s", 0.0):.2f} s at most'
@@ -403,15 +431,22 @@ def adversary(options: Options) -> Outcome:
     return outcome
 
 
-def _judge(world: World, what: str, outcome: Outcome) -> None:
+def _judge(world: World, what: str, outcome: Outcome) -> tuple[int, int]:
+    """End the monitor; return the messages that it claimed and those that are found."""
     outcome.count('runs')
     session = world.session
+    told = 0
+    if world.generator.random() < 0.5:
+        # In some runs the health has the time to say what happened.
+        time.sleep(HEALTH_S)
+        told = int(world.gateway.health.get('Messages written', 0))
+        outcome.count('asked_for_health')
     for problem in [*world.problems, *end(session)]:
         outcome.expect(False, f'{what}: {problem}')
     claim = session.claim()
     if claim is None:
         outcome.expect(False, f'{what}: no account: {session.lines[-3:]}')
-        return
+        return 0, 0
     folder, claimed = claim
     found = len(truth(world.folder).get(folder, set()) - world.before.get(folder, set()))
     outcome.count('claimed', claimed)
@@ -421,6 +456,7 @@ def _judge(world: World, what: str, outcome: Outcome) -> None:
     outcome.expect(
         claimed <= found <= claimed + more, f'{what}: {claimed} claimed, {found} found in {folder}'
     )
+    outcome.expect(told <= found, f'{what}: {told} written by the health, {found} found')
     if not session.says('he state cannot be saved'):
         path = world.recordings / 'state_unit' / 'monitor.state'
         try:
@@ -433,6 +469,7 @@ def _judge(world: World, what: str, outcome: Outcome) -> None:
         outcome.worst('longest_answer_s', round(seconds, 2))
         outcome.expect(answered == asked, f'{what}: {answered} of {asked} requests answered')
         outcome.wish(seconds <= ANSWER_S, f'{what}: answers took {seconds:.2f} s')
+    return claimed, found
 
 
 def end(session: Session) -> list[str]:

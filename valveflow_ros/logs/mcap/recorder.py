@@ -27,7 +27,7 @@ from valveflow_ros.logs.source import os_errors
 # So long after the last drop the state says so, for those who look once a second.
 DROPS_SHOWN_S = 2.0
 # So often somebody looks whether finished files are there as they were left.
-_LOOK_S = 5.0
+_LOOK_S = 2.0
 # More waiting messages than this wake the thread before its time.
 _WAKE_AT = 4000
 MIB = 1 << 20
