@@ -329,7 +329,9 @@ class StateStore:
     @property
     def altered(self) -> bool:
         """Return True if another program removed or changed the state since it was saved."""
-        return self._folder is not None and self._folder.altered
+        self.finish()
+        # A disk that does not answer is not asked again.
+        return self._folder is not None and not self.busy and self._folder.altered
 
     def watch(self) -> None:
         """See once a second, from a thread, that folder, lock and state are as they were left."""
