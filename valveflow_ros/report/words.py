@@ -5,9 +5,13 @@ from __future__ import annotations
 import math
 from datetime import datetime, timezone
 from fractions import Fraction
+from typing import TYPE_CHECKING
 
-from valveflow_ros.curve.characteristic import HeldCause
 from valveflow_ros.records import NS_PER_S
+
+if TYPE_CHECKING:
+    # The compiler behind it takes half a second to load, and `info` shows no curve.
+    from valveflow_ros.curve.characteristic import HeldCause
 
 UNKNOWN = 'unknown'
 _MINUS = '−'
