@@ -225,6 +225,9 @@ def add_mapping(parser: ArgumentParser) -> None:
          'whether 01/02/2026 is in February (dmy) or in January (mdy)'),
         ('decimal', 'point|comma', 'what stands before the decimals of a number'),
         ('sheet', 'NAME', 'which sheet of a workbook'),
+        ('max-unpacked', 'MB',
+         'to how much a workbook or a Parquet file may unpack (default: 64 MB, or 200 times its '
+         'size if that is more, up to 1074 MB and 2147 MB)'),
     ):  # fmt: skip
         about.add_argument(
             f'--{option}', dest='column', action='append', metavar=metavar, help=told,
