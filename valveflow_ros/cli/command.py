@@ -341,4 +341,6 @@ def rejected_words(counts: Mapping[str, Mapping[str, int]]) -> str:
         if refused:
             words = ', '.join(f'{count(n)} {REASON_WORDS[r]}' for r, n in refused.items())
             told.append(f'  {topic}: {words}')
+    if not any(n for by_reason in counts.values() for n in by_reason.values()):
+        return 'No reading was found.'
     return '\n'.join(['Readings not used:', *told]) if told else 'Every reading was used.'
