@@ -7,7 +7,6 @@ checksum is wrong is left out and counted: nothing is repaired by guessing.
 from __future__ import annotations
 
 import struct
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
+from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Channel, Schema
 
 from valveflow_ros.errors import RecordingError, counted
@@ -220,10 +219,20 @@ class _Proven:
         """Read every message, and give the file its name; raises `RecordingError`."""
         try:
             with self.out.part.open('rb') as stream:
+                # From end to end; a reader that seeks would hold all messages at once.
+                messages = NonSeekingReader(stream, validate_crcs=True).iter_messages(
+                    log_time_order=False
+                )
+                topics = {channel.id for _, channel, _ in messages}
+                stream.seek(0)
                 reader = make_reader(stream, validate_crcs=True)
-                deque(reader.iter_messages(log_time_order=False), maxlen=0)
+                next(reader.iter_messages(), None)
+                summary = reader.get_summary()
+                if summary is None or not topics <= summary.channels.keys():
+                    raise McapError('its summary does not name all topics')
         except (McapError, ValueError, KeyError, EOFError, struct.error) as error:
-            problem = f'what is intact in it makes no file that other programs read ({error})'
+            reason = str(error) or type(error).__name__
+            problem = f'what is intact in it makes no file that other programs read ({reason})'
             raise RecordingError(self.source, f'{problem}; nothing was written') from None
         self.out.publish()
 
