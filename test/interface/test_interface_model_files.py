@@ -130,7 +130,7 @@ def text(value: Any) -> bool:
 
 
 # By the parameters an opening may be as low as -50 %, so a curve may begin a little below zero.
-INPUT, POWER = (-1e6, 1e8), (-1e7, 1e7)
+INPUT, POWER = (-1e6, 1e8), (-1e8, 1e8)
 
 
 def piece_can_be(piece: dict[str, Any]) -> bool:
