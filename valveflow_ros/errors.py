@@ -6,6 +6,8 @@ The command line prints it and exits with status 1; the node logs it and goes
 on. Errors of other libraries are translated at the edge where they arise.
 """
 
+import resource
+
 
 class ValveflowError(Exception):
     """Root of all errors raised on purpose; its text is one sentence for a person."""
@@ -55,3 +57,18 @@ def counted(number: float, one: str, many: str = '') -> str:
     """Write a number and its noun for a sentence: '1 row', '3 rows', '0.5 days'."""
     told = str(number) if isinstance(number, int) else f'{number:g}'
     return f'{told} {one if told == "1" else many or one + "s"}'
+
+
+# Compiled code ends the process without a word when it gets no memory. On two cores the engine
+# was loaded in 1 GiB of address space, and a log of a day identified in 2.4 GiB.
+LOADING_BYTES, WORKING_BYTES = 1 << 30, 5 << 29
+
+
+def check_address_space(need: int) -> None:
+    """Refuse a limit of address space below ``need`` bytes; raises `ValveflowError`."""
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY and limit < need:
+        raise ValveflowError(
+            f'This process may use {limit >> 20} MiB of address space and needs '
+            f'{need >> 20} MiB at least; raise the limit (ulimit -v).'
+        )

@@ -36,6 +36,7 @@ TRIALS = {
     'signals': ('signals', 3600),
     'restart': ('restart', 5400),
     'rehearing': ('rehearing', 3600),
+    'adversary': ('adversary', 7200),
     'soak': ('soak', 7200),
 }
 

@@ -122,7 +122,8 @@ def _wait(condition: Callable[[], bool]) -> bool:
 
 
 def _balanced(status: RecorderStatus) -> bool:
-    columns = status.written + status.queued + status.lost + sum(status.dropped.values())
+    columns = status.written + status.queued + status.lost + status.removed
+    columns += sum(status.dropped.values())
     return status.received == columns
 
 

@@ -74,6 +74,12 @@ class FailingFile:
         self.disk.count('sync', b'')
         self.file.sync()
 
+    def check(self, size):
+        self.file.check(size)
+
+    def check_content(self, size, crc):
+        self.file.check_content(size, crc)
+
     def publish(self):
         self.disk.count('publish', b'')
         self.file.publish()
@@ -112,7 +118,8 @@ def values_on_disk(folder):
 
 
 def is_balanced(status):
-    columns = status.written + status.queued + status.lost + sum(status.dropped.values())
+    columns = status.written + status.queued + status.lost + status.removed
+    columns += sum(status.dropped.values())
     return status.received == columns
 
 

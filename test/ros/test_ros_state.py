@@ -768,3 +768,56 @@ def test_each_output_stands_in_the_recording_once(
     assert ours.log_ns == (LOG_NS if said else 1)
     assert list(ours.begin(given, engine, outputs)) == again
     assert logged == [(Level.OK, 'Going on after 0 rows of an earlier run.')]
+
+
+@pytest.mark.parametrize('what', ['state', 'lock', 'everything', 'folder', 'folder moved'])
+def test_what_another_program_removes_is_made_again_and_stays_taken(
+    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(state_store, '_WATCH_S', 0.0)
+    given = settings(tmp_path)
+    store = StateStore(given)
+    state = {'settings': dict(given), 'number': 1}
+    store.write(state, lambda: True)
+    store.finish()
+    folder = tmp_path / 'state_unit'
+    acts: dict[str, Callable[[], object]] = {
+        'state': (folder / STATE).unlink,
+        'lock': (folder / LOCK).unlink,
+        'everything': lambda: [path.unlink() for path in folder.iterdir()],
+        'folder': lambda: shutil.rmtree(folder),
+        'folder moved': lambda: folder.rename(tmp_path / 'moved'),
+    }
+    acts[what]()
+    store.watch()
+    store.finish()
+    assert store.altered == bool(what != 'lock')
+    if store.altered:
+        assert 'was removed or changed by another program' in store.problem
+        assert store.item().level == Level.ERROR
+    with pytest.raises(RecordingError, match=rf'another monitor \(process {os.getpid()}\)'):
+        StateStore(given)
+    store.write(state, lambda: True)
+    store.close()
+    assert store.problem == ''
+    found = StateStore(given)
+    assert found.saved is not None
+    assert found.saved['number'] == 1
+    found.close()
+
+
+def test_who_lost_its_lock_to_another_monitor_says_so_and_writes_nothing(tmp_path: Path) -> None:
+    given = settings(tmp_path)
+    first = StateStore(given)
+    (tmp_path / 'state_unit' / LOCK).unlink()
+    second = StateStore(given)
+    second.write({'settings': dict(given), 'whose': 'second'}, lambda: True)
+    second.finish()
+    first.write({'settings': dict(given), 'whose': 'first'}, lambda: True)
+    first.close()
+    assert 'another monitor' in first.problem
+    second.close()
+    found = StateStore(given)
+    assert found.saved is not None
+    assert found.saved['whose'] == 'second'
+    found.close()

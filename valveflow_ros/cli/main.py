@@ -18,7 +18,7 @@ from types import FrameType
 from typing import Any, NoReturn, Protocol, cast
 
 from valveflow_ros.cli.command import Console, Outcome
-from valveflow_ros.errors import UsageError, ValveflowError
+from valveflow_ros.errors import LOADING_BYTES, UsageError, ValveflowError, check_address_space
 from valveflow_ros.interface.files import check_folder, check_readable, check_writable
 
 DONE, NOT_DONE, WRONG_USAGE = 0, 1, 2
@@ -291,6 +291,7 @@ def _command(words: list[str], console: Console) -> int:
         return DONE
     if words[0].startswith('-'):
         raise UsageError(f"The verb comes first, options after it: '{words[0]}' is no verb.")
+    check_address_space(LOADING_BYTES)
     verb = load(words[0])
     parser = parser_of(words[0], verb)
     try:

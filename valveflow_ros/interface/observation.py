@@ -12,7 +12,7 @@ from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.extended import ExtendedModel
-from valveflow_ros.errors import DataError
+from valveflow_ros.errors import WORKING_BYTES, DataError, check_address_space
 from valveflow_ros.fit.fit import fit, outline
 from valveflow_ros.fit.task import FitTask
 from valveflow_ros.interface import SILENT, Progress
@@ -138,6 +138,7 @@ def observe_log(
     shown: Callable[[float, str], None] | None = None,
 ) -> Observed:  # fmt: skip
     """Observe a log as `observe` does; with a ``model`` its causes are taken out of the rows."""
+    check_address_space(WORKING_BYTES)
     if is_first_run():
         progress.say(SENTENCE)
     corrector = None if model is None else corrector_of(model, settings.real('sample_period'))

@@ -11,6 +11,7 @@ import errno
 import fcntl
 import os
 import threading
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,6 +21,11 @@ PART_SUFFIX = '.part'
 FILE_MODE = 0o600
 FOLDER_MODE = 0o700
 _TRIES = 20
+_BLOCK = 1 << 20
+
+
+class AlteredError(OSError):
+    """Another program removed, replaced or changed a file that is being written."""
 
 
 class Writable(Protocol):
@@ -30,6 +36,12 @@ class Writable(Protocol):
 
     def sync(self) -> None:
         """Bring everything to the disk; raises `OSError`."""
+
+    def check(self, size: int) -> None:
+        """See that the file still has its name and ``size`` bytes; raises `AlteredError`."""
+
+    def check_content(self, size: int, crc: int) -> None:
+        """Read ``size`` bytes back; raises `AlteredError` if they have another CRC-32."""
 
     def publish(self) -> None:
         """Give the file its own name; raises `OSError`."""
@@ -72,10 +84,36 @@ class PartFile:
         """Bring everything to the disk."""
         os.fdatasync(self._descriptor)
 
+    def check(self, size: int) -> None:
+        """See that the file still has its name and ``size`` bytes.
+
+        Raises
+        ------
+        AlteredError
+            It has not; the text continues a sentence that begins with its name.
+        OSError
+            It cannot be found out.
+        """
+        self._check_name(self.part)
+        if os.fstat(self._descriptor).st_size != size:
+            raise AlteredError('was cut or extended by another program')
+
+    def check_content(self, size: int, crc: int) -> None:
+        """Read ``size`` bytes back and compare their CRC-32; raises as `check` does."""
+        found = 0
+        for start in range(0, size, _BLOCK):
+            block = os.pread(self._descriptor, min(_BLOCK, size - start), start)
+            found = zlib.crc32(block, found)
+        if found != crc:
+            raise AlteredError('was changed by another program')
+
     def publish(self) -> None:
-        """Give the file its own name, durably."""
+        """Give the file its own name, durably; raises `OSError`, and as `check` does."""
         os.fsync(self._descriptor)
+        self._check_name(self.part)
         os.replace(self.part, self.path)
+        # Between the two somebody may have put another file there.
+        self._check_name(self.path)
         sync_folder(self.path.parent)
 
     def close(self) -> None:
@@ -87,10 +125,20 @@ class PartFile:
                 os.close(descriptor)
 
     def discard(self) -> None:
-        """Let go of the file and remove it."""
-        self.close()
+        """Let go of the file and remove it; another file of its name stays."""
         with suppress(OSError):
+            self._check_name(self.part)
             self.part.unlink()
+        self.close()
+
+    def _check_name(self, path: Path) -> None:
+        """Raise `AlteredError` unless ``path`` names the file that is open."""
+        try:
+            named = path.lstat()
+        except (FileNotFoundError, NotADirectoryError):
+            raise AlteredError('was removed or renamed by another program') from None
+        if not os.path.samestat(named, os.fstat(self._descriptor)):
+            raise AlteredError('was replaced by another file')
 
 
 def _made(part: Path) -> int:
@@ -99,7 +147,7 @@ def _made(part: Path) -> int:
     Between making and locking somebody may look whether it is a leftover, and even take it for an
     empty one and remove it: then it is made again.
     """
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
     for left in reversed(range(_TRIES)):
         descriptor = os.open(part, flags, FILE_MODE)
         try:

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from valveflow_ros.errors import ValveflowError
+from valveflow_ros.errors import WORKING_BYTES, ValveflowError, check_address_space
 from valveflow_ros.parameters import TABLE
 from valveflow_ros.ros.process import (
     StopFlag,
@@ -43,6 +43,7 @@ def main(args: Sequence[str] | None = None) -> int:
     before = os.umask(0o077)
     presence: Any = None
     try:
+        check_address_space(WORKING_BYTES)
         # A signal need not wait for what is loaded: nothing has begun yet.
         with stop.cutting():
             domain = importlib.import_module('valveflow_ros.ros.domain')

@@ -276,8 +276,20 @@ class ChunkFile:
         """Bring what was written to the disk."""
         self._out.sync()
 
+    def check(self) -> None:
+        """See that the file is there as far as it was written; raises `AlteredError` if not."""
+        self._out.check(self.position)
+
     def finish(self, table: TopicTable) -> None:
-        """Write the summary and give the file its own name."""
+        """Write the summary and give the file its own name.
+
+        Raises
+        ------
+        AlteredError
+            What is in the file is not what was written.
+        """
+        self._out.check(self.position)
+        self._out.check_content(self.position, self._crc)
         self._append(pack(DataEnd(data_section_crc=self._crc)))
         self._write(self._summary(table))
         self._out.publish()

@@ -26,6 +26,8 @@ from valveflow_ros.logs.source import os_errors
 
 # So long after the last drop the state says so, for those who look once a second.
 DROPS_SHOWN_S = 2.0
+# So often somebody looks whether finished files are there as they were left.
+_LOOK_S = 2.0
 # More waiting messages than this wake the thread before its time.
 _WAKE_AT = 4000
 MIB = 1 << 20
@@ -74,7 +76,9 @@ class RecorderSettings:
 
 @dataclass(slots=True)
 class RecorderStatus:
-    """What a recorder counted: ``received == written + queued + lost + sum of dropped``, always.
+    """What a recorder counted.
+
+    Always ``received == written + queued + lost + removed + sum of dropped``.
 
     Attributes
     ----------
@@ -87,11 +91,16 @@ class RecorderStatus:
     received : int
         Messages handed in.
     written : int
-        Of these, in whole chunks on disk.
+        Of these, in whole chunks on disk, in files that are there.
     queued : int
         Of these, waiting.
     lost : int
-        Of these, waiting when the recorder had to stop.
+        Of these, waiting when the recorder had to stop, or in files that another program removed
+        or changed while they were written, or damaged afterwards.
+    loss : str
+        What happened to those that were in a file, in a sentence; empty if nothing did.
+    removed : int
+        Of these, in finished files that were removed since, by ``keep_files`` or another program.
     dropped : dict[str, int]
         Of these, refused because too many were waiting, by topic.
     files_finished : int
@@ -112,6 +121,8 @@ class RecorderStatus:
     written: int = 0
     queued: int = 0
     lost: int = 0
+    loss: str = ''
+    removed: int = 0
     dropped: dict[str, int] = field(default_factory=dict)
     files_finished: int = 0
     bytes_written: int = 0
@@ -132,7 +143,7 @@ class RecorderCounters:
         self._limit = limit
         self._open = True
         self._now = RecorderStatus(RecorderState.RECORDING)
-        self._drops = 0
+        self._drops = self._lost_in_files = 0
         self._working_since_s: float | None = None
 
     def working(self) -> None:
@@ -162,14 +173,18 @@ class RecorderCounters:
         with self._lock:
             self._open = False
 
-    def on_disk(self, written: int, file: str, files: int, size: int) -> None:
-        """Set how many messages are on disk in all, and in which file."""
+    def on_disk(self, writer: RecordingWriter) -> None:
+        """Take over what a writer counted."""
         with self._lock:
             now = self._now
-            now.queued -= written - now.written
-            now.written, now.file, now.files_finished, now.bytes_written = (
-                written, file, files, size,
-            )  # fmt: skip
+            before = now.written + now.removed + self._lost_in_files
+            now.written, now.removed, now.loss = writer.written, writer.removed, writer.loss
+            now.lost += writer.lost - self._lost_in_files
+            self._lost_in_files = writer.lost
+            now.queued -= now.written + now.removed + writer.lost - before
+            now.file = writer.path.name if writer.path is not None else ''
+            now.files_finished = writer.files_finished
+            now.bytes_written = writer.bytes_finished + writer.file_bytes
 
     def healthy(self) -> None:
         """Set the state after all that waited was written."""
@@ -245,7 +260,7 @@ class RecorderLoop:
         self._latched: dict[str, Message] = {}
         self._writer: RecordingWriter | None = None
         self._path: Path | None = None
-        self._begun_at = self._synced_at = self._retry_at = 0.0
+        self._begun_at = self._synced_at = self._retry_at = self._looked_at = 0.0
         self._retry_wait = settings.retry_s
         self.rotation_asked = False
         self._stopping = False
@@ -303,6 +318,8 @@ class RecorderLoop:
         try:
             writer = self._ready()
             self._counters.working()
+            writer.check()
+            self._check_finished(writer, now)
             self._check_space(writer)
             self._drain(writer)
             self._counters.working()
@@ -332,6 +349,14 @@ class RecorderLoop:
             self._counters.recovered(recover_leftovers(self._folder))
             self._writer = self._make_writer(head_messages=self.latched)
         return self._writer
+
+    def _check_finished(self, writer: RecordingWriter, now: float) -> None:
+        if now - self._looked_at >= _LOOK_S:
+            self._looked_at = now
+            # One that was changed is read again, which takes as long as it is large.
+            self._counters.resting()
+            writer.check_finished()
+            self._counters.working()
 
     def _check_space(self, writer: RecordingWriter) -> None:
         floor = self._settings.free_floor_bytes
@@ -396,11 +421,8 @@ class RecorderLoop:
             writer.forget(split.name)
 
     def _count(self) -> None:
-        writer = self._writer
-        if writer is not None:
-            file = writer.path.name if writer.path is not None else ''
-            size = writer.bytes_finished + writer.file_bytes
-            self._counters.on_disk(writer.written, file, writer.files_finished, size)
+        if self._writer is not None:
+            self._counters.on_disk(self._writer)
 
     def _finish(self) -> str:
         """Finish the file; return what kept it from being finished, empty if nothing did."""
@@ -410,6 +432,7 @@ class RecorderLoop:
         try:
             writer.note('valveflow_recorder', self._counters.as_metadata())
             writer.close()
+            writer.check_finished()
         except RecordingError as error:
             writer.abandon()
             return str(error)

@@ -98,6 +98,15 @@ def recover(
     return _recover(Path(path), target, target.name, progress, proven=True)
 
 
+def intact_messages(path: Path) -> int:
+    """Return how many messages stand in the intact chunks of a file; 0 if it cannot be read."""
+    try:
+        with Source.open(path) as source:
+            return sum(map(len, _intact(Scanner(source), TopicTable(), None, source.size)))
+    except RecordingError:
+        return 0
+
+
 def recover_leftovers(folder: str | Path) -> tuple[RecoveryReport, ...]:
     """Finish every ``.part`` in a folder that no living recorder holds.
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from mcap.records import Channel, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
-from valveflow_ros.errors import InputError
+from valveflow_ros.errors import InputError, counted
 from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES, ChunkBuilder, ChunkFile
 from valveflow_ros.logs.mcap.definitions import Definitions, parse_all, type_hash
 from valveflow_ros.logs.mcap.folder import (
@@ -25,7 +25,14 @@ from valveflow_ros.logs.mcap.folder import (
     write_metadata,
 )
 from valveflow_ros.logs.mcap.records import LayoutError, TopicTable, pack
-from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, Writable, make_folder
+from valveflow_ros.logs.mcap.recover import intact_messages
+from valveflow_ros.logs.part_file import (
+    PART_SUFFIX,
+    AlteredError,
+    PartFile,
+    Writable,
+    make_folder,
+)
 from valveflow_ros.logs.source import os_errors
 
 # The longest duration that ROS 2 can express stands for "no limit".
@@ -148,6 +155,19 @@ class Message(NamedTuple):
     publish_time_ns: int
 
 
+@dataclass(slots=True)
+class _File:
+    """A split that this writer wrote, and by what it knows the file that it left.
+
+    ``own`` messages were handed in by `RecordingWriter.write`; ``messages`` are all in it.
+    """
+
+    path: Path
+    own: int = 0
+    messages: int = 0
+    mark: tuple[int, ...] | None = None
+
+
 class RecordingWriter:
     """One recording folder, one thread.
 
@@ -155,7 +175,18 @@ class RecordingWriter:
     covers all of its finished splits. A file is begun with its first chunk.
     After a `RecordingError` the file at hand is abandoned as it is, the
     messages that were not on disk are kept, and the next `flush` begins a new
-    file with them.
+    file with them. A file or folder that another program removed is not
+    waited for: a new one is begun, and what was in it is counted as lost.
+
+    Attributes
+    ----------
+    lost : int
+        Messages that were written to a file and damaged or removed there before it was finished,
+        or damaged afterwards.
+    removed : int
+        Messages in finished splits that were removed since, by `forget` or by another program.
+    loss : str
+        What happened to those that were lost last, in a sentence; empty if none was.
 
     Parameters
     ----------
@@ -196,12 +227,16 @@ class RecordingWriter:
         self.name = name or self.folder.resolve().name
         self.attachments: dict[str, bytes] = dict(attachments or {})
         self.metadata: dict[str, Mapping[str, str]] = dict(metadata or {})
-        self.written = 0
+        self.lost = self.removed = 0
+        self.loss = ''
         self.bytes_finished = 0
         self.files_finished = 0
         self.path: Path | None = None
         self._open_file = open_file
         self._head_messages = head_messages
+        self._files: list[_File] = []
+        self._at_hand = _File(Path())
+        self._number = -1
         self._begun = 0
         self._topics = TopicBook(definitions or Definitions())
         self._builder = ChunkBuilder()
@@ -246,6 +281,11 @@ class RecordingWriter:
             self.flush()
 
     @property
+    def written(self) -> int:
+        """Messages taken by `write` that a reader finds in the folder."""
+        return sum(file.own for file in self._files)
+
+    @property
     def waiting(self) -> int:
         """Messages taken by `write` and not on disk yet."""
         return len(self._builder)
@@ -263,8 +303,43 @@ class RecordingWriter:
     def flush(self) -> None:
         """Hand waiting messages to the operating system; a killed process loses them no more."""
         if len(self._builder):
+            self.check()
             with self._writing():
                 self._put(self._begin())
+
+    def check(self) -> None:
+        """See that folder and split at hand are there as they were written.
+
+        Another program may have removed or replaced them: the folder is made again, the split
+        given up, its messages counted as lost, and the next `flush` begins a new one.
+
+        Raises
+        ------
+        RecordingError
+            If that cannot be found out, or the folder cannot be made.
+        """
+        with os_errors(self.folder, 'cannot be made'):
+            make_folder(self.folder)
+        if self._file is not None:
+            with self._writing():
+                try:
+                    self._file.check()
+                except AlteredError as error:
+                    self._give_up(error)
+
+    def check_finished(self) -> None:
+        """See that the finished splits are there as they were left; count what is not.
+
+        `metadata.yaml` is brought in line with them.
+        """
+        changed = [
+            file for file in self._files
+            if file is not self._at_hand and file.mark != _mark(file.path)
+        ]  # fmt: skip
+        for file in changed:
+            self._recount(file)
+        if changed:
+            self._list()
 
     def sync(self) -> None:
         """Bring what was flushed to the disk itself; a power cut loses it no more."""
@@ -291,12 +366,16 @@ class RecordingWriter:
         """Let go of the split at hand, unfinished; `recover` makes a whole file of it."""
         if self._file is not None:
             self._file.abandon()
-            self._file = None
-            self.path = None
+            part = self._at_hand.path.with_name(f'{self._at_hand.path.name}{PART_SUFFIX}')
+            self._at_hand.path, self._at_hand.mark = part, _mark(part)
+            self._at_hand = _File(Path())
+            self._file = self.path = None
 
     def forget(self, name: str) -> None:
         """Strike a split that was deleted from `metadata.yaml`."""
         self._splits.pop(name, None)
+        for file in [file for file in self._files if file.path.name == name]:
+            self._take_out(file)
         self._list()
 
     def __enter__(self) -> RecordingWriter:
@@ -324,13 +403,15 @@ class RecordingWriter:
         finally:
             # A whole chunk is not to be written again, even if the index behind it failed.
             if file.messages > before:
-                self.written += self.waiting
+                self._at_hand.own += self.waiting
+                self._at_hand.messages = file.messages
                 self._on_disk = dict(self._sequences)
                 self._builder.clear()
 
     def _begin(self) -> ChunkFile:
         if self._file is None:
-            self.path = self.folder / f'{self.name}_{self._next_number()}.mcap'
+            number = self._next_number()
+            self.path = self.folder / f'{self.name}_{number}.mcap'
             out = self._open_file(self.path)
             try:
                 file = ChunkFile(out, LIBRARY)
@@ -340,7 +421,9 @@ class RecordingWriter:
             except OSError:
                 out.discard()
                 raise
-            self._begun, self._file = self._begun + 1, file
+            self._begun, self._file, self._number = self._begun + 1, file, number
+            self._at_hand = _File(self.path)
+            self._files.append(self._at_hand)
         return self._file
 
     def _repeat(self, file: ChunkFile) -> None:
@@ -357,21 +440,67 @@ class RecordingWriter:
 
     def _next_number(self) -> int:
         parts = self.folder.glob(f'*.mcap{PART_SUFFIX}')
-        return max(map(split_number, [*finished_files(self.folder), *parts]), default=-1) + 1
+        found = max(map(split_number, [*finished_files(self.folder), *parts]), default=-1)
+        # Never that of a file that was taken away: somebody may bring it back.
+        return max(found, self._number) + 1
 
     def _finish(self) -> None:
         if self._file is not None and self.path is not None:
+            # Until this is done, a file may have its name that the list does not name.
+            self._list_due = True
             with self._writing():
-                # Until this is done, a file may have its name that the list does not name.
-                self._list_due = True
-                split = finish_split(self._file, self.path.name, self._topics.table)
-            self.bytes_finished += self._file.position
-            self.files_finished += 1
-            self._splits[split.name] = split
-            self._file = self.path = None
+                try:
+                    split = finish_split(self._file, self.path.name, self._topics.table)
+                except AlteredError as error:
+                    self._give_up(error)
+                else:
+                    self.bytes_finished += self._file.position
+                    self.files_finished += 1
+                    self._splits[split.name] = split
+                    self._at_hand.mark = _mark(self.path)
+                    self._at_hand = _File(Path())
+                    self._file = self.path = None
         elif not self._list_due:
             return
         self._list()
+
+    def _give_up(self, error: AlteredError) -> None:
+        """Let go of the split at hand, which another program altered; count what it took away."""
+        file = self._at_hand
+        self.abandon()
+        # Its name may be a link to where it was moved.
+        self._lose(file, intact_messages(file.path), str(error))
+
+    def _recount(self, file: _File) -> None:
+        """Count the messages of an earlier split again, which another program altered."""
+        whole = file.path.with_suffix('') if file.path.suffix == PART_SUFFIX else file.path
+        for path in (whole, file.path):
+            file.mark = _mark(path)
+            self._splits.pop(path.name, None)
+            if file.mark is not None:
+                file.path = path
+                self._lose(file, intact_messages(path), 'was changed by another program')
+                return
+        # What was finished may have been taken to an archive.
+        self._take_out(file)
+
+    def _lose(self, file: _File, left: int, what: str) -> None:
+        """Count as lost what is not ``left`` of the messages in a file."""
+        lost = min(file.own, max(0, file.messages - left))
+        if lost:
+            self.lost += lost
+            told = counted(lost, 'message in it is', 'messages in it are')
+            self.loss = f"'{file.path}' {what}: {told} lost."
+            if left:
+                self.loss += ' The others need `valveflow recover`.'
+        file.own, file.messages = file.own - lost, left
+        if not file.own:
+            self._files.remove(file)
+
+    def _take_out(self, file: _File) -> None:
+        """Count the messages of a file that was removed."""
+        self.removed += file.own
+        self._files.remove(file)
 
     def _list(self) -> None:
         """Write `metadata.yaml` for what is whole on the disk."""
@@ -391,3 +520,12 @@ class RecordingWriter:
             self.abandon()
             with os_errors(self.path or self.folder, 'cannot be written'):
                 raise error
+
+
+def _mark(path: Path) -> tuple[int, ...] | None:
+    """Return device, inode, size and time of change of a file; None if it is not there."""
+    try:
+        found = path.lstat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns

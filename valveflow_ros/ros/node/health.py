@@ -431,19 +431,15 @@ def recorder_item(recording: Recording) -> Item:
         'Messages waiting': status.queued,
         'Messages dropped': dropped,
         'Messages lost': status.lost,
+        'Messages in files removed since': status.removed,
         'Files finished': status.files_finished,
         'Bytes written': status.bytes_written,
     }
     if status.state != RecorderState.RECORDING:
         return Item('recorder', Level.ERROR, f'Not recording: {status.reason}', values)
     if dropped or status.lost:
-        missing = dropped + status.lost
-        return Item(
-            'recorder',
-            Level.WARN,
-            f'{counted(missing, "message is", "messages are")} missing.',
-            values,
-        )
+        told = f'{counted(dropped + status.lost, "message is", "messages are")} missing.'
+        return Item('recorder', Level.WARN, f'{told} {status.loss}'.rstrip(), values)
     return Item('recorder', Level.OK, 'Recording.', values)
 
 

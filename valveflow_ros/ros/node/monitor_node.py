@@ -13,9 +13,15 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import (
+    Executor,
+    ShutdownException,
+    SingleThreadedExecutor,
+    TimeoutException,
+)
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
 from valveflow_ros.errors import ParameterError, ValveflowError, counted
@@ -41,6 +47,10 @@ _PERIOD_S = 0.02
 _MUCH = 50
 # Services may wait that long; a look of the executor costs as much as forty messages.
 _SPIN_EVERY_S = 0.1
+# Of each look; a storm of requests must not keep samples waiting.
+_SPIN_S = 0.05
+# The default of ten loses the eleventh request of a burst without a word.
+_REQUESTS = QoSProfile(depth=1000)
 # The compiler works when a configuration runs for the first time, and an activation may feed what
 # an earlier run recorded.
 _LONGEST_START_S = 600.0
@@ -221,7 +231,9 @@ class MonitorNode(LifecycleNode):
         self.add_post_set_parameters_callback(self._apply)
         self._health = self.create_publisher(DiagnosticArray, DIAGNOSTICS, 10)
         self._trigger_services = [
-            self.create_service(Trigger, f'~/{name}', functools.partial(self._serve, name))
+            self.create_service(
+                Trigger, f'~/{name}', functools.partial(self._serve, name), qos_profile=_REQUESTS
+            )
             for name in SERVICES
         ]
 
@@ -308,9 +320,10 @@ class MonitorNode(LifecycleNode):
             return
         status = session.close()
         if status is not None:
-            self.get_logger().info(
-                f'Recorded {counted(status.written, "message")} to {session.recording.folder}.'
-            )
+            told = f'Recorded {counted(status.written, "message")} to {session.recording.folder}.'
+            if status.removed:
+                told += f' {status.removed} more were in files that were removed since.'
+            self.get_logger().info(told)
         if status is not None and session.recording.problem:
             self.get_logger().error(session.recording.problem)
 
@@ -416,6 +429,20 @@ class MonitorNode(LifecycleNode):
         return f'Curve {curve.model_id} is the reference that later ones are judged against.'
 
 
+def serve_requests(executor: Executor, longest_s: float) -> None:
+    """Serve what is ready, requests of services and parameters; after that time the rest waits."""
+    until_s, served = time.monotonic() + longest_s, True
+    while served:
+        # The executor takes one request of each service, then says that its time is over.
+        served = False
+        with contextlib.suppress(TimeoutException, ShutdownException):
+            while time.monotonic() < until_s:
+                handler, _, _ = executor.wait_for_ready_callbacks(timeout_sec=0)
+                served = True
+                handler()
+                handler.result()
+
+
 def run(stop: StopFlag, presence: Presence) -> int:
     """Watch until the process is asked to stop; return the exit status."""
     if stop:
@@ -442,7 +469,7 @@ def run(stop: StopFlag, presence: Presence) -> int:
             found = node.step()
             if begun_s >= spin_s:
                 spin_s = begun_s + _SPIN_EVERY_S
-                executor.spin_once(timeout_sec=0)
+                serve_requests(executor, _SPIN_S)
             # Taken, fed, handed to the recorder: only a whole cycle counts.
             watchdog.completed(node.recorder_status)
             if found < _MUCH:

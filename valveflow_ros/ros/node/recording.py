@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from valveflow_ros.errors import RecordingError, ValveflowError
+from valveflow_ros.errors import RecordingError, ValveflowError, counted
 from valveflow_ros.logs import (
     Qos,
     Recorder,
@@ -204,6 +204,10 @@ class Recording:
         status = recorder.close(_CLOSE_S)
         if status.state == RecorderState.DEGRADED or status.queued:
             self.problem = status.reason or f'{status.queued} messages were not written in time.'
+        elif status.lost or any(status.dropped.values()):
+            missing = status.lost + sum(status.dropped.values())
+            told = f'{counted(missing, "message is", "messages are")} missing from the recording.'
+            self.problem = f'{told} {status.loss or status.reason}'.rstrip()
         return status
 
     def _give_up(self, problem: str) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 from valveflow_ros.errors import DataError, RecordingError, ValveflowError
 from valveflow_ros.logs import LoggedMessage, messages_since, recover_leftovers
+from valveflow_ros.logs.part_file import PART_SUFFIX, is_held
 from valveflow_ros.monitoring.alarms import AlarmState
 from valveflow_ros.monitoring.events import JournalEntry, JournalKind
 from valveflow_ros.monitoring.offline import JournalReplayer
@@ -170,10 +171,12 @@ class Restart:
         try:
             recover_leftovers(folder)
             self._tail = list(messages_since(folder, self.log_ns))
+            if any(map(is_held, folder.glob(f'*{PART_SUFFIX}'))):
+                self._missing = f'Another process records into {folder}; a new recording is begun.'
             # With the same names on the topics it is one recording, and a replay finds all of it.
-            if saved['topics'] == self._topics and not self._result_lost():
+            elif saved['topics'] == self._topics and not self._result_lost():
                 self.folder = folder
-        except (RecordingError, DataError) as error:
+        except (RecordingError, DataError, OSError) as error:
             self._missing = f'What was recorded after the state was saved is not there: {error}'
         if self._tail:
             self.log_ns = max(self.log_ns, self._tail[-1].log_time_ns)

@@ -155,8 +155,10 @@ class Session:
         self.publish(self.engine.poll())
         for level, sentence in self._recovery.reports() if self._recovery else ():
             self._log(level, sentence)
-        if self._store.due and self._begun:
-            self._save_state()
+        if self._begun:
+            self._store.watch()
+            if self._store.due:
+                self._save_state()
         if self._intake is None:
             return 0
         arrivals = self._intake.collect(time.monotonic(), time.time_ns(), last)
@@ -222,10 +224,12 @@ class Session:
         self._fit_worker.close()
         self._diagnosis_worker.close()
         # Where not all is recorded, nothing else tells what happened since it was saved last.
-        if not self.recording.whole and self._begun:
+        if self._begun and (not self.recording.whole or self._store.altered):
             self._save_state()
         status = self.recording.close()
         self._store.close()
+        if self._store.problem:
+            self._log(Level.ERROR, self._store.problem)
         for publisher in self._publishers.values():
             self._node.destroy_publisher(publisher)
         return status

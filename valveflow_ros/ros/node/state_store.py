@@ -41,6 +41,7 @@ _LONGEST_S = 30.0
 # A window of ten days takes 40 MB.
 _LEAST_S = 1.0
 _RETRY_S = 10.0
+_WATCH_S = 1.0
 # What must survive the end of the process.
 _SAVED_EVENTS = (AlarmChange, CurveAdopted, Diagnosed, ReferenceSet)
 _KINDS = {
@@ -73,24 +74,48 @@ class StateFolder:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.path, self.aside = folder / STATE, folder / ASIDE
-        try:
-            make_folder(folder)
-            self._lock = _locked(folder / LOCK)
-        except BlockingIOError:
-            owner = ''
-            with contextlib.suppress(OSError, ValueError):
-                owner = f' (process {int((folder / LOCK).read_text()[:20])})'
-            problem = (
-                f'another monitor{owner} keeps its state there; stop it, or give this one a '
-                'state_directory or unit_tag of its own'
-            )
-            raise InUseError(folder, problem) from None
-        except (OSError, ValueError) as error:
-            raise RecordingError(folder, f'cannot be used ({_reason(error)})') from None
+        self._lock = -1
+        self._mark: tuple[int, ...] | None = None
+        self.keep()
         # What a killed process left half written; if it cannot be removed, it does no harm.
         with contextlib.suppress(OSError):
             for stale in folder.glob('.*.tmp'):
                 stale.unlink()
+
+    def keep(self) -> None:
+        """Make folder and lock, and make them again if another program removed them.
+
+        Raises
+        ------
+        InUseError
+            Another monitor keeps its state there.
+        RecordingError
+            They cannot be made or used.
+        """
+        lock = self.folder / LOCK
+        try:
+            if self._lock >= 0 and _mark(lock) == _mark(self._lock):
+                return
+            make_folder(self.folder)
+            taken = _locked(lock)
+        except BlockingIOError:
+            owner = ''
+            with contextlib.suppress(OSError, ValueError):
+                owner = f' (process {int(lock.read_text()[:20])})'
+            problem = (
+                f'another monitor{owner} keeps its state there; stop it, or give this one a '
+                'state_directory or unit_tag of its own'
+            )
+            raise InUseError(self.folder, problem) from None
+        except (OSError, ValueError) as error:
+            raise RecordingError(self.folder, f'cannot be used ({_reason(error)})') from None
+        self.close()
+        self._lock = taken
+
+    @property
+    def altered(self) -> bool:
+        """Return True if another program removed or changed the state since it was written."""
+        return self._mark is not None and _mark(self.path) != self._mark
 
     def read(self, path: Path | None = None) -> bytes | None:
         """Return the bytes at ``path`` (by default) or ``aside``; None if nothing is there.
@@ -111,11 +136,19 @@ class StateFolder:
         except OSError as error:
             raise RecordingError(path, f'cannot be read ({_reason(error)})') from None
 
-    def set_aside(self) -> None:
-        """Keep a state that cannot be used from being overwritten; of two the larger one stays."""
+    def set_aside(self) -> bool:
+        """Keep a state that cannot be used from being overwritten; of two the larger one stays.
+
+        Returns
+        -------
+        bool
+            Whether this one stays.
+        """
         with contextlib.suppress(OSError):
             if not self.aside.exists() or self.aside.lstat().st_size < self.path.lstat().st_size:
                 self.path.replace(self.aside)
+                return True
+        return False
 
     def swap_aside(self) -> None:
         """Exchange the last state and the one that was set aside."""
@@ -128,8 +161,18 @@ class StateFolder:
                 between.replace(self.aside)
 
     def write(self, data: bytes) -> None:
-        """Replace the state; a reader finds the old or the new one, never half."""
+        """Replace the state; a reader finds the old or the new one, never half.
+
+        Raises
+        ------
+        OSError
+            It cannot be written.
+        RecordingError
+            As `keep`.
+        """
+        self.keep()
         write_whole(self.path, data)
+        self._mark = _mark(self.path)
 
     def write_curve(self, curve: Characteristic) -> None:
         """Write a curve beside the state, which follows a moment later; older curves are removed.
@@ -209,7 +252,7 @@ class StateStore:
         self.problem = ''
         self.saved_s: float | None = None
         self._period_s = settings.real('state_period')
-        self._begun_s = time.monotonic()
+        self._begun_s = self._watched_s = time.monotonic()
         # At the start too: with any state, however empty, the recording after it is fed again.
         self._urgent = True
         self._thread: threading.Thread | None = None
@@ -262,14 +305,14 @@ class StateStore:
         """
         self.saved = None
         self.lost = not whole
+        stays = self._folder is not None and self._folder.set_aside()
+        kept = 'It stays beside the new one' if stays else f'It is not kept beside {ASIDE}'
         then = (
-            'It stays beside the new one, and a run that it fits takes it up again.' if whole else
-            'It stays beside the new one. Window, standing alarms and reference of before are '
+            f'{kept}, and a run that it fits takes it up again.' if whole and stays else
+            f'{kept}. Window, standing alarms and reference of before are '
             'gone; curves of before stand there as curve_*.json, for reference_file.'
         )  # fmt: skip
         self.sentence = f'The state saved by an earlier run is not used. {reason} {then}'
-        if self._folder is not None:
-            self._folder.set_aside()
 
     def curve(self, model_id: str) -> Characteristic:
         """Return a curve that was adopted lately; raises `DataError` if it is not there."""
@@ -287,6 +330,20 @@ class StateStore:
             ):
                 self._urgent = True
 
+    @property
+    def altered(self) -> bool:
+        """Return True if another program removed or changed the state since it was saved."""
+        self.finish()
+        # A disk that does not answer is not asked again.
+        return self._folder is not None and not self.busy and self._folder.altered
+
+    def watch(self) -> None:
+        """See once a second, from a thread, that folder, lock and state are as they were left."""
+        folder, now_s = self._folder, time.monotonic()
+        if folder is not None and not self.busy and now_s - self._watched_s >= _WATCH_S:
+            self._watched_s = now_s
+            self._start(self._watch, folder)
+
     def write(self, state: State, ready: Callable[[], bool]) -> None:
         """Write a state from a thread, after the one before.
 
@@ -301,10 +358,7 @@ class StateStore:
             return
         self.finish()
         self._urgent, self._begun_s = False, time.monotonic()
-        self._thread = threading.Thread(
-            target=self._write, args=(self._folder, state, ready), name='state writer', daemon=True
-        )
-        self._thread.start()
+        self._start(self._write, self._folder, state, ready)
 
     def finish(self) -> None:
         """Wait for the state being written; that is bounded, unless a disk hangs."""
@@ -333,6 +387,20 @@ class StateStore:
             self._folder.close()
             self._folder = None
 
+    def _start(self, work: Callable[..., None], *given: object) -> None:
+        self._thread = threading.Thread(target=work, args=given, name='state writer', daemon=True)
+        self._thread.start()
+
+    def _watch(self, folder: StateFolder) -> None:
+        try:
+            folder.keep()
+            if folder.altered:
+                self.problem = f"'{folder.path}' was removed or changed by another program."
+                self._urgent = True
+        except ValveflowError as error:
+            # Saving is tried again, and tells of it as long as it fails.
+            self.problem = f'The state cannot be saved. {error}'
+
     def _write(self, folder: StateFolder, state: State, ready: Callable[[], bool]) -> None:
         try:
             data = to_bytes(state)
@@ -342,6 +410,8 @@ class StateStore:
             folder.write(data)
         except OSError as error:
             self.problem = f'{folder.path}: the state cannot be saved ({_reason(error)}).'
+        except ValveflowError as error:
+            self.problem = f'The state cannot be saved. {error}'
         except Exception as error:  # noqa: BLE001 - a dead thread must not go unnoticed
             self.problem = f'The state cannot be saved ({type(error).__name__}: {error}).'
         else:
@@ -389,6 +459,15 @@ def _fitting(data: bytes | None, settings: Settings) -> State | None:
         other = ' and '.join(filter(None, (', '.join(names[:-1]), names[-1])))
         raise _OtherError(f'It was made with another {other}.')
     return saved
+
+
+def _mark(file: Path | int) -> tuple[int, ...] | None:
+    """Return by what a file is known again; None if it is not there."""
+    try:
+        found = os.stat(file) if isinstance(file, int) else file.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def _locked(path: Path) -> int:

@@ -1,0 +1,491 @@
+"""Acts put together at random against a running monitor: its claims are held against the truth.
+
+The truth is what the stock reader finds in the files, damaged ones recovered; the claims are the
+closing account, the health and the exit status.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
+
+from benchmarks.torture.stepped_clock import SECONDS
+from benchmarks.torture.stock import stock_messages
+from benchmarks.torture.trial import Options, Outcome
+from valveflow_ros.errors import ValveflowError
+from valveflow_ros.logs import recover
+from valveflow_ros.records import SIGNALS
+from valveflow_ros.ros.demo import ros_arguments
+from valveflow_ros.ros.outputs import OUTPUTS, SERVICES
+from valveflow_ros.state import from_bytes
+
+RUNS = 200
+ACTS = (2, 5)
+# Between two acts; the recorder looks twice a second.
+PAUSE_S = (0.0, 1.5)
+# Finished files are looked at each 2 s, and the health comes once a second.
+HEALTH_S = 3.5
+PERIOD_S = 0.01
+PATIENCE_S = 60.0
+END_S = 10.0
+ANSWER_S = 1.0
+BURST = 17
+DAY_S = 86_400.0
+# Latched outputs, each of which keeps some.
+REPEATED = sum(topic.latched for topic in OUTPUTS.values())
+MANY = QoSProfile(depth=1000)
+VALUES = {'valve_opening': 50.0, 'main_steam_pressure': 12.0, 'main_steam_temperature': 530.0,
+          'generated_power': 300.0}  # fmt: skip
+Key = tuple[str, int]
+
+
+@dataclass(slots=True)
+class Session:
+    """One process of the monitor and what it said."""
+
+    process: subprocess.Popen[str]
+    lines: list[str] = field(default_factory=list)
+    listener: threading.Thread = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.listener = threading.Thread(target=self._listen, daemon=True)
+        self.listener.start()
+
+    def _listen(self) -> None:
+        assert self.process.stdout is not None
+        self.lines.extend(self.process.stdout)
+
+    def says(self, text: str) -> bool:
+        """Tell whether it said so by now."""
+        return any(text in line for line in list(self.lines))
+
+    def claim(self) -> tuple[Path, int] | None:
+        """Return the recording and the messages in it, by its closing account."""
+        for line in self.lines:
+            if match := re.search(r'Recorded (\d+) messages? to (\S+?)\.( |$)', line):
+                return Path(match[2]), int(match[1])
+        return None
+
+
+class Gateway:
+    """Publishes four signals without a pause, hears the health and calls the services."""
+
+    def __init__(self) -> None:
+        self.node = rclpy.create_node('adversary')
+        self._inputs = self._publishers()
+        self.health: dict[str, str] = {}
+        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._heard, MANY)
+        name = '/valveflow_monitor'
+        self._triggers = [
+            self.node.create_client(Trigger, f'{name}/{service}', qos_profile=MANY)
+            for service in SERVICES
+        ]
+        self._setter = self.node.create_client(
+            SetParameters, f'{name}/set_parameters', qos_profile=MANY
+        )
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        self._going, self._renew = True, threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _publishers(self) -> list[tuple[Publisher, float]]:
+        return [
+            (self.node.create_publisher(Float64, info.topic, MANY), VALUES[info.topic])
+            for info in SIGNALS if info.required
+        ]  # fmt: skip
+
+    def start_again(self) -> None:
+        """Publish with new publishers, as a gateway that was started again."""
+        self._renew.set()
+        while self._renew.is_set():
+            time.sleep(PERIOD_S)
+
+    def _heard(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name.endswith('recorder'):
+                self.health = {value.key: value.value for value in status.values}
+
+    def _run(self) -> None:
+        number = 0
+        while self._going:
+            if self._renew.is_set():
+                for publisher, _ in self._inputs:
+                    self.node.destroy_publisher(publisher)
+                self._inputs = self._publishers()
+                self._renew.clear()
+            for publisher, value in self._inputs:
+                publisher.publish(Float64(data=value + 0.01 * (number % 100)))
+            number += 1
+            end_s = time.monotonic() + PERIOD_S
+            while (left_s := end_s - time.monotonic()) > 0:
+                self._executor.spin_once(timeout_sec=left_s)
+
+    def storm(self) -> tuple[int, int, float]:
+        """Call everything at once; return calls, answers, and how long the last one took."""
+        value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=7200.0)
+        change = SetParameters.Request(
+            parameters=[Parameter(name='alarm_shelve_time', value=value)]
+        )
+        begun_s = time.monotonic()
+        futures = [
+            *(t.call_async(Trigger.Request()) for t in self._triggers for _ in range(BURST)),
+            *(self._setter.call_async(change) for _ in range(BURST)),
+        ]
+        while not all(f.done() for f in futures) and time.monotonic() < begun_s + PATIENCE_S / 4:
+            time.sleep(0.005)
+        return len(futures), sum(f.done() for f in futures), time.monotonic() - begun_s
+
+    def close(self) -> None:
+        """Publish no more."""
+        self._going = False
+        self._thread.join()
+        self.node.destroy_node()
+
+
+class World:
+    """One composed run: a folder, a clock, and the monitors started in it."""
+
+    def __init__(self, folder: Path, gateway: Gateway, generator: random.Random) -> None:
+        self.folder, self.gateway, self.generator = folder, gateway, generator
+        self.recordings = folder / 'recordings'
+        self._clock = folder / 'clock'
+        folder.mkdir()
+        self._clock.write_bytes(SECONDS.pack(0.0))
+        self.sessions: list[Session] = []
+        self.storms: list[tuple[int, int, float]] = []
+        self.problems: list[str] = []
+        # Messages that were there when the last monitor began.
+        self.before: dict[Path, set[Key]] = {}
+        self.start()
+
+    @property
+    def session(self) -> Session:
+        """Return the monitor that runs now."""
+        return self.sessions[-1]
+
+    def start(self) -> None:
+        """Start a monitor and wait until it records."""
+        self.sessions.append(self.new_session())
+        self.wait(lambda: int(self.gateway.health.get('Messages written', 0)) > 0)
+
+    def new_session(self) -> Session:
+        """Start a monitor."""
+        command = [sys.executable, '-m', 'benchmarks.torture.stepped_clock', str(self._clock)]
+        parameters = {
+            'record_directory': self.recordings, 'sample_period': 0.1,
+            'record_rotation': 60.0, 'input_reliability': 'reliable',
+        }  # fmt: skip
+        self.gateway.health = {}
+        process = subprocess.Popen(
+            [*command, *ros_arguments(parameters)], text=True, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )  # fmt: skip
+        return Session(process)
+
+    def wait(self, done: Callable[[], object]) -> bool:
+        """Wait until it is done or the monitor has ended; tell whether it is."""
+        end_s = time.monotonic() + PATIENCE_S
+        while not done() and time.monotonic() < end_s and self.session.process.poll() is None:
+            time.sleep(0.02)
+        return bool(done())
+
+    def files(self, pattern: str) -> list[Path]:
+        """Return files of all recordings."""
+        return sorted(self.recordings.glob(f'valveflow_*/{pattern}'))
+
+    def any_file(self) -> Path | None:
+        """Return a finished or growing file."""
+        found = self.files('*.mcap') + self.files('*.mcap.part')
+        return self.generator.choice(found) if found else None
+
+    def recording(self) -> Path | None:
+        """Return the newest recording."""
+        found = sorted(self.recordings.glob('valveflow_*'))
+        return found[-1] if found else None
+
+    def step_clock(self, seconds: float) -> None:
+        """Step the clock of all monitors."""
+        now_s = SECONDS.unpack(self._clock.read_bytes())[0]
+        with self._clock.open('r+b') as stream:
+            stream.write(SECONDS.pack(now_s + seconds))
+
+    def kill_and_start(self, later_s: float = 0.0) -> None:
+        """Kill the monitor and start another, with a clock that went on meanwhile."""
+        self.session.process.kill()
+        self.session.process.wait()
+        self.before = truth(self.folder)
+        self.step_clock(later_s)
+        self.start()
+
+
+def truth(folder: Path) -> dict[Path, set[Key]]:
+    """Return what a reader finds in each recording: topic and number of each message."""
+    found: dict[Path, set[Key]] = {}
+    for path in sorted(folder.glob('recordings/valveflow_*/*.mcap*')):
+        keys = found.setdefault(path.parent, set())
+        with tempfile.TemporaryDirectory() as scratch:
+            try:
+                keys |= {(topic, number) for topic, number, _, _ in stock_messages(path)}
+            except Exception:  # noqa: BLE001 - readers raise what they like
+                whole = Path(scratch, 'whole.mcap')
+                with suppress(ValveflowError):
+                    recover(path, whole)
+                    keys |= {(topic, number) for topic, number, _, _ in stock_messages(whole)}
+    return found
+
+
+# The acts. Each takes a world and does one thing to it.
+
+
+def delete_file(world: World) -> None:
+    if path := world.any_file():
+        path.unlink()
+
+
+def move_file(world: World) -> None:
+    if path := world.any_file():
+        path.rename(world.folder / f'moved_{time.monotonic_ns()}')
+
+
+def link_file(world: World) -> None:
+    if path := world.any_file():
+        other = world.folder / f'linked_{time.monotonic_ns()}'
+        path.rename(other)
+        path.symlink_to(other)
+
+
+def truncate_file(world: World) -> None:
+    if path := world.any_file():
+        os.truncate(path, world.generator.randrange(path.stat().st_size + 1))
+
+
+def extend_file(world: World) -> None:
+    if path := world.any_file():
+        with path.open('ab') as stream:
+            stream.write(world.generator.randbytes(100))
+
+
+def overwrite_file(world: World) -> None:
+    if path := world.any_file():
+        with path.open('r+b') as stream:
+            stream.seek(world.generator.randrange(path.stat().st_size + 1))
+            stream.write(world.generator.randbytes(50))
+
+
+def delete_recording(world: World) -> None:
+    if folder := world.recording():
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def move_recording(world: World) -> None:
+    if folder := world.recording():
+        folder.rename(world.folder / f'moved_{time.monotonic_ns()}')
+
+
+def delete_all_recordings(world: World) -> None:
+    shutil.rmtree(world.recordings, ignore_errors=True)
+
+
+def delete_state(world: World) -> None:
+    shutil.rmtree(world.recordings / 'state_unit', ignore_errors=True)
+
+
+def delete_state_file(world: World) -> None:
+    (world.recordings / 'state_unit' / 'monitor.state').unlink(missing_ok=True)
+
+
+def truncate_state_file(world: World) -> None:
+    with suppress(FileNotFoundError):
+        os.truncate(world.recordings / 'state_unit' / 'monitor.state', 20)
+
+
+def delete_lock_and_start_another(world: World) -> None:
+    (world.recordings / 'state_unit' / 'lock').unlink(missing_ok=True)
+    before = truth(world.folder)
+    second = world.new_session()
+    time.sleep(world.generator.uniform(2.0, 5.0))
+    world.problems += end(second)
+    claim = second.claim()
+    if claim is None:
+        if not second.says('another monitor'):
+            world.problems.append(f'the second one: no account: {second.lines[-3:]}')
+        return
+    folder, claimed = claim
+    found = len(truth(world.folder).get(folder, set()) - before.get(folder, set()))
+    if found != claimed:
+        world.problems.append(f'the second one: {claimed} claimed, {found} found in {folder}')
+
+
+def fill_disk(world: World) -> None:
+    pid = world.session.process.pid
+    _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, hard))
+    time.sleep(world.generator.uniform(0.2, 2.0))
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (hard, hard))
+
+
+def stop_process(world: World) -> None:
+    world.session.process.send_signal(signal.SIGSTOP)
+    time.sleep(world.generator.uniform(0.2, 2.0))
+    world.session.process.send_signal(signal.SIGCONT)
+
+
+def kill_process(world: World) -> None:
+    world.kill_and_start()
+
+
+def kill_process_and_wait_400_days(world: World) -> None:
+    world.kill_and_start(400.0 * DAY_S)
+
+
+def step_clock_back(world: World) -> None:
+    world.step_clock(-world.generator.uniform(0.1, 2.0) * DAY_S)
+
+
+def step_clock_on(world: World) -> None:
+    world.step_clock(world.generator.uniform(0.001, 2.0) * DAY_S)
+
+
+def restart_gateway(world: World) -> None:
+    for _ in range(world.generator.randint(1, 4)):
+        world.gateway.start_again()
+        time.sleep(0.3)
+
+
+def storm_of_requests(world: World) -> None:
+    world.storms.append(world.gateway.storm())
+
+
+ALL_ACTS = (
+    delete_file, move_file, link_file, truncate_file, extend_file, overwrite_file,
+    delete_recording, move_recording, delete_all_recordings, delete_state, delete_state_file,
+    truncate_state_file, delete_lock_and_start_another, fill_disk, stop_process, kill_process,
+    kill_process_and_wait_400_days, step_clock_back, step_clock_on, restart_gateway,
+    storm_of_requests,
+)  # fmt: skip
+
+
+def adversary(options: Options) -> Outcome:
+    """Compose acts from a seed, end the monitor, and compare its claims with what is there."""
+    outcome = Outcome()
+    os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 101 + 1)
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    rclpy.init(args=[])
+    gateway = Gateway()
+    table: dict[str, dict[str, int]] = {}
+    for run in range(options.many(RUNS, 2)):
+        generator = random.Random(f'{options.seed} {run}')
+        acts = generator.choices(ALL_ACTS, k=generator.randint(*ACTS))
+        world = World(options.folder / str(run), gateway, generator)
+        for act in acts:
+            time.sleep(generator.uniform(*PAUSE_S))
+            act(world)
+        time.sleep(generator.uniform(*PAUSE_S))
+        names = [act.__name__ for act in acts]
+        outcome.count('composed', len(acts))
+        before = outcome.failed
+        claimed, found = _judge(world, f'run {run} ({", ".join(names)})', outcome)
+        for name in set(names):
+            row = table.setdefault(name, dict.fromkeys(('runs', 'claimed', 'found', 'false'), 0))
+            for key, value in (
+                ('runs', 1), ('claimed', claimed), ('found', found),
+                ('false', outcome.failed > before),
+            ):  # fmt: skip
+                row[key] += value
+        if outcome.failed == before:
+            shutil.rmtree(options.folder / str(run))
+    gateway.close()
+    rclpy.shutdown()
+    outcome.counts['acts'] = dict(sorted(table.items()))
+    counts = outcome.counts
+    outcome.sentence = (
+        f'{counts["runs"]} runs, {counts["composed"]} acts: '
+        f'{counts["claimed"]} messages claimed, {counts["found"]} found, {outcome.failed} false '
+        f'claims; {counts.get("answered", 0)} of {counts.get("asked", 0)} requests answered, the '
+        f'last of a burst after {outcome.measured.get("longest_answer_s", 0.0):.2f} s at most'
+    )
+    return outcome
+
+
+def _judge(world: World, what: str, outcome: Outcome) -> tuple[int, int]:
+    """End the monitor; return the messages that it claimed and those that are found."""
+    outcome.count('runs')
+    session = world.session
+    told = 0
+    if world.generator.random() < 0.5:
+        # In some runs the health has the time to say what happened.
+        time.sleep(HEALTH_S)
+        told = int(world.gateway.health.get('Messages written', 0))
+        outcome.count('asked_for_health')
+    for problem in [*world.problems, *end(session)]:
+        outcome.expect(False, f'{what}: {problem}')
+    claim = session.claim()
+    if claim is None:
+        outcome.expect(False, f'{what}: no account: {session.lines[-3:]}')
+        return 0, 0
+    folder, claimed = claim
+    found = len(truth(world.folder).get(folder, set()) - world.before.get(folder, set()))
+    outcome.count('claimed', claimed)
+    outcome.count('found', found)
+    # What is latched stands at the head of the next file too, where a lost one may be found.
+    more = REPEATED * ACTS[1]
+    outcome.expect(
+        claimed <= found <= claimed + more, f'{what}: {claimed} claimed, {found} found in {folder}'
+    )
+    outcome.expect(told <= found, f'{what}: {told} written by the health, {found} found')
+    if not session.says('he state cannot be saved'):
+        path = world.recordings / 'state_unit' / 'monitor.state'
+        try:
+            from_bytes(path.read_bytes())
+        except (OSError, ValueError, ValveflowError) as error:
+            outcome.expect(False, f'{what}: no word that there is no state ({error})')
+    for asked, answered, seconds in world.storms:
+        outcome.count('asked', asked)
+        outcome.count('answered', answered)
+        outcome.worst('longest_answer_s', round(seconds, 2))
+        outcome.expect(answered == asked, f'{what}: {answered} of {asked} requests answered')
+        outcome.wish(seconds <= ANSWER_S, f'{what}: answers took {seconds:.2f} s')
+    return claimed, found
+
+
+def end(session: Session) -> list[str]:
+    """Ask a monitor to end; return what was wrong with its end."""
+    process, wrong = session.process, []
+    process.terminate()
+    try:
+        process.wait(END_S)
+    except subprocess.TimeoutExpired:
+        wrong.append(f'it did not end within {END_S:g} s')
+        process.kill()
+        process.wait()
+    session.listener.join()
+    if session.says('Traceback'):
+        wrong.append(f'a traceback: {session.lines[-5:]}')
+    # One that finds another monitor at work refuses to start.
+    if process.returncode != 0 and not session.says('another monitor'):
+        wrong.append(f'status {process.returncode}: {session.lines[-3:]}')
+    return wrong
