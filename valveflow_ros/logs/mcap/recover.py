@@ -102,7 +102,7 @@ def intact_messages(path: Path) -> int:
     """Return how many messages stand in the intact chunks of a file; 0 if it cannot be read."""
     try:
         with Source.open(path) as source:
-            return sum(map(len, _intact(Scanner(source), TopicTable(), None, source.size)))
+            return sum(map(len, _Copier(source, Scanner(source)).chunks(None)))
     except RecordingError:
         return 0
 
@@ -222,6 +222,7 @@ class _Proven:
 
     def __post_init__(self) -> None:
         self.write, self.sync = self.out.write, self.out.sync
+        self.check, self.check_content = self.out.check, self.out.check_content
         self.close, self.discard = self.out.close, self.out.discard
 
     def publish(self) -> None:
