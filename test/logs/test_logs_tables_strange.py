@@ -286,6 +286,25 @@ def test_a_small_parquet_of_many_rows_costs_what_one_of_few_rows_does(tmp_path, 
     assert peak < opened(repeated(tmp_path / 'few.parquet', names, 100))[1] + 100
 
 
+@pytest.mark.parametrize('names', [('a', 'time'), WIDE])
+def test_a_parquet_of_one_page_costs_what_one_of_few_rows_does(tmp_path, names):
+    pa = pytest.importorskip('pyarrow')
+    from pyarrow import parquet
+
+    def written(path, n):
+        parquet.write_table(
+            pa.table({name: np.zeros(n) for name in names}), path, row_group_size=n,
+            compression='zstd', use_dictionary=False, data_page_size=1 << 30, write_batch_size=n,
+            max_rows_per_page=n,
+        )  # fmt: skip
+        return path
+
+    bomb = written(tmp_path / 'bomb.parquet', 30_000_000)
+    assert bomb.stat().st_size < 1_000_000
+    peak = opened(bomb)[1]
+    assert peak < opened(written(tmp_path / 'few.parquet', 100))[1] + 100
+
+
 def test_the_limit_of_what_is_unpacked_can_be_raised(tmp_path):
     path = repeated(tmp_path / 'x.parquet', WIDE, 2_000_000)
     with pytest.raises(RecordingError, match='add --max-unpacked 80') as refused:

@@ -8,7 +8,7 @@ import math
 import re
 import tempfile
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -72,11 +72,17 @@ def parquet_names(path: Path) -> tuple[str, ...]:
         return tuple(str(name).strip() for name in file.schema_arrow.names)
 
 
-def parquet_samples(path: Path, places: Sequence[int]) -> list[list[str]]:
-    """Return cells at these places, of rows from the first and from the last group."""
+def parquet_samples(path: Path, places: Sequence[int], options: TableOptions) -> list[list[str]]:
+    """Return cells at these places, of rows from the first and from the last group.
+
+    Of a group that unpacks beyond the limit there are none: all of it may be one page.
+    """
     rows: list[list[str]] = []
+    most = options.unpacked_bytes(path.stat().st_size, _PARQUET_BYTES)
     with _parquet(path, places) as (file, names):
         for group in sorted({0, file.num_row_groups - 1} & set(range(file.num_row_groups))):
+            if _stated(file.metadata, names, [group]) > most:
+                continue
             batch = next(file.iter_batches(_SAMPLES, row_groups=[group], columns=names), None)
             columns = [] if batch is None else [c.to_pylist() for c in _decoded(path, batch)]
             rows += [[_text(cell) for cell in row] for row in zip(*columns, strict=True)]
@@ -128,11 +134,9 @@ def _check_unpacked(path: Path, footer: Any, names: list[str], options: TableOpt
     """Refuse columns out of proportion to the file before one of their rows is read."""
     packed = path.stat().st_size
     most = options.unpacked_bytes(packed, _PARQUET_BYTES)
-    groups = [footer.row_group(k) for k in range(footer.num_row_groups)]
-    rows = max(footer.num_rows, sum(group.num_rows for group in groups))
-    wanted = [k for k in range(footer.num_columns) if footer.schema.column(k).path in names]
-    stated = sum(group.column(k).total_uncompressed_size for group in groups for k in wanted)
-    unpacked = max(_CELL_BYTES * rows * len(names), stated)
+    groups = range(footer.num_row_groups)
+    rows = max(footer.num_rows, sum(footer.row_group(k).num_rows for k in groups))
+    unpacked = max(_CELL_BYTES * rows * len(names), _stated(footer, names, groups))
     if unpacked > most:
         raise RecordingError(
             path,
@@ -140,6 +144,13 @@ def _check_unpacked(path: Path, footer: Any, names: list[str], options: TableOpt
             f'{most / 1e6:.0f} MB that are read of a file of {packed / 1e6:.1f} MB; '
             f'{_allowed(unpacked)}',
         )
+
+
+def _stated(footer: Any, names: list[str], groups: Iterable[int]) -> int:
+    """Return the bytes of some columns in some groups, unpacked, by what the footer says."""
+    wanted = [k for k in range(footer.num_columns) if footer.schema.column(k).path in names]
+    parts = map(footer.row_group, groups)
+    return sum(part.column(k).total_uncompressed_size for part in parts for k in wanted)
 
 
 def _allowed(unpacked: float) -> str:

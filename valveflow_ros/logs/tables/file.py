@@ -100,7 +100,8 @@ class TableFile:
         """
         if self.rows is None:
             with _translated(self.path):
-                return [tuple(map(str.strip, r)) for r in parquet_samples(self.path, places)]
+                found = parquet_samples(self.path, places, self.options)
+                return [tuple(map(str.strip, row)) for row in found]
         whole = [row for row in self.rows if max(places) < len(row)]
         return [tuple(row[k].strip() for k in places) for row in whole]
 
