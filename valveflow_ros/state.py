@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from valveflow_ros.errors import DataError
 
 State = dict[str, Any]
+_LARGEST = 2**64  # times are nanoseconds in 64 bits, and nothing counts further
 
 
 class Memory:
@@ -73,16 +74,38 @@ def _of_kind(own: Any, saved: Any, key: str) -> Any:
     """Return a saved value as the kind of value that an object has now."""
     if isinstance(own, np.ndarray):
         return own  # written in place
-    if hasattr(own, 'restore') != isinstance(saved, dict):
+    if hasattr(own, 'restore') != isinstance(saved, dict) or not _fits(own, saved, key):
         raise DataError(f"The saved state has '{key}' of another kind.")
     if hasattr(own, 'restore'):
         own.restore(saved)
         return own
-    if isinstance(own, enum.IntEnum):
-        return type(own)(saved)
-    if isinstance(own, tuple):
-        return type(own)(*saved) if hasattr(own, '_fields') else tuple(saved)
+    try:
+        if isinstance(own, enum.IntEnum):
+            return type(own)(saved)
+        if isinstance(own, tuple):
+            return type(own)(*saved) if hasattr(own, '_fields') else tuple(saved)
+    except (TypeError, ValueError):
+        raise DataError(f"The saved state has '{key}' of another kind.") from None
     return saved
+
+
+def _fits(own: Any, saved: Any, key: str) -> bool:
+    """Tell whether a saved value may stand in the place of the one that an object has now."""
+    if own is None:
+        # Of what is none yet the name tells that it is a time.
+        return not key.endswith('_ns') or saved is None or type(saved) is int
+    if isinstance(own, bool | str):
+        return isinstance(saved, type(own))
+    if isinstance(own, int | float):
+        return type(saved) is int or (isinstance(own, float) and isinstance(saved, float))
+    return isinstance(saved, list) or not isinstance(own, tuple | list)
+
+
+def perhaps(saved: State, key: str, kind: type) -> Any:
+    """Return what stands under a key, None or of one kind; raises `DataError`."""
+    if saved[key] is not None and type(saved[key]) is not kind:
+        raise DataError(f"The saved state has '{key}' of another kind.")
+    return saved[key]
 
 
 def copies(arrays: Mapping[str, NDArray[Any]]) -> State:
@@ -158,6 +181,8 @@ def from_bytes(data: bytes) -> State:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             tree = json.loads(archive['tree'].tobytes())
             state = _full(tree, archive)
+    except DataError:
+        raise
     except Exception as error:  # noqa: BLE001 - zip, numpy and json raise what they like
         reason = type(error).__name__
         raise DataError(f'The saved state cannot be read ({reason}).') from None
@@ -188,4 +213,6 @@ def _full(value: Any, archive: Any) -> Any:
         return {key: _full(item, archive) for key, item in value.items()}
     if isinstance(value, list):
         return [_full(item, archive) for item in value]
+    if isinstance(value, int) and abs(value) >= _LARGEST:
+        raise DataError('The saved state cannot be read: it has a number that nothing counts to.')
     return value

@@ -61,8 +61,8 @@ def test_errors_are_those_of_the_curve_and_of_its_parameters():
         (lambda raw: raw['pieces'][0].update(u_to=-1.0) or raw, r"'pieces\[0\].u_to' is not"),
         (lambda raw: raw['pieces'][1].update(u_from=12.0) or raw, r"'pieces\[1\].u_from' is not"),
         (lambda raw: raw['pieces'][0].update(slope=True) or raw, r"'pieces\[0\].slope' is"),
-        (lambda raw: raw['pieces'][0].update(slope=float('nan')) or raw, 'is missing or no'),
-        (lambda raw: raw | {'pressure_exponent': 'x'}, "'pressure_exponent' is missing or no"),
+        (lambda raw: raw['pieces'][0].update(slope=float('nan')) or raw, 'is out of range'),
+        (lambda raw: raw | {'pressure_exponent': 'x'}, "'pressure_exponent' is not a number"),
     ],
 )
 def test_what_is_no_truth_is_refused(change, sentence):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -166,3 +168,50 @@ def test_a_restored_alarm_keeps_to_the_settings_of_the_monitor():
         if isinstance(value, bool | int | float):
             assert vars(monitor.reference.alarm)[name] == value
     assert vars(fresh) != vars(default)
+
+
+def scalars(state, at=()):
+    """Yield the places of single values in a state; of a list, the first and the last entry."""
+    ends = {0, len(state) - 1}
+    items = state.items() if isinstance(state, dict) else enumerate(state)
+    for key, value in items:
+        if isinstance(state, list) and key not in ends:
+            continue
+        if isinstance(value, dict | list):
+            yield from scalars(value, (*at, key))
+        elif not isinstance(value, np.ndarray):
+            yield (*at, key)
+
+
+@pytest.mark.parametrize(
+    'value',
+    [np.nan, np.inf, -1, 0, 10**400, 'x', None, [], True],
+    ids=lambda value: repr(value)[:9],
+)
+def test_a_state_with_one_value_changed_is_refused_or_goes_on(value):
+    """What is refused is so before the first row; the restart catches these errors."""
+    caught = (DataError, LookupError, TypeError, ValueError, AttributeError)
+    table = plant_table(2, 1560)
+    first = Monitor(SETTINGS)
+    feed_rows(first, table.part(0, 1500))
+    saved, refused, tried = first.snapshot(), 0, 0
+    for path in scalars(saved):
+        state = copy.deepcopy(saved)
+        inside = state
+        for key in path[:-1]:
+            inside = inside[key]
+        inside[path[-1]] = value
+        second = Monitor(SETTINGS)
+        tried += 1
+        try:
+            second.restore(from_bytes(to_bytes(state)))
+        except caught:
+            refused += 1
+            continue
+        feed_rows(second, table.part(1500, 1560))
+        assert from_bytes(to_bytes(second.snapshot())), path
+    assert tried > 100
+    if value in (10**400, 'x'):
+        assert refused > 0.3 * tried
+    if value == 10**400:
+        assert refused == tried

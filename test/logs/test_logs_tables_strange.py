@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import tracemalloc
 import zipfile
 from pathlib import Path
@@ -15,6 +17,7 @@ from hypothesis import strategies as st
 from valveflow_ros.errors import RecordingError, ValveflowError
 from valveflow_ros.logs import open_log, read_table
 from valveflow_ros.logs.tables.cells import foreign_quality
+from valveflow_ros.logs.tables.refusal import TableOptions
 from valveflow_ros.logs.tables.text import LONGEST_LINE
 from valveflow_ros.records import Quality, Signal
 
@@ -227,3 +230,133 @@ def _workbook(path: Path, rows: str, texts: str = '') -> Path:
 def test_a_small_workbook_that_would_fill_the_memory_is_refused(rows, texts, sentence, tmp_path):
     with pytest.raises(RecordingError, match=sentence):
         open_log(_workbook(tmp_path / 'bomb.xlsx', rows, texts))
+
+
+WIDE = ('time', 'valve_opening_percent', 'main_steam_pressure_mpa', 'main_steam_temperature_degc',
+        'generated_power_mw')  # fmt: skip
+LONG = ('Tag', 'Time', 'Value', 'Quality')
+# Opens a table, says why not, and how much memory that took in MB.
+OPEN = """
+import resource, sys
+from valveflow_ros.errors import ValveflowError
+import valveflow_ros as vf
+try:
+    vf.open_log(sys.argv[1])
+    print('read')
+except ValveflowError as error:
+    print(str(error).replace(chr(10), ' '))
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+"""
+
+
+def opened(path):
+    done = subprocess.run(
+        [sys.executable, '-c', OPEN, str(path)], capture_output=True, text=True, check=True
+    )
+    *said, peak = done.stdout.strip().splitlines()
+    return said[-1], int(peak)
+
+
+def repeated(path, names, n):
+    """Write a Parquet file in which one row stands n times; text in columns named as such."""
+    pa = pytest.importorskip('pyarrow')
+    from pyarrow import parquet
+
+    place = pa.array(np.zeros(n, dtype=np.int32))
+    one = {name: ['CV_POS' if name == 'Tag' else 'Good' if name == 'Quality' else 1.0]
+           for name in names}  # fmt: skip
+    parquet.write_table(pa.table(one).take(place), path, row_group_size=n, compression='zstd')
+    return path
+
+
+@pytest.mark.parametrize(
+    ('names', 'why'),
+    [
+        (('a', 'b', 'c', 'time'), "no column 'valve_opening_percent'"),
+        (('a', 'b'), "no column 'valve_opening_percent'"),
+        (WIDE, 'has 20000000 rows that unpack to 800 MB'),
+        (LONG, 'has 20000000 rows that unpack to'),
+    ],
+)
+def test_a_small_parquet_of_many_rows_costs_what_one_of_few_rows_does(tmp_path, names, why):
+    bomb = repeated(tmp_path / 'bomb.parquet', names, 20_000_000)
+    assert bomb.stat().st_size < 500_000
+    said, peak = opened(bomb)
+    assert why in said
+    assert peak < opened(repeated(tmp_path / 'few.parquet', names, 100))[1] + 100
+
+
+@pytest.mark.parametrize('names', [('a', 'time'), WIDE])
+def test_a_parquet_of_one_page_costs_what_one_of_few_rows_does(tmp_path, names):
+    pa = pytest.importorskip('pyarrow')
+    from pyarrow import parquet
+
+    def written(path, n):
+        parquet.write_table(
+            pa.table({name: np.zeros(n) for name in names}), path, row_group_size=n,
+            compression='zstd', use_dictionary=False, data_page_size=1 << 30, write_batch_size=n,
+            max_rows_per_page=n,
+        )  # fmt: skip
+        return path
+
+    bomb = written(tmp_path / 'bomb.parquet', 30_000_000)
+    assert bomb.stat().st_size < 1_000_000
+    peak = opened(bomb)[1]
+    assert peak < opened(written(tmp_path / 'few.parquet', 100))[1] + 100
+
+
+def test_the_limit_of_what_is_unpacked_can_be_raised(tmp_path):
+    path = repeated(tmp_path / 'x.parquet', WIDE, 2_000_000)
+    with pytest.raises(RecordingError, match='add --max-unpacked 80') as refused:
+        read_table(path)
+    enough = str(refused.value).rstrip('.').rpartition(' ')[2]
+    assert len(read_table(path, options=TableOptions(max_unpacked=enough)).time_ns) == 2_000_000
+    book = book_of(tmp_path / 'x.xlsx')
+    with pytest.raises(RecordingError, match='add --max-unpacked 1'):
+        read_table(book, options=TableOptions(max_unpacked='0.001'))
+    same = read_table(book, options=TableOptions(max_unpacked='1')).time_ns
+    assert same.tolist() == read_table(book).time_ns.tolist()
+    for wrong in ('0', '-1', 'nan', 'inf', 'much'):
+        with pytest.raises(ValveflowError, match='must be a number of megabytes'):
+            TableOptions(max_unpacked=wrong)
+
+
+def test_columns_of_lists_or_of_endless_texts_are_refused_only_where_they_are_needed(tmp_path):
+    pa = pytest.importorskip('pyarrow')
+    from pyarrow import parquet
+
+    rows, path = 100, tmp_path / 'x.parquet'
+    plain = {name: np.arange(1.0, rows + 1) for name in WIDE}
+    text = pa.array(['9' * 1_000_000]).take(pa.array(np.zeros(rows, dtype=np.int32)))
+    lists = [[1.0, 2.0]] * rows
+    structures = [{'value': 1.0}] * rows
+    parquet.write_table(pa.table(plain), path)
+    expected = read_table(path).columns
+    for strange, why in ((text, 'texts too long'), (lists, 'list<'), (structures, 'struct<')):
+        parquet.write_table(pa.table({**plain, 'remark': strange}), path)
+        found = read_table(path).columns
+        assert all((found[name] == expected[name]).all() for name in expected)
+        parquet.write_table(pa.table({**plain, WIDE[1]: strange}), path)
+        with pytest.raises(RecordingError, match=why):
+            read_table(path)
+
+
+def test_cells_of_a_parquet_mean_the_same_as_numbers_as_texts_and_as_categories(tmp_path):
+    frame = pd.DataFrame({name: np.arange(1.0, 60.0) for name in WIDE})
+    kinds = (float, str, 'category')
+    found = []
+    for kind in kinds:
+        frame.astype(dict.fromkeys(WIDE[1:], kind)).to_parquet(tmp_path / 'x.parquet')
+        found.append(read_table(tmp_path / 'x.parquet'))
+    for other in found[1:]:
+        assert other.time_ns.tolist() == found[0].time_ns.tolist()
+        assert all((other.columns[n] == found[0].columns[n]).all() for n in found[0].columns)
+
+
+@pytest.mark.parametrize('name', ['x.csv', 'x.csv.gz', 'x.parquet', 'x.feather'])
+def test_packed_texts_are_not_unpacked(tmp_path, name):
+    import gzip
+
+    (tmp_path / name).write_bytes(gzip.compress(text_of(tmp_path / 'plain.csv').read_bytes()))
+    with pytest.raises(RecordingError, match='is neither'):
+        open_log(tmp_path / name)

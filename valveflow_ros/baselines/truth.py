@@ -8,11 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valveflow_ros.curve.characteristic_json import PIECE, Joint, check_pieces
+from valveflow_ros.curve.json_schema import MOST_PIECES, ListOf, Maybe, Number, checked
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import FloatArray
 
 _PLACES = 2000
-_LARGEST = 1e9
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +64,13 @@ class CurveError:
     intercept: float = math.nan
 
 
+_LINE = 'u_from', 'u_to', 'slope', 'intercept'
+_SCHEMA = {
+    'pressure_exponent': Maybe(Number(0.5, 2.0)),
+    'pieces': ListOf({name: PIECE[name] for name in _LINE}, 1, MOST_PIECES),
+}
+
+
 def read_truth(raw: object) -> Truth:
     """Read a truth: what ``valveflow simulate --truth`` writes, or a characteristic.
 
@@ -73,36 +81,11 @@ def read_truth(raw: object) -> Truth:
     """
     if not isinstance(raw, dict) or not isinstance(raw.get('pieces'), list) or not raw['pieces']:
         raise DataError("This is no truth of a plant: it must hold a list 'pieces'.")
-    pieces = [_piece(piece, k) for k, piece in enumerate(raw['pieces'])]
-    for k in range(1, len(pieces)):
-        if not math.isclose(pieces[k][0], pieces[k - 1][1], rel_tol=1e-9):
-            raise DataError(
-                f"The truth cannot be used: 'pieces[{k}].u_from' is not where the piece before "
-                'it ends.'
-            )
-    table = np.array(pieces)
-    exponent = _number(raw.get('pressure_exponent', 1.125), 'pressure_exponent')
+    top = checked(raw, _SCHEMA, 'truth')
+    check_pieces(top['pieces'], 'truth', 'pieces', Joint.NEARLY)
+    table = np.array([list(piece.values()) for piece in top['pieces']])
+    exponent = top['pressure_exponent'] or 1.125
     return Truth(np.append(table[:, 0], table[-1, 1]), table[:, 2], table[:, 3], exponent)
-
-
-def _piece(raw: object, number: int) -> tuple[float, float, float, float]:
-    where = f'pieces[{number}]'
-    if not isinstance(raw, dict):
-        raise DataError(f"The truth cannot be used: '{where}' is not an object.")
-    low, high, slope, intercept = (
-        _number(raw.get(name), f'{where}.{name}')
-        for name in ('u_from', 'u_to', 'slope', 'intercept')
-    )
-    if not low < high:
-        raise DataError(f"The truth cannot be used: '{where}.u_to' is not above u_from.")
-    return low, high, slope, intercept
-
-
-def _number(value: object, where: str) -> float:
-    good = isinstance(value, int | float) and not isinstance(value, bool)
-    if not (good and abs(value) < _LARGEST):  # type: ignore[arg-type]
-        raise DataError(f"The truth cannot be used: '{where}' is missing or no number.")
-    return float(value)  # type: ignore[arg-type]
 
 
 def curve_error(

@@ -225,6 +225,9 @@ def add_mapping(parser: ArgumentParser) -> None:
          'whether 01/02/2026 is in February (dmy) or in January (mdy)'),
         ('decimal', 'point|comma', 'what stands before the decimals of a number'),
         ('sheet', 'NAME', 'which sheet of a workbook'),
+        ('max-unpacked', 'MB',
+         'to how much a workbook or a Parquet file may unpack (default: 64 MB, or 200 times its '
+         'size if that is more, up to 1074 MB and 2147 MB)'),
     ):  # fmt: skip
         about.add_argument(
             f'--{option}', dest='column', action='append', metavar=metavar, help=told,
@@ -338,4 +341,6 @@ def rejected_words(counts: Mapping[str, Mapping[str, int]]) -> str:
         if refused:
             words = ', '.join(f'{count(n)} {REASON_WORDS[r]}' for r, n in refused.items())
             told.append(f'  {topic}: {words}')
+    if not any(n for by_reason in counts.values() for n in by_reason.values()):
+        return 'No reading was found.'
     return '\n'.join(['Readings not used:', *told]) if told else 'Every reading was used.'

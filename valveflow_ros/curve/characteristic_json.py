@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import math
 from typing import Any
 
@@ -16,7 +17,22 @@ from valveflow_ros.curve.characteristic import (
     Source,
     Support,
 )
-from valveflow_ros.curve.json_field import Field
+from valveflow_ros.curve.json_schema import (
+    DEGC,
+    MOST_PIECES,
+    MW,
+    NS,
+    Count,
+    Flag,
+    ListOf,
+    Maybe,
+    Members,
+    Number,
+    Text,
+    U,
+    checked,
+    fail,
+)
 from valveflow_ros.errors import DataError
 
 # Causes held while a curve was fitted, as JSON.
@@ -31,27 +47,29 @@ def held_json(held: tuple[HeldCause, ...]) -> dict[str, Any]:
     }
 
 
-def held_from(field: Field | None) -> tuple[HeldCause, ...]:
-    """Read what `held_json` wrote.
+# The name of a cause, and the values it has there; which they are its catalogue knows.
+HELD = Maybe(ListOf({'name': Text(), 'values': Members(Number(-1e12, 1e12)), 'sentence': Text()}))
+
+
+def held_from(raw: object) -> tuple[HeldCause, ...]:
+    """Read what `held_json` wrote from the object that has it, or has none.
 
     Raises
     ------
     DataError
         It is not that; the sentence names the place.
     """
-    if field is None:
-        return ()
+    return _held(checked(raw, {'held': HELD}, _WHOLE)['held'])
+
+
+def _held(found: list[dict[str, Any]] | None) -> tuple[HeldCause, ...]:
     return tuple(
-        HeldCause(
-            f.key('name').text(),
-            tuple((name, value.real()) for name, value in f.key('values').members()),
-            f.key('sentence').text(),
-        )
-        for f in field.items()
+        HeldCause(h['name'], tuple(h['values'].items()), h['sentence']) for h in found or ()
     )
 
 
 FORMAT = 'valveflow/characteristic'
+_WHOLE = 'characteristic'
 VERSION = 1
 
 
@@ -162,6 +180,64 @@ def to_json(c: Characteristic) -> dict[str, Any]:
     }
 
 
+# An error that is hardly known may be beyond all bounds.
+_ERROR = Number(0.0, 1e30, null=True)
+PIECE = {
+    'u_from': Number(*U), 'u_to': Number(*U), 'slope': Number(-1e9, 1e9),
+    'intercept': Number(-1e15, 1e15), 'slope_stderr': _ERROR,
+    'intercept_stderr': _ERROR, 'samples': Count(),
+}  # fmt: skip
+_SUPPORT = {
+    'steady': Count(), 'slope_response': Count(), 'samples': Count(),
+    'levels': ListOf(Number(*U), rising=True, most=1_000_000),
+}  # fmt: skip
+_SUM = {'slack': Number(0.0, 1e6), 'limit': Number(1e-6, 1e9)}
+_COST = Members(Number(0.0, 1e30, null=True), pieces=True)
+_ANGLE = Members(Number(-360.0, 360.0, null=True), pieces=True)
+_SCHEMA = {
+    'model_id': Maybe(Text()),
+    'pressure_exponent': Number(0.5, 2.0),
+    'pieces': ListOf(
+        {**PIECE, 'identifiable': Maybe(Flag()), 'support': Maybe(_SUPPORT)}, 1, MOST_PIECES
+    ),
+    'breakpoint_intervals': ListOf(
+        # Where a breakpoint is hardly known its interval leaves the plant.
+        ListOf(Number(-1e30, 1e30, null=True), 2, 2)
+    ),
+    'selection': {
+        'rule': Text(), 'cost': _COST, 'turning_angle': _ANGLE, 'note': Maybe(Text()),
+        'confidence': Maybe(Members(Number(0.0, 1.0 + 1e-9, null=True), pieces=True)),
+    },
+    'segments': {'steady': Count(), 'slope_response': Count(), 'samples': Count()},
+    'window': Maybe({'start_ns': Count(NS), 'end_ns': Count(NS)}),
+    'temperature': Maybe({
+        'mean_degc': Number(*DEGC, null=True),
+        'spread_k': Number(0.0, DEGC[1], null=True), 'flag': Flag(),
+    }),
+    'dynamics': ListOf({
+        'power_from': Number(*MW), 'power_to': Number(*MW),
+        'time_constant_s': Number(1e-6, 3600.0), 'delay_s': Number(0.0, 600.0),
+        'time_constant_stderr_s': Maybe(_ERROR),
+        'delay_stderr_s': Maybe(_ERROR),
+        'power_to_stderr_mw': Maybe(_ERROR),
+    }),
+    'residuals': Maybe({
+        'rmse_mw': Number(0.0, MW[1]), 'average_sd_mw': Number(0.0, MW[1]),
+        'average_s': Number(1e-3, 1e7), 'input_noise': Number(0.0, U[1]),
+        'power_noise_mw': Number(0.0, MW[1]), 'width_mw': Maybe(_ERROR),
+        'chart': Maybe({
+            'block_s': Number(1e-3, 864_000.0), 'correlation': Number(0.0, 0.999),
+            'innovation_mw': Number(1e-12, MW[1]), 'small': _SUM, 'large': _SUM,
+            'run_length_days': Number(1e-6, 1e6),
+        }),
+    }, or_empty=True),
+    'partition': Maybe({'pieces': ListOf(PIECE, most=MOST_PIECES)}),
+    'notes': Maybe(ListOf(Text())),
+    'held': HELD,
+    'optimal': Maybe(Flag()),
+}  # fmt: skip
+
+
 def from_json(raw: object) -> Characteristic:
     """Read the content of ``characteristic.json``.
 
@@ -177,152 +253,134 @@ def from_json(raw: object) -> Characteristic:
         raise DataError(f"This is no flow characteristic: 'format' must be '{FORMAT}'.")
     if raw.get('version') is not VERSION:
         raise DataError(
-            f'The characteristic has version {raw.get("version")}, this program reads {VERSION}.'
+            f'The characteristic has version {_told(raw.get("version"))}, this program reads '
+            f'{VERSION}.'
         )
-    top = Field(raw, '')
-    pieces = _pieces(top.key('pieces'))
-    intervals = tuple(_interval(f) for f in top.key('breakpoint_intervals').items())
-    if len(intervals) != len(pieces) - 1:
-        raise top.key('breakpoint_intervals').fail(f'must have {len(pieces) - 1} entries')
-    selection = top.key('selection')
-    notes, partition, name = (top.may_have(n) for n in ('notes', 'partition', 'model_id'))
-    note, confidence = (selection.may_have(n) for n in ('note', 'confidence'))
+    top = checked(raw, _SCHEMA, _WHOLE)
+    check_pieces(top['pieces'], _WHOLE, 'pieces', Joint.SAME)
+    partition = top['partition'] or {'pieces': []}
+    check_pieces(partition['pieces'], _WHOLE, 'partition.pieces', Joint.FREE)
+    _check_intervals(top)
+    _check_order(top)
+    choice, source, window, temperature = (
+        top['selection'], top['segments'], top['window'], top['temperature'],
+    )  # fmt: skip
+    window = window or {'start_ns': 0, 'end_ns': 0}
+    temperature = temperature or {'mean_degc': math.nan, 'spread_k': math.nan, 'flag': False}
     return Characteristic(
-        pressure_exponent=top.key('pressure_exponent').real(0.5, 2.0),
-        pieces=pieces,
-        breakpoint_intervals=intervals,
+        pressure_exponent=top['pressure_exponent'],
+        pieces=tuple(map(_piece, top['pieces'])),
+        breakpoint_intervals=tuple((low, high) for low, high in top['breakpoint_intervals']),
         choice=Choice(
-            selection.key('rule').text(),
-            selection.key('cost').by_pieces(),
-            selection.key('turning_angle').by_pieces(),
-            note.text() if note else '',
-            confidence.by_pieces() if confidence else {},
+            choice['rule'], choice['cost'], choice['turning_angle'], choice['note'] or '',
+            choice['confidence'] or {},
         ),
-        source=_source(top),
-        residuals=_residuals(top.may_have('residuals')),
-        dynamics=_dynamics(top.key('dynamics')),
-        partition_pieces=_pieces(partition.key('pieces'), touching=False) if partition else (),
-        notes=tuple(n.text() for n in notes.items()) if notes else (),
-        support=_support(top.key('pieces')),
-        model_id=name.text() if name else '',
-        held=held_from(top.may_have('held')),
-    )
+        source=Source(
+            window['start_ns'], window['end_ns'], source['steady'], source['slope_response'],
+            source['samples'], temperature['mean_degc'], temperature['spread_k'],
+            temperature['flag'],
+        ),
+        residuals=_residuals(top['residuals']),
+        dynamics=tuple(
+            RegionDynamics(**{k: math.nan if v is None else v for k, v in region.items()})
+            for region in top['dynamics']
+        ),
+        partition_pieces=tuple(map(_piece, partition['pieces'])),
+        notes=tuple(top['notes'] or ()),
+        support=_support(top['pieces']),
+        model_id=top['model_id'] or '',
+        held=_held(top['held']),
+    )  # fmt: skip
 
 
-def _pieces(field: Field, touching: bool = True) -> tuple[Piece, ...]:
-    pieces: list[Piece] = []
-    for f in field.items():
-        if pieces and touching and f.key('u_from').real() != pieces[-1].u_to:
-            raise f.key('u_from').fail('is not where the piece before it ends')
-        piece = Piece(
-            f.key('u_from').real(),
-            f.key('u_to').real(),
-            f.key('slope').real(),
-            f.key('intercept').real(),
-            f.key('slope_stderr').real_or_nan(0.0),
-            f.key('intercept_stderr').real_or_nan(0.0),
-            f.key('samples').whole(),
-        )
-        if not piece.u_from < piece.u_to:
-            raise f.key('u_to').fail('is not above u_from')
-        pieces.append(piece)
-    if touching and not pieces:
-        raise field.fail('is empty')
-    return tuple(pieces)
+def _told(version: object) -> str:
+    return repr(version)[:20]
 
 
-def _support(field: Field) -> tuple[Support, ...]:
+def _piece(found: dict[str, Any]) -> Piece:
+    return Piece(**{name: found[name] for name in PIECE})
+
+
+def _support(pieces: list[dict[str, Any]]) -> tuple[Support, ...]:
     """Return what the pieces rest on; empty unless every piece says so."""
-    found: list[Support] = []
-    for piece in field.items():
-        judged, support = piece.may_have('identifiable'), piece.may_have('support')
-        if judged is None or support is None:
-            return ()
-        found.append(
-            Support(
-                support.key('steady').whole(),
-                support.key('slope_response').whole(),
-                support.key('samples').whole(),
-                tuple(level.real() for level in support.key('levels').items()),
-                judged.flag(),
-            )
-        )
-    return tuple(found)
+    if any(p['support'] is None or p['identifiable'] is None for p in pieces):
+        return ()
+    return tuple(
+        Support(**{**p['support'], 'levels': tuple(p['support']['levels'])},
+                identifiable=p['identifiable'])
+        for p in pieces
+    )  # fmt: skip
 
 
-def _interval(field: Field) -> tuple[float, float]:
-    ends = field.items()
-    if len(ends) != 2:
-        raise field.fail('must be a lower and an upper end')
-    return ends[0].real_or_nan(), ends[1].real_or_nan()
-
-
-def _source(top: Field) -> Source:
-    segments, window, temperature = (
-        top.key('segments'),
-        top.may_have('window'),
-        top.may_have('temperature'),
-    )
-    return Source(
-        window_start_ns=window.key('start_ns').whole() if window else 0,
-        window_end_ns=window.key('end_ns').whole() if window else 0,
-        steady=segments.key('steady').whole(),
-        slope_response=segments.key('slope_response').whole(),
-        samples=segments.key('samples').whole(),
-        temperature_mean_degc=temperature.key('mean_degc').real_or_nan()
-        if temperature
-        else math.nan,
-        temperature_spread_k=temperature.key('spread_k').real_or_nan(0.0)
-        if temperature
-        else math.nan,
-        temperature_flag=temperature.key('flag').flag() if temperature else False,
-    )
-
-
-def _residuals(field: Field | None) -> ResidualStatistics:
-    names = ('rmse_mw', 'average_sd_mw', 'average_s', 'input_noise', 'power_noise_mw')
-    if field is None or not field.may_have('rmse_mw'):
+def _residuals(found: dict[str, Any] | None) -> ResidualStatistics:
+    if found is None:
         return ResidualStatistics(math.nan, math.nan, math.nan, math.nan, math.nan)
-    width, chart = field.may_have('width_mw'), field.may_have('chart')
-    rmse, average_sd, average, noise, power_noise = (field.key(n).real(0.0) for n in names)
+    width, chart = found['width_mw'], found['chart']
+    if chart is not None:
+        sums = chart.pop('small'), chart.pop('large')
+        slack, limit = ((sums[0][name], sums[1][name]) for name in ('slack', 'limit'))
+        chart = ChartDesign(**chart, slack=slack, limit=limit)
     return ResidualStatistics(
-        rmse,
-        average_sd,
-        average,
-        noise,
-        power_noise,
-        width.real_or_nan(0.0) if width else math.nan,
-        _chart(chart) if chart else None,
+        **{**found, 'width_mw': math.nan if width is None else width, 'chart': chart}
     )
 
 
-def _chart(field: Field) -> ChartDesign:
-    sums = field.key('small'), field.key('large')
-    return ChartDesign(
-        block_s=field.key('block_s').real(1e-3),
-        correlation=field.key('correlation').real(0.0, 0.999),
-        innovation_mw=field.key('innovation_mw').real(1e-12),
-        slack=(sums[0].key('slack').real(0.0), sums[1].key('slack').real(0.0)),
-        limit=(sums[0].key('limit').real(1e-6), sums[1].key('limit').real(1e-6)),
-        run_length_days=field.key('run_length_days').real(0.0),
-    )
+class Joint(enum.Enum):
+    """How each line has to begin where the one before ends."""
+
+    SAME = 'same number'
+    NEARLY = 'but for rounding'
+    FREE = 'not before the one before begins'
 
 
-def _dynamics(field: Field) -> tuple[RegionDynamics, ...]:
-    regions: list[RegionDynamics] = []
-    for f in field.items():
-        t_error, d_error = f.may_have('time_constant_stderr_s'), f.may_have('delay_stderr_s')
-        level = f.may_have('power_to_stderr_mw')
-        region = RegionDynamics(
-            f.key('power_from').real(),
-            f.key('power_to').real(),
-            f.key('time_constant_s').real(1e-6, 3600.0),
-            f.key('delay_s').real(0.0, 600.0),
-            t_error.real_or_nan(0.0) if t_error else math.nan,
-            d_error.real_or_nan(0.0) if d_error else math.nan,
-            level.real_or_nan(0.0) if level else math.nan,
+def check_pieces(pieces: list[dict[str, Any]], whole: str, path: str, joint: Joint) -> None:
+    """Refuse lines that do not follow each other, or lead where no plant is.
+
+    Raises
+    ------
+    DataError
+        The sentence names the place.
+    """
+    for k, piece in enumerate(pieces):
+        begin, before = piece['u_from'], pieces[k - 1] if k else None
+        follows = (
+            before is None
+            or {
+                Joint.SAME: begin == before['u_to'],
+                Joint.NEARLY: math.isclose(begin, before['u_to'], rel_tol=1e-9),
+                Joint.FREE: begin > before['u_from'],
+            }[joint]
         )
-        if regions and not region.power_to > regions[-1].power_to:
-            raise f.key('power_to').fail('does not lie above the region before')
-        regions.append(region)
-    return tuple(regions)
+        if not follows:
+            raise fail(whole, f'{path}[{k}].u_from', 'is not where the piece before it ends')
+        if not begin < piece['u_to']:
+            raise fail(whole, f'{path}[{k}].u_to', 'is not above u_from')
+        for end in ('u_from', 'u_to'):
+            power = piece['slope'] * piece[end] + piece['intercept']
+            if not MW[0] <= power <= MW[1]:
+                raise fail(whole, f'{path}[{k}]', f'leads to {power:g} MW at {end}')
+
+
+def _fail(path: str, problem: str) -> DataError:
+    return fail(_WHOLE, path, problem)
+
+
+def _check_intervals(top: dict[str, Any]) -> None:
+    pieces, intervals = top['pieces'], top['breakpoint_intervals']
+    if len(intervals) != len(pieces) - 1:
+        raise _fail('breakpoint_intervals', "must have one entry less than 'pieces'")
+    for k, (low, high) in enumerate(intervals):
+        # Comparisons with NaN, what is not known, are false.
+        if low > pieces[k]['u_to'] or high < pieces[k]['u_to']:
+            raise _fail(f'breakpoint_intervals[{k}]', 'does not hold its breakpoint')
+
+
+def _check_order(top: dict[str, Any]) -> None:
+    window, dynamics = top['window'], top['dynamics']
+    if window and window['end_ns'] < window['start_ns']:
+        raise _fail('window.end_ns', 'is before start_ns')
+    for k, region in enumerate(dynamics):
+        if not region['power_from'] < region['power_to']:
+            raise _fail(f'dynamics[{k}].power_to', 'is not above power_from')
+        if k and region['power_from'] != dynamics[k - 1]['power_to']:
+            raise _fail(f'dynamics[{k}].power_from', 'is not where the region before it ends')

@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from valveflow_ros.curve.json_field import Field
+from valveflow_ros.curve.json_schema import (
+    DEGC,
+    MOST_PIECES,
+    MW,
+    NS,
+    Count,
+    ListOf,
+    Maybe,
+    Members,
+    Number,
+    Text,
+    U,
+    checked,
+    fail,
+)
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import Active, Estimate
 from valveflow_ros.diagnosis.causes import catalogue
@@ -18,7 +31,6 @@ from valveflow_ros.diagnosis.evidence import Gain, SegmentGain
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
 from valveflow_ros.diagnosis.scene import Reference
 from valveflow_ros.errors import DataError
-from valveflow_ros.records import FloatArray
 
 NAMED, NOTHING, UNEXPLAINED = 'named', 'nothing', 'unexplained'
 
@@ -98,7 +110,7 @@ class Diagnosis:
 
 MODEL_FORMAT, MODEL_VERSION = 'valveflow/extended_model', 1
 _MOST_MODELS = 10  # on top of one another
-_LONGEST_DELAY_S, _LONGEST_S = 600.0, 3600.0
+_WHOLE = 'extended model'
 
 
 def model_to_json(given: ExtendedModel) -> dict[str, Any]:
@@ -129,6 +141,30 @@ def is_model(raw: object) -> bool:
     return isinstance(raw, dict) and raw.get('format') == MODEL_FORMAT
 
 
+_TIME = Number(-4e7, 4e7)  # seconds from the model's start, 400 days and more
+_SCHEMA = {
+    'pressure_exponent': Number(0.5, 2.0),
+    'start_ns': Count(NS),
+    'reference': {
+        'span_s': Number(1.0, 4e7), 'temperature_degc': Number(*DEGC),
+        'log_pressure': Number(-20.0, 10.0), 'pressure_level': Number(-1e6, 1e6),
+        'pressure_slope': Number(-1e6, 1e6), 'opening_noise': Maybe(Number(0.0, 100.0)),
+    },
+    'curve': {
+        'knots': ListOf(Number(*U), most=MOST_PIECES, rising=True),
+        'left': ListOf(Number(*MW)), 'right': ListOf(Number(*MW)),
+    },
+    'dynamics': {
+        'levels': ListOf(Number(*MW), rising=True),
+        'time_constants_s': ListOf(Number(1e-6, 3600.0)), 'delays_s': ListOf(Number(0.0, 600.0)),
+    },
+    'causes': ListOf({
+        'name': Text(), 'values': Members(Number(-1e12, 1e12)),
+        'switches_s': ListOf(_TIME, rising=True),
+    }),
+}  # fmt: skip
+
+
 def model_from_json(raw: object, depth: int = 0) -> ExtendedModel:
     """Read ``extended_model.json``.
 
@@ -137,78 +173,61 @@ def model_from_json(raw: object, depth: int = 0) -> ExtendedModel:
     DataError
         It is none, or not one this version can use; the sentence names the place.
     """
+    path = '.'.join(['on_top_of'] * depth)
+    inside = f'{path}.' if path else ''
     if not isinstance(raw, dict) or not is_model(raw):
-        raise DataError(f"This is no extended model: 'format' must be '{MODEL_FORMAT}'.")
+        raise DataError(f"This is no extended model: '{inside}format' must be '{MODEL_FORMAT}'.")
     if raw.get('version') is not MODEL_VERSION:
+        where = f" in '{path}'" if path else ''
         raise DataError(
-            f'The extended model has version {raw.get("version")}, '
+            f'The extended model has version {repr(raw.get("version"))[:20]}{where}, '
             f'this program reads {MODEL_VERSION}.'
         )
-    top = Field(raw, '', 'extended model')
     if depth >= _MOST_MODELS:
-        raise top.key('on_top_of').fail(f'lies more than {_MOST_MODELS} models deep')
+        raise fail(_WHOLE, path, f'lies more than {_MOST_MODELS} models deep')
+    top = checked(raw, _SCHEMA, _WHOLE, path)
     earlier = model_from_json(raw['on_top_of'], depth + 1) if 'on_top_of' in raw else None
+    reference = top['reference']
+    noise = reference.pop('opening_noise') or 0.0
     given = ExtendedModel(
-        Extended(_base(top), _causes(top.key('causes'))),
-        top.key('pressure_exponent').real(0.5, 2.0), top.key('start_ns').whole(),
-        _reference(top.key('reference')), earlier,
+        Extended(_base(top, inside), _causes(top['causes'], f'{inside}causes')),
+        top['pressure_exponent'], top['start_ns'], Reference(**reference, opening_noise=noise),
+        earlier,
     )  # fmt: skip
     if earlier is not None and earlier.pressure_exponent != given.pressure_exponent:
-        raise top.key('on_top_of').fail('is a model over another input u')
+        raise fail(_WHOLE, f'{inside}on_top_of', 'is a model over another input u')
     return given
 
 
-def _numbers(field: Field, low: float = -np.inf, high: float = np.inf) -> FloatArray:
-    return np.array([f.real(low, high) for f in field.items()], dtype=np.float64)
-
-
-def _base(top: Field) -> RegionalModel:
-    """Read curve and dynamics, and refuse what could not be run."""
-    curve, dynamics = top.key('curve'), top.key('dynamics')
-    knots, left, right = (_numbers(curve.key(k)) for k in ('knots', 'left', 'right'))
+def _base(top: dict[str, Any], inside: str) -> RegionalModel:
+    """Return curve and dynamics, and refuse what could not be run."""
+    knots, left, right = (np.array(top['curve'][k]) for k in ('knots', 'left', 'right'))
     if not len(left) == len(right) == len(knots) - 1 >= 1:
-        raise curve.fail('must have one knot more than values at left and right ends')
-    if not np.all(np.diff(knots) > 0.0):
-        raise curve.key('knots').fail('do not rise')
-    levels = _numbers(dynamics.key('levels'))
-    times = _numbers(dynamics.key('time_constants_s'), 1e-6, _LONGEST_S)
-    delays = _numbers(dynamics.key('delays_s'), 0.0, _LONGEST_DELAY_S)
+        problem = 'must have one knot more than values at left and right ends'
+        raise fail(_WHOLE, f'{inside}curve', problem)
+    levels, times, delays = (
+        np.array(top['dynamics'][k]) for k in ('levels', 'time_constants_s', 'delays_s')
+    )
     if not len(times) == len(delays) == len(levels) + 1:
-        raise dynamics.fail('must have one level less than time constants and delays')
-    if not np.all(np.diff(levels) > 0.0):
-        raise dynamics.key('levels').fail('do not rise')
+        problem = 'must have one level less than time constants and delays'
+        raise fail(_WHOLE, f'{inside}dynamics', problem)
     return RegionalModel(knots, left, right, levels, times, delays)
 
 
-def _reference(field: Field) -> Reference:
-    """Read what causes count from; the noise of the opening may be missing."""
-    span, level = field.key('span_s'), field.key('pressure_level')
-    noise = field.may_have('opening_noise')
-    return Reference(
-        span.real(1.0), field.key('temperature_degc').real(), field.key('log_pressure').real(),
-        level.real(), field.key('pressure_slope').real(), noise.real(0.0) if noise else 0.0,
-    )  # fmt: skip
-
-
-def _causes(field: Field) -> tuple[Active, ...]:
-    found = tuple(_cause(f) for f in field.items())
-    names = [a.name for a in found]
+def _causes(found: list[dict[str, Any]], path: str) -> tuple[Active, ...]:
+    names = [cause['name'] for cause in found]
     if len(set(names)) < len(names):
-        raise field.fail('names a cause twice')
-    return found
+        raise fail(_WHOLE, path, 'names a cause twice')
+    return tuple(_cause(cause, f'{path}[{k}]') for k, cause in enumerate(found))
 
 
-def _cause(field: Field) -> Active:
-    name = field.key('name').text()
-    cause = catalogue().get(name)
+def _cause(found: dict[str, Any], path: str) -> Active:
+    cause = catalogue().get(found['name'])
     if cause is None:
-        raise field.key('name').fail('is no cause of the catalogue')
-    values = field.key('values')
-    numbers = tuple(values.key(u.name).real(u.low, u.high) for u in cause.unknowns)
-    switches = tuple(_numbers(field.key('switches_s')).tolist())
-    if any(b <= a for a, b in itertools.pairwise(switches)):
-        raise field.key('switches_s').fail('do not rise')
-    return Active(cause, numbers, switches)
+        raise fail(_WHOLE, f'{path}.name', 'is no cause of the catalogue')
+    schema = {u.name: Number(u.low, u.high) for u in cause.unknowns}
+    values = checked(found['values'], schema, _WHOLE, f'{path}.values')
+    return Active(cause, tuple(values.values()), tuple(found['switches_s']))
 
 
 # The diagnosis as JSON: ``diagnosis.json``.

@@ -123,6 +123,7 @@ def open_log(
     date_order: str = '',
     decimal: str = '',
     sheet: str = '',
+    max_unpacked: str = '',
     progress: Progress = SILENT,
 ) -> Log:
     """Open a log, convert it, and report what looks wrong.
@@ -142,6 +143,8 @@ def open_log(
         Signals that were not logged: ``{'main_steam_temperature': 540}``.
     time_zone, date_order, decimal, sheet : str
         How a table is written, where it does not show that itself.
+    max_unpacked : str
+        Megabytes to which a workbook or a Parquet file may unpack.
     progress : Progress
 
     Raises
@@ -151,7 +154,7 @@ def open_log(
     """
     if mapping is None:
         table = {'time_zone': time_zone, 'date_order': date_order, 'decimal': decimal,
-                 'sheet': sheet}  # fmt: skip
+                 'sheet': sheet, 'max_unpacked': max_unpacked}  # fmt: skip
         mapping = read_mapping(
             [f'{name}={theirs}' for name, theirs in (columns or {}).items()],
             [f'{name}={value}' for name, value in (constants or {}).items()],

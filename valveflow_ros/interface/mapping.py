@@ -27,7 +27,7 @@ Answer = TypeVar('Answer')
 _TIMES = ('time', 'date')
 _BY_NAME = {name: info for info in SIGNALS for name in (info.topic, info.column)}
 _TABLE = {'time-zone': 'time_zone', 'date-order': 'date_order', 'decimal': 'decimal',
-          'sheet': 'sheet'}  # fmt: skip
+          'sheet': 'sheet', 'max-unpacked': 'max_unpacked'}  # fmt: skip
 # Stands in for a signal that nobody has named yet, to find what else a table leaves open.
 _STAND_IN = {
     'valve_opening': 50.0,
@@ -132,7 +132,7 @@ def read_mapping(columns: Sequence[str], constants: Sequence[str], **table: str)
     constants : sequence of str
         Each ``NAME=VALUE[:UNIT]``.
     **table : str
-        Of a table: ``time_zone``, ``date_order``, ``decimal``, ``sheet``.
+        Of a table: ``time_zone``, ``date_order``, ``decimal``, ``sheet``, ``max_unpacked``.
 
     Raises
     ------

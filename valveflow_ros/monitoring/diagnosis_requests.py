@@ -30,7 +30,7 @@ from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
 from valveflow_ros.segments.window import NO_ROWS, RollingWindow
-from valveflow_ros.state import State
+from valveflow_ros.state import State, perhaps
 
 ASKED = 'asked for by hand'
 NIGHTLY = 'nightly'
@@ -195,12 +195,13 @@ class DiagnosisRequests:
         """Go on from a state; raises `DataError` if it does not fit."""
         self._mismatch.restore(saved['mismatch'])
         self.misfit, self.sentence = Misfit(*saved['misfit']), saved['sentence']
-        last, pending = saved['last'], saved['pending']
-        self.last = last and Diagnosed(self._task(last[0]), last[1], last[2])
-        self._pending = pending and self._task(pending)
-        self._hour, self._night = saved['hour'], saved['night']
-        self._night_before = saved['night_before']
-        self._asked_ns, self._named_ns = saved['asked_ns'], saved['named_ns']
+        last, pending = perhaps(saved, 'last', list), perhaps(saved, 'pending', dict)
+        self.last = None if last is None else Diagnosed(self._task(last[0]), last[1], last[2])
+        self._pending = None if pending is None else self._task(pending)
+        self._hour, self._night, self._night_before, self._asked_ns, self._named_ns = (
+            perhaps(saved, name, int)
+            for name in ('hour', 'night', 'night_before', 'asked_ns', 'named_ns')
+        )
         self._wanted, self._raised = saved['wanted'], saved['raised']
 
     def _task(self, plain: State) -> DiagnosisTask:

@@ -13,7 +13,7 @@ from valveflow_ros.monitoring.events import Event
 from valveflow_ros.monitoring.prediction import PredictionBlock, as_measured
 from valveflow_ros.records import FloatArray, IntArray, SampleTable, Signal
 from valveflow_ros.signals.integrated_input import integrated_input
-from valveflow_ros.state import State
+from valveflow_ros.state import State, perhaps
 
 # Rows freed of causes that are known, before the engine sees them.
 #
@@ -114,7 +114,8 @@ class Correction:
             raise DataError('The saved state was made with another model_file.')
         if self._corrector is not None:
             self._corrector.restore(saved['corrector'])
-        self._ahead = saved['ahead'] and SampleTable(*saved['ahead'])
+        ahead = perhaps(saved, 'ahead', list)
+        self._ahead = None if ahead is None else SampleTable(*ahead)
 
     def restart(self) -> None:
         """Forget all rows after the clock went back."""

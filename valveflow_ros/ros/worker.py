@@ -32,7 +32,6 @@ import numpy as np
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import from_json, held_from, held_json, to_json
-from valveflow_ros.curve.json_field import Field
 from valveflow_ros.errors import DataError, counted
 from valveflow_ros.fit.task import FitTask
 from valveflow_ros.monitoring.events import DiagnosisContent, DiagnosisTask
@@ -103,7 +102,7 @@ def task_from_bytes(data: bytes) -> Task:
     if 'curve' in state:
         curve = from_json(state['curve'])
         return DiagnosisTask(state['request_ns'], window, settings, curve, state['window_end_ns'])
-    held = held_from(Field(state, '').may_have('held'))
+    held = held_from(state)
     noise = state['input_noise'], state['power_noise_mw']
     return FitTask(state['request_ns'], window, settings, *noise, held)
 

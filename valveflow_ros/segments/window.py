@@ -13,7 +13,7 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SegmentKind, SpecialSegment
 from valveflow_ros.segments.segmenter import FoundSegment
-from valveflow_ros.state import State
+from valveflow_ros.state import State, perhaps
 
 # Special segments as plain values, for a saved state.
 
@@ -41,6 +41,8 @@ def found_values(found: FoundSegment) -> list[Any]:
 
 def found_of(values: list[Any]) -> FoundSegment:
     """Return the segment of such values; raises `DataError` if they make none."""
+    if [type(row) for row in values[:2]] != [int, int]:
+        raise DataError('The saved state has a segment whose rows are no numbers.')
     return FoundSegment(segment_of(values[2:]), values[0], values[1])
 
 
@@ -289,12 +291,12 @@ class RollingWindow:
 
     def restore(self, saved: State) -> None:
         """Go on from a state; raises `DataError` if it does not fit."""
-        rows, aside = _rows_of(saved), saved['aside']
+        rows, aside = _rows_of(saved), perhaps(saved, 'aside', dict)
         self._clear()
-        self._seen = int(saved['seen'])
+        self._seen = perhaps(saved, 'seen', int) or 0
         self._add(rows.time_ns, rows.number, rows.data)
         self._segments = deque(rows.segments)
-        self._aside = aside and _rows_of(aside)
+        self._aside = None if aside is None else _rows_of(aside)
 
     def _clear(self) -> None:
         """Hold nothing."""
@@ -431,4 +433,4 @@ def _rows_of(saved: State) -> _Aside:
     last = command if len(command) else np.full(n, np.nan)
     segments = [found_of(values) for values in saved['segments']]
     data = np.concatenate([rows, last[None]])
-    return _Aside(int(saved['from_ns']), time_ns, number, data, segments)
+    return _Aside(perhaps(saved, 'from_ns', int) or 0, time_ns, number, data, segments)

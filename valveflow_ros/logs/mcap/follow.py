@@ -32,7 +32,7 @@ from valveflow_ros.logs.mcap.records import (
     unpack_attachment,
     walk,
 )
-from valveflow_ros.logs.mcap.scan import CHUNK_HEAD_SIZE, Scanner, candidates
+from valveflow_ros.logs.mcap.scan import CHUNK_HEAD_SIZE, Scanner, candidates, is_foreign
 from valveflow_ros.logs.names import FLOAT64, PLANT_SAMPLE, last_part, signal_of
 from valveflow_ros.logs.part_file import PART_SUFFIX, is_held
 from valveflow_ros.logs.source import DEFAULT_LIMITS, OverBudgetError, Source
@@ -73,6 +73,7 @@ def first_in(folder: Path) -> Path | None:
 
 
 _MOST_ATTACHED = 1 << 20
+_MOST_ADDED = 256  # bytes that a later version of the format adds to a record
 _GROUP_BYTES = 1 << 20
 _NEAR = 1 << 12
 _KINDS = frozenset(int(op) for op in Opcode)
@@ -230,11 +231,12 @@ class Follower:
             return None
         op, length = RECORD_HEAD.unpack(head)
         after = start + RECORD_HEAD.size + length
-        if _LAST.get(op) == length:
+        if op in _LAST and 0 <= length - _LAST[op] < _MOST_ADDED:
             whole = source.size >= after + FOOTER_SIZE
             self._ended = whole and source.read(source.size - len(MAGIC), len(MAGIC)) == MAGIC
             return None
-        if op not in _KINDS or op in _LAST or (op == Opcode.CHUNK and length < CHUNK_HEAD_SIZE):
+        known = op in _KINDS or is_foreign(source, start)
+        if not known or op in _LAST or (op == Opcode.CHUNK and length < CHUNK_HEAD_SIZE):
             return self._beyond_damage(source)
         if after > source.size:
             if self.written and length <= DEFAULT_LIMITS.record_bytes:
@@ -245,6 +247,12 @@ class Follower:
         self._position = after
         if op == Opcode.ATTACHMENT:
             self._attach(source, start, length)
+        elif op in (Opcode.SCHEMA, Opcode.CHANNEL) and length <= _MOST_ATTACHED:
+            content = source.read(start + RECORD_HEAD.size, length)
+            try:
+                self._topics.add(op, content, checked=False)
+            except LayoutError:
+                self.damaged += 1
         return b''
 
     def _chunk(self, source: Source, scanner: Scanner, after: int) -> bytes | None:

@@ -162,15 +162,16 @@ def gather(
     RecordingError
         If the file contradicts itself or claims what cannot be.
     """
-    summary = read_summary(source)
+    summary = read_summary(source, unchecked=True)
     seed = TopicTable(limits) if summary is None else summary.table
     while True:
         collector = _Collector(source, choice, seed, Scanner(source, limits, unchecked))
         contents = collector.run()
-        if not collector.unnamed & collector.known:
+        if not collector.unnamed & collector.known and not contents.table.replaced:
             break
-        # The chunk that first named a topic is lost, but a later one repeats the name. From the
-        # next pass on it is known from the beginning, so there is at most one for each topic.
+        # The chunk that first named a topic is lost, but a later one repeats the name, or a
+        # record outside of the chunks was damaged. From the next pass on the name is known from
+        # the beginning, so there is at most one for each topic.
         seed = contents.table
     contents.announced = None if summary is None else summary.messages
     return contents
@@ -185,19 +186,33 @@ class _Collector:
         self.unnamed: set[int] = set()
         self._choice = choice
         self._scanner = scanner
+        self._heard = 0
         self._floats = np.zeros(1 << 16, dtype=np.bool_)
         self._samples: dict[int, PlantSampleReader] = {}
         self._take_over(seed)
 
     def run(self) -> FileContents:
         for chunks in _grouped(self._scanner.chunks()):
+            self._hear()
             try:
                 self._group(chunks)
             except LayoutError:
                 # One of them is not what its checksum promises; the others are not to suffer.
                 for chunk in chunks:
                     self._single(chunk)
+        self._hear()
         return self.contents
+
+    def _hear(self) -> None:
+        """Take what stands outside of chunks, unless what has a checksum says otherwise."""
+        new, self._heard = self._scanner.outside[self._heard :], len(self._scanner.outside)
+        for record in new:
+            try:
+                self.contents.table.take(record, checked=False)
+            except LayoutError as error:
+                self.contents.findings.add_damage(f'a record outside of the chunks: {error}')
+        if new:
+            self._learn()
 
     def _single(self, chunk: Chunk) -> None:
         try:

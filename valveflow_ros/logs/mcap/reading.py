@@ -14,7 +14,7 @@ from valveflow_ros.logs.contents import LogContents, LoggedMessage, TopicInfo
 from valveflow_ros.logs.mcap.folder import Split, recording_files
 from valveflow_ros.logs.mcap.gather import FileContents, Group, Rows, gather
 from valveflow_ros.logs.mcap.records import HEAD_SIZE, LayoutError, MessageTable, walk
-from valveflow_ros.logs.mcap.scan import Findings, Scanner, scan_warnings
+from valveflow_ros.logs.mcap.scan import Scanner, scan_warnings, why_empty
 from valveflow_ros.logs.names import PLANT_SAMPLE_TOPIC, TopicChoice, misfits
 from valveflow_ros.logs.source import DEFAULT_LIMITS, Limits, OverBudgetError, Source
 from valveflow_ros.records import IntArray, Readings, Signal
@@ -171,7 +171,7 @@ def read_recording(
             with Source.open(path) as source:
                 contents = gather(source, choice, limits, unchecked)
             if not contents.messages:
-                raise RecordingError(path, _why_empty(contents.findings))
+                raise RecordingError(path, why_empty(contents.findings))
             files.append(contents)
         except RecordingError as error:
             if len(paths) == 1:
@@ -195,8 +195,8 @@ def read_recording(
     attachments: dict[str, bytes] = {}
     metadata: dict[str, dict[str, str]] = {}
     for file in files:
-        attachments |= {key: item.data for key, item in file.findings.attachments.items()}
-        metadata |= file.findings.metadata
+        attachments |= {found.name: found.data for found in file.findings.attachments}
+        metadata |= dict(file.findings.metadata)
     return LogContents(
         name,
         *found,
@@ -210,28 +210,6 @@ def read_recording(
         sum(file.findings.damaged for file in files),
         MessageReader(files, unchecked).messages,
     )
-
-
-def _why_empty(findings: Findings) -> str:
-    if findings.unchecked:
-        return (
-            'was written without checksums, so damage in it could not be seen; '
-            'record with checksums, or ask for it to be read unchecked'
-        )
-    if findings.over_budget:
-        return 'unpacks to far more than its size justifies and was not read'
-    if findings.bare_messages:
-        return (
-            'was written without chunks, so damage in it could not be seen; '
-            "rewrite it with 'ros2 bag convert' to the preset zstd_small"
-        )
-    if not findings.begins_well and not findings.damaged:
-        return 'is not an MCAP file'
-    if findings.damaged:
-        return f'holds no intact chunk of messages ({findings.reasons[0]})'
-    if findings.cut_off_at is not None:
-        return 'is cut off before its first message'
-    return 'holds no messages'
 
 
 def _types(files: list[FileContents], name: str) -> dict[str, str]:

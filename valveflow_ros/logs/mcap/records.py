@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import lz4.frame
 import numpy as np
@@ -60,10 +60,11 @@ def unpack(read: Callable[[ReadDataStream], Record], content: bytes) -> Record:
 
 
 def unpack_attachment(content: bytes) -> Attachment:
-    """Return an attachment; raises `LayoutError`, also if its checksum is wrong."""
+    """Return an attachment; raises `LayoutError`, also if it has a checksum that is wrong."""
     found: Attachment = unpack(Attachment.read, content)
     # The library does not compare the checksum; it writes it, and the same bytes, if all is well.
-    if pack(found)[RECORD_HEAD.size :] != content:
+    whole = pack(found)[RECORD_HEAD.size :]
+    if content not in (whole, whole[:-4] + bytes(4)):
         raise LayoutError(f"the checksum of the attachment '{found.name}' is wrong")
     return found
 
@@ -118,32 +119,57 @@ class Unpacker:
 
 @dataclass(slots=True)
 class TopicTable:
-    """Schemas and channels as they are met; the same id never means two things."""
+    """Schemas and channels as they are met; the same id never means two things.
+
+    What stands outside of chunks has no checksum (``unchecked``). It counts until a record with
+    one says something else (``replaced``).
+    """
 
     limits: Limits = DEFAULT_LIMITS
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     definition_bytes: int = 0
+    unchecked: set[tuple[str, int]] = field(default_factory=set)
+    replaced: bool = False
 
-    def add(self, op: int, content: bytes) -> None:
-        """Take a schema or a channel record.
+    def __len__(self) -> int:
+        """Return the number of schemas and channels."""
+        return len(self.schemas) + len(self.channels)
+
+    def add(self, op: int, content: bytes, checked: bool = True) -> None:
+        """Take a schema or a channel record; raises `LayoutError` like `take`, or malformed."""
+        record = definition(op, content)
+        if record is not None:
+            self.take(record, checked)
+
+    def take(self, record: Schema | Channel, checked: bool = True) -> None:
+        """Take a schema or a channel.
 
         Raises
         ------
         LayoutError
-            If it is malformed, contradicts an earlier one, or is one too many.
+            If it contradicts an earlier one, or is one too many.
         """
-        if op == Opcode.SCHEMA:
-            self._add_schema(unpack(Schema.read, content))
-        elif op == Opcode.CHANNEL:
-            self._add_channel(unpack(Channel.read, content))
+        known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
+        key = ('schema' if isinstance(record, Schema) else 'channel', record.id)
+        before = known.get(record.id)
+        if before is None or before != record:
+            if before is not None and (not checked or key not in self.unchecked):
+                raise LayoutError(f'it defines {key[0]} {key[1]} twice, differently')
+            self._check_size(len(known) - (before is not None), record)
+            self.replaced |= before is not None
+            known[record.id] = record
+            if not checked:
+                self.unchecked.add(key)
+        if checked:
+            self.unchecked.discard(key)
 
     def take_over(self, other: TopicTable) -> None:
-        """Add all that another table knows; raises `LayoutError` like `add`."""
-        for schema in other.schemas.values():
-            self._add_schema(schema)
-        for channel in other.channels.values():
-            self._add_channel(channel)
+        """Add all that another table knows; raises `LayoutError` like `take`."""
+        for number, schema in other.schemas.items():
+            self.take(schema, ('schema', number) not in other.unchecked)
+        for number, channel in other.channels.items():
+            self.take(channel, ('channel', number) not in other.unchecked)
 
     def type_of(self, channel: Channel) -> str:
         """Return the type of a channel, empty if the file does not say."""
@@ -157,35 +183,25 @@ class TopicTable:
             return ''
         return schema.data.decode(errors='replace')
 
-    def _add_schema(self, schema: Schema) -> None:
-        known = self.schemas.get(schema.id)
-        if known is not None:
-            if known != schema:
-                raise LayoutError(f'it defines schema {schema.id} twice, differently')
-            return
-        self.definition_bytes += len(schema.data)
-        if self.definition_bytes > self.limits.definition_bytes:
-            raise LayoutError('its definitions of messages are larger than can be read')
-        self._check_count(len(self.schemas))
-        self.schemas[schema.id] = schema
-
-    def _add_channel(self, channel: Channel) -> None:
-        known = self.channels.get(channel.id)
-        if known is not None:
-            if known != channel:
-                raise LayoutError(f'it defines channel {channel.id} twice, differently')
-            return
-        self._check_count(len(self.channels))
-        self.channels[channel.id] = channel
-
-    def _check_count(self, count: int) -> None:
+    def _check_size(self, count: int, record: Schema | Channel) -> None:
+        if isinstance(record, Schema):
+            self.definition_bytes += len(record.data)
+            if self.definition_bytes > self.limits.definition_bytes:
+                raise LayoutError('its definitions of messages are larger than can be read')
         if count >= self.limits.channels:
             raise LayoutError(f'it has more than {self.limits.channels} topics')
 
 
+def definition(op: int, content: bytes) -> Schema | Channel | None:
+    """Return a schema or a channel, ``None`` for another record; raises `LayoutError`."""
+    readers: dict[int, Any] = {Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read}
+    record: Schema | Channel | None = unpack(readers[op], content) if op in readers else None
+    return record
+
+
 @dataclass(slots=True)
 class Summary:
-    """What a finished file says about itself."""
+    """What a finished file says about itself; without a checksum, the topics alone."""
 
     table: TopicTable = field(default_factory=TopicTable)
     messages: int = 0
@@ -203,8 +219,11 @@ def ends_well(source: Source) -> bool:
     return raw.startswith(RECORD_HEAD.pack(Opcode.FOOTER, 20)) and raw.endswith(MAGIC)
 
 
-def read_summary(source: Source) -> Summary | None:
-    """Return the summary, or ``None`` if there is none whose checksum is right."""
+def read_summary(source: Source, unchecked: bool = False) -> Summary | None:
+    """Return the summary, or ``None`` if there is none whose checksum is right.
+
+    With ``unchecked`` one that was written without a checksum is returned too.
+    """
     if not ends_well(source):
         return None
     footer_at = source.size - len(MAGIC) - FOOTER_SIZE
@@ -214,14 +233,15 @@ def read_summary(source: Source) -> Summary | None:
     if footer.summary_start == 0 or not 0 < size <= DEFAULT_LIMITS.record_bytes:
         return None
     raw = source.read(footer.summary_start, size)
-    if zlib.crc32(raw_footer[:-4], zlib.crc32(raw)) != footer.summary_crc:
+    checked = zlib.crc32(raw_footer[:-4], zlib.crc32(raw)) == footer.summary_crc
+    if not checked and (footer.summary_crc or not unchecked):
         return None
     summary, position = Summary(), 0
     try:
         while position < len(raw):
             op, content = record_at(raw, position)
             position += RECORD_HEAD.size + len(content)
-            if op == Opcode.STATISTICS:
+            if op == Opcode.STATISTICS and checked:
                 found = unpack(Statistics.read, content)
                 summary.messages, summary.counts = (
                     found.message_count,
@@ -229,7 +249,7 @@ def read_summary(source: Source) -> Summary | None:
                 )
                 summary.start_ns, summary.end_ns = found.message_start_time, found.message_end_time
             else:
-                summary.table.add(op, content)
+                summary.table.add(op, content, checked)
     except LayoutError:
         return None
     return summary
@@ -262,6 +282,8 @@ HEAD_DTYPE = np.dtype(
 RUN_PROBE = 64
 _FEW_BREAKS = 64
 MAX_TOPIC_RECORDS = 1 << 16
+# Later versions of the format and applications of their own may use kinds from here on.
+FIRST_FOREIGN = max(Opcode) + 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,7 +318,8 @@ def walk(content: bytes) -> tuple[MessageTable, list[tuple[int, bytes]]]:
     Raises
     ------
     LayoutError
-        If a record is cut off or of a kind that has no place in a chunk.
+        If a record is cut off or of a kind that has no place in a chunk. Kinds that the format
+        does not know yet are passed over.
     """
     starts, others = _boundaries(content)
     if not len(starts):
@@ -384,7 +407,7 @@ def _boundaries(content: bytes) -> tuple[IntArray, list[tuple[int, bytes]]]:
             if len(others) > MAX_TOPIC_RECORDS:
                 raise LayoutError('a chunk mentions topics without end')
             probe = True
-        else:
+        elif op < FIRST_FOREIGN:
             raise LayoutError(f'a chunk holds a record of kind {op}')
         position = after
     return np.concatenate([*parts, np.array(singles, dtype=np.int64)]), others

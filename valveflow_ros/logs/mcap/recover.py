@@ -6,23 +6,47 @@ checksum is wrong is left out and counted: nothing is repaired by guessing.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
-from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs.mcap.chunk_file import ChunkFile, PackedChunk
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import Channel, Schema
+
+from valveflow_ros.errors import RecordingError, counted
+from valveflow_ros.logs.mcap.chunk_file import ChunkBuilder, ChunkFile, PackedChunk
 from valveflow_ros.logs.mcap.folder import (
     LIBRARY,
     finish_split,
     finished_splits,
     write_metadata,
 )
-from valveflow_ros.logs.mcap.records import LayoutError, TopicTable, read_summary, walk
-from valveflow_ros.logs.mcap.scan import SHAPE_SIZE, Scanner, candidates, scan_warnings
-from valveflow_ros.logs.part_file import PART_SUFFIX, new_file, taken
+from valveflow_ros.logs.mcap.records import (
+    RECORD_HEAD,
+    LayoutError,
+    MessageTable,
+    TopicTable,
+    pack,
+    read_summary,
+    walk,
+)
+from valveflow_ros.logs.mcap.scan import (
+    SHAPE_SIZE,
+    Chunk,
+    Scanner,
+    candidates,
+    scan_warnings,
+    why_empty,
+)
+from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, new_file, taken
 from valveflow_ros.logs.source import Source, os_errors
+from valveflow_ros.records import IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +75,8 @@ def recover(
 ) -> RecoveryReport:
     """Copy the intact chunks of ``path`` into a finished file ``out``.
 
+    It gets its name when the library `mcap` has read it from end to end.
+
     Parameters
     ----------
     path : str or Path
@@ -63,19 +89,20 @@ def recover(
     Raises
     ------
     RecordingError
-        If ``path`` holds no intact chunk, or ``out`` exists or cannot be written.
+        If ``path`` holds no intact chunk, ``out`` exists or cannot be written, or other programs
+        could not read it.
     """
     target = Path(out)
     if target.exists():
         raise RecordingError(target, 'exists already; choose another name for the recovered file')
-    return _recover(Path(path), target, target.name, progress)
+    return _recover(Path(path), target, target.name, progress, proven=True)
 
 
 def intact_messages(path: Path) -> int:
     """Return how many messages stand in the intact chunks of a file; 0 if it cannot be read."""
     try:
         with Source.open(path) as source:
-            return sum(map(len, _intact(Scanner(source), TopicTable(), None, source.size)))
+            return sum(map(len, _Copier(source, Scanner(source)).chunks(None)))
     except RecordingError:
         return 0
 
@@ -122,7 +149,7 @@ def _made_whole(part: Path) -> RecoveryReport | None:
     # a draft that a crash leaves is not taken for a recording.
     draft = target.with_name(f'.{target.stem}.recovering')
     try:
-        report = _recover(part, draft, target.name, None)
+        report = _recover(part, draft, target.name)
     except RecordingError:
         if _holds_nothing(part):
             part.unlink()
@@ -146,27 +173,34 @@ def _holds_nothing(part: Path) -> bool:
         return next(candidates(source, cut_at, cut_at + 1), None) is not None
 
 
-def _recover(path: Path, target: Path, name: str, progress: Progress | None) -> RecoveryReport:
+def _recover(
+    path: Path,
+    target: Path,
+    name: str,
+    progress: Progress | None = None,
+    proven: bool = False,
+) -> RecoveryReport:
     with Source.open(path) as source:
         scanner = Scanner(source)
-        table = TopicTable()
-        chunks = _intact(scanner, table, progress, source.size)
+        copier = _Copier(source, scanner)
+        chunks = copier.chunks(progress)
         first = next(chunks, None)
         if first is None:
-            raise RecordingError(path, 'holds no intact chunk of messages, nothing to recover')
+            why = why_empty(scanner.findings, '')
+            raise RecordingError(path, f'{why}; nothing was recovered')
         with os_errors(target, 'cannot be written'), new_file(target) as out:
-            file = ChunkFile(out, LIBRARY)
+            file = ChunkFile(_Proven(out, path) if proven else out, LIBRARY)
             for chunk in chain([first], chunks):
                 file.put_chunk(chunk)
-            _complete(table, source)
-            for attachment in scanner.findings.attachments.values():
+            copier.complete()
+            for attachment in scanner.findings.attachments:
                 file.put_attachment(attachment)
-            for key, items in scanner.findings.metadata.items():
+            for key, items in scanner.findings.metadata:
                 if key != 'rosbag2':
                     file.put_metadata(key, items)
-            finish_split(file, name, table)
+            finish_split(file, name, copier.table)
         findings = scanner.findings
-        warnings = scan_warnings(findings, 'file')
+        warnings = (*scan_warnings(findings, 'file'), *copier.warnings())
     return RecoveryReport(
         path,
         target,
@@ -179,36 +213,158 @@ def _recover(path: Path, target: Path, name: str, progress: Progress | None) -> 
     )
 
 
-def _intact(
-    scanner: Scanner, table: TopicTable, progress: Progress | None, size: int
-) -> Iterator[PackedChunk]:
-    for chunk in scanner.chunks():
-        if not chunk.content:
-            continue
+@dataclass
+class _Proven:
+    """A file that gets its name only if the library `mcap` reads it to the end; a `Writable`."""
+
+    out: PartFile
+    source: Path
+
+    def __post_init__(self) -> None:
+        self.write, self.sync = self.out.write, self.out.sync
+        self.check, self.check_content = self.out.check, self.out.check_content
+        self.close, self.discard = self.out.close, self.out.discard
+
+    def publish(self) -> None:
+        """Read every message, and give the file its name; raises `RecordingError`."""
         try:
-            messages, others = walk(chunk.content)
-            for op, content in others:
-                table.add(op, content)
-        except LayoutError as error:
-            scanner.findings.add_damage(f'the chunk at byte {chunk.offset}: {error}')
-            continue
-        yield PackedChunk(
-            chunk.record,
-            messages.channel,
-            messages.log_time,
-            messages.offset,
-            len(chunk.content),
-            chunk.compression,
-        )
-        if progress is not None:
-            progress(chunk.end, size)
+            with self.out.part.open('rb') as stream:
+                # From end to end; a reader that seeks would hold all messages at once.
+                messages = NonSeekingReader(stream, validate_crcs=True).iter_messages(
+                    log_time_order=False
+                )
+                topics = {channel.id for _, channel, _ in messages}
+                stream.seek(0)
+                reader = make_reader(stream, validate_crcs=True)
+                next(reader.iter_messages(), None)
+                summary = reader.get_summary()
+                if summary is None or not topics <= summary.channels.keys():
+                    raise McapError('its summary does not name all topics')
+        except (McapError, ValueError, KeyError, EOFError, struct.error) as error:
+            reason = str(error) or type(error).__name__
+            problem = f'what is intact in it makes no file that other programs read ({reason})'
+            raise RecordingError(self.source, f'{problem}; nothing was written') from None
+        self.out.publish()
 
 
-def _complete(table: TopicTable, source: Source) -> None:
-    """Add topics that only an intact summary still knows."""
-    summary = read_summary(source)
-    if summary is not None:
-        try:
-            table.take_over(summary.table)
-        except LayoutError as error:
-            raise RecordingError(source.path, f'contradicts itself: {error}') from None
+class _Copier:
+    """Gives the intact chunks of a file, before each the topics that are not told by then.
+
+    Attributes
+    ----------
+    table : TopicTable
+        What is known of the topics so far; after `complete`, all of it.
+    """
+
+    def __init__(self, source: Source, scanner: Scanner) -> None:
+        self.table = TopicTable()
+        self._source = source
+        self._scanner = scanner
+        self._told: set[tuple[int, int]] = set()
+        self._whole = False
+        self._left_out = 0
+
+    def chunks(self, progress: Progress | None) -> Iterator[PackedChunk]:
+        """Yield them; what contradicts an earlier chunk is left out and counted as damage."""
+        for chunk in self._scanner.chunks():
+            if not chunk.content:
+                continue
+            try:
+                yield from self._copied(chunk)
+            except LayoutError as error:
+                self._scanner.findings.add_damage(f'the chunk at byte {chunk.offset}: {error}')
+                continue
+            if progress is not None:
+                progress(chunk.end, self._source.size)
+
+    def complete(self) -> None:
+        """Learn all that the file says of topics, wherever it does.
+
+        Raises
+        ------
+        RecordingError
+            If the summary contradicts the chunks.
+        """
+        if self._whole:
+            return
+        self._whole = True
+        scanner = Scanner(self._source)
+        for chunk in scanner.chunks():
+            with suppress(LayoutError):
+                for op, content in walk(chunk.content)[1]:
+                    self.table.add(op, content)
+        summary = read_summary(self._source, unchecked=True)
+        if summary is not None:
+            try:
+                self.table.take_over(summary.table)
+            except LayoutError as error:
+                problem = f'contradicts itself: {error}'
+                raise RecordingError(self._source.path, problem) from None
+        for record in scanner.outside:
+            try:
+                self.table.take(record, checked=False)
+            except LayoutError as error:
+                self._scanner.findings.add_damage(f'a record outside of the chunks: {error}')
+
+    def warnings(self) -> list[str]:
+        """Return a sentence if messages were left out because nothing says of which topic."""
+        if not self._left_out:
+            return []
+        one = self._left_out == 1
+        return [
+            f'{counted(self._left_out, "message")} {"is on a topic" if one else "are on topics"} '
+            f'that the file does not name any more, and {"was" if one else "were"} left out.'
+        ]
+
+    def _copied(self, chunk: Chunk) -> Iterator[PackedChunk]:
+        messages, others = walk(chunk.content)
+        for op, content in others:
+            self.table.add(op, content)
+        here = {(op, _id(content)) for op, content in others}
+        present = np.flatnonzero(np.bincount(messages.channel)).tolist()
+        if any(self._records(number) is None for number in present):
+            self.complete()
+        known = {n: records for n in present if (records := self._records(n)) is not None}
+        needed = {key: r for records in known.values() for key, r in records.items()}
+        missing = {key: r for key, r in needed.items() if key not in self._told | here}
+        self._told |= here | missing.keys()
+        if missing:
+            yield ChunkBuilder().build(pack(*missing.values()))
+        named = np.isin(messages.channel, list(known))
+        self._left_out += len(messages) - int(named.sum())
+        if named.all():
+            yield PackedChunk(
+                chunk.record, messages.channel, messages.log_time, messages.offset,
+                len(chunk.content), chunk.compression,
+            )  # fmt: skip
+        elif named.any():
+            yield _rebuilt(chunk.content, messages, np.flatnonzero(named), others)
+
+    def _records(self, number: int) -> dict[tuple[int, int], Schema | Channel] | None:
+        """Return what a reader must know before a message of this channel; None if it is lost."""
+        channel = self.table.channels.get(number)
+        if channel is None:
+            return None
+        own: dict[tuple[int, int], Schema | Channel] = {(Opcode.CHANNEL, number): channel}
+        if not channel.schema_id:
+            return own
+        schema = self.table.schemas.get(channel.schema_id)
+        return None if schema is None else {(Opcode.SCHEMA, schema.id): schema, **own}
+
+
+def _id(content: bytes) -> int:
+    """Return the number with which a schema's or a channel's record begins."""
+    return int.from_bytes(content[:2], 'little')
+
+
+def _rebuilt(
+    content: bytes, messages: MessageTable, kept: IntArray, others: list[tuple[int, bytes]]
+) -> PackedChunk:
+    """Return a chunk with some of its messages."""
+    builder = ChunkBuilder()
+    m = messages
+    for k in kept.tolist():
+        sequence, log_ns, publish_ns = m.sequence[k], m.log_time[k], m.publish_time[k]
+        data = m.payload(content, k)
+        builder.add(int(m.channel[k]), int(sequence), int(log_ns), int(publish_ns), data)
+    return builder.build(b''.join(RECORD_HEAD.pack(op, len(raw)) + raw for op, raw in others))

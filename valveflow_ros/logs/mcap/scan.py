@@ -16,15 +16,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Metadata
+from mcap.records import Attachment, Channel, Metadata, Schema
 from mcap.records import Chunk as ChunkRecord
 
 from valveflow_ros.errors import counted
 from valveflow_ros.logs.mcap.records import (
+    FIRST_FOREIGN,
     MAGIC,
     RECORD_HEAD,
     LayoutError,
+    TopicTable,
     Unpacker,
+    definition,
     ends_well,
     unpack,
     unpack_attachment,
@@ -66,6 +69,25 @@ def _fields_agree(window: bytes, position: int, names_end: int) -> bool:
     return bool(packed_at - position - RECORD_HEAD.size + packed == length)
 
 
+def is_foreign(source: Source, position: int) -> bool:
+    """Tell whether a record is of a kind that the format does not know, which is passed over.
+
+    A known one whose kind was damaged is not: what is within still shows what it was.
+    """
+    raw = source.read(position, SHAPE_SIZE)
+    if len(raw) < RECORD_HEAD.size or raw[0] < FIRST_FOREIGN:
+        return False
+    _, length = RECORD_HEAD.unpack_from(raw)
+    as_chunk = _SHAPE.match(bytes([Opcode.CHUNK]) + raw[1:])
+    if as_chunk is not None and _fields_agree(raw, 0, as_chunk.end()):
+        return False
+    try:
+        unpack_attachment(source.read(position + RECORD_HEAD.size, min(length, _WINDOW)))
+    except LayoutError:
+        return True
+    return False
+
+
 _INDEX_HEAD = struct.Struct('<BQHI')
 _INDEX_BLOCK = 4096
 _KINDS = frozenset(int(op) for op in Opcode)
@@ -77,17 +99,17 @@ _SMALLEST_CHUNK = RECORD_HEAD.size + CHUNK_HEAD_SIZE + 12
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """An intact chunk: where it stands, its record as it is, what it holds."""
+    """An intact chunk: where it stands, its record as it is, what it holds.
+
+    ``end`` is where the next record begins. Fields that a later version of the format added to
+    the record are not part of ``record``.
+    """
 
     offset: int
     record: bytes
     content: bytes
     compression: str
-
-    @property
-    def end(self) -> int:
-        """Return where the next record begins."""
-        return self.offset + len(self.record)
+    end: int
 
 
 @dataclass(slots=True)
@@ -103,8 +125,8 @@ class Findings:
     begins_well: bool = True
     over_budget: bool = False
     reasons: list[str] = field(default_factory=list)
-    attachments: dict[str, Attachment] = field(default_factory=dict)
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    attachments: list[Attachment] = field(default_factory=list)
+    metadata: list[tuple[str, dict[str, str]]] = field(default_factory=list)
 
     def add_damage(self, reason: str) -> None:
         """Count a damaged chunk or stretch; the first few reasons are kept."""
@@ -117,12 +139,21 @@ class Scanner:
     """Goes once through a file; `findings` is complete when `chunks` is exhausted.
 
     With ``unchecked`` it also accepts chunks that were written without a checksum.
+
+    Attributes
+    ----------
+    findings : Findings
+    outside : list of Schema or Channel
+        Those met so far that stand outside of chunks, each once.
     """
 
     def __init__(
         self, source: Source, limits: Limits = DEFAULT_LIMITS, unchecked: bool = False
     ) -> None:
         self.findings = Findings()
+        self.outside: list[Schema | Channel] = []
+        self._outside_table = TopicTable(limits)
+        self._in_summary = False
         self._source = source
         self._limits = limits
         self._unchecked = unchecked
@@ -200,7 +231,7 @@ class Scanner:
                 if agreed and self._plausible(after):
                     self.findings.add_damage(problem)
                     return None, after
-        elif op in _KINDS and after <= self._source.size and self._plausible(after):
+        elif self._known(op, position) and after <= self._source.size and self._plausible(after):
             hidden = self._inside(op, position, length)
             return hidden, (after if hidden is None else hidden.end)
         return self._resynchronise(position, problem)
@@ -237,7 +268,10 @@ class Scanner:
         self._budget.spend(length)
         found = unpack(ChunkRecord.read, raw[RECORD_HEAD.size :])
         size, crc, name = found.uncompressed_size, found.uncompressed_crc, found.compression
-        if CHUNK_HEAD_SIZE + 12 + len(name.encode()) + len(found.data) != length:
+        exact = CHUNK_HEAD_SIZE + 12 + len(name.encode()) + len(found.data)
+        end = position + RECORD_HEAD.size + length
+        # A later version of the format may have added fields at the end.
+        if exact != length and not self._plausible(end):
             raise LayoutError('its length disagrees with its content')
         if size > self._limits.chunk_bytes:
             raise LayoutError(f'it claims to unpack to {size} bytes, which is beyond all bounds')
@@ -249,7 +283,9 @@ class Scanner:
             self.findings.unchecked += 1
             if not self._unchecked:
                 raise LayoutError('it was written without a checksum')
-        return Chunk(position, raw, content, name)
+        if exact != length:
+            raw = RECORD_HEAD.pack(Opcode.CHUNK, exact) + raw[RECORD_HEAD.size :][:exact]
+        return Chunk(position, raw, content, name, end)
 
     def _inside(self, op: int, position: int, length: int) -> Chunk | None:
         """Look into a record that is no chunk, and for a chunk that a wrong length would hide."""
@@ -260,6 +296,10 @@ class Scanner:
             return None
         if op == Opcode.METADATA and length <= self._limits.definition_bytes:
             self._metadata(position, length)
+        # The summary, which follows, repeats what it says with a checksum.
+        self._in_summary |= op == Opcode.DATA_END
+        if op in (Opcode.SCHEMA, Opcode.CHANNEL) and not self._in_summary:
+            self._definition(op, position, length)
         if length < _SMALLEST_CHUNK or (
             op == Opcode.MESSAGE_INDEX and self._is_index(position, length)
         ):
@@ -285,7 +325,7 @@ class Scanner:
         except LayoutError as error:
             self.findings.add_damage(str(error))
             return
-        self.findings.attachments[attachment.name] = attachment
+        self.findings.attachments.append(attachment)
 
     def _metadata(self, position: int, length: int) -> None:
         content = self._source.read(position + RECORD_HEAD.size, length)
@@ -295,7 +335,25 @@ class Scanner:
             self.findings.add_damage(f'the metadata at byte {position}: {error}')
             return
         if len(self.findings.metadata) < self._limits.channels:
-            self.findings.metadata[found.name] = found.metadata
+            self.findings.metadata.append((found.name, found.metadata))
+
+    def _definition(self, op: int, position: int, length: int) -> None:
+        """Take a schema or a channel that stands outside of chunks."""
+        kind = 'schema' if op == Opcode.SCHEMA else 'channel'
+        try:
+            if length > self._limits.definition_bytes:
+                raise LayoutError('it is larger than can be read')
+            record = definition(op, self._source.read(position + RECORD_HEAD.size, length))
+            known = self._outside_table
+            before = len(known)
+            if record is not None:
+                known.take(record, checked=False)
+                self.outside += [record] * (len(known) - before)
+        except LayoutError as error:
+            self.findings.add_damage(f'the {kind} at byte {position}: {error}')
+
+    def _known(self, op: int, position: int) -> bool:
+        return op in _KINDS or is_foreign(self._source, position)
 
     def _head(self, position: int) -> tuple[int, int]:
         raw = self._source.read(position, RECORD_HEAD.size)
@@ -317,10 +375,35 @@ class Scanner:
             # Too little of a last record to be judged.
             return True
         op, length = self._head(position)
-        if op not in _KINDS or position + RECORD_HEAD.size + length <= size:
-            return op in _KINDS
+        if position + RECORD_HEAD.size + length <= size:
+            return self._known(op, position)
+        if op not in _KINDS:
+            return False
         # The last chunk of an unfinished file may be cut off, with a head that agrees.
         return next(candidates(self._source, position, position + 1), None) is not None
+
+
+def why_empty(findings: Findings, asked: str = ', or ask for it to be read unchecked') -> str:
+    """Return why a file gave no message; ``asked`` is what may be done without checksums."""
+    if findings.unchecked:
+        return (
+            'was written without checksums, so damage in it could not be seen; '
+            f'record with checksums{asked}'
+        )
+    if findings.over_budget:
+        return 'unpacks to far more than its size justifies and was not read'
+    if findings.bare_messages:
+        return (
+            'was written without chunks, so damage in it could not be seen; '
+            "rewrite it with 'ros2 bag convert' to the preset zstd_small"
+        )
+    if not findings.begins_well and not findings.damaged:
+        return 'is not an MCAP file'
+    if findings.damaged:
+        return f'holds no intact chunk of messages ({findings.reasons[0]})'
+    if findings.cut_off_at is not None:
+        return 'is cut off before its first message'
+    return 'holds no messages'
 
 
 def scan_warnings(findings: Findings, what: str) -> tuple[str, ...]:
@@ -338,6 +421,13 @@ def scan_warnings(findings: Findings, what: str) -> tuple[str, ...]:
         sentences.append(
             f'The {what} is damaged in {findings.damaged} {places}, what stood there was left out '
             f'({"; ".join(findings.reasons)}).'
+        )
+    if findings.bare_messages:
+        one = findings.bare_messages == 1
+        sentences.append(
+            f'{counted(findings.bare_messages, "message")} of the {what} '
+            f'{"stands" if one else "stand"} outside of its chunks, where damage cannot be seen, '
+            f'and {"was" if one else "were"} left out.'
         )
     if findings.over_budget:
         sentences.append(

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import datetime
 import itertools
+import math
 import re
 import tempfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from valveflow_ros.errors import InputError, RecordingError
-from valveflow_ros.logs.tables.refusal import RefusedError, Remedy
+from valveflow_ros.logs.tables.refusal import RefusedError, Remedy, TableOptions
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,10 +23,11 @@ _BLOCK_ROWS = 200_000
 _SHEET_BLOCK = 50_000
 _SAMPLES = 200
 _SHEET_ROWS = 1_048_576  # a sheet has no more
-# What a workbook may unpack to: XML of tables shrinks to a tenth, hardly ever to a hundredth.
-_UNPACKED_BYTES = 1 << 30
-_UNPACKED_FREELY = 64 << 20
-_UNPACKED_TIMES = 200
+# What a file may unpack to, however large it is itself, unless a person allows more.
+_BOOK_BYTES = 1 << 30
+_PARQUET_BYTES = 2 << 30  # a year of seconds with five signals takes 1.5 GB
+_CELL_BYTES = 8
+_TEXT_BYTES = 64 << 20  # of the texts of one column in a block
 # The library holds a sheet as a full rectangle, so two cells far apart would fill the memory. A
 # cell takes at least 16 bytes of XML, so a sheet that is a table stays below.
 _CELLS_FREELY = 8 << 20
@@ -61,33 +63,120 @@ def check_parquet(path: Path) -> None:
         ) from None
 
 
-def look_at_parquet(path: Path) -> tuple[tuple[str, ...], list[list[str]]]:
-    """Return the names of the columns and rows from the first and the last group."""
+def parquet_names(path: Path) -> tuple[str, ...]:
+    """Return the names of the columns, which stand in the footer of the file."""
     check_parquet(path)
     from pyarrow import parquet
 
     with parquet.ParquetFile(path) as file:
-        names = tuple(str(name).strip() for name in file.schema_arrow.names)
-        rows: list[list[str]] = []
-        groups = sorted({0, file.num_row_groups - 1} & set(range(file.num_row_groups)))
-        for group in groups:
-            batch = next(file.iter_batches(_SAMPLES, row_groups=[group]), None)
-            columns = [] if batch is None else [c.to_pylist() for c in batch.columns]
+        return tuple(str(name).strip() for name in file.schema_arrow.names)
+
+
+def parquet_samples(path: Path, places: Sequence[int], options: TableOptions) -> list[list[str]]:
+    """Return cells at these places, of rows from the first and from the last group.
+
+    Of a group that unpacks beyond the limit there are none: all of it may be one page.
+    """
+    rows: list[list[str]] = []
+    most = options.unpacked_bytes(path.stat().st_size, _PARQUET_BYTES)
+    with _parquet(path, places) as (file, names):
+        for group in sorted({0, file.num_row_groups - 1} & set(range(file.num_row_groups))):
+            if _stated(file.metadata, names, [group]) > most:
+                continue
+            batch = next(file.iter_batches(_SAMPLES, row_groups=[group], columns=names), None)
+            columns = [] if batch is None else [c.to_pylist() for c in _decoded(path, batch)]
             rows += [[_text(cell) for cell in row] for row in zip(*columns, strict=True)]
-    return names, rows
+    return rows
 
 
-def parquet_blocks(path: Path, places: list[int]) -> Iterator[pd.DataFrame]:
-    """Yield the columns at these places."""
+def parquet_blocks(
+    path: Path, places: Sequence[int], options: TableOptions
+) -> Iterator[pd.DataFrame]:
+    """Yield the columns at these places.
+
+    Raises
+    ------
+    RecordingError
+        If they are too large for the size of the file, by what its footer says.
+    """
+    import pandas as pd
+
+    with _parquet(path, places) as (file, names):
+        _check_unpacked(path, file.metadata, names, options)
+        for batch in file.iter_batches(_BLOCK_ROWS, columns=names):
+            columns = _decoded(path, batch)
+            yield pd.DataFrame({k: column.to_pandas() for k, column in enumerate(columns)})
+
+
+@contextmanager
+def _parquet(path: Path, places: Sequence[int]) -> Iterator[tuple[Any, list[str]]]:
+    """Open a file for the columns at these places; yield it with their names.
+
+    Texts are read as they are packed, each once, since one repeated a million times is small
+    in the file.
+    """
+    import pyarrow as pa
     from pyarrow import parquet
 
     with parquet.ParquetFile(path) as file:
-        names = file.schema_arrow.names
-        for batch in file.iter_batches(_BLOCK_ROWS, columns=[names[k] for k in places]):
-            yield batch.to_pandas(ignore_metadata=True)
+        fields = [file.schema_arrow.field(k) for k in places]
+    for field in fields:
+        if pa.types.is_nested(field.type):
+            raise RecordingError(
+                path, f"the column '{field.name}' holds a {field.type} in each cell, no value"
+            )
+    names = [field.name for field in fields]
+    with parquet.ParquetFile(path, read_dictionary=names) as file:
+        yield file, names
 
 
-def look_at_sheet(path: Path, wanted: str, most: int) -> tuple[Any, list[list[str]]]:
+def _check_unpacked(path: Path, footer: Any, names: list[str], options: TableOptions) -> None:
+    """Refuse columns out of proportion to the file before one of their rows is read."""
+    packed = path.stat().st_size
+    most = options.unpacked_bytes(packed, _PARQUET_BYTES)
+    groups = range(footer.num_row_groups)
+    rows = max(footer.num_rows, sum(footer.row_group(k).num_rows for k in groups))
+    unpacked = max(_CELL_BYTES * rows * len(names), _stated(footer, names, groups))
+    if unpacked > most:
+        raise RecordingError(
+            path,
+            f'has {rows} rows that unpack to {unpacked / 1e6:.0f} MB, more than the '
+            f'{most / 1e6:.0f} MB that are read of a file of {packed / 1e6:.1f} MB; '
+            f'{_allowed(unpacked)}',
+        )
+
+
+def _stated(footer: Any, names: list[str], groups: Iterable[int]) -> int:
+    """Return the bytes of some columns in some groups, unpacked, by what the footer says."""
+    wanted = [k for k in range(footer.num_columns) if footer.schema.column(k).path in names]
+    parts = map(footer.row_group, groups)
+    return sum(part.column(k).total_uncompressed_size for part in parts for k in wanted)
+
+
+def _allowed(unpacked: float) -> str:
+    """Return how a person may have a file read that is larger than it looks."""
+    return f'if it is not damaged, add --max-unpacked {math.ceil(unpacked / 1e6)}'
+
+
+def _decoded(path: Path, batch: Any) -> list[Any]:
+    """Return the columns of a batch with each text in its cells, as far as these are texts."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    columns = []
+    for column in batch.columns:
+        if pa.types.is_dictionary(column.type):
+            kind = column.type.value_type
+            if not pa.types.is_primitive(kind):
+                lengths = pc.binary_length(column.dictionary).take(column.indices)
+                if (pc.sum(lengths).as_py() or 0) > _TEXT_BYTES:
+                    raise RecordingError(path, 'has texts too long for the cells of a table')
+            column = column.dictionary_decode()
+        columns.append(column)
+    return columns
+
+
+def look_at_sheet(path: Path, options: TableOptions, most: int) -> tuple[Any, list[list[str]]]:
     """Return the sheet to be read, for `sheet_blocks`, and its first rows as texts.
 
     Raises
@@ -98,7 +187,7 @@ def look_at_sheet(path: Path, wanted: str, most: int) -> tuple[Any, list[list[st
     names: list[str] = []
     tables: list[str] = []
     found: tuple[Any, list[list[str]]] | None = None
-    with _book(path) as book:
+    with _book(path, options) as book:
         from python_calamine import SheetTypeEnum, SheetVisibleEnum
 
         for sheet in book.sheets_metadata:
@@ -110,14 +199,14 @@ def look_at_sheet(path: Path, wanted: str, most: int) -> tuple[Any, list[list[st
             rows = [[_text(_plain(cell)) for cell in row] for row in head]
             while rows and not any(rows[-1]):
                 rows.pop()
-            if sheet.name == wanted:
+            if sheet.name == options.sheet:
                 return cells, rows
             if len(rows) > 1 and len(rows[0]) > 1:
                 tables.append(sheet.name)
                 # One sheet is held at a time, and only what may be read in the end.
                 found = found or (cells, rows)
-    if wanted:
-        raise InputError(f"{path} has no sheet '{wanted}'; it has {', '.join(names)}.")
+    if options.sheet:
+        raise InputError(f"{path} has no sheet '{options.sheet}'; it has {', '.join(names)}.")
     if found is None:
         raise RecordingError(path, 'is a workbook without a table')
     if len(tables) > 1:
@@ -188,7 +277,7 @@ def _text(cell: Any) -> str:
 
 
 @contextmanager
-def _book(path: Path) -> Iterator[Any]:
+def _book(path: Path, options: TableOptions) -> Iterator[Any]:
     try:
         from python_calamine import CalamineWorkbook
     except ImportError:
@@ -199,7 +288,7 @@ def _book(path: Path) -> Iterator[Any]:
         ) from None
     # The library trusts the archive, so it is given a copy of what was counted and measured.
     with tempfile.NamedTemporaryFile(suffix='.xlsx') as copy:
-        _copy_within_bounds(path, copy)
+        _copy_within_bounds(path, copy, options)
         copy.flush()
         try:
             with CalamineWorkbook.from_path(copy.name) as book:
@@ -211,19 +300,19 @@ def _book(path: Path) -> Iterator[Any]:
             raise RecordingError(path, 'cannot be read as a table (it is no workbook)') from None
 
 
-def _copy_within_bounds(path: Path, copy: IO[bytes]) -> None:
+def _copy_within_bounds(path: Path, copy: IO[bytes], options: TableOptions) -> None:
     """Copy a workbook whose parts and sheets do not fill the memory; raises `RecordingError`."""
     with zipfile.ZipFile(path) as archive, zipfile.ZipFile(copy, 'w') as out:
         parts = {part.filename: part for part in archive.infolist()}
         unpacked = sum(part.file_size for part in parts.values())
         packed = path.stat().st_size
-        most = min(_UNPACKED_BYTES, max(_UNPACKED_FREELY, _UNPACKED_TIMES * packed))
+        most = options.unpacked_bytes(packed, _BOOK_BYTES)
         if unpacked > most:
             raise RecordingError(
                 path,
                 f'is a workbook of {packed / 1e6:.1f} MB that unpacks to {unpacked / 1e6:.0f} MB, '
                 f'more than the {most / 1e6:.0f} MB that are read of one its size; save the sheet '
-                'as CSV or Parquet',
+                f'as CSV or Parquet, or, {_allowed(unpacked)}',
             )
         longest, shared = 0, 0
         for name, part in parts.items():

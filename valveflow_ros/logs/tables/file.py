@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.logs.source import Source
 from valveflow_ros.logs.tables.binary import (
-    look_at_parquet,
     look_at_sheet,
     parquet_blocks,
+    parquet_names,
+    parquet_samples,
     sheet_blocks,
 )
 from valveflow_ros.logs.tables.cells import Marks
@@ -66,14 +67,16 @@ class Heading:
 class TableFile:
     """A table that was looked at and not yet read.
 
-    ``rows`` are some of its data from its beginning, from places on the way, and from its end;
-    ``marks`` is ``None`` where a comma may be either mark; ``notes`` are complete when all blocks
-    were read; ``share`` is how much of a text was read so far, 0 to 1.
+    ``rows`` are some of its data from its beginning, from places on the way, and from its end
+    (``None``: only the names of the columns were read so far); ``marks`` is ``None`` where a
+    comma may be either mark; ``notes`` are complete when all blocks were read;
+    ``share`` is how much of a text was read so far, 0 to 1.
     """
 
     path: Path
     heading: Heading
-    rows: list[list[str]]
+    rows: list[list[str]] | None
+    options: TableOptions
     marks: Marks | None = Marks()  # noqa: RUF009
     encoding: str = ''
     separator: str = ''
@@ -86,6 +89,21 @@ class TableFile:
     def names(self) -> tuple[str, ...]:
         """Return the names of the columns as they stand in the file."""
         return self.heading.names
+
+    def samples(self, *places: int) -> list[tuple[str, ...]]:
+        """Return what stands at these places in some rows; not of rows that end before.
+
+        Raises
+        ------
+        RecordingError
+            If the file cannot be read.
+        """
+        if self.rows is None:
+            with _translated(self.path):
+                found = parquet_samples(self.path, places, self.options)
+                return [tuple(map(str.strip, row)) for row in found]
+        whole = [row for row in self.rows if max(places) < len(row)]
+        return [tuple(row[k].strip() for k in places) for row in whole]
 
     def blocks(self, places: Sequence[int]) -> Iterator[pd.DataFrame]:
         """Yield the columns at these places, named by them, block by block.
@@ -111,7 +129,7 @@ class TableFile:
             if self.sheet is not None:
                 yield from sheet_blocks(self.sheet, self.heading.below, places)
             else:
-                yield from parquet_blocks(self.path, places)
+                yield from parquet_blocks(self.path, places, self.options)
             return
         yield from self._text_frames(places)
 
@@ -156,15 +174,15 @@ def look_at(path: Path, options: TableOptions = AS_SEEN) -> TableFile:
         head = source.read(0, _HEAD_BYTES)
         with _translated(path):
             if head[:4] == b'PAR1':
-                names, rows = look_at_parquet(path)
+                names = parquet_names(path)
                 blank = ('',) * len(names)
                 units = heading([list(names)]).units
-                return TableFile(path, Heading(0, (), names, units, blank), rows)
+                return TableFile(path, Heading(0, (), names, units, blank), None, options)
             if path.suffix.lower() in BOOKS or head[:4] == b'PK\x03\x04':
-                sheet, rows = look_at_sheet(path, options.sheet, _HEAD_ROWS)
+                sheet, rows = look_at_sheet(path, options, _HEAD_ROWS)
                 top = heading(rows)
                 marks = _marks(rows[top.below :], '\t', options)
-                return TableFile(path, top, rows[top.below :], marks, sheet=sheet)
+                return TableFile(path, top, rows[top.below :], options, marks, sheet=sheet)
             return _look_at_text(source, path, head, options)
 
 
@@ -191,9 +209,8 @@ def _look_at_text(source: Source, path: Path, head: bytes, options: TableOptions
     notes = []
     if any(cell.strip() for row in data for cell in row[len(top.names) :]):
         notes.append('Rows have more cells than the header; what stands beyond it was left out.')
-    return TableFile(
-        path, top, data, _marks(data, separator, options), encoding, separator, skip, notes=notes
-    )
+    marks = _marks(data, separator, options)
+    return TableFile(path, top, data, options, marks, encoding, separator, skip, notes=notes)
 
 
 def _peeks(source: Source, encoding: str, separator: str, start: int) -> list[list[str]]:

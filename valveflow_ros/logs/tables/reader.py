@@ -303,8 +303,7 @@ class TableReader:
 
     def _cells(self, place: int) -> list[str]:
         """Return what stands in a column in the rows that were looked at."""
-        rows = self._file.rows
-        return [row[place].strip() for row in rows if place < len(row) and row[place].strip()]
+        return [cell for (cell,) in self._file.samples(place) if cell]
 
     def _long_form(self, by_signal: Mapping[Signal, str]) -> LongForm | None:
         form = LongForm.of(self._file.heading)
@@ -351,9 +350,8 @@ class TableReader:
         samples = self._cells(self._time)
         if self._date is not None:
             samples = [
-                f'{row[self._date].strip()[:11].strip()} {row[self._time].strip()}'
-                for row in self._file.rows
-                if max(self._date, self._time) < len(row)
+                f'{date[:11].strip()} {time}'
+                for date, time in self._file.samples(self._date, self._time)
             ]
         clock = TimeReader(samples, str(self.path), name, self._options, zone_in(name))
         abbreviated, place = local_zone_in(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 from collections.abc import Sequence
@@ -81,6 +82,9 @@ def quoted(word: str) -> str:
     return word if re.fullmatch(r'[\w.:/=%+@,-]+', word) else shlex.quote(word)
 
 
+# Tables shrink to a tenth when they are packed, hardly ever to a hundredth.
+_UNPACKED_FREELY = 64_000_000
+_UNPACKED_TIMES = 200
 DATE_ORDERS = ('dmy', 'mdy', 'ymd')
 DECIMALS = ('point', 'comma')
 
@@ -100,18 +104,44 @@ class TableOptions:
         ``point`` or ``comma``.
     sheet : str
         Sheet of a workbook; the first with a table by default.
+    max_unpacked : str
+        Megabytes to which a workbook or the needed columns of a Parquet file may unpack. Empty:
+        64, or 200 times the file if that is more, up to a fixed bound.
     """
 
     time_zone: str = ''
     date_order: str = ''
     decimal: str = ''
     sheet: str = ''
+    max_unpacked: str = ''
 
     def __post_init__(self) -> None:
         if self.date_order not in ('', *DATE_ORDERS):
             raise InputError(f"--date-order must be dmy, mdy or ymd, not '{self.date_order}'.")
         if self.decimal not in ('', *DECIMALS):
             raise InputError(f"--decimal must be point or comma, not '{self.decimal}'.")
+        if self.max_unpacked:
+            self.unpacked_bytes(0, 0)
+
+    def unpacked_bytes(self, packed: int, bound: int) -> float:
+        """Return to how many bytes a file of ``packed`` bytes may unpack; ``bound`` at most.
+
+        Raises
+        ------
+        InputError
+            The limit that a person set is no positive number.
+        """
+        if not self.max_unpacked:
+            return min(bound, max(_UNPACKED_FREELY, _UNPACKED_TIMES * packed))
+        try:
+            given = float(self.max_unpacked)
+        except ValueError:
+            given = math.nan
+        if not 0.0 < given < math.inf:
+            raise InputError(
+                f"--max-unpacked must be a number of megabytes, not '{self.max_unpacked}'."
+            )
+        return given * 1e6
 
 
 AS_SEEN = TableOptions()

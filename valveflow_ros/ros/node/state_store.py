@@ -27,7 +27,7 @@ from valveflow_ros.monitoring.events import (
 from valveflow_ros.parameters import Settings, parameter
 from valveflow_ros.ros.node.diagnostics import Item, Level
 from valveflow_ros.ros.node.recording import DEFAULT_FOLDER, expand_home, tag_of
-from valveflow_ros.state import State, from_bytes, to_bytes
+from valveflow_ros.state import State, from_bytes, perhaps, to_bytes
 
 STATE = 'monitor.state'
 ASIDE = 'monitor.state.unused'
@@ -44,6 +44,10 @@ _RETRY_S = 10.0
 _WATCH_S = 1.0
 # What must survive the end of the process.
 _SAVED_EVENTS = (AlarmChange, CurveAdopted, Diagnosed, ReferenceSet)
+_KINDS = {
+    'settings': dict, 'engine': dict, 'log_ns': int, 'topics': dict, 'began': dict,
+    'recording': str,
+}  # fmt: skip
 _SAVED_ENTRIES = (JournalKind.SETTINGS, JournalKind.RESET, JournalKind.RESUMED)
 
 
@@ -447,6 +451,8 @@ def _fitting(data: bytes | None, settings: Settings) -> State | None:
     if data is None:
         return None
     saved = from_bytes(data)
+    for name in saved.keys() & _KINDS.keys():
+        perhaps(saved, name, _KINDS[name])
     then: Mapping[str, object] = Settings(saved['settings'])
     names = [n for n, v in settings.items() if v != then[n] and parameter(n).of_state]
     if names:
