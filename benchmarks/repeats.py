@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULT = ROOT / 'benchmarks' / 'results' / 'repeats.json'
 FILES = sorted(
     str(path.relative_to(ROOT))
-    for pattern in ('logs/test_*reco*.py', 'ros/test_*state*.py', 'core/test_state.py')
+    for pattern in ('logs/test_*reco*.py', 'ros/test_*state*.py', 'test_state.py')
     for path in (ROOT / 'test').glob(pattern)
 )
 _SUMMARY = re.compile(r'^(?:FAILED|ERROR) (\S+)(?: - (.*))?$', re.MULTILINE)

@@ -7,10 +7,10 @@ import json
 
 import numpy as np
 import pytest
+from curves import curve
 from hypothesis import given
 from hypothesis import strategies as st
 from streams import examples, grid_ns
-from test_characteristic import curve
 
 from valveflow_ros.curve.characteristic import Piece
 from valveflow_ros.curve.characteristic_json import from_json, to_json

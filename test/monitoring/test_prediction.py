@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 import pytest
+from curves import DYNAMICS, curve
 from hypothesis import given
 from hypothesis import strategies as st
 from naive_stream import naive_curve, naive_respond
 from streams import START_NS, blocks_of, cuts, examples, frozen, grid_ns, steps_and_ramps
-from test_characteristic import DYNAMICS, curve
 
 from valveflow_ros.monitoring.prediction import PredictionState, Predictor, no_prediction
 from valveflow_ros.records import NS_PER_S
