@@ -14,11 +14,7 @@ from streams import examples, grid_ns
 
 from valveflow_ros.curve.characteristic import Piece
 from valveflow_ros.curve.characteristic_json import from_json, to_json
-from valveflow_ros.errors import DataError
-from valveflow_ros.fit.fit import fit
 from valveflow_ros.fit.result import support_of, with_support
-from valveflow_ros.fit.task import FitTask
-from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.segments.window import WindowContents
 
@@ -127,27 +123,3 @@ def test_what_pieces_rest_on_and_the_confidence_survive_json():
     plain = from_json(raw)
     assert plain.support == ()
     assert plain.choice.confidence == {}
-
-
-@pytest.mark.parametrize('jitter', [0.0, 0.005])
-def test_a_valve_that_stands_still_has_no_characteristic(jitter):
-    """The pressure moves u, and the power with it, but that is no property of the valve."""
-    r = np.random.default_rng(3)
-    n, hold = 3000, 60
-    pressure = np.repeat(r.uniform(10.0, 16.0, n // hold), hold)
-    opening = 80.0 + jitter * r.normal(size=n)
-    u = opening * pressure**1.125
-    power = 0.15 * u + 20.0 + 0.3 * r.normal(size=n)
-    spans = np.array([[k + 15, k + hold, STEADY] for k in range(0, n, hold)])
-    window = WindowContents(grid_ns(n), u, power, np.full(n, 540.0), spans, opening)
-    settings = Settings({'refine': False, 'selection_rule': 'paper', 'min_fit_samples': 100})
-    with pytest.raises(DataError, match=r'The valve did not move: .* transmitter'):
-        fit(FitTask(0, window, settings, NOISE, 0.3))
-    moving = 80.0 + 10.0 * np.repeat(r.uniform(-1.0, 1.0, n // hold), hold)
-    u = moving * pressure**1.125
-    power = 0.15 * u + 20.0 + 0.3 * r.normal(size=n)
-    window = dataclasses.replace(window, u=u, power_mw=power, opening_percent=moving)
-    found = fit(FitTask(0, window, settings, NOISE, 0.3))
-    assert len(found.pieces) == 1
-    assert found.choice.rule == 'paper'
-    assert found.support[0].identifiable
