@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from streams import needs_jit
 
 from valveflow_ros.baselines import comparison
 from valveflow_ros.baselines.comparison import compare, to_json
@@ -18,9 +18,7 @@ from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.records import NS_PER_S, SegmentKind
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
-)
+pytestmark = needs_jit
 REST_S, MOVE_S = 420, 180
 
 

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 
 import numpy as np
 import pytest
+from streams import needs_jit
 
 from valveflow_ros.curve.characteristic_json import from_json
 from valveflow_ros.logs import open_log, write_table
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import NS_PER_S, SampleTable, Signal
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
-)
+pytestmark = needs_jit
 START_NS = 1_700_000_000 * NS_PER_S
 
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 
 import pytest
+from streams import needs_jit
 
 from valveflow_ros.curve.characteristic_json import from_json
 from valveflow_ros.logs import write_samples
 from valveflow_ros.plant.step_test import StepPlan, step_test
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
-)
+pytestmark = needs_jit
 
 
 @pytest.fixture(scope='module')

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import re
 
 import pytest
+from streams import needs_jit
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
-)
+pytestmark = needs_jit
 SEGMENTS = {'steady': 40, 'slope_response': 10, 'samples': 20000}
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from streams import needs_jit
 
 from benchmarks import refinery_score
 from benchmarks import refinery_valves as study
@@ -19,9 +19,7 @@ from benchmarks.refinery_loops import simulate_loop
 from benchmarks.refinery_score import LoopScore
 from valveflow_ros.errors import DataError
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='loops of hours need the compiled kernels'
-)
+pytestmark = needs_jit
 STEP_S = 10.0
 
 
