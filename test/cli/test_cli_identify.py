@@ -202,16 +202,6 @@ def test_files_that_are_no_logs(run, tmp_path, verb, name, content):
         assert not (tmp_path / output).exists()
 
 
-def test_wrong_parameters_are_wrong_usage(run, logs, tmp_path):
-    words = ['identify', logs / 'plant.csv', '-o', tmp_path / 'out', '--set']
-    assert "did you mean 'time_constant'" in run(*words, 'time_constnt=3').refused(2)
-    assert 'must be from' in run(*words, 'time_constant=1e9').refused(2)
-    assert 'NAME=VALUE' in run(*words, 'time_constant').refused(2)
-    sentence = run(*words, 'hold_limit=1', '--set', 'sample_period=5').refused()
-    assert 'must not be below sample_period' in sentence
-    assert not (tmp_path / 'out').exists()
-
-
 def test_slow_data_are_met_with_fitting_parameters(run, tmp_path):
     log = table(240, stairs, lambda t, rng: 4.0 * stairs(t) + rng.standard_normal(len(t)),
                 step_s=60)  # fmt: skip

@@ -76,14 +76,6 @@ def test_export_takes_a_step(run, logs, tmp_path):
     assert set(np.diff(written.time_ns)) == {10_000_000_000}
 
 
-@pytest.mark.parametrize(
-    ('output', 'part'),
-    [('a.mcap', 'must end in .csv or .parquet'), ('no/a.csv', 'there is no folder')],
-)
-def test_export_to_where_it_cannot(run, logs, tmp_path, output, part):
-    assert part in run('export', logs / 'plant.csv', '-o', tmp_path / output).refused()
-
-
 def test_export_does_not_replace_by_accident(run, logs, tmp_path):
     table = tmp_path / 'a.csv'
     table.write_text('mine')

@@ -118,12 +118,6 @@ def test_errors_raised_on_purpose_and_by_the_system(breaks):
     assert 'memory' in breaks(MemoryError()).refused()
 
 
-def test_a_misspelt_option_is_told_before_anything_that_is_missing(run):
-    sentence = run('validate', '--modell', 'x.json').refused(2)
-    assert "There is no option '--modell'. Did you mean '--model'?" in sentence
-    assert 'There is no option' in run('info', 'x.mcap', '--xyz=1').refused(2)
-
-
 def test_a_file_that_is_not_there_is_told_before_anything_is_loaded(tmp_path):
     words = [
         ['identify', 'nothing.mcap', '-o', 'o'],
