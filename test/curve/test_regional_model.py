@@ -58,15 +58,6 @@ def test_the_response_is_the_slow_one(model, seed, step):
         assert settled[k] == (k >= 20 and recent.all())
 
 
-@examples(20)
-@given(models(), st.integers(0, 2**32 - 1))
-def test_in_equilibrium_the_answer_is_the_curve(model, seed):
-    level = float(np.random.default_rng(seed).uniform(model.knots[0], model.knots[-1]))
-    u = np.full(200, level)
-    got, _ = model.respond(u, np.ones(200, dtype=np.uint8), 1.0, 20.0)
-    assert got == pytest.approx(np.full(200, model.static(np.array([level]))[0]), rel=1e-12)
-
-
 def one_region(time_constant, delay):
     return RegionalModel(
         np.array([0.0, 100.0]), np.array([0.0]), np.array([100.0]), np.empty(0),
@@ -98,16 +89,3 @@ def test_a_step_is_answered_after_the_delay_with_the_time_constant():
     expected = 1.0 - (1.0 - first) * np.exp(-after / 10.0)
     assert got[:53] == pytest.approx(20.0)
     assert got[53:] == pytest.approx(20.0 + 40.0 * expected, rel=1e-12)
-
-
-@examples(20)
-@given(models(most_regions=1), st.integers(0, 2**32 - 1), st.floats(-100.0, 100.0))
-def test_power_shifted_with_the_curve_shifts_the_answer(model, seed, more):
-    u, usable = inputs(model, seed), gaps(seed, 300)
-    here, _ = model.respond(u, usable, 1.0, 20.0)
-    moved = RegionalModel(
-        model.knots, model.left + more, model.right + more, model.levels,
-        model.time_constants, model.delays,
-    )  # fmt: skip
-    there, _ = moved.respond(u, usable, 1.0, 20.0)
-    assert there == pytest.approx(here + more, abs=1e-9, nan_ok=True)

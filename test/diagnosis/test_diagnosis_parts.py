@@ -176,15 +176,11 @@ def test_scores_of_noise_have_even_chances():
     assert sign_flip(-np.full(30, 1.0)) == 1.0
 
 
-def test_a_clean_record_has_no_faults():
+def test_faults_are_masked_where_they_are():
     samples = table(0.4, 2, (), unit())
     bad, found = record_faults.faults(samples, 2.0)
     assert found == ()
     assert not bad.any()
-
-
-def test_faults_are_masked_where_they_are():
-    samples = table(0.4, 2, (), unit())
     values = samples.values.copy()
     places = np.array([3000, 5001, 9000, 12000, 15000])
     values[places, Signal.GENERATED_POWER] += 60.0

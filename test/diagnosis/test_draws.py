@@ -27,9 +27,6 @@ def test_the_noise_of_a_wandering_position_is_told_from_its_moves(noise, seed):
     v = np.round(moves + rng.normal(0.0, noise, len(moves)), 2)
     v[::997] = np.nan
     assert sensor_noise(v) == pytest.approx(noise, rel=0.2, abs=0.003)
-
-
-def test_a_position_without_values_has_no_noise():
     assert sensor_noise(np.full(10, np.nan)) == 0.0
 
 

@@ -193,22 +193,6 @@ def test_any_cutting_gives_the_same_bits(seed, harms, data):
 
 @examples(30)
 @given(st.integers(0, 2**32 - 1), harm)
-def test_segments_lie_apart_inside_the_rows_and_on_good_data_only(seed, harms):
-    stream = harmed(plant(seed, 600), harms)
-    out, segmenter = whole(Settings(QUICK), stream)
-    usable = np.isfinite(stream.u) & np.isfinite(stream.power)
-    steps = np.diff(stream.time_ns)
-    last_end = 0
-    for row, f in out.found:
-        assert last_end <= f.first_row < f.end_row <= row <= 600
-        assert row - f.first_row <= segmenter.longest_rows
-        assert usable[f.first_row : f.end_row].all()
-        assert (steps[f.first_row : f.end_row - 1] == NS_PER_S).all()
-        last_end = f.end_row
-
-
-@examples(30)
-@given(st.integers(0, 2**32 - 1), harm)
 def test_after_a_gap_the_transient_never_counts(seed, harms):
     stream = harmed(plant(seed, 600), harms)
     out, _ = whole(Settings(QUICK), stream)
