@@ -88,7 +88,7 @@ def main() -> None:
     for pattern, draw in (
         ('coverage_*.json', _coverage),
         ('paper_study_*.json', _paper),
-        ('alarm_*.json', _alarm),
+        ('alarm_[0-9]*.json', _alarm),
     ):
         for path in sorted(RESULTS.glob(pattern)):
             figure = draw(json.loads(path.read_text(encoding='utf-8')), pyplot)
