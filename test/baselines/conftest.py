@@ -46,18 +46,12 @@ def other_data(noise_mw=1.0, seed=7, shift_mw=0.0, above=9e9, u_shift=0.0) -> Ot
 
 
 @pytest.fixture(scope='session')
-def make_curve():
+def curve():
     """Return the maker of characteristics."""
     return characteristic
 
 
-@pytest.fixture
-def curve(make_curve):
-    """Return the same, by its short name."""
-    return make_curve
-
-
-@pytest.fixture
+@pytest.fixture(scope='session')
 def data():
     """Return the maker of data to judge by."""
     return other_data

@@ -23,7 +23,7 @@ REST_S, MOVE_S = 420, 180
 
 
 @pytest.fixture(scope='module')
-def plant(make_curve):
+def plant(curve):
     """Return rows of a unit with one time constant that rests, moves and rests again."""
     rng = np.random.default_rng(21)
     hours = 12
@@ -33,7 +33,7 @@ def plant(make_curve):
     times = np.concatenate([[0.0], np.cumsum(np.tile([REST_S, MOVE_S], count + 1))])[:-1]
     u = np.interp(np.arange(count * cycle), times, levels)
     everywhere = np.ones(len(u), dtype=np.uint8)
-    clean, _ = make_curve(dynamics=True).model.respond(u, everywhere, 1.0, 110.0)
+    clean, _ = curve(dynamics=True).model.respond(u, everywhere, 1.0, 110.0)
     power = clean + rng.normal(0.0, 1.0, len(u))
     spans = [(k * cycle + 150, k * cycle + REST_S, int(SegmentKind.STEADY)) for k in range(count)]
     return Samples(u, power, everywhere, 1.0, 110.0, 10), np.array(spans, dtype=np.int64)
