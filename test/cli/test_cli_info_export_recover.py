@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from logged import rewritten
 from monitor_recording import FLOAT64, Monitor, cdr
 
 from valveflow_ros.interface.alignment import align
@@ -34,12 +35,12 @@ def test_info_tells_what_is_there(run, logs):
 
 
 def test_info_of_a_table_tells_gaps_and_values_that_will_be_rejected(run, logs, tmp_path):
-    lines = (logs / 'plant.csv').read_text().splitlines()
-    column = lines[0].split(',').index('main_steam_pressure_mpa')
-    cells = lines[50].split(',')
-    cells[column] = '-5'
-    lines[50] = ','.join(cells)
-    (tmp_path / 'x.csv').write_text('\n'.join([*lines[:100], *lines[700:1000]]) + '\n')
+    table = tmp_path / 'x.csv'
+    rewritten(
+        logs / 'plant.csv', table, 'main_steam_pressure_mpa', lambda k, p: '-5' if k == 49 else p
+    )
+    lines = table.read_text().splitlines()
+    table.write_text('\n'.join([*lines[:100], *lines[700:1000]]) + '\n')
     ran = run('info', tmp_path / 'x.csv')
     assert 'main_steam_pressure: 1 impossible value' in ran.out
     assert 'valve_opening: 1 gap, the longest 10 min 1 s from' in ran.out
