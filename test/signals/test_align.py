@@ -126,6 +126,28 @@ def test_time_shifted_by_whole_periods_gives_the_same_rows_later(eras, values, p
     assert np.array_equal(here.values, there.values, equal_nan=True)
 
 
+# Seconds off, at which places, and for which signals.
+WILD = [
+    ((86_400, 50, [0]), (-86_400, 90, [0]), (5_000_000, 120, [0])),
+    ((5000, 80, range(4)),),  # the values of one wrong instant do not confirm each other
+    ((5000, 80, range(4)), (5001, 80, range(4))),
+]
+
+
+@pytest.mark.parametrize('wild', WILD)
+def test_wrong_stamps_are_counted_and_change_no_row(wild):
+    rows, odd = steady_stream(40), []
+    for off_s, place, signals in wild:
+        odd += [(place, (rows[place][0] + off_s * NS_PER_S, s, GOOD[s], 0)) for s in signals]
+    told = list(rows)
+    for place, reading in reversed(odd):
+        told.insert(place, reading)
+    table, aligner = run(Settings(), told)
+    expected, _ = run(Settings(), rows)
+    assert np.array_equal(table.values, expected.values, equal_nan=True)
+    assert sum(c['time_outlier'] for c in aligner.counts().values()) == len(odd)
+
+
 @examples(30)
 @given(st.integers(1, 30), st.integers(0, 2**32 - 1))
 def test_a_table_on_the_grid_comes_back_as_it_was(n, seed):
