@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from logged import rewritten
-from monitor_recording import FLOAT64, Monitor, cdr
+from monitor_recording import FLOAT64, Monitor, cdr, diagnosis
 
 from valveflow_ros.interface.alignment import align
 from valveflow_ros.interface.logs import steps_of
@@ -113,7 +113,7 @@ USUAL = {
 @pytest.mark.parametrize(
     ('wrong', 'reason'),
     [
-        ('', ''), ('not a number', 'not_finite'), ('impossible', 'impossible'),
+        ('', ''), ('no reading', ''), ('not a number', 'not_finite'), ('impossible', 'impossible'),
         ('told twice', 'duplicate'), ('a leap ahead', ''), ('everything', 'duplicate'),
     ],
 )  # fmt: skip
@@ -121,7 +121,8 @@ def test_info_counts_what_the_engine_accepts(run, tmp_path, wrong, reason):
     """The quick look may ask the engine too often, but may never say other than it."""
     rng, monitor = np.random.default_rng(5), Monitor(tmp_path / 'r')
     odd = {'not a number': np.nan, 'impossible': 1e9}
-    for row in range(80):
+    monitor.say('diagnosis', diagnosis(monitor.now_ns, 1, 'All is well.'))
+    for row in range(0 if wrong == 'no reading' else 80):
         here = wrong if row == 40 else ''
         if wrong == 'everything':
             here = str(rng.choice(['', 'not a number', 'impossible', 'told twice']))
