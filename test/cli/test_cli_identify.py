@@ -226,7 +226,7 @@ def test_readings_that_were_not_used_are_told(run, logs, tmp_path):
 def test_a_curve_that_explains_little_is_not_to_be_relied_on(run, logs, tmp_path):
     """The power is that of another time."""
     power = open_log(logs / 'plant.csv').readings.by_signal()[Signal.GENERATED_POWER].value
-    shifted = np.roll(power, len(power) // 3)
+    shifted = np.roll(power, -(len(power) // 3))
     rewritten(
         logs / 'plant.csv', tmp_path / 'x.csv', 'generated_power_mw',
         lambda k, _: repr(float(shifted[k])),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -104,6 +105,11 @@ def test_a_piece_without_data_of_its_own_is_marked_and_says_what_would_help():
     assert 'an hour at u 1720 (' in second
     assert third.startswith('Piece 3 (u 1800 to 2200) rests on no special sample: ')
     assert 'an hour each at u 1880 (' in third
+    touched = contents((1000.0, 1408.0, SLOPE))
+    (*_, said) = with_support(curve([1000.0, 1400.0, 1800.0], [0.2, 0.1]), touched, NOISE).notes
+    assert re.search(r'rests on no special segment, only on \d+ samples? at their ends', said), (
+        said
+    )
     everywhere = contents(*[(u, u + 90.0, SLOPE) for u in range(1000, 2200, 100)])
     assert with_support(found, everywhere, NOISE).notes == found.notes
 
