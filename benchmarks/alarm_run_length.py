@@ -12,21 +12,18 @@ show it. Then lasting shifts of one and of three sd of a block mean set in at so
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 from scipy.signal import lfilter
 
+from benchmarks import study
 from valveflow_ros.fit.residual_chart import ChartDesign, ResidualChart, design_chart
 from valveflow_ros.monitoring.alarms import AlarmState, ResidualAlarm
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, FloatArray
 
-RESULTS = Path(__file__).parent / 'results'
 PHI = (0.0, 0.5, 0.9, 0.98, 0.995)
 _DAY = 86400
 _DESIGN_DAYS = 10
@@ -155,27 +152,19 @@ def summary(phi: float, found: list[dict[str, object]], days: int) -> dict[str, 
 
 def main() -> None:
     """Run, print a line a coefficient, and write the figures beside the other results."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--records', type=int, default=40)
-    parser.add_argument('--days', type=int, default=60)
-    parser.add_argument('--first', type=int, default=5000)
-    parser.add_argument('--moments', type=int, default=5)
-    parser.add_argument('--block-sd', type=float, default=5.0)
-    parser.add_argument('--curve-error', type=float, default=0.2)
+    parser = study.options(
+        __doc__, records=40, days=60, first=5000, moments=5, block_sd=5.0, curve_error=0.2
+    )
     args = parser.parse_args()
     begun = time.monotonic()
-    rows = []
-    for phi in PHI:
-        found = [record(args.first + k, phi, args) for k in range(args.records)]
-        rows.append(summary(phi, found, args.days))
-        print(json.dumps(rows[-1]), flush=True)
-    RESULTS.mkdir(exist_ok=True)
-    name = f'alarm_run_length_{args.first}_{args.first + args.records - 1}.json'
-    command = ' '.join(['python -m benchmarks.alarm_run_length', *sys.argv[1:]])
-    text = json.dumps(
-        {'command': command, 'took_s': round(time.monotonic() - begun), 'noise': rows}, indent=1
-    )
-    (RESULTS / name).write_text(text + '\n', encoding='utf-8')
+
+    def of(phi: float) -> dict[str, object]:
+        found = [record(seed, phi, args) for seed in study.seeds(args.first, args.records)]
+        return summary(phi, found, args.days)
+
+    rows = study.rows_of(of, PHI)
+    name = study.name_of('alarm_run_length', args.first, args.records)
+    study.keep(name, took_s=round(time.monotonic() - begun), noise=rows)
 
 
 if __name__ == '__main__':

@@ -9,15 +9,13 @@ others.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-import sys
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 
-from benchmarks.coverage_study import identify
+from benchmarks import study
 from valveflow_ros.fit.residual_chart import ChartDesign, ResidualChart, block_means, design_chart
 from valveflow_ros.monitoring.prediction import Predictor
 from valveflow_ros.parameters import Settings
@@ -26,19 +24,7 @@ from valveflow_ros.plant.unit import random_unit
 from valveflow_ros.records import NS_PER_S, Signal
 from valveflow_ros.signals.integrated_input import integrated_input
 
-RESULTS = Path(__file__).parent / 'results'
 _MOMENTS = 50
-
-
-def episodes(evidence: np.ndarray) -> int:
-    """Count how often the evidence goes beyond the limit, with a return to 0.7 in between."""
-    count, active = 0, False
-    for value in np.abs(evidence[np.isfinite(evidence)]):
-        if not active and value > 1.0:
-            count, active = count + 1, True
-        elif active and value < 0.7:
-            active = False
-    return count
 
 
 def delays_min(
@@ -60,7 +46,7 @@ def delays_min(
 def plant(seed: int, days: float) -> dict[str, object]:
     """Identify one plant on ten days and watch it for more of them."""
     unit = random_unit(np.random.default_rng(seed))
-    curve = identify(unit, seed, 10.0)
+    curve = study.identify(unit, seed, 10.0)
     design = curve.residuals.chart
     assert design is not None
     log = simulate(10.0 + days, seed, unit)
@@ -84,7 +70,7 @@ def plant(seed: int, days: float) -> dict[str, object]:
     )
     sd = float(np.nanstd(means))
     out: dict[str, object] = {
-        'seed': seed, 'days': days, 'alarms': episodes(block.evidence),
+        'seed': seed, 'days': days, 'alarms': study.episodes(block.evidence),
         'block_sd_mw': round(sd, 3), 'correlation': round(design.correlation, 3),
         'limit': [round(v, 2) for v in design.limit],
     }  # fmt: skip
@@ -111,7 +97,7 @@ def alone(correlation: float, seeds: int) -> dict[str, object]:
         )  # fmt: skip
         time_ns = np.arange(60 * 1440) * 60 * NS_PER_S
         evidence, _ = ResidualChart(design, 60.0).feed(time_ns, series[10 * 1440 :])
-        count += episodes(evidence)
+        count += study.episodes(evidence)
     return {
         'correlation': correlation,
         'days': 60 * seeds,
@@ -122,16 +108,8 @@ def alone(correlation: float, seeds: int) -> dict[str, object]:
 
 def main() -> None:
     """Run both parts, print them, and write them beside the other results."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--plants', type=int, default=20)
-    parser.add_argument('--days', type=float, default=30.0)
-    parser.add_argument('--first', type=int, default=300)
-    parser.add_argument('--series', type=int, default=40)
-    args = parser.parse_args()
-    rows = []
-    for seed in range(args.first, args.first + args.plants):
-        rows.append(plant(seed, args.days))
-        print(json.dumps({k: v for k, v in rows[-1].items() if 'delay' not in k}), flush=True)
+    args = study.options(__doc__, plants=20, days=30.0, first=300, series=40).parse_args()
+    rows = study.rows_of(partial(plant, days=args.days), study.seeds(args.first, args.plants))
     charts = [alone(c, args.series) for c in (0.0, 0.5, 0.9, 0.98)]
     watched, false = args.days * len(rows), sum(int(r['alarms']) for r in rows)  # type: ignore[call-overload]
     summary = {
@@ -145,13 +123,8 @@ def main() -> None:
         summary[f'missed_{size}_sd'] = int(np.isinf(delays).sum())
         summary[f'tried_{size}_sd'] = len(delays)
     print(json.dumps({'plants': summary, 'chart_alone': charts}, indent=1))
-    RESULTS.mkdir(exist_ok=True)
-    name = f'alarm_{args.first}_{args.first + args.plants - 1}.json'
-    command = ' '.join(['python -m benchmarks.alarm_study', *sys.argv[1:]])
-    text = json.dumps(
-        {'command': command, 'summary': summary, 'chart_alone': charts, 'plants': rows}, indent=1
-    )
-    (RESULTS / name).write_text(text + '\n', encoding='utf-8')
+    name = study.name_of('alarm', args.first, args.plants)
+    study.keep(name, strict=False, summary=summary, chart_alone=charts, plants=rows)
 
 
 if __name__ == '__main__':

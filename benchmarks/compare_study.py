@@ -10,14 +10,15 @@ a delay of one row, nothing chosen by data held out.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks import study
 from valveflow_ros.baselines.comparison import Comparison, compare, finding_of
 from valveflow_ros.baselines.hammerstein import HammersteinModel
 from valveflow_ros.baselines.hammerstein_fit import (
@@ -31,24 +32,11 @@ from valveflow_ros.baselines.judged import other_data, samples_of
 from valveflow_ros.baselines.truth import Truth, curve_error
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.fit.problem import Samples
-from valveflow_ros.fit.task import FitTask
-from valveflow_ros.monitoring.events import FitRequested
-from valveflow_ros.monitoring.monitor import Monitor
-from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.unit import UnitDescription, random_unit
 from valveflow_ros.records import SegmentKind
 
-RESULTS = Path(__file__).parent / 'results'
 OTHER_DAYS = 50_000  # added to the seed
-
-
-def task_of(unit: UnitDescription, seed: int, days: float, settings: Settings) -> FitTask:
-    """Simulate one plant and find its special segments."""
-    monitor = Monitor(settings)
-    monitor.feed(simulate(days, seed, unit).table)
-    (task,) = (e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
-    return task
 
 
 def untuned(samples: Samples, pieces: int) -> HammersteinModel:
@@ -59,18 +47,14 @@ def untuned(samples: Samples, pieces: int) -> HammersteinModel:
     return move(samples, grown(start, 2, 3), OUTPUT_ERROR, 20)[0]
 
 
-def study(seed: int, days: float, random: bool) -> dict[str, object]:
+def compared(seed: int, days: float, random: bool) -> dict[str, object]:
     """Learn from one plant, judge on its other days."""
     unit = random_unit(np.random.default_rng(seed)) if random else UnitDescription()
-    settings = Settings(
-        {
-            'refit_period': 0.0,
-            'window_days': max(days, 0.1),
-            'sample_period': unit.sample_period_s,
-        }
+    settings = study.whole_window(unit, days)
+    learn, judged = (
+        study.task_of(simulate(days, s, unit).table, settings)[0]
+        for s in (seed, seed + OTHER_DAYS)
     )
-    learn = task_of(unit, seed, days, settings)
-    judged = task_of(unit, seed + OTHER_DAYS, days, settings)
     curve = unit.curve
     truth = Truth(curve.knots, curve.slopes, curve.intercepts, unit.pressure_exponent)
     begin = time.perf_counter()
@@ -78,12 +62,12 @@ def study(seed: int, days: float, random: bool) -> dict[str, object]:
     fitted = time.perf_counter()
     samples = samples_of(learn.contents, settings)
     result = compare(samples, found, other_data(judged.contents, settings), truth)
-    compared = time.perf_counter()
+    ended = time.perf_counter()
     ends = float(found.breakpoints[0]), float(found.breakpoints[-1])
     plain = untuned(samples, len(found.pieces))
     row = {
         'seed': seed,
-        'seconds': {'fit': round(fitted - begin, 1), 'compare': round(compared - fitted, 1)},
+        'seconds': {'fit': round(fitted - begin, 1), 'compare': round(ended - fitted, 1)},
         'true_pieces': len(curve.slopes),
         'true_regions': [[r.time_constant_s, r.delay_s] for r in unit.regions],
         **summary(result),
@@ -134,15 +118,6 @@ def summary(r: Comparison) -> dict[str, dict[str, object]]:
     }  # fmt: skip
 
 
-def finite(value: object) -> object:
-    """Replace what JSON does not know by null."""
-    if isinstance(value, dict):
-        return {k: finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(v) for v in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
 def lines_of(rows: list[dict[str, object]]) -> list[str]:
     """Return what came out over all seeds, a line each."""
     lines = []
@@ -167,17 +142,12 @@ def lines_of(rows: list[dict[str, object]]) -> list[str]:
 
 def draw(source: Path, target: Path) -> None:
     """Draw curve errors and errors of simulation of all seeds."""
-    import matplotlib
-
-    matplotlib.use('Agg')
-    import matplotlib.pyplot as plt
-
     rows = json.loads(source.read_text(encoding='utf-8'))['rows']
     names = {
         'paper': "paper's\ncurve", 'proposed': 'valveflow', 'hammerstein': 'Hammer-\nstein',
         'untuned': 'Hammerstein,\nuntuned', 'sparse': 'sparse',
     }  # fmt: skip
-    fig, axes = plt.subplots(1, 3, figsize=(13, 4.4), layout='constrained')
+    fig, axes = study.plots().subplots(1, 3, figsize=(13, 4.4), layout='constrained')
     panels: list[tuple[str, dict[str, list[float]]]] = [
         ('curve against the truth, rms (MW)',
          {m: [row['curve_errors'][m]['rmse_mw'] for row in rows] for m in names}),
@@ -208,31 +178,18 @@ def draw(source: Path, target: Path) -> None:
 
 def main() -> None:
     """Run the study, print it, and write it beside the other results."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--seeds', type=int, default=5)
-    parser.add_argument('--first', type=int, default=1)
-    parser.add_argument('--days', type=float, default=10.0)
+    parser = study.options(__doc__, seeds=5, first=1, days=10.0)
     parser.add_argument('--units', choices=('paper', 'random'), default='paper')
     parser.add_argument('--figure', action='store_true', help='draw what is there, run nothing')
     args = parser.parse_args()
-    name = f'compare_study_{args.units}_{args.first}_{args.first + args.seeds - 1}.json'
-    place = RESULTS / name
-    if args.figure:
-        draw(place, place.with_suffix('.png'))
-        return
-    rows = []
-    for seed in range(args.first, args.first + args.seeds):
-        rows.append(study(seed, args.days, args.units == 'random'))
-        print(json.dumps(finite(rows[-1])), flush=True)
-    lines = lines_of(rows)
-    print('\n'.join(lines))
-    RESULTS.mkdir(exist_ok=True)
-    command = (
-        f'python -m benchmarks.compare_study --seeds {args.seeds} --first {args.first} '
-        f'--days {args.days:g} --units {args.units}'
-    )
-    content = {'command': command, 'summary': lines, 'rows': rows}
-    place.write_text(json.dumps(finite(content), indent=1) + '\n', encoding='utf-8')
+    name = study.name_of(f'compare_study_{args.units}', args.first, args.seeds)
+    place = study.RESULTS / f'{name}.json'
+    if not args.figure:
+        work = partial(compared, days=args.days, random=args.units == 'random')
+        rows = study.rows_of(work, study.seeds(args.first, args.seeds))
+        lines = lines_of(rows)
+        print('\n'.join(lines))
+        study.keep(name, summary=lines, rows=rows)
     draw(place, place.with_suffix('.png'))
 
 

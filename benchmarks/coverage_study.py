@@ -8,36 +8,18 @@ often it is, and whether a too simple curve is wrong by more than noise, is told
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 
+from benchmarks import study
 from valveflow_ros.curve.characteristic import Characteristic
-from valveflow_ros.fit.fit import fit
-from valveflow_ros.monitoring.events import FitRequested
-from valveflow_ros.monitoring.monitor import Monitor
-from valveflow_ros.parameters import Settings
-from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.unit import UnitDescription, random_unit
 
-RESULTS = Path(__file__).parent / 'results'
 _Z95 = 1.959963984540054
-
-
-def identify(unit: UnitDescription, seed: int, days: float) -> Characteristic:
-    """Simulate a unit and identify it with the defaults."""
-    log = simulate(days, seed, unit)
-    monitor = Monitor(
-        Settings({'refit_period': 0.0, 'window_days': days, 'sample_period': unit.sample_period_s})
-    )
-    monitor.feed(log.table)
-    (task,) = (e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
-    return fit(task)
 
 
 def scores(found: Characteristic, unit: UnitDescription) -> Iterator[tuple[str, float]]:
@@ -63,11 +45,11 @@ def scores(found: Characteristic, unit: UnitDescription) -> Iterator[tuple[str, 
             yield 'delay', (region.delay_s - true.delay_s) / region.delay_stderr_s
 
 
-def study(seed: int, days: float) -> dict[str, object]:
+def judged(seed: int, days: float) -> dict[str, object]:
     """Draw one plant and identify it."""
     unit = random_unit(np.random.default_rng(seed))
     begin = time.process_time()
-    found = identify(unit, seed, days)
+    found = study.identify(unit, seed, days)
     table: dict[str, list[float]] = {}
     for name, value in scores(found, unit):
         table.setdefault(name, []).append(round(float(value), 3))
@@ -107,24 +89,12 @@ def summary(rows: list[dict[str, object]]) -> dict[str, object]:
 
 def main() -> None:
     """Run the study, print it, and write it beside the other results."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--seeds', type=int, default=200)
-    parser.add_argument('--first', type=int, default=9000)
-    parser.add_argument('--days', type=float, default=10.0)
-    args = parser.parse_args()
-    rows = []
-    for seed in range(args.first, args.first + args.seeds):
-        rows.append(study(seed, args.days))
-        print(json.dumps(rows[-1]), flush=True)
+    args = study.options(__doc__, seeds=200, first=9000, days=10.0).parse_args()
+    rows = study.rows_of(partial(judged, days=args.days), study.seeds(args.first, args.seeds))
     result = summary(rows)
     print(json.dumps(result, indent=1))
-    RESULTS.mkdir(exist_ok=True)
-    name = f'coverage_{args.first}_{args.first + args.seeds - 1}.json'
-    command = ' '.join(['python -m benchmarks.coverage_study', *sys.argv[1:]])
-    text = json.dumps(
-        {'command': command, 'days': args.days, 'summary': result, 'rows': rows}, indent=1
-    )
-    (RESULTS / name).write_text(text + '\n', encoding='utf-8')
+    name = study.name_of('coverage', args.first, args.seeds)
+    study.keep(name, strict=False, days=args.days, summary=result, rows=rows)
 
 
 if __name__ == '__main__':

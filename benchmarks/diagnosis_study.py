@@ -14,11 +14,11 @@ import argparse
 import json
 import time
 from collections import Counter
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks import study
 from benchmarks.diagnosis_cases import (
     CONFOUNDED,
     EFFECTS,
@@ -37,13 +37,10 @@ from valveflow_ros.diagnosis.scene import make_scene
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.fit.fit import fit, outline
 from valveflow_ros.fit.task import FitTask
-from valveflow_ros.monitoring.events import FitRequested, SegmentClosed
-from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import SimulatedLog, simulate
 from valveflow_ros.records import IntArray
 
-RESULTS = Path(__file__).parent / 'results'
 KINDS = ('hidden', 'null', 'pair', 'confounded', 'outside')
 # Four fifths of 64, which is four times the 16 that just reach detection.
 ENOUGH = 51.0
@@ -52,17 +49,10 @@ OTHER_SEED = 1_000_003  # of the record that an earlier model comes from
 
 def watched(log: SimulatedLog, days: float) -> tuple[FitTask, IntArray, Settings]:
     """Find special segments, and what a curve is found from."""
-    settings = Settings(
-        {'refit_period': 0.0, 'window_days': max(days, 0.1),
-         'sample_period': log.unit.sample_period_s}
-    )  # fmt: skip
-    monitor = Monitor(settings)
-    fed = monitor.feed(log.table)
-    spans = [
-        (e.segment.start_ns, e.segment.end_ns) for e in fed.events if isinstance(e, SegmentClosed)
-    ]
-    (task,) = (e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
-    return task, np.array(spans, dtype=np.int64).reshape(-1, 2), settings
+    settings = study.whole_window(log.unit, days)
+    task, segments = study.task_of(log.table, settings)
+    spans = np.array([(s.start_ns, s.end_ns) for s in segments], dtype=np.int64)
+    return task, spans.reshape(-1, 2), settings
 
 
 def run(case: Case, days: float) -> tuple[Diagnosis, SimulatedLog, Record, dict[str, float]]:
@@ -189,51 +179,27 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return table
 
 
-def _plain(value: Any) -> Any:
-    """JSON has no NaN: absent is null."""
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, list):
-        return [_plain(v) for v in value]
-    return None if isinstance(value, float) and value != value else value
-
-
 def main() -> None:
     """Run the study, print it, and write it beside the other results."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = study.options(__doc__, seeds=1, first=0, days=10.0, low=2.0, high=4.0)
     parser.add_argument('--kind', choices=KINDS, default='hidden')
     parser.add_argument('--effect', action='append')
-    parser.add_argument('--seeds', type=int, default=1)
-    parser.add_argument('--first', type=int, default=0)
-    parser.add_argument('--days', type=float, default=10.0)
-    parser.add_argument('--low', type=float, default=2.0)
-    parser.add_argument('--high', type=float, default=4.0)
-    parser.add_argument('--output', type=Path)
     args = parser.parse_args()
-    last = args.first + args.seeds - 1
-    name = f'diagnosis_{args.kind}_{args.first}_{last}_{args.days:g}d.json'
-    path = args.output or RESULTS / name
-    path.parent.mkdir(exist_ok=True)
-    command = (
-        f'python -m benchmarks.diagnosis_study --kind {args.kind} --seeds {args.seeds} '
-        f'--first {args.first} --days {args.days:g} --low {args.low:g} --high {args.high:g}'
-        + ''.join(f' --effect {name}' for name in args.effect or [])
-    )
+    name = study.name_of(f'diagnosis_{args.kind}', args.first, args.seeds)
     rows: list[dict[str, Any]] = []
     for case in cases(args):
         rows.append(row_of(case, args.days))
         print(json.dumps(rows[-1]), flush=True)
         # Hours of work: what is done is kept, whatever comes.
-        path.write_text(json.dumps(_plain(totals(command, rows)), indent=1) + '\n', 'utf-8')
+        study.keep(f'{name}_{args.days:g}d', **totals(rows))
     for label, line in summary(rows).items():
         print(f'{label:22} {line["right"]}/{line["records"]}  {line["said"]}')
 
 
-def totals(command: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
+def totals(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return what is kept of a run."""
     enough = [r for r in rows if (r.get('available') or 0.0) >= ENOUGH]
     return {
-        'command': command,
         'right': sum(bool(r.get('right')) for r in rows), 'records': len(rows),
         'named_with_confidence_wrongly': sum(map(_confidently_wrong, rows)),
         'detectable_twice': {

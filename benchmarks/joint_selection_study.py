@@ -9,38 +9,29 @@ were used to set how far the evidence is believed.
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 
+from benchmarks import study
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.fit.fit import fit
-from valveflow_ros.monitoring.events import FitRequested
-from valveflow_ros.monitoring.monitor import Monitor
-from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.unit import random_unit
 
-RESULTS = Path(__file__).parent / 'results'
 FIRST_UNTOUCHED = 1000
 EDGES = ((0.0, 0.6), (0.6, 0.8), (0.8, 0.9), (0.9, 1.01))
 
 
-def study(seed: int) -> dict[str, object]:
+def judged(seed: int) -> dict[str, object]:
     """Simulate one unit and identify it."""
     rng = np.random.default_rng([seed, 5])
     unit = random_unit(rng)
     days = float(rng.choice([1.0, 2.0, 4.0]))
     log = simulate(days, seed, unit)
     begin = time.process_time()
-    settings = {'refit_period': 0.0, 'window_days': days, 'sample_period': unit.sample_period_s}
-    monitor = Monitor(Settings(settings))
-    monitor.feed(log.table)
-    (task,) = (e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
+    task, _ = study.task_of(log.table, study.whole_window(unit, days))
     try:
         found = fit(task)
     except ValveflowError as error:
@@ -76,28 +67,17 @@ def summary(rows: list[dict[str, object]]) -> dict[str, object]:
     }  # fmt: skip
 
 
-def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
-    parser.add_argument('--seeds', type=int, default=40)
-    parser.add_argument('--first', type=int, default=5000, help='1000 or more')
-    options = parser.parse_args(arguments)
-    if options.first < FIRST_UNTOUCHED:
+def main() -> None:
+    """Run the study, print it, and write it beside the other results."""
+    parser = study.options(__doc__, seeds=40, first=5000)
+    args = parser.parse_args()
+    if args.first < FIRST_UNTOUCHED:
         parser.error(f'seeds below {FIRST_UNTOUCHED} were used to set the constants')
-    rows = []
-    for seed in range(options.first, options.first + options.seeds):
-        rows.append(study(seed))
-        print(json.dumps(rows[-1]), flush=True)
+    rows = study.rows_of(judged, study.seeds(args.first, args.seeds))
     found = summary([row for row in rows if 'found' in row])
     print(json.dumps(found, indent=1))
-    command = (
-        f'python -m benchmarks.joint_selection_study --seeds {options.seeds} '
-        f'--first {options.first}'
-    )
-    text = json.dumps({'command': command, 'summary': found, 'rows': rows}, indent=1)
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / 'joint_selection_study.json').write_text(text + '\n', encoding='utf-8')
-    return 0
+    study.keep('joint_selection_study', summary=found, rows=rows)
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

@@ -11,16 +11,15 @@ limit, or the residual alarm is raised. The limit was fixed on the clean seeds 4
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from benchmarks import study
 from benchmarks.diagnosis_cases import Case, hidden, null
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.monitoring.events import CurveAdopted
@@ -32,14 +31,12 @@ from valveflow_ros.parameters import PARAMETERS, Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import Signal
 
-RESULTS = Path(__file__).parent / 'results'
 STEP_S = 2.0
 KINDS = (
     'gain_drift', 'gain_step', 'input_step', 'curve_step', 'temperature', 'diurnal', 'backlash',
     'region_lag', 'intervals',
 )  # fmt: skip
 LIMITS = (3.5, 4.0, 4.5, 5.0, 5.5, 6.0)
-_RETURN = 0.7
 
 
 @dataclass(frozen=True)
@@ -81,17 +78,6 @@ def _feed(
         watch.feed(event, np.ascontiguousarray(warm), model)
 
 
-def episodes(seen: list[Look], limit: float) -> int:
-    """Count how often a statistic passes the limit, with a return in between."""
-    count, active = 0, False
-    for look in seen:
-        if not active and abs(look.score) > limit:
-            count, active = count + 1, True
-        elif active and abs(look.score) < _RETURN * limit:
-            active = False
-    return count
-
-
 def onset_of(case: Case) -> float:
     """Return the day from which on the effect is there."""
     return max((float(e.parameters.get('t0_days', 0.0)) for e in case.effects), default=0.0)
@@ -101,6 +87,7 @@ def row_of(case: Case, days: float) -> dict[str, Any]:
     """Watch one plant and return what is counted."""
     seen, onset = list(looks(case, days)), onset_of(case)
     late = [look for look in seen if look.day >= onset]
+    scores = [look.score for look in seen]
     largest = max(seen, key=lambda look: abs(look.score))
     first: dict[str, float | None] = {}
     for limit in LIMITS:
@@ -110,7 +97,7 @@ def row_of(case: Case, days: float) -> dict[str, Any]:
     return {
         'label': case.label, 'seed': case.seed, 'effects': [str(e) for e in case.effects],
         'onset_day': round(onset, 2), 'largest': round(largest.score, 2), 'by': largest.name,
-        'episodes': {f'{limit:g}': episodes(seen, limit) for limit in LIMITS},
+        'episodes': {f'{limit:g}': study.episodes(scores, limit) for limit in LIMITS},
         'days_until_told': first, 'days_until_alarm': round(alarm[0], 2) if alarm else None,
     }  # fmt: skip
 
@@ -145,27 +132,18 @@ def summary(rows: list[dict[str, Any]], days: float, limit: str) -> dict[str, An
 
 def main() -> None:
     """Watch, print, and write the result beside the others."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = study.options(__doc__, seeds=10, first=400, days=10.0)
     parser.add_argument('--kind', choices=('clean', 'hidden'), default='clean')
-    parser.add_argument('--seeds', type=int, default=10)
-    parser.add_argument('--first', type=int, default=400)
-    parser.add_argument('--days', type=float, default=10.0)
     parser.add_argument('--effects', nargs='*', default=list(KINDS), metavar='NAME')
     args = parser.parse_args()
-    rows = []
-    for case in cases(args.kind, args.first, args.seeds, args.days, args.effects):
-        rows.append(row_of(case, args.days))
-        print(json.dumps(rows[-1]), flush=True)
+    plants = cases(args.kind, args.first, args.seeds, args.days, args.effects)
+    rows = study.rows_of(partial(row_of, days=args.days), plants)
     table = PARAMETERS.get('mismatch_limit')
     limit = f'{float(table.default):g}' if table else '5'
-    text = {
-        'command': ' '.join(['python -m benchmarks.mismatch_study', *sys.argv[1:]]),
-        'summary': summary(rows, args.days, limit), 'plants': rows,
-    }  # fmt: skip
-    print(json.dumps(text['summary'], indent=1))
-    RESULTS.mkdir(exist_ok=True)
-    name = f'mismatch_{args.kind}_{args.first}_{args.first + args.seeds - 1}.json'
-    (RESULTS / name).write_text(json.dumps(text, indent=1) + '\n', encoding='utf-8')
+    found = summary(rows, args.days, limit)
+    print(json.dumps(found, indent=1))
+    name = study.name_of(f'mismatch_{args.kind}', args.first, args.seeds)
+    study.keep(name, summary=found, plants=rows)
 
 
 if __name__ == '__main__':

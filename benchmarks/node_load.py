@@ -22,22 +22,19 @@ then counts as a passed limit.
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import platform
 import sys
 import tempfile
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import rclpy
 
+from benchmarks import study
 from benchmarks.load.cases import BOTH, CASES, SOAK, cases
 from benchmarks.load.trial import result_of
 
-RESULTS = Path(__file__).resolve().parent / 'results'
 _DOMAINS = 101
 
 
@@ -92,21 +89,17 @@ def write(
     given = [name, *(['--full'] if options.full else [])]
     given += ['--qos', options.qos] if options.qos else []
     given += ['--hours', f'{options.hours:g}'] if name == SOAK else []
-    content = {
-        'command': ' '.join(['python -m benchmarks.node_load', *given]),
-        'passed': not any(r['faults'] for r in found),
-        'within_limits': not any(r['over_limits'] for r in found),
-        'machine': {
-            'cpus': os.cpu_count(), 'load_before': before, 'load_after': os.getloadavg(),
-            'platform': platform.platform(), 'python': platform.python_version(),
-            'numpy': np.__version__, 'rclpy': _version('rclpy'),
+    study.keep(
+        f'node_load_{name}', folder=options.output, command=study.command(*given),
+        passed=not any(r['faults'] for r in found),
+        within_limits=not any(r['over_limits'] for r in found),
+        machine={
+            **study.machine(), 'load_before': before, 'load_after': os.getloadavg(),
+            'rclpy': _version('rclpy'),
             'middleware': os.environ.get('RMW_IMPLEMENTATION', 'the default one'),
         },
-        'runs': found,
-    }  # fmt: skip
-    options.output.mkdir(parents=True, exist_ok=True)
-    path = options.output / f'node_load_{name}.json'
-    path.write_text(json.dumps(content, indent=1) + '\n', 'utf-8')
+        runs=found,
+    )  # fmt: skip
 
 
 def _version(name: str) -> str:
@@ -118,15 +111,13 @@ def _version(name: str) -> str:
 
 def main() -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = study.options(__doc__)
     parser.add_argument('cases', nargs='*', metavar='CASE', help=', '.join((*CASES, SOAK)))
     parser.add_argument('--full', action='store_true', help='as long as the figures ask for')
     parser.add_argument('--qos', choices=('best_effort', 'reliable', 'both'))
     parser.add_argument('--hours', type=float, default=8.0, help='of the soak (default 8)')
     parser.add_argument('--strict', action='store_true', help='a passed limit fails, too')
-    parser.add_argument('--output', type=Path, default=RESULTS)
+    parser.add_argument('--output', type=Path, default=study.RESULTS)
     options = parser.parse_args()
     unknown = [name for name in options.cases if name not in (*CASES, SOAK)]
     if unknown:

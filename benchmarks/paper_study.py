@@ -9,25 +9,19 @@ early or late, and the aligner makes a table of them.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 import time
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 
+from benchmarks import study
 from valveflow_ros.curve.characteristic import Piece
 from valveflow_ros.fit.fit import fit
-from valveflow_ros.monitoring.events import FitRequested
-from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
-from valveflow_ros.plant.unit import paper_curve
+from valveflow_ros.plant.unit import UnitDescription, paper_curve
 from valveflow_ros.records import Readings, SampleTable, table_to_readings
 from valveflow_ros.signals.align import Aligner
-
-RESULTS = Path(__file__).parent / 'results'
 
 
 def errors(pieces: tuple[Piece, ...]) -> dict[str, float]:
@@ -61,15 +55,12 @@ def irregular(table: SampleTable, seed: int, settings: Settings) -> SampleTable:
     return Aligner(settings).feed(odd).table
 
 
-def study(seed: int, days: float, odd: bool) -> dict[str, object]:
+def judged(seed: int, days: float, odd: bool) -> dict[str, object]:
     """Simulate one plant and identify it."""
     table = simulate(days, seed).table
-    settings = Settings({'refit_period': 0.0, 'window_days': max(days, 0.1)})
+    settings = study.whole_window(UnitDescription(), days)
     begin = time.perf_counter()
-    monitor = Monitor(settings)
-    monitor.feed(irregular(table, seed, settings) if odd else table)
-    (task,) = (e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
-    found = fit(task)
+    found = fit(study.task_of(irregular(table, seed, settings) if odd else table, settings)[0])
     return {
         'seed': seed,
         'seconds': round(time.perf_counter() - begin, 2),
@@ -96,26 +87,16 @@ def summary(rows: list[dict[str, object]], which: str) -> str:
 
 def main() -> None:
     """Run the study, print it, and write it beside the other results."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--seeds', type=int, default=10)
-    parser.add_argument('--first', type=int, default=1)
-    parser.add_argument('--days', type=float, default=10.0)
+    parser = study.options(__doc__, seeds=10, first=1, days=10.0)
     parser.add_argument('--irregular', action='store_true')
     args = parser.parse_args()
-    rows = []
-    for seed in range(args.first, args.first + args.seeds):
-        rows.append(study(seed, args.days, args.irregular))
-        print(json.dumps(rows[-1]), flush=True)
+    work = partial(judged, days=args.days, odd=args.irregular)
+    rows = study.rows_of(work, study.seeds(args.first, args.seeds))
     lines = [summary(rows, which) for which in ('published', 'partition')]
     print('\n'.join(lines))
-    RESULTS.mkdir(exist_ok=True)
     kind = 'paper_study_irregular' if args.irregular else 'paper_study'
-    name = f'{kind}_{args.first}_{args.first + args.seeds - 1}.json'
-    command = ' '.join(['python -m benchmarks.paper_study', *sys.argv[1:]])
-    text = json.dumps(
-        {'command': command, 'days': args.days, 'summary': lines, 'rows': rows}, indent=1
-    )
-    (RESULTS / name).write_text(text + '\n', encoding='utf-8')
+    name = study.name_of(kind, args.first, args.seeds)
+    study.keep(name, days=args.days, summary=lines, rows=rows)
 
 
 if __name__ == '__main__':

@@ -2,7 +2,9 @@
 
 Run: python -m benchmarks.partition [--kinds valve noise ...] [--sizes 20000 305633 ...]
                                     [--large 3000000] [--plain 8000] [--no-peers] [--repeats 3]
-     python -m benchmarks.partition --certify    the judge of the exact partition, minutes
+     python -m benchmarks.partition --certify [--layers 4]    the judge of the exact partition
+
+With --large 0 or --plain 0 that part is left out.
 
 Every kind is partitioned into 1..10 pieces at every size. In the same run the plain
 dynamic programme (every break for every end, in compiled loops) solves the size given by
@@ -21,20 +23,18 @@ import platform
 import resource
 import subprocess
 import sys
-import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numba
 import numpy as np
 
+from benchmarks import study
 from benchmarks.partition_certify import certify
 from benchmarks.partition_peers import against_peers
 from valveflow_ros.partition.partition import Partition, make_levels, partition
 from valveflow_ros.partition.search import best_partitions, prepare
 
 PIECES = 10
-RESULTS = Path(__file__).parent / 'results'
 
 
 def valve(u: np.ndarray) -> np.ndarray:
@@ -104,21 +104,10 @@ def plain(x: np.ndarray, y: np.ndarray, pieces: int) -> np.ndarray:
     return best[1:, n]
 
 
-def timed(action: Callable[[], object], repeats: int = 1) -> tuple[dict[str, float], object]:
-    """Return the least wall and processor time of several runs, and the last result."""
-    wall, cpu, result = [], [], None
-    for _ in range(repeats):
-        begin, begin_cpu = time.perf_counter(), time.process_time()
-        result = action()
-        wall.append(time.perf_counter() - begin)
-        cpu.append(time.process_time() - begin_cpu)
-    return {'wall_s': round(min(wall), 4), 'cpu_s': round(min(cpu), 4)}, result
-
-
 def ours(kind: str, n: int, threads: int | None, repeats: int) -> dict[str, object]:
     """Time the whole call, and the search alone: without checking, sorting and merging."""
     u, y = samples(kind, n)
-    whole, found = timed(lambda: partition(u, y, PIECES, threads=threads), repeats)
+    whole, found = study.timed(lambda: partition(u, y, PIECES, threads=threads), repeats)
     levels = make_levels(u, y)
     used = threads or (len(os.sched_getaffinity(0)) if len(levels) >= 20_000 else 1)
 
@@ -126,7 +115,7 @@ def ours(kind: str, n: int, threads: int | None, repeats: int) -> dict[str, obje
         problem = prepare(levels.x, levels.residual, levels.weight, 2, 2e-14 * len(levels.u), used)
         return best_partitions(problem, PIECES)
 
-    alone, _ = timed(search, repeats)
+    alone, _ = study.timed(search, repeats)
     assert isinstance(found, Partition)
     return {
         'kind': kind, 'samples': n, 'distinct': found.n_distinct, 'search': alone,
@@ -139,8 +128,8 @@ def against_plain(kind: str, n: int) -> dict[str, object]:
     u, y = samples(kind, n)
     order = np.argsort(u)
     u, y = u[order], y[order]
-    fast, found = timed(lambda: partition(u, y, PIECES, threads=1), 3)
-    slow, cost = timed(lambda: plain(u, y, PIECES))
+    fast, found = study.timed(lambda: partition(u, y, PIECES, threads=1), 3)
+    slow, cost = study.timed(lambda: plain(u, y, PIECES))
     assert isinstance(found, Partition)
     assert isinstance(cost, np.ndarray)
     return {
@@ -179,19 +168,15 @@ def measure(options: argparse.Namespace) -> dict[str, list[dict[str, object]]]:
     return result
 
 
-def arguments_of(given: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
+def arguments_of() -> argparse.Namespace:
+    parser = study.options(__doc__, large=3_000_000, plain=8000, repeats=3, layers=4)
     parser.add_argument('--kinds', nargs='+', choices=list(KINDS), default=list(KINDS))
     parser.add_argument('--sizes', nargs='*', type=int, default=[20_000, 305_633])
-    parser.add_argument('--large', type=int, default=3_000_000, help='0: left out')
-    parser.add_argument('--plain', type=int, default=8000, help='0: not compared')
     parser.add_argument('--no-peers', dest='peers', action='store_false')
     parser.add_argument('--threads', type=int)
-    parser.add_argument('--repeats', type=int, default=3)
     parser.add_argument('--certify', action='store_true', help='every layer, every end; minutes')
-    parser.add_argument('--layers', type=int, default=4, help='to certify')
     parser.add_argument('--json', action='store_true', help='print only, as JSON')
-    return parser.parse_args(given)
+    return parser.parse_args()
 
 
 def show(result: dict[str, list[dict[str, object]]]) -> None:
@@ -213,27 +198,15 @@ def show(result: dict[str, list[dict[str, object]]]) -> None:
         )
 
 
-def keep(name: str, result: object, arguments: list[str] | None) -> None:
-    """Write a result beside the others, with the command that brought it."""
-    given = sys.argv[1:] if arguments is None else arguments
-    content = {
-        'command': ' '.join(['python -m benchmarks.partition', *given]),
-        'python': platform.python_version(), 'cores': len(os.sched_getaffinity(0)),
-        'load_at_end': round(os.getloadavg()[0], 1), 'pieces': PIECES, 'result': result,
-    }  # fmt: skip
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / name).write_text(json.dumps(content, indent=1) + '\n', encoding='utf-8')
-
-
-def main(arguments: list[str] | None = None) -> int:
-    options = arguments_of(arguments)
+def main() -> int:
+    options = arguments_of()
     if options.certify:
         found = [
             {'kind': k, **certify(*samples(k, n), options.layers)}
             for n in options.sizes for k in options.kinds
         ]  # fmt: skip
         print(json.dumps(found, indent=1))
-        keep('partition_certified.json', found, arguments)
+        study.keep('partition_certified', machine=study.machine(), pieces=PIECES, result=found)
         return 0 if all(row['agree'] for row in found) else 1
     result = measure(options)
     if options.json:
@@ -241,7 +214,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     print(f'Python {platform.python_version()}, {len(os.sched_getaffinity(0))} cores; J = 1..10')
     show(result)
-    keep('partition.json', result, arguments)
+    study.keep('partition', machine=study.machine(), pieces=PIECES, result=result)
     return 0
 
 

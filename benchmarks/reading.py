@@ -11,26 +11,22 @@ control system, in a process of its own, whose largest memory is told too.
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 import platform
 import struct
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks import study
 from valveflow_ros.logs import open_log, write_samples, write_table
 from valveflow_ros.logs.mcap.recover import recover
 from valveflow_ros.records import SampleTable, Signal
 
 SECONDS_A_DAY = 86_400
-RESULTS = Path(__file__).parent / 'results'
 _IN_A_PROCESS = """
 import json, re, sys, time
 from valveflow_ros.cli.main import main
@@ -112,34 +108,24 @@ def in_a_process(*words: str) -> dict[str, float]:
     return found
 
 
-def timed(action: Callable[[], object]) -> tuple[dict[str, float], object]:
-    wall, cpu = time.perf_counter(), time.process_time()
-    result = action()
-    seconds = {
-        'wall_s': round(time.perf_counter() - wall, 2),
-        'cpu_s': round(time.process_time() - cpu, 2),
-    }
-    return seconds, result
-
-
 def measure(days: float, peers: bool) -> dict[str, dict[str, float]]:
     table = plant(days)
     results: dict[str, dict[str, float]] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         path = folder / 'log' / 'log.mcap'
-        results['write mcap'], written = timed(lambda: write_samples(table, path))
-        results['read mcap, cold'], _ = timed(lambda: open_log(path))
-        results['read mcap, warm'], contents = timed(lambda: open_log(path))
+        results['write mcap'], written = study.timed(lambda: write_samples(table, path))
+        results['read mcap, cold'], _ = study.timed(lambda: open_log(path))
+        results['read mcap, warm'], contents = study.timed(lambda: open_log(path))
         total = float(contents.readings.value.sum())
-        results['raw messages in order'], _ = timed(
+        results['raw messages in order'], _ = study.timed(
             lambda: sum(1 for _ in contents.iter_messages())
         )
-        results['recover'], _ = timed(lambda: recover(path, folder / 'copy.mcap'))
+        results['recover'], _ = study.timed(lambda: recover(path, folder / 'copy.mcap'))
         for suffix in ('.csv', '.parquet'):
             target = folder / f'table{suffix}'
-            results[f'write {suffix[1:]}'], _ = timed(lambda t=target: write_table(table, t))
-            results[f'read {suffix[1:]}'], _ = timed(lambda t=target: open_log(t))
+            results[f'write {suffix[1:]}'], _ = study.timed(lambda t=target: write_table(table, t))
+            results[f'read {suffix[1:]}'], _ = study.timed(lambda t=target: open_log(t))
         results['info mcap'] = in_a_process('info', str(path))
         german = folder / 'german.csv'
         german_table(table, german)
@@ -148,7 +134,7 @@ def measure(days: float, peers: bool) -> dict[str, dict[str, float]]:
         )
         results['import csv']['csv_mib'] = round(german.stat().st_size / 2**20)
         for reader in (by_rosbags, by_mcap, by_mcap_ros2) if peers else ():
-            results[f'peer {reader.__name__}'], found = timed(lambda r=reader: r(path))
+            results[f'peer {reader.__name__}'], found = study.timed(lambda r=reader: r(path))
             if not np.isclose(found, total, rtol=1e-9):
                 raise SystemExit(f'{reader.__name__} read other values')
         results['file'] = {'messages': written.messages, 'bytes': path.stat().st_size}
@@ -156,8 +142,7 @@ def measure(days: float, peers: bool) -> dict[str, dict[str, float]]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--days', type=float, default=10.0)
+    parser = study.options(__doc__, days=10.0)
     parser.add_argument('--peers', action='store_true', help='also time other libraries (slow)')
     parser.add_argument('--json', action='store_true')
     parser.add_argument('--keep', action='store_true', help='write to benchmarks/results')
@@ -169,13 +154,8 @@ def main() -> int:
         if name.startswith('peer '):
             numbers['cpu_times_ours'] = round(numbers['cpu_s'] / ours, 1)
     if options.keep:
-        about = {
-            'command': ' '.join(['python -m benchmarks.reading', *sys.argv[1:]]),
-            'python': platform.python_version(), 'machine': platform.machine(),
-            'cpus': os.cpu_count(), 'load_average': round(os.getloadavg()[0], 1),
-        }  # fmt: skip
-        name = 'reading_peers.json' if options.peers else 'reading.json'
-        (RESULTS / name).write_text(json.dumps({**about, 'results': results}, indent=2) + '\n')
+        name = 'reading_peers' if options.peers else 'reading'
+        study.keep(name, machine=study.machine(), results=results)
     if options.json:
         print(json.dumps(results, indent=2))
         return 0

@@ -23,7 +23,6 @@ found is coarse.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import json
 import os
@@ -35,13 +34,13 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import study
 from benchmarks.horch import STICTION, UNDECIDED, horch
 from benchmarks.refinery_judge import LEAST_GAIN, LEAST_JUMP_GAIN, LoopVerdict, judge_loop
 from benchmarks.refinery_loops import KINDS, NULLS, simulate_loop
 from valveflow_ros.records import FloatArray
 
 ROOT = Path(__file__).resolve().parents[1]
-RESULT = Path(__file__).parent / 'results' / 'refinery_valves.json'
 FIXED_BELOW = 300
 _HEADER_ROWS = 3
 
@@ -246,33 +245,25 @@ def _rounded(value: float) -> float | None:
     return round(value, 2) if np.isfinite(value) else None
 
 
-def parser() -> argparse.ArgumentParser:
-    said = argparse.ArgumentParser(description='Sticking valves found in control loops.')
-    said.add_argument('--data', help='folder that holds refinery_valves/')
-    said.add_argument('--seeds', type=int, default=200)
-    said.add_argument('--first', type=int, default=5000)
-    said.add_argument('--output', type=Path, default=RESULT)
-    return said
-
-
 def main() -> None:
-    args = parser().parse_args()
+    """Judge simulated and, where they are, measured loops; print, and write beside the others."""
+    parser = study.options(__doc__, seeds=200, first=5000)
+    parser.add_argument('--data', help='folder that holds refinery_valves/')
+    args = parser.parse_args()
     folder = data_folder(args.data)
     there = (folder / 'refinery_valves' / 'index.csv').is_file()
     result: dict[str, Any] = {
-        'command': f'python -m benchmarks.refinery_valves --seeds {args.seeds} '
-        f'--first {args.first} --data DIR',
         'fixed_on': f'simulated loops with seeds below {FIXED_BELOW}; no measured window',
         'tried_on': f'simulated loops with seeds from {args.first}; measured windows, once',
         'least_gain': LEAST_GAIN,
         'least_jump_gain': LEAST_JUMP_GAIN,
         'simulated': on_simulated(args.first, args.seeds),
-        'measured': on_measured(folder) if there else f'skipped: no refinery_valves in {folder}',
+        'measured': 'skipped: the folder refinery_valves was not there',
     }
-    if not there:
-        result['measured'] = 'skipped: the folder refinery_valves was not there'
-    args.output.parent.mkdir(exist_ok=True)
-    args.output.write_text(json.dumps(result, indent=1) + '\n', encoding='utf-8')
+    if there:
+        result['measured'] = on_measured(folder)
+    given = f'--seeds {args.seeds} --first {args.first} --data DIR'
+    study.keep('refinery_valves', strict=False, **{'command': study.command(given), **result})
     shown = {'simulated': result['simulated']['all']}
     if there:
         shown |= {k: result['measured'][k] for k in ('per_valve', 'per_valve_by_windows_decided')}

@@ -10,10 +10,7 @@ stood then. The exit status is 1 if any did, or if there was no time for one run
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
-import platform
 import random
 import re
 import subprocess
@@ -24,11 +21,12 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from benchmarks import study
+
 ROOT = Path(__file__).resolve().parents[1]
-RESULT = ROOT / 'benchmarks' / 'results' / 'repeats.json'
 FILES = sorted(
     str(path.relative_to(ROOT))
-    for pattern in ('logs/test_*reco*.py', 'ros/test_*state*.py', 'core/test_state.py')
+    for pattern in ('logs/test_*reco*.py', 'ros/test_*state*.py', 'test_state.py')
     for path in (ROOT / 'test').glob(pattern)
 )
 _SUMMARY = re.compile(r'^(?:FAILED|ERROR) (\S+)(?: - (.*))?$', re.MULTILINE)
@@ -57,15 +55,8 @@ def once(order: list[str]) -> tuple[int, float, list[dict[str, Any]]]:
 
 def main() -> int:
     """Run it."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--count', type=int, default=200)
-    parser.add_argument('--minutes', type=float, default=600.0, help='begin no more after these')
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--output', type=Path, default=RESULT)
-    parser.add_argument('--lanes', type=int, default=1, help='runs beside each other')
-    given = parser.parse_args()
+    # No run begins after so many minutes; lanes are runs beside each other.
+    given = study.options(__doc__, count=200, minutes=600.0, seed=1, lanes=1).parse_args()
     chance, end_s = random.Random(given.seed), time.monotonic() + 60.0 * given.minutes
     orders = [chance.sample(FILES, len(FILES)) for _ in range(given.count)]
     passed: list[int] = []
@@ -86,18 +77,13 @@ def main() -> int:
             seconds.append(found[1])
             failures += [{'run': len(seconds), **failure} for failure in found[2]]
             print(f'{len(seconds)}: {found[0]} passed in {found[1]:.0f} s', *found[2], flush=True)
-    content = {
-        'command': f'python -m benchmarks.repeats --count {given.count} --seed {given.seed}'
-                   f' --lanes {given.lanes}',
-        'wanted': given.count, 'done': len(seconds), 'files': FILES,
-        'tests_each': max(passed, default=0), 'passed': sum(passed),
-        'failed': len(failures), 'failures': failures,
-        'seconds_each': round(median(seconds), 1) if seconds else 0.0,
-        'machine': {'cpus': os.cpu_count(), 'platform': platform.platform(),
-                    'python': platform.python_version(),
-                    'load': [round(x, 1) for x in (min(loads, default=0), max(loads, default=0))]},
-    }  # fmt: skip
-    given.output.write_text(json.dumps(content, indent=1) + '\n', 'utf-8')
+    study.keep(
+        'repeats', wanted=given.count, done=len(seconds), files=FILES,
+        tests_each=max(passed, default=0), passed=sum(passed), failed=len(failures),
+        failures=failures, seconds_each=round(median(seconds), 1) if seconds else 0.0,
+        machine=study.machine(),
+        load=[round(x, 1) for x in (min(loads, default=0), max(loads, default=0))],
+    )  # fmt: skip
     print(
         f'{len(seconds)} of {given.count} runs, {sum(passed)} tests passed, {len(failures)} failed'
     )

@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks import segment_study as study
 from benchmarks.segment_truth import true_stretches
+from benchmarks.study import plots
 from valveflow_ros.monitoring.rows import Rows
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
@@ -20,11 +21,7 @@ _EXCERPT_H = (30.0, 42.0)
 
 def draw(result: dict[str, Any], place: Path) -> None:
     """Write the picture."""
-    import matplotlib
-
-    matplotlib.use('Agg')
-    import matplotlib.pyplot as plt
-
+    plt = plots()
     figure, (above, below) = plt.subplots(
         2, 1, figsize=(11, 8), gridspec_kw={'height_ratios': [3, 2]}, layout='constrained'
     )

@@ -11,14 +11,13 @@ what they learn.
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 
+from benchmarks import study
 from benchmarks.segment_truth import Stretch, by_row, true_stretches
 from valveflow_ros.monitoring.rows import Rows
 from valveflow_ros.parameters import Settings
@@ -27,7 +26,6 @@ from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.segments.segmenter import Segmenter
 
-RESULTS = Path(__file__).parent / 'results'
 RIGHT, FOUND = 0.9, 0.5
 KINDS = {'steady': SegmentKind.STEADY, 'slope': SegmentKind.SLOPE}
 PLANTS = {
@@ -94,7 +92,7 @@ def shares(counts: dict[str, int]) -> dict[str, float | None]:
     }  # fmt: skip
 
 
-def study(name: str, seeds: range, days: float, fixed: dict[str, float]) -> dict[str, object]:
+def judged(name: str, seeds: range, days: float, fixed: dict[str, float]) -> dict[str, object]:
     """Judge one kind of plant over some seeds, with learnt and with fixed thresholds."""
     noise, period_s = PLANTS[name]
     given = {'sample_period': period_s}
@@ -130,39 +128,22 @@ def ordinary_noise(seeds: range, days: float) -> dict[str, float]:
     return {key: float(np.mean([f[key] for f in found])) for key in found[0]}
 
 
-def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
-    parser.add_argument('--seeds', type=int, default=4)
-    parser.add_argument('--first', type=int, default=3000)
-    parser.add_argument('--days', type=float, default=5.0)
+def main() -> None:
+    """Run the study, print it, and write it beside the other results."""
+    parser = study.options(__doc__, seeds=4, first=3000, days=5.0)
     parser.add_argument('--figure', action='store_true', help='draw the result (needs matplotlib)')
-    options = parser.parse_args(arguments)
-    place = RESULTS / 'segment_study.json'
-    if options.figure:
+    args = parser.parse_args()
+    if args.figure:
         from benchmarks.segment_figure import draw
 
-        draw(json.loads(place.read_text(encoding='utf-8')), RESULTS / 'segment_study.png')
-        return 0
-    seeds = range(options.first, options.first + options.seeds)
-    fixed = ordinary_noise(seeds, min(options.days, 2.0))
-    rows = []
-    for name in PLANTS:
-        rows.append(study(name, seeds, options.days, fixed))
-        for how in ('learnt', 'fixed'):
-            said = rows[-1][how]
-            assert isinstance(said, dict)
-            for kind, found in said.items():
-                numbers = ', '.join(f'{k} {v}' for k, v in found.items() if k != 'counts')
-                print(f'{name:16} {how:7} {kind:7} {numbers}', flush=True)
-    content = {
-        'command': f'python -m benchmarks.segment_study --seeds {options.seeds} '
-        f'--first {options.first} --days {options.days:g}',
-        'first_seed': options.first, 'fixed_noise': fixed, 'plants': rows,
-    }  # fmt: skip
-    RESULTS.mkdir(exist_ok=True)
-    place.write_text(json.dumps(content, indent=1) + '\n', encoding='utf-8')
-    return 0
+        place = study.RESULTS / 'segment_study.json'
+        draw(json.loads(place.read_text(encoding='utf-8')), place.with_suffix('.png'))
+        return
+    seeds = study.seeds(args.first, args.seeds)
+    fixed = ordinary_noise(seeds, min(args.days, 2.0))
+    rows = study.rows_of(partial(judged, seeds=seeds, days=args.days, fixed=fixed), PLANTS)
+    study.keep('segment_study', first_seed=args.first, fixed_noise=fixed, plants=rows)
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

@@ -9,25 +9,21 @@ other seeds. ``--wander 1`` adds a slow disturbance of so many MW (time constant
 
 from __future__ import annotations
 
-import argparse
 import json
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 
-from valveflow_ros.curve.characteristic import Characteristic
+from benchmarks import study
 from valveflow_ros.curve.shift import Shift, judge_shift
 from valveflow_ros.fit.fit import fit
-from valveflow_ros.monitoring.events import FitRequested, SegmentClosed
-from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.plant.unit import UnitDescription
-from valveflow_ros.records import NS_PER_S, SampleTable, SpecialSegment
+from valveflow_ros.records import NS_PER_S
 
-RESULTS = Path(__file__).parent / 'results'
+SETTINGS = Settings({'refit_period': 0.0})
 ONSET_DAYS = 16.0
 EFFECTS = {
     'clean': '',
@@ -38,14 +34,6 @@ EFFECTS = {
     'curve_step -1 MW': f'curve_step:s_mw=-1,t0_days={ONSET_DAYS}',
     'curve_step -2.5 MW': f'curve_step:s_mw=-2.5,t0_days={ONSET_DAYS}',
 }
-
-
-def identified(table: SampleTable) -> tuple[Characteristic, list[SpecialSegment]]:
-    """Return the curve of some rows, and their segments."""
-    monitor = Monitor(Settings({'refit_period': 0.0}))
-    events = monitor.feed(table).events
-    (task,) = (e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
-    return fit(task), [e.segment for e in events if isinstance(e, SegmentClosed)]
 
 
 def truth_mw(name: str, shift: Shift) -> list[float]:
@@ -81,7 +69,7 @@ def row_of(seed: int, name: str, shift: Shift) -> dict[str, object]:
     }  # fmt: skip
 
 
-def study(seed: int, wander_mw: float) -> list[dict[str, object]]:
+def judged(seed: int, wander_mw: float) -> list[dict[str, object]]:
     """Return the judgements of one plant with each effect."""
     unit = UnitDescription()
     unit = replace(unit, noise=replace(unit.noise, wander_mw=wander_mw))
@@ -91,9 +79,9 @@ def study(seed: int, wander_mw: float) -> list[dict[str, object]]:
         table = simulate(20.0, seed, unit, effects=specs).table
         half = len(table) // 2
         if reference is None:
-            reference, _ = identified(table.part(0, half))
-        current, segments = identified(table.part(half, len(table)))
-        rows.append(row_of(seed, name, judge_shift(reference, current, segments)))
+            reference = fit(study.task_of(table.part(0, half), SETTINGS)[0])
+        task, segments = study.task_of(table.part(half, len(table)), SETTINGS)
+        rows.append(row_of(seed, name, judge_shift(reference, fit(task), segments)))
     return rows
 
 
@@ -117,30 +105,16 @@ def line(name: str, rows: list[dict[str, object]]) -> dict[str, object]:
 
 def main() -> None:
     """Run the study, print it, and write it beside the other results."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--seeds', type=int, default=12)
-    parser.add_argument('--first', type=int, default=101)
-    parser.add_argument('--wander', type=float, default=0.0)
-    args = parser.parse_args()
+    args = study.options(__doc__, seeds=12, first=101, wander=0.0).parse_args()
     rows: list[dict[str, object]] = []
-    for seed in range(args.first, args.first + args.seeds):
-        rows += study(seed, args.wander)
+    for seed in study.seeds(args.first, args.seeds):
+        rows += judged(seed, args.wander)
         print(seed, [r['moved'] for r in rows[-len(EFFECTS) :]], flush=True)
-        write(rows, args.first, seed, args.wander)
-    for name in EFFECTS:
-        print(json.dumps(line(name, [r for r in rows if r['effect'] == name])))
-
-
-def write(rows: list[dict[str, object]], first: int, last: int, wander_mw: float) -> None:
-    """Write what is known so far, so that a study that is broken off leaves its seeds."""
-    tail = f'_wander_{wander_mw:g}' if wander_mw else ''
-    more = f' --wander {wander_mw:g}' if wander_mw else ''
-    command = f'python -m benchmarks.shift_study --seeds {last - first + 1} --first {first}{more}'
-    lines = [line(name, [r for r in rows if r['effect'] == name]) for name in EFFECTS]
-    text = json.dumps({'command': command, 'summary': lines, 'rows': rows}, indent=1)
-    RESULTS.mkdir(exist_ok=True)
-    path = RESULTS / f'shift_study_{first}{tail}.json'
-    path.write_text(text.replace('NaN', 'null') + '\n', encoding='utf-8')
+        # Whatever comes, what is done is kept.
+        lines = [line(name, [r for r in rows if r['effect'] == name]) for name in EFFECTS]
+        tail = f'_wander_{args.wander:g}' if args.wander else ''
+        study.keep(f'shift_study_{args.first}{tail}', summary=lines, rows=rows)
+    print('\n'.join(map(json.dumps, lines)))
 
 
 if __name__ == '__main__':

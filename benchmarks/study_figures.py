@@ -6,21 +6,21 @@ Run: ``python -m benchmarks.study_figures``. Each result that is there gets a pi
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-RESULTS = Path(__file__).parent / 'results'
+from benchmarks.study import RESULTS, plots
+
 _KINDS = ('slope', 'intercept', 'knee', 'time_constant', 'delay')
 _BLUE, _ORANGE, _GREY = '#2b7bba', '#d9822b', '#777777'
 
 
-def _coverage(result: dict[str, Any], plots: Any) -> Any:
+def _coverage(result: dict[str, Any], pyplot: Any) -> Any:
     """Draw errors over standard errors against what chance would give."""
     from scipy.stats import norm
 
-    figure, axes = plots.subplots(1, len(_KINDS), figsize=(15, 3.6), sharey=True)
+    figure, axes = pyplot.subplots(1, len(_KINDS), figsize=(15, 3.6), sharey=True)
     for axis, kind in zip(axes, _KINDS, strict=True):
         z = np.sort([v for r in result['rows'] for v in r['scores'].get(kind, [])])
         chance = norm.ppf((np.arange(len(z)) + 0.5) / len(z))
@@ -38,9 +38,9 @@ def _coverage(result: dict[str, Any], plots: Any) -> Any:
     return figure
 
 
-def _paper(result: dict[str, Any], plots: Any) -> Any:
+def _paper(result: dict[str, Any], pyplot: Any) -> Any:
     """Draw each seed's largest errors, of the published curve and of the partition's."""
-    figure, axes = plots.subplots(1, 3, figsize=(12, 3.6))
+    figure, axes = pyplot.subplots(1, 3, figsize=(12, 3.6))
     shown = (
         ('slope', 'largest slope error (MW per unit of u)'),
         ('knee', 'largest knee error (units of u)'),
@@ -61,9 +61,9 @@ def _paper(result: dict[str, Any], plots: Any) -> Any:
     return figure
 
 
-def _alarm(result: dict[str, Any], plots: Any) -> Any:
+def _alarm(result: dict[str, Any], pyplot: Any) -> Any:
     """Draw how soon shifts are found."""
-    figure, axis = plots.subplots(figsize=(7, 4))
+    figure, axis = pyplot.subplots(figsize=(7, 4))
     for size, colour in (('3', _BLUE), ('1', _ORANGE)):
         delays = np.sort([v for r in result['plants'] for v in r[f'delay_min_{size}_sd']])
         axis.plot(
@@ -84,21 +84,17 @@ def _alarm(result: dict[str, Any], plots: Any) -> Any:
 
 def main() -> None:
     """Draw all."""
-    import matplotlib
-
-    matplotlib.use('Agg')
-    import matplotlib.pyplot as plots
-
+    pyplot = plots()
     for pattern, draw in (
         ('coverage_*.json', _coverage),
         ('paper_study_*.json', _paper),
-        ('alarm_*.json', _alarm),
+        ('alarm_[0-9]*.json', _alarm),
     ):
         for path in sorted(RESULTS.glob(pattern)):
-            figure = draw(json.loads(path.read_text(encoding='utf-8')), plots)
+            figure = draw(json.loads(path.read_text(encoding='utf-8')), pyplot)
             figure.tight_layout()
             figure.savefig(path.with_suffix('.png'), dpi=110)
-            plots.close(figure)
+            pyplot.close(figure)
             print(path.with_suffix('.png').name)
 
 

@@ -1,6 +1,6 @@
 """From ten days of a simulated plant on disk to the report: how long each step takes.
 
-    python benchmarks/ten_days.py [--days 10] [--seed 1] [--effect NAME]... [--cold] [--json]
+    python -m benchmarks.ten_days [--days 10] [--seed 1] [--effect NAME]... [--cold] [--json]
 
 The steps are those of ``valveflow identify`` on an MCAP recording, one after
 the other in one process. The kernels are compiled (or loaded from their cache)
@@ -12,18 +12,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
 import resource
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
+from benchmarks import study
 from valveflow_ros.cli.command import columns
 from valveflow_ros.interface.logs import steps_of
 from valveflow_ros.interface.observation import observe
@@ -46,16 +44,8 @@ class Stopwatch:
 
     def measure(self, name: str, work: Callable[[], T], what: Callable[[T], str]) -> T:
         """Do ``work`` and note how long it took and what came of it."""
-        wall, cpu = time.perf_counter(), time.process_time()
-        result = work()
-        self.rows.append(
-            {
-                'step': name,
-                'wall_s': time.perf_counter() - wall,
-                'cpu_s': time.process_time() - cpu,
-                'what': what(result),
-            }
-        )
+        seconds, result = study.timed(work)
+        self.rows.append({'step': name, **seconds, 'what': what(result)})
         return result
 
     def total(self, clock: str) -> float:
@@ -98,11 +88,7 @@ def identify(path: Path, watch: Stopwatch) -> dict[str, Any]:
 
 
 def options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--days', type=float, default=10.0)
-    parser.add_argument('--seed', type=int, default=1)
+    parser = study.options(__doc__, days=10.0, seed=1)
     parser.add_argument('--effect', action='append', default=[], metavar='NAME[:KEY=VALUE,...]')
     parser.add_argument('--cold', action='store_true', help='do not compile beforehand')
     parser.add_argument('--json', action='store_true')
@@ -121,11 +107,10 @@ def main() -> int:
         found = identify(path, watch)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
     about = {
-        'command': ' '.join(['python -m benchmarks.ten_days', *sys.argv[1:]]),
+        'command': study.command(),
         'days': asked.days, 'seed': asked.seed, 'effects': asked.effect, 'mcap_bytes': size,
         'total_wall_s': watch.total('wall_s'), 'total_cpu_s': watch.total('cpu_s'),
-        'peak_memory_mib': peak, 'load_average': os.getloadavg()[0], 'cpus': os.cpu_count(),
-        'python': platform.python_version(), 'machine': platform.machine(),
+        'peak_memory_mib': peak, **study.machine(),
     }  # fmt: skip
     if asked.json:
         json.dump({**about, 'steps': watch.rows, **found}, sys.stdout, indent=2)

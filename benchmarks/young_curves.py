@@ -7,13 +7,12 @@ Counted are the occurrences of the residual alarm by the age of the first curve.
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 
+from benchmarks import study
 from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState
 from valveflow_ros.monitoring.events import CurveAdopted
 from valveflow_ros.monitoring.monitor import Monitor
@@ -22,7 +21,6 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.unit import random_unit
 
-RESULTS = Path(__file__).parent / 'results'
 _BLOCK = 3600
 _DAY_NS = 86_400 * 10**9
 
@@ -72,30 +70,14 @@ def summary(rows: list[dict[str, object]]) -> dict[str, object]:
             'by_age_of_the_first_curve': by_age}  # fmt: skip
 
 
-def main() -> int:
+def main() -> None:
     """Run, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--plants', type=int, default=20)
-    parser.add_argument('--days', type=float, default=3.0)
-    parser.add_argument('--first', type=int, default=8000)
-    parser.add_argument('--results', type=Path, default=RESULTS)
-    given = parser.parse_args()
-    rows = []
-    for seed in range(given.first, given.first + given.plants):
-        rows.append(plant(seed, given.days))
-        print(json.dumps(rows[-1]), flush=True)
-    result = {
-        'command': f'python -m benchmarks.young_curves --plants {given.plants} '
-        f'--days {given.days:g} --first {given.first}',
-        'summary': summary(rows),
-        'plants': rows,
-    }
-    last = given.first + given.plants - 1
-    path = given.results / f'young_curves_{given.first}_{last}.json'
-    path.write_text(json.dumps(result, indent=1) + '\n', encoding='utf-8')
-    print(json.dumps(result['summary'], indent=1))
-    return 0
+    args = study.options(__doc__, plants=20, days=3.0, first=8000).parse_args()
+    rows = study.rows_of(partial(plant, days=args.days), study.seeds(args.first, args.plants))
+    found = summary(rows)
+    study.keep(study.name_of('young_curves', args.first, args.plants), summary=found, plants=rows)
+    print(json.dumps(found, indent=1))
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

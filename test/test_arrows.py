@@ -154,24 +154,18 @@ def test_no_modules_import_one_another_in_a_circle():
     assert circles() == []
 
 
-def test_only_ros_knows_ros():
+@pytest.mark.parametrize(
+    ('rooms', 'known'),
+    [(set(ALLOWED) - {'ros'}, ROS), (set(PURE), WORLDLY)],
+    ids=['only ros knows ROS', 'the method has no clock and no files'],
+)
+def test_nobody_knows_what_is_not_his(rooms, known):
     wrong = [
         f'{path.relative_to(ROOT)}:{line} imports {name}'
         for path in sources()
-        if room(path) != 'ros'
+        if room(path) in rooms
         for line, name in imported(path)
-        if name.split('.')[0] in ROS
-    ]
-    assert wrong == []
-
-
-def test_the_method_has_no_clock_and_no_files():
-    wrong = [
-        f'{path.relative_to(ROOT)}:{line} imports {name}'
-        for path in sources()
-        if room(path) in PURE
-        for line, name in imported(path)
-        if name.split('.')[0] in WORLDLY
+        if name.split('.')[0] in known
     ]
     assert wrong == []
 

@@ -17,8 +17,6 @@ LOCK = (ROOT / 'requirements.lock').read_text(encoding='utf-8')
 HASH = re.compile(r'--hash=sha256:[0-9a-f]{64}')
 PINNED = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*(\[[A-Za-z0-9,._-]+\])?==[^\s;=]+(\s*;.*)?')
 
-# Where something that was read may be turned into more than data, and why.
-ALLOWED: dict[str, set[str]] = {}
 # Called by these names, after every import and alias is followed.
 FORBIDDEN = {
     'eval', 'exec', 'compile', 'builtins.eval', 'builtins.exec', 'builtins.compile',
@@ -173,15 +171,7 @@ def test_nothing_read_is_run() -> None:
         short = str(path.relative_to(HOUSE))
         with tokenize.open(path) as file:
             found = {what for _, what in runs_what_it_reads(file.read(), short)}
-        assert found <= ALLOWED.get(short, set()), short
-
-
-def test_what_was_allowed_is_still_needed() -> None:
-    for short, allowed in ALLOWED.items():
-        path = HOUSE / short
-        if path.exists():
-            found = {what for _, what in runs_what_it_reads(path.read_text(), short)}
-            assert found <= allowed
+        assert not found, short
 
 
 @pytest.mark.parametrize(

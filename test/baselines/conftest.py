@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
+import curves
 import numpy as np
 import pytest
 
 from valveflow_ros.baselines.judged import OtherData
-from valveflow_ros.curve.characteristic import Characteristic
-from valveflow_ros.curve.characteristic_json import from_json
+from valveflow_ros.curve.characteristic import Characteristic, RegionDynamics
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.records import NS_PER_S, SegmentKind
 
@@ -19,24 +21,10 @@ ROWS, SEGMENT = 12_000, 400
 
 def characteristic(shift_mw=0.0, exponent=1.125, dynamics=False) -> Characteristic:
     """Return a curve of three pieces, lifted by ``shift_mw``."""
-    values = FIRST_MW + shift_mw + np.concatenate([[0.0], np.cumsum(400.0 * np.array(SLOPES))])
-    pieces = [
-        {
-            'u_from': KNOTS[k], 'u_to': KNOTS[k + 1], 'slope': SLOPES[k],
-            'intercept': float(values[k] - SLOPES[k] * KNOTS[k]),
-            'slope_stderr': 0.001, 'intercept_stderr': 1.0, 'samples': 1000,
-        }
-        for k in range(3)
-    ]  # fmt: skip
-    region = {'power_from': 100.0, 'power_to': 400.0, 'time_constant_s': 20.0, 'delay_s': 2.0}
-    return from_json(
-        {
-            'format': 'valveflow/characteristic', 'version': 1, 'pressure_exponent': exponent,
-            'pieces': pieces, 'breakpoint_intervals': [[None, None]] * 2,
-            'selection': {'rule': 'paper', 'cost': {}, 'turning_angle': {}},
-            'segments': {'steady': 10, 'slope_response': 5, 'samples': 3000},
-            'dynamics': [region] if dynamics else [], 'partition': {'pieces': pieces},
-        }
+    region = RegionDynamics(100.0, 400.0, 20.0, 2.0, math.nan, math.nan)
+    return curves.curve(
+        KNOTS, SLOPES, start=FIRST_MW + shift_mw, stderr=0.001, samples=1000,
+        pressure_exponent=exponent, dynamics=(region,) if dynamics else (),
     )  # fmt: skip
 
 
@@ -58,18 +46,12 @@ def other_data(noise_mw=1.0, seed=7, shift_mw=0.0, above=9e9, u_shift=0.0) -> Ot
 
 
 @pytest.fixture(scope='session')
-def make_curve():
+def curve():
     """Return the maker of characteristics."""
     return characteristic
 
 
-@pytest.fixture
-def curve(make_curve):
-    """Return the same, by its short name."""
-    return make_curve
-
-
-@pytest.fixture
+@pytest.fixture(scope='session')
 def data():
     """Return the maker of data to judge by."""
     return other_data

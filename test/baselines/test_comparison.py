@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from streams import needs_jit
 
 from valveflow_ros.baselines import comparison
 from valveflow_ros.baselines.comparison import compare, to_json
@@ -18,14 +18,12 @@ from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.records import NS_PER_S, SegmentKind
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
-)
+pytestmark = needs_jit
 REST_S, MOVE_S = 420, 180
 
 
 @pytest.fixture(scope='module')
-def plant(make_curve):
+def plant(curve):
     """Return rows of a unit with one time constant that rests, moves and rests again."""
     rng = np.random.default_rng(21)
     hours = 12
@@ -35,7 +33,7 @@ def plant(make_curve):
     times = np.concatenate([[0.0], np.cumsum(np.tile([REST_S, MOVE_S], count + 1))])[:-1]
     u = np.interp(np.arange(count * cycle), times, levels)
     everywhere = np.ones(len(u), dtype=np.uint8)
-    clean, _ = make_curve(dynamics=True).model.respond(u, everywhere, 1.0, 110.0)
+    clean, _ = curve(dynamics=True).model.respond(u, everywhere, 1.0, 110.0)
     power = clean + rng.normal(0.0, 1.0, len(u))
     spans = [(k * cycle + 150, k * cycle + REST_S, int(SegmentKind.STEADY)) for k in range(count)]
     return Samples(u, power, everywhere, 1.0, 110.0, 10), np.array(spans, dtype=np.int64)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from streams import needs_jit
 
 from valveflow_ros.baselines.hammerstein import HammersteinModel, tangents
 from valveflow_ros.baselines.hammerstein_fit import (
@@ -18,10 +18,6 @@ from valveflow_ros.baselines.hammerstein_fit import (
 )
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.fit.problem import Samples
-
-compiled = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
-)
 
 
 def samples(u, power, usable=None, group=1, settle_s=0.0, step_s=1.0):
@@ -163,7 +159,7 @@ def own_class():
     return plant, samples(u, power, group=10, settle_s=410.0)
 
 
-@compiled
+@needs_jit
 def test_a_plant_of_its_own_class_is_found(own_class):
     plant, data = own_class
     fitted = fit_hammerstein(data, 3)
@@ -178,7 +174,7 @@ def test_a_plant_of_its_own_class_is_found(own_class):
     assert all(1.0 <= mse < 1.1 for *_, mse in fitted.tried)
 
 
-@compiled
+@needs_jit
 def test_scaled_power_scales_the_curve_and_nothing_else(own_class):
     _, data = own_class
     short = replace(

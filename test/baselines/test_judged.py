@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from streams import needs_jit
 
 from valveflow_ros.baselines.comparison import (
     Finding,
@@ -21,9 +21,7 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.report.comparison_tables import pairs_table
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
-)
+pytestmark = needs_jit
 
 
 def test_scores_are_those_of_obvious_loops(curve, data):

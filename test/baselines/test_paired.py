@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
+from streams import needs_jit
 
 from valveflow_ros.baselines.judged import (
     over_blocks,
     over_samples,
     widening_of,
-)
-
-compiled = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
 )
 
 
@@ -41,7 +36,7 @@ def test_counting_each_sample_is_the_textbooks_paired_test(seed, n, shift):
     np.testing.assert_allclose([low, high], [wanted.low, wanted.high], rtol=1e-8)
 
 
-@compiled
+@needs_jit
 def test_correlated_noise_fools_the_one_and_not_the_other():
     """Under the null, a zero mean is rejected ever so often at 5 %."""
     rng = np.random.default_rng(12)
@@ -72,7 +67,7 @@ def test_independent_blocks_are_worth_nearly_all_of_them():
     assert 140.0 < np.median(worth) <= 200.0
 
 
-@compiled
+@needs_jit
 @pytest.mark.parametrize('phi', [0.0, 0.8, 0.95])
 def test_the_widening_of_a_known_noise(phi):
     rng = np.random.default_rng(15)
@@ -82,7 +77,7 @@ def test_the_widening_of_a_known_noise(phi):
     assert found == pytest.approx((1.0 + phi) / (1.0 - phi), rel=0.3)
 
 
-@compiled
+@needs_jit
 def test_rows_between_stretches_do_not_matter():
     rng = np.random.default_rng(16)
     residual = rng.standard_normal(3000)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
+from streams import needs_jit
 
 from valveflow_ros.baselines import sparse as library
 from valveflow_ros.baselines.judged import part_of
@@ -22,9 +21,6 @@ from valveflow_ros.baselines.sparse import (
 )
 from valveflow_ros.fit.problem import Samples
 
-compiled = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
-)
 TIME_S, GAIN, OFFSET = 40.0, 0.15, 20.0  # y' = (GAIN u + OFFSET - y) / TIME_S
 
 
@@ -104,7 +100,7 @@ def test_a_gap_begins_anew_at_the_measured_power_and_running_away_is_told():
     assert np.isinf(model(away).run(data)[0][10:200]).all()
 
 
-@compiled
+@needs_jit
 @pytest.mark.parametrize('form', forms_for(1.0), ids=lambda f: f'{f.kind}-{f.window_s:g}')
 def test_exact_data_satisfy_the_equations(form):
     data, _ = linear_plant(2.0, 0.0)
@@ -115,7 +111,7 @@ def test_exact_data_satisfy_the_equations(form):
     assert np.abs(error).max() < 0.05 * np.abs(rows[:, -1]).max()
 
 
-@compiled
+@needs_jit
 def test_no_window_holds_a_gap():
     data, _ = linear_plant(0.5, 0.0)
     usable = data.usable.copy()
@@ -145,7 +141,7 @@ def test_thresholding_keeps_what_is_large_and_refits():
     assert not thresholded(theta, target, 10.0).any()
 
 
-@compiled
+@needs_jit
 def test_a_linear_plant_is_found():
     data, clean = linear_plant(12.0, 1.0)
     found = fit_sparse(data)
@@ -159,7 +155,7 @@ def test_a_linear_plant_is_found():
     assert all(np.isfinite(mse) or np.isinf(mse) for *_, mse in found.mse_by_form)
 
 
-@compiled
+@needs_jit
 def test_the_curve_is_where_the_equation_rests():
     u = np.linspace(1000.0, 2000.0, 77)
     np.testing.assert_allclose(model(linear_xi()).static(u), GAIN * u + OFFSET, atol=1e-6)
@@ -169,7 +165,7 @@ def test_the_curve_is_where_the_equation_rests():
     assert np.isnan(model(never).static(u)).all()
 
 
-@compiled
+@needs_jit
 def test_of_several_rests_the_curve_keeps_to_one_branch():
     xi = np.zeros(library.SIZE)
     xi[0], xi[1], xi[2], xi[10] = OFFSET / TIME_S, -1.0 / TIME_S, GAIN / TIME_S, 0.02
@@ -179,7 +175,7 @@ def test_of_several_rests_the_curve_keeps_to_one_branch():
     assert np.abs(curve - (GAIN * u + OFFSET)).max() < 0.02 * TIME_S + 0.01
 
 
-@compiled
+@needs_jit
 def test_a_rest_that_swings_with_sin_u_is_followed():
     xi = linear_xi()
     xi[library.NAMES.index('sin u')] = 4.0 / TIME_S

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 
 import numpy as np
 import pytest
+from streams import needs_jit
 
 from valveflow_ros.baselines.validation import Verdict, to_json, validate
 from valveflow_ros.errors import DataError
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
-)
+pytestmark = needs_jit
 
 
 def test_the_right_curve_holds(curve, data):

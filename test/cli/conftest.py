@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from curves import curve
 
 from valveflow_ros.cli.main import main
+from valveflow_ros.curve.characteristic import RegionDynamics
+from valveflow_ros.curve.characteristic_json import to_json
 
 # Long enough for a curve of several pieces, short enough for a test.
 DAYS, SEED = '0.4', '1'
+# The curve and the dynamics of the paper's plant.
+KNOTS, SLOPES = (1000.0, 1250.0, 1600.0, 1900.0, 2600.0), (0.24, 0.18, 0.09, 0.01)
+REGIONS = (
+    RegionDynamics(100.0, 240.0, 10.0, 3.0, 1.0, 1.0),
+    RegionDynamics(240.0, 320.0, 80.0, 10.0, 1.0, 1.0),
+)
 
 
 @dataclass(frozen=True)
@@ -83,21 +91,27 @@ def identified(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / 'characteristic.json'
 
 
-@pytest.fixture(scope='session')
-def shared_data() -> Path:
-    """Return the folder of measured data that are not part of the project."""
-    place = os.environ.get('VALVEFLOW_SHARED_DATA')
-    folder = Path(place) if place else Path(__file__).resolve().parents[3] / 'shared' / 'data'
-    if not folder.is_dir():
-        pytest.skip(f'no measured data at {folder}; VALVEFLOW_SHARED_DATA names another place')
-    return folder
-
-
 @pytest.fixture
 def write_csv(tmp_path: Path) -> Callable[[str, list[str]], Path]:
     def write(header: str, rows: list[str]) -> Path:
         path = tmp_path / 'history.csv'
         path.write_text('\n'.join([header, *rows]) + '\n', encoding='utf-8')
+        return path
+
+    return write
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Callable[..., Path]:
+    """Return a writer of curves as files: knots, slopes, and any field of a characteristic."""
+
+    def write(
+        name: str = 'model.json', knots=KNOTS, slopes=SLOPES, start: float = 140.0, **fields: Any
+    ) -> Path:  # fmt: skip
+        made = curve(knots, slopes, start=start, stderr=5e-4, samples=5000)
+        content = to_json(replace(made, dynamics=REGIONS, **fields))
+        path = tmp_path / name
+        path.write_text(json.dumps(content), encoding='utf-8')
         return path
 
     return write

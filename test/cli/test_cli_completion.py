@@ -101,7 +101,3 @@ def test_each_shell_understands_its_script(run, tmp_path, shell):
         [shell, *more, '-c', f'{before}source {path}'], capture_output=True, text=True, check=True
     )
     assert done.stderr == ''
-
-
-def test_another_shell_is_refused(run):
-    assert run('completion', 'tcsh').refused(2).startswith('valveflow: SHELL must be one of bash')

@@ -81,11 +81,6 @@ def test_what_the_monitor_would_refuse_is_named(run, tmp_path, text, part):
     assert 'x.yaml' in sentence
 
 
-def test_only_init_and_check(run, tmp_path):
-    assert "not 'make'" in run('config', 'make', tmp_path / 'x').refused(2)
-    assert 'no such file' in run('config', 'check', tmp_path / 'x.yaml').refused()
-
-
 def test_a_column_s_name_cannot_write_parameters(run, tmp_path):
     name = "PT\n    unit_tag: 'OWNED'\r\u2028    # [bar]"
     n = 600

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
 
 import pytest
+from streams import needs_jit
 
 from valveflow_ros.cli.main import main
 from valveflow_ros.diagnosis.result import model_from_json
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
-)
+pytestmark = needs_jit
 
 
 @pytest.fixture(scope='module')

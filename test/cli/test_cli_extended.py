@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
 
 import pytest
 from extended_file import extended_json, write_extended
+from streams import needs_jit
 
 from valveflow_ros.cli.main import main
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
-)
+pytestmark = needs_jit
 HELD = {'output_offset_drift': {'b_mw': 8.0}, 'backlash': {'w_percent': 0.1}}
 
 

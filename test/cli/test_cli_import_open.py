@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from logged import values
 
 from valveflow_ros.cli import import_table
 from valveflow_ros.cli.command import Console, TableOption
@@ -32,11 +33,6 @@ def table(tmp_path):
     ]
     path.write_text('\n'.join([HEAD, *rows]) + '\n')
     return path
-
-
-def values(path, signal):
-    readings = open_log(path).readings
-    return readings.value[readings.signal == signal]
 
 
 def last_command(text):

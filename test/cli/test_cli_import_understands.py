@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from logged import values
 
 from valveflow_ros.interface import table_import
 from valveflow_ros.logs import open_log
@@ -33,11 +34,6 @@ def german(tmp_path):
                if k == 70 else row(k) for k in range(N))]  # fmt: skip
     path.write_bytes('\r\n'.join(lines).encode('cp1252'))
     return path
-
-
-def values(path, signal):
-    readings = open_log(path).readings
-    return readings.value[readings.signal == signal]
 
 
 def test_a_german_export_needs_no_option(run, german, tmp_path):
@@ -106,18 +102,6 @@ def test_a_gauge_pressure_is_made_absolute_and_said(run, german, tmp_path):
     ran = run('import', german, '-o', tmp_path / 'x.mcap')
     assert 'gauge pressure (barg); 1.01325 bar of air' in ran.err
     assert values(tmp_path / 'x.mcap', Signal.MAIN_STEAM_PRESSURE)[0] == pytest.approx(13.101325)
-
-
-@pytest.mark.parametrize(
-    ('option', 'part'),
-    [
-        (('--time-zone', 'Europe/Nowhere'), "'Europe/Nowhere' is not known"),
-        (('--date-order', 'dym'), 'must be dmy, mdy or ymd'),
-        (('--decimal', 'dot'), 'must be point or comma'),
-    ],
-)
-def test_wrong_options_are_wrong_usage(run, german, option, part):
-    assert part in run('import', german, '--dry-run', *option).refused(2)
 
 
 @pytest.mark.parametrize('order', ['as it stands', 'newest first', 'shuffled'])

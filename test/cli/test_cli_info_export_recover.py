@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from logged import rewritten
+from monitor_recording import FLOAT64, Monitor, cdr, diagnosis
 
-from valveflow_ros.cli.info import _fates
 from valveflow_ros.interface.alignment import align
+from valveflow_ros.interface.logs import steps_of
+from valveflow_ros.interface.settings import settings_for
 from valveflow_ros.logs import open_log, read_table
-from valveflow_ros.parameters import Settings
-from valveflow_ros.records import NS_PER_S, SIGNALS, Readings, Signal
+from valveflow_ros.records import NS_PER_S, SIGNALS, Signal
 
 
 def test_info_tells_what_is_there(run, logs):
@@ -35,12 +35,12 @@ def test_info_tells_what_is_there(run, logs):
 
 
 def test_info_of_a_table_tells_gaps_and_values_that_will_be_rejected(run, logs, tmp_path):
-    lines = (logs / 'plant.csv').read_text().splitlines()
-    column = lines[0].split(',').index('main_steam_pressure_mpa')
-    cells = lines[50].split(',')
-    cells[column] = '-5'
-    lines[50] = ','.join(cells)
-    (tmp_path / 'x.csv').write_text('\n'.join([*lines[:100], *lines[700:1000]]) + '\n')
+    table = tmp_path / 'x.csv'
+    rewritten(
+        logs / 'plant.csv', table, 'main_steam_pressure_mpa', lambda k, p: '-5' if k == 49 else p
+    )
+    lines = table.read_text().splitlines()
+    table.write_text('\n'.join([*lines[:100], *lines[700:1000]]) + '\n')
     ran = run('info', tmp_path / 'x.csv')
     assert 'main_steam_pressure: 1 impossible value' in ran.out
     assert 'valve_opening: 1 gap, the longest 10 min 1 s from' in ran.out
@@ -76,14 +76,6 @@ def test_export_takes_a_step(run, logs, tmp_path):
     assert set(np.diff(written.time_ns)) == {10_000_000_000}
 
 
-@pytest.mark.parametrize(
-    ('output', 'part'),
-    [('a.mcap', 'must end in .csv or .parquet'), ('no/a.csv', 'there is no folder')],
-)
-def test_export_to_where_it_cannot(run, logs, tmp_path, output, part):
-    assert part in run('export', logs / 'plant.csv', '-o', tmp_path / output).refused()
-
-
 def test_export_does_not_replace_by_accident(run, logs, tmp_path):
     table = tmp_path / 'a.csv'
     table.write_text('mine')
@@ -112,35 +104,42 @@ def test_recover_makes_a_whole_file_of_half_of_one(run, logs, tmp_path):
     assert 'exists already' in run('recover', broken, '-o', tmp_path / 'b.mcap').refused()
 
 
-READINGS = st.lists(
-    st.tuples(
-        st.integers(0, 50), st.integers(0, len(SIGNALS) - 1),
-        st.sampled_from([50.0, 100.0, -200.0, np.nan, 1e9]) | st.floats(50.0, 60.0),
-        st.sampled_from([0, 0, 0, 1, 2]),
-    ),
-    max_size=60,
+USUAL = {
+    '/valve_opening': 55.0, '/main_steam_pressure': 13.0, '/main_steam_temperature': 538.0,
+    '/generated_power': 240.0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('wrong', 'reason'),
+    [
+        ('', ''), ('no reading', ''), ('not a number', 'not_finite'), ('impossible', 'impossible'),
+        ('told twice', 'duplicate'), ('a leap ahead', ''), ('everything', 'duplicate'),
+    ],
 )  # fmt: skip
-
-
-@given(READINGS, st.booleans())
-def test_what_looks_in_order_is_what_the_engine_accepts(rows, tidy):
+def test_info_counts_what_the_engine_accepts(run, tmp_path, wrong, reason):
     """The quick look may ask the engine too often, but may never say other than it."""
-    limits = {f'{i.topic}_high': 60.0 for i in SIGNALS if i.required and 'power' in i.topic}
-    # No two of these stamps lie so far apart that the later one is doubted.
-    settings = Settings({**limits, 'clock_jump': 60.0})
-    if tidy:
-        rows = sorted(
-            {(t, s): (t, s, 55.0 if s == 2 else 30.0, 0) for t, s, _, _ in rows}.values()
-        )
-    readings = Readings.of([(t * NS_PER_S, s, v, q) for t, s, v, q in rows])
-    told = _fates(readings, readings.by_signal(), settings)
-    if tidy:
-        assert all(set(by_reason) == {'accepted'} for by_reason in told.values())
-    _, _, counts = align(readings, settings)
+    rng, monitor = np.random.default_rng(5), Monitor(tmp_path / 'r')
+    odd = {'not a number': np.nan, 'impossible': 1e9}
+    monitor.say('diagnosis', diagnosis(monitor.now_ns, 1, 'All is well.'))
+    for row in range(0 if wrong == 'no reading' else 80):
+        here = wrong if row == 40 else ''
+        if wrong == 'everything':
+            here = str(rng.choice(['', 'not a number', 'impossible', 'told twice']))
+        monitor.now_ns += (7200 if here == 'a leap ahead' else 1) * NS_PER_S
+        for topic, usual in USUAL.items():
+            value = odd.get(here, usual) if topic == '/generated_power' else usual
+            for _ in range(1 + (here == 'told twice')):
+                monitor.say(topic, cdr(FLOAT64, {'data': value}))
+    monitor.writer.close()
+    told = run('info', tmp_path / 'r', '--json').json['readings']
+    readings = open_log(tmp_path / 'r').readings
+    _, _, counts = align(readings, settings_for(steps_of(readings.by_signal()), 0.0, {})[0])
     for topic, by_reason in counts.items():
-        for reason, n in by_reason.items():
-            if reason != 'late':
-                assert told[topic].get(reason, 0) == n, (topic, reason)
+        for name, n in by_reason.items():
+            if name != 'late':
+                assert told.get(topic, {}).get(name, 0) == n, (topic, name)
+    assert not reason or told['generated_power'][reason]
 
 
 def test_info_names_what_is_attached(run, logs, tmp_path):

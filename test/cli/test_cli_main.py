@@ -118,12 +118,6 @@ def test_errors_raised_on_purpose_and_by_the_system(breaks):
     assert 'memory' in breaks(MemoryError()).refused()
 
 
-def test_a_misspelt_option_is_told_before_anything_that_is_missing(run):
-    sentence = run('validate', '--modell', 'x.json').refused(2)
-    assert "There is no option '--modell'. Did you mean '--model'?" in sentence
-    assert 'There is no option' in run('info', 'x.mcap', '--xyz=1').refused(2)
-
-
 def test_a_file_that_is_not_there_is_told_before_anything_is_loaded(tmp_path):
     words = [
         ['identify', 'nothing.mcap', '-o', 'o'],
@@ -150,25 +144,3 @@ def test_a_file_that_is_not_there_is_told_before_anything_is_loaded(tmp_path):
         assert name in line
     assert not HEAVY & set(modules.split())
     assert [p.name for p in tmp_path.iterdir()] == ['log.mcap']
-
-
-def test_interrupt_is_status_130(breaks):
-    assert 'stopped' in breaks(KeyboardInterrupt()).refused(130)
-
-
-def test_ctrl_c_in_the_middle_of_the_work_leaves_nothing(logs, tmp_path):
-    """Stop a real process as soon as it tells that it has begun."""
-    words = ['identify', str(logs / 'plant.csv'), '-o', str(tmp_path / 'out')]
-    code = (
-        'import os, signal, sys, time\n'
-        # A shell that starts things in the background lets them ignore it.
-        'signal.signal(signal.SIGINT, signal.default_int_handler)\n'
-        'from valveflow_ros.cli.main import main\n'
-        'from valveflow_ros.interface import observation\n'
-        'observation.fit = lambda *_: (os.kill(os.getpid(), signal.SIGINT), time.sleep(60))\n'
-        f'sys.exit(main({words!r}))'
-    )
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
-    assert done.returncode == 130
-    assert 'Traceback' not in done.stderr
-    assert not (tmp_path / 'out').exists()

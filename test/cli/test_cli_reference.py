@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import json
-import os
 
 import pytest
+from streams import needs_jit
 
 from valveflow_ros.curve.characteristic_json import from_json
 from valveflow_ros.logs import write_samples
 from valveflow_ros.plant.step_test import StepPlan, step_test
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
-)
+pytestmark = needs_jit
 
 
 @pytest.fixture(scope='module')
-def test_log(tmp_path_factory):
+def levels_log(tmp_path_factory):
     """Return the log of a manual test with twelve levels."""
     path = tmp_path_factory.mktemp('test') / 'test.mcap'
     plan = StepPlan(opening_from_percent=45.0, opening_to_percent=85.0, steps=11)
@@ -25,8 +23,8 @@ def test_log(tmp_path_factory):
     return path
 
 
-def test_a_step_test_gives_a_curve_others_can_read(run, test_log, tmp_path):
-    ran = run('identify', test_log, '-o', tmp_path / 'out', '--step-test')
+def test_a_step_test_gives_a_curve_others_can_read(run, levels_log, tmp_path):
+    ran = run('identify', levels_log, '-o', tmp_path / 'out', '--step-test')
     assert ran.status == 0, ran.err
     assert '12 of 12 levels count' in ran.out
     curve = from_json(json.loads((tmp_path / 'out' / 'characteristic.json').read_text()))
@@ -38,8 +36,8 @@ def test_a_step_test_gives_a_curve_others_can_read(run, test_log, tmp_path):
     assert made.json['checks']['passed'] is True
 
 
-def test_the_way_to_a_step_test_is_told(run, test_log, tmp_path):
-    ran = run('identify', test_log, '-o', tmp_path / 'out', '--set', 'min_fit_samples=100000')
+def test_the_way_to_a_step_test_is_told(run, levels_log, tmp_path):
+    ran = run('identify', levels_log, '-o', tmp_path / 'out', '--set', 'min_fit_samples=100000')
     assert '--step-test identifies it' in ran.refused()
 
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 
 import pytest
+from streams import needs_jit
 
 from valveflow_ros.report import drawing
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
-)
+pytestmark = needs_jit
 
 
 def test_pictures_and_tables_stand_beside_the_report(run, logs, tmp_path):

@@ -67,26 +67,6 @@ def test_effects_are_listed_with_their_parameters(run):
         assert set(data['effects'][name]['parameters']) == {p.name for p in effect.parameters}
 
 
-@pytest.mark.parametrize(
-    ('words', 'part'),
-    [
-        (['-o', 'x.xlsx'], 'must end in .mcap or .csv or .parquet'),
-        (['-o', 'none/x.mcap'], 'there is no folder'),
-        (['-o', 'x.mcap', '--days', '0'], 'above 0'),
-        (['-o', 'x.mcap', '--days', 'nan'], 'above 0'),
-        (['-o', 'x.mcap', '--seed', '-1'], '0 or more'),
-        (['-o', 'x.mcap', '--effect', 'gain_drif'], "Did you mean 'gain_drift'"),
-        (['-o', 'x.mcap', '--effect', 'gain_drift:h=1'], "no parameter 'h'"),
-        (['-o', 'x.mcap', '--effect', 'gain_drift:g=big'], "not 'big'"),
-    ],
-)
-def test_refusals_leave_nothing_behind(run, tmp_path, monkeypatch, words, part):
-    monkeypatch.chdir(tmp_path)
-    status = 1 if 'x.mcap' not in words else 2
-    assert part in run('simulate', *words).refused(status)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_log_that_is_there_is_not_replaced_by_accident(run, tmp_path):
     log = tmp_path / 'x.mcap'
     log.touch()
@@ -100,8 +80,3 @@ def test_a_log_that_is_there_is_not_replaced_by_accident(run, tmp_path):
     bag.mkdir()
     (bag / 'mine.txt').write_text('keep')
     assert 'not empty' in run('simulate', '-o', bag, *SHORT).refused()
-
-
-def test_refused_truth_leaves_the_sentence(run, tmp_path):
-    ran = run('simulate', '-o', tmp_path / 'x.csv', *SHORT, '--truth', tmp_path / 'no' / 't.json')
-    assert 'cannot be written' in ran.refused()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 
-import pytest
 from monitor_recording import recording
 
 from valveflow_ros.cli import watch as verb
@@ -46,19 +45,6 @@ def test_the_newest_recording_of_a_folder_is_taken(run, tmp_path):
     recording(tmp_path / 'new')
     os.utime(tmp_path / 'old', (1, 1))
     assert 'new' in run('watch', tmp_path, '--once').out.splitlines()[0]
-
-
-@pytest.mark.parametrize(('words', 'status', 'part'), [
-    (['x.csv'], 2, 'valveflow info'),
-    (['nothing.mcap'], 1, 'is not there'),
-    (['.'], 1, 'has no recording in it'),
-    (['x.mcap', '--node', 'a'], 2, '--node'),
-    (['x.mcap', '--ask', 'refit'], 2, '--ask'),
-    (['x', '--interval', '0'], 2, '0.1 to 3600'),
-])  # fmt: skip
-def test_what_cannot_be_watched(run, tmp_path, monkeypatch, words, status, part):
-    monkeypatch.chdir(tmp_path)
-    assert part in run('watch', *words).refused(status)
 
 
 def test_without_ros_it_says_so_and_what_else_there_is(run, monkeypatch):

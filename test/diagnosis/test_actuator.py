@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 from diagnosis_records import masked, record, table, unit
+from streams import needs_jit
 
 from valveflow_ros.diagnosis import actuator
 from valveflow_ros.diagnosis.actuator import sized
@@ -14,9 +13,7 @@ from valveflow_ros.diagnosis.diagnose import notes
 from valveflow_ros.diagnosis.scene import make_scene
 from valveflow_ros.records import Signal
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled loops'
-)
+pytestmark = needs_jit
 DAYS = 0.5
 FAULTS = {
     'stiction': ('stiction:before_sensor=1,s_percent=1.2,j_percent=0.8', (1.2, 0.8)),

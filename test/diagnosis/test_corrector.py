@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 from diagnosis_records import EXPONENT, SETTLE_S, STEP_S, record, rough_model, table, unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from streams import needs_jit
 from test_diagnosis_parts import TYPICAL
 
 from valveflow_ros.diagnosis.cause import Active
@@ -23,9 +23,7 @@ from valveflow_ros.records import NS_PER_S, Quality, SampleTable, Signal
 from valveflow_ros.signals.integrated_input import integrated_input
 from valveflow_ros.state import from_bytes, to_bytes
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled loops'
-)
+pytestmark = needs_jit
 NAMES = sorted(catalogue())
 VALUES = {**TYPICAL, 'clock': (4.0,)}  # a whole number of rows
 SEVERAL = ('rate_limit', 'backlash', 'exponent', 'input_drift', 'curve_shape', 'temperature',

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 from diagnosis_records import EXPONENT, STEP_S, record, rough_model, table, unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from streams import needs_jit
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import from_json, to_json
@@ -30,9 +30,7 @@ from valveflow_ros.monitoring.rows import Correction, Corrector
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import Quality, SampleTable, Signal
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
-)
+pytestmark = needs_jit
 OFF = {'refit_period': 0.0, 'refit_segments': 0, 'diagnosis_hour': -1}
 BY_HAND = Settings({'sample_period': STEP_S, **OFF})
 OFTEN = Settings({'sample_period': STEP_S, 'refit_segments': 8, 'refine': False,

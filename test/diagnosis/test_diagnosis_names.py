@@ -17,15 +17,14 @@ from diagnosis_records import (
     table,
     unit,
 )
+from streams import needs_jit
 
 from valveflow_ros.diagnosis.diagnose import diagnose
 from valveflow_ros.errors import DataError
 from valveflow_ros.plant.unit import Noise, Programme
 from valveflow_ros.records import SampleTable, Signal
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='days of data need the compiled loops'
-)
+pytestmark = needs_jit
 HALF_DAY_ROWS = 21_600
 SHORT = 2.0  # days
 

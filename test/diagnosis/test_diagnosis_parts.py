@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +11,7 @@ import pytest
 from diagnosis_records import record, rough_model, table, unit
 from hypothesis import given
 from hypothesis import strategies as st
+from streams import needs_jit
 
 from valveflow_ros.diagnosis import kernels, record_faults
 from valveflow_ros.diagnosis.cause import Active, SentenceValues, Stage
@@ -25,9 +25,7 @@ from valveflow_ros.diagnosis.search import simplified
 from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.records import SampleTable, Signal
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled loops'
-)
+pytestmark = needs_jit
 NAMES = {
     'temperature', 'exponent', 'choked', 'gain_drift', 'input_drift', 'output_offset_drift',
     'gain_step', 'input_step', 'curve_step', 'intervals', 'diurnal', 'backlash', 'stiction',
@@ -178,15 +176,11 @@ def test_scores_of_noise_have_even_chances():
     assert sign_flip(-np.full(30, 1.0)) == 1.0
 
 
-def test_a_clean_record_has_no_faults():
+def test_faults_are_masked_where_they_are():
     samples = table(0.4, 2, (), unit())
     bad, found = record_faults.faults(samples, 2.0)
     assert found == ()
     assert not bad.any()
-
-
-def test_faults_are_masked_where_they_are():
-    samples = table(0.4, 2, (), unit())
     values = samples.values.copy()
     places = np.array([3000, 5001, 9000, 12000, 15000])
     values[places, Signal.GENERATED_POWER] += 60.0

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 from diagnosis_records import record, rough_model, table, unit
 from hypothesis import given
 from hypothesis import strategies as st
+from streams import needs_jit
 
 from valveflow_ros.diagnosis.cause import Active, Kind
 from valveflow_ros.diagnosis.causes import catalogue
@@ -16,9 +15,7 @@ from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import Task, beliefs, free, held, whitening
 from valveflow_ros.diagnosis.scene import ORDER, make_scene, sensor_noise
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled loops'
-)
+pytestmark = needs_jit
 STICKS = (2.0, 1.4)
 
 
@@ -30,9 +27,6 @@ def test_the_noise_of_a_wandering_position_is_told_from_its_moves(noise, seed):
     v = np.round(moves + rng.normal(0.0, noise, len(moves)), 2)
     v[::997] = np.nan
     assert sensor_noise(v) == pytest.approx(noise, rel=0.2, abs=0.003)
-
-
-def test_a_position_without_values_has_no_noise():
     assert sensor_noise(np.full(10, np.nan)) == 0.0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 
@@ -11,15 +10,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from extended_file import write_extended
+from streams import needs_jit
 
 import valveflow_ros as vf
 from valveflow_ros.errors import DataError, InputError, RecordingError, UsageError
 from valveflow_ros.logs import write_samples, write_table
 from valveflow_ros.records import SIGNALS, SampleTable, Signal
 
-needs_jit = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
-)
 QUICK = {'refine': False, 'selection_rule': 'paper'}
 HEAVY = {'numpy', 'numba', 'scipy', 'pandas', 'pyarrow', 'plotly', 'yaml'}
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from pathlib import Path
 
-import pytest
+from streams import needs_jit
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
 EXAMPLES = re.findall(r'```python\n(.*?)```', (DOCS / 'python.md').read_text(), re.DOTALL)
@@ -26,9 +25,7 @@ def test_the_notebook_shows_the_examples_of_the_page():
     assert all(text in page for text in cells('markdown')[1:])
 
 
-@pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
-)
+@needs_jit
 def test_the_cells_of_the_notebook_run_in_their_order(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {'__name__': 'notebook'}

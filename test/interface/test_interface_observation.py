@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
+from streams import needs_jit
 
 from valveflow_ros.errors import DataError
 from valveflow_ros.interface.alignment import align
@@ -13,9 +12,7 @@ from valveflow_ros.interface.observation import cut_in_two, observe
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, Readings, SampleTable, Signal, table_to_readings
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='hours of data need the compiled engine'
-)
+pytestmark = needs_jit
 
 
 def stairs(hours):

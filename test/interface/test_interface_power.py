@@ -4,30 +4,17 @@ from __future__ import annotations
 
 import math
 
+import curves
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from valveflow_ros.curve.characteristic_json import from_json
-
 
 def curve(knots, left, right, exponent=1.125):
-    pieces = []
-    for u_from, u_to, a, b in zip(knots[:-1], knots[1:], left, right, strict=True):
-        slope = (b - a) / (u_to - u_from)
-        pieces.append(
-            {'u_from': u_from, 'u_to': u_to, 'slope': slope, 'intercept': a - slope * u_from,
-             'slope_stderr': 0.001, 'intercept_stderr': 1.0, 'samples': 100}
-        )  # fmt: skip
-    return from_json(
-        {
-            'format': 'valveflow/characteristic', 'version': 1, 'pressure_exponent': exponent,
-            'pieces': pieces, 'breakpoint_intervals': [[None, None]] * (len(pieces) - 1),
-            'selection': {'rule': 'paper', 'cost': {}, 'turning_angle': {}},
-            'segments': {'steady': 1, 'slope_response': 1, 'samples': 100}, 'dynamics': [],
-        }
-    )  # fmt: skip
+    left, right = np.asarray(left), np.asarray(right)
+    slopes = (right - left) / np.diff(knots)
+    return curves.curve(knots, slopes, left[1:] - right[:-1], left[0], pressure_exponent=exponent)
 
 
 @st.composite

@@ -11,78 +11,55 @@ from valveflow_ros.errors import InputError
 from valveflow_ros.plant.simulator import simulate, simulate_parts
 from valveflow_ros.plant.unit import Curve, Noise, Programme, Region, UnitDescription, random_unit
 
+END = Region(np.inf, 10.0, 3.0)
+REFUSED = [
+    *(
+        (lambda a=arguments: simulate(**{'days': 0.1, 'seed': 1, **a}), words)
+        for arguments, words in (
+            ({'days': 0.0}, 'more than 0'),
+            ({'days': np.nan}, 'more than 0'),
+            ({'days': 401.0}, 'at most 400'),
+            ({'seed': -1}, 'seed must be 0 or more, not -1'),
+            ({'start_ns': -1}, 'between the years'),
+            ({'start_ns': 2**63 - 2}, 'between the years'),
+        )
+    ),
+    *(
+        (lambda s=part_s: simulate_parts(0.1, 1, part_s=s), 'one sample period')
+        for part_s in (0.0, -1.0, np.nan)
+    ),
+    *(
+        (lambda r=regions: UnitDescription(regions=r), 'follow each other')
+        for regions in (
+            (), (Region(240.0, 10.0, 3.0),), (END, END),
+            (Region(240.0, 10.0, 3.0), Region(230.0, 5.0, 3.0), END),
+        )
+    ),
+    *(
+        (lambda c=change: Programme(**c), 'This programme cannot be simulated: ')
+        for change in (
+            {'load_mean_mw': 100.0}, {'full_load_from_mw': 300.0}, {'full_load_share': 1.1},
+            {'load_spread_mw': -1.0}, {'hold_min_s': -1.0}, {'ramp_low_mw_per_min': 0.0},
+            {'ramp_low_mw_per_min': 7.0}, {'pressure_low_mpa': np.nan}, {'pressure_span_mw': 0.0},
+            {'jitter_s': 0.0}, {'temperature_pressure_correlation': 1.1},
+            {'pulse_low_percent': 5.0}, {'feedback_slope_mw': 0.0},
+        )
+    ),
+    *(
+        (lambda c=change: Noise(**c), 'This noise cannot be simulated: ')
+        for change in ({'slow_time_s': 0.0}, {'white_mw': -1.0}, {'load_dependence': np.nan})
+    ),
+    *(
+        (lambda p=pair: Region(np.inf, *p), 'time constant above 0')
+        for pair in ((0.0, 1.0), (np.inf, 1.0), (1.0, -1.0), (1.0, np.nan))
+    ),
+]  # fmt: skip
 
-@pytest.mark.parametrize(
-    ('arguments', 'words'),
-    [
-        ({'days': 0.0}, 'more than 0'),
-        ({'days': float('nan')}, 'more than 0'),
-        ({'days': 401.0}, 'at most 400'),
-        ({'seed': -1}, 'seed must be 0 or more, not -1'),
-        ({'start_ns': -1}, 'between the years'),
-        ({'start_ns': 2**63 - 2}, 'between the years'),
-    ],
-)
-def test_what_cannot_be_simulated_is_refused(arguments: dict, words: str) -> None:
+
+@pytest.mark.parametrize(('make', 'words'), REFUSED)
+def test_what_cannot_be_simulated_is_refused(make, words) -> None:
     with pytest.raises(InputError, match=words):
-        simulate(**{'days': 0.1, 'seed': 1, **arguments})
-
-
-@pytest.mark.parametrize('part_s', [0.0, -1.0, float('nan')])
-def test_parts_without_rows_are_refused_at_the_call(part_s: float) -> None:
-    with pytest.raises(InputError, match='one sample period'):
-        simulate_parts(0.1, 1, part_s=part_s)
-
-
-@pytest.mark.parametrize(
-    'regions',
-    [
-        (),
-        (Region(240.0, 10.0, 3.0),),
-        (Region(240.0, 10.0, 3.0), Region(230.0, 5.0, 3.0), Region(np.inf, 10.0, 3.0)),
-        (Region(np.inf, 10.0, 3.0), Region(np.inf, 10.0, 3.0)),
-    ],
-)
-def test_regions_that_leave_gaps_are_refused(regions: tuple[Region, ...]) -> None:
-    with pytest.raises(InputError, match='follow each other'):
-        UnitDescription(regions=regions)
-
-
-@pytest.mark.parametrize(
-    'change',
-    [
-        {'load_mean_mw': 100.0},
-        {'full_load_from_mw': 300.0},
-        {'full_load_share': 1.1},
-        {'load_spread_mw': -1.0},
-        {'hold_min_s': -1.0},
-        {'ramp_low_mw_per_min': 0.0},
-        {'ramp_low_mw_per_min': 7.0},
-        {'pressure_low_mpa': float('nan')},
-        {'pressure_span_mw': 0.0},
-        {'jitter_s': 0.0},
-        {'temperature_pressure_correlation': 1.1},
-        {'pulse_low_percent': 5.0},
-        {'feedback_slope_mw': 0.0},
-    ],
-)
-def test_contradicting_habits_are_refused(change: dict) -> None:
-    with pytest.raises(InputError, match='This programme cannot be simulated: '):
-        Programme(**change)
-
-
-@pytest.mark.parametrize(
-    'change', [{'slow_time_s': 0.0}, {'white_mw': -1.0}, {'load_dependence': float('nan')}]
-)
-def test_impossible_noise_is_refused(change: dict) -> None:
-    with pytest.raises(InputError, match='This noise cannot be simulated: '):
-        Noise(**change)
-
-
-@pytest.mark.parametrize('pair', [(0.0, 1.0), (np.inf, 1.0), (1.0, -1.0), (1.0, np.nan)])
-def test_impossible_dynamics_are_refused(pair: tuple[float, float]) -> None:
-    with pytest.raises(InputError, match='time constant above 0'):
-        Region(np.inf, *pair)
+        make()
 
 
 def test_a_curve_through_points_passes_through_them() -> None:

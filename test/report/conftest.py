@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from chromium import BROWSERS, Chromium, installed
+from curves import curve
 
 from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
-    Piece,
     RegionDynamics,
     ResidualStatistics,
     Source,
@@ -68,16 +69,8 @@ def _segments(table: SampleTable, period_s: int) -> tuple[SpecialSegment, ...]:
 
 
 def _characteristic(table: SampleTable, segments: tuple[SpecialSegment, ...]) -> Characteristic:
-    pieces = tuple(
-        Piece(KNOTS[k], KNOTS[k + 1], SLOPES[k], INTERCEPTS[k], 0.0012, 1.4, 1000 * (k + 1))
-        for k in range(2)
-    )
-    raw = tuple(
-        Piece(p.u_from, p.u_to, 1.01 * p.slope, p.intercept, 0.002, 2.0, p.samples) for p in pieces
-    )
-    return Characteristic(
-        pressure_exponent=1.125,
-        pieces=pieces,
+    made = curve(
+        KNOTS, SLOPES, start=100.0, stderr=0.0012, samples=1000, notes=(),
         breakpoint_intervals=((1189.0, 1211.0),),
         choice=Choice(
             'paper', {1: 9e5, 2: 2e5, 3: 1.9e5, 4: 1.85e5}, {2: 0.81, 3: 0.32}, 'A <note>.'
@@ -93,8 +86,9 @@ def _characteristic(table: SampleTable, segments: tuple[SpecialSegment, ...]) ->
             RegionDynamics(100.0, 180.0, 11.5, 3.25, 0.4, 0.3),
             RegionDynamics(180.0, 195.0, 77.0, 9.5, 2.0, 1.0),
         ),
-        partition_pieces=raw,
-    ).with_id()  # fmt: skip
+    )  # fmt: skip
+    raw = tuple(replace(p, slope=1.01 * p.slope, slope_stderr=0.002) for p in made.pieces)
+    return replace(made, partition_pieces=raw).with_id()
 
 
 Make = Callable[..., Identified]

@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from valveflow_ros.report.curve import curve_figure, density, last_range
+from valveflow_ros.records import Signal
+from valveflow_ros.report.curve import curve_figure, density
 from valveflow_ros.report.data import (
     coverage_figure,
     envelope,
-    presence,
     presence_figure,
     segment_path,
 )
@@ -33,24 +33,26 @@ def test_hours_add_up_to_the_log(identified):
     assert len(figure.layout['shapes']) == 1, 'one breakpoint'
 
 
-def test_a_whole_log_needs_no_picture_of_holes(identified):
+def shares_of(data):
+    """Return the middles of the stretches in ns, and the share there of each signal."""
+    (heat,) = presence_figure(data).traces
+    edges_ns = np.array(heat['x']) * 1e6
+    return 0.5 * (edges_ns[1:] + edges_ns[:-1]), dict(
+        zip(heat['y'], np.array(heat['z']) / 100.0, strict=True)
+    )
+
+
+def test_holes_show_when_they_were_and_a_whole_log_needs_no_picture(identified):
     assert presence_figure(identified) is None
-
-
-def test_holes_show_when_they_were(identified):
     table = identified.table
     values = table.values.copy()
     n = len(table)
-    values[: n // 4, 3] = np.nan
-    data = replace(identified, table=replace(table, values=values))
-    edges, share = presence(data)
-    row = share[3]
-    middle = 0.5 * (edges[1:] + edges[:-1])
+    values[: n // 4, Signal.GENERATED_POWER] = np.nan
+    middle, share = shares_of(replace(identified, table=replace(table, values=values)))
     early = middle < table.time_ns[n // 4]
-    assert row[early].max() < 0.5
-    assert row[~early][1:].min() == 1.0
-    assert share[[0, 1]].min() == 1.0
-    assert presence_figure(data) is not None
+    assert share['generated power'][early].max() < 0.5
+    assert share['generated power'][~early][1:].min() == 1.0
+    assert share['valve opening'].min() == share['main steam pressure'].min() == 1.0
 
 
 def test_rows_that_are_not_there_count_as_holes(identified):
@@ -58,20 +60,17 @@ def test_rows_that_are_not_there_count_as_holes(identified):
     keep = np.ones(len(table), dtype=bool)
     keep[3000:6000] = False
     short = replace(table, time_ns=table.time_ns[keep], values=table.values[keep])
-    _, share = presence(replace(identified, table=short))
-    whole = (1.0 - share[0]).mean()
-    assert whole == pytest.approx(3000 / len(table), rel=0.05)
+    _, share = shares_of(replace(identified, table=short))
+    assert (1.0 - share['valve opening']).mean() == pytest.approx(3000 / len(table), rel=0.05)
 
 
 def test_the_last_day_is_shaded_where_the_log_is_longer(make):
-    assert last_range(make(days=1.0)) is None
+    assert not curve_figure(make(days=1.0)).layout.get('shapes')
     data = make(days=2.0)
-    low, high = last_range(data)
-    rows = data.table.time_ns >= data.table.time_ns[-1] - 86400 * 10**9
-    inside = (data.u[rows] >= low) & (data.u[rows] <= high)
-    assert inside.mean() == pytest.approx(0.99, abs=0.002)
     (shape,) = curve_figure(data).layout['shapes']
-    assert (shape['x0'], shape['x1']) == (low, high)
+    rows = data.table.time_ns >= data.table.time_ns[-1] - 86400 * 10**9
+    inside = (data.u[rows] >= shape['x0']) & (data.u[rows] <= shape['x1'])
+    assert inside.mean() == pytest.approx(0.99, abs=0.002)
 
 
 def test_the_reference_is_drawn_beside_the_curve(identified):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from streams import needs_jit
 
 from benchmarks import refinery_score
 from benchmarks import refinery_valves as study
@@ -17,11 +17,10 @@ from benchmarks.horch import NO_STICTION, STICTION, UNDECIDED, cross_correlation
 from benchmarks.refinery_judge import LEAST_GAIN, judge_loop
 from benchmarks.refinery_loops import simulate_loop
 from benchmarks.refinery_score import LoopScore
+from benchmarks.study import RESULTS
 from valveflow_ros.errors import DataError
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get('NUMBA_DISABLE_JIT') == '1', reason='loops of hours need the compiled kernels'
-)
+pytestmark = needs_jit
 STEP_S = 10.0
 
 
@@ -213,7 +212,7 @@ def test_measured_windows_give_what_the_result_says(shared_data: Path):
     """The recorded score is poor (see the benchmark); it is at least true, and rarely false."""
     if not (shared_data / 'refinery_valves' / 'index.csv').is_file():
         pytest.skip(f'no refinery_valves in {shared_data}')
-    told = json.loads(study.RESULT.read_text(encoding='utf-8'))['measured']
+    told = json.loads((RESULTS / 'refinery_valves.json').read_text(encoding='utf-8'))['measured']
     read = study.windows(shared_data)
     assert len(read) == len(told['windows']) == 31
     assert len({w.tag for w in read}) == len(told['valves']) == 17

@@ -113,11 +113,6 @@ class Segmenter(Memory):
         self._found = np.zeros(kernel.SEG_SIZE)
         self._number = 0
 
-    @property
-    def longest_rows(self) -> int:
-        """The most rows a segment can reach back from its close."""
-        return self._blocks.shape[1] * self._block_rows
-
     def noise(self) -> NoiseLevel:
         """Return the noise level in use now."""
         given = self._setting[kernel.NOISE_U] > 0.0 and self._setting[kernel.NOISE_Y] > 0.0

@@ -55,40 +55,37 @@ def test_the_rule_knows_no_scale(cost, factor):
     assert scaled == pytest.approx(angles, abs=1e-9)
 
 
-def test_the_first_exact_fit_is_the_turn():
-    angles, pieces = paper_rule([100.0, 20.0, 10.0, 0.0, 0.0, 0.0])
-    assert pieces == 4
-    assert angles[4] == 1.0
-    assert angles[3] == -1.0
-    assert angles[5] == -1.0
-    assert paper_rule([100.0, 20.0, 10.0, 1e-9, 1e-10, 1e-12], exact=1e-6)[1] == 4
+@pytest.mark.parametrize(
+    ('cost', 'exact', 'pieces', 'known'),
+    [
+        ([100.0, 20.0, 10.0, 0.0, 0.0, 0.0], 0.0, 4, {3: -1.0, 4: 1.0, 5: -1.0}),
+        ([100.0, 20.0, 10.0, 1e-9, 1e-10, 1e-12], 1e-6, 4, {}),
+        ([100.0, 20.0, 10.0, 0.0], 0.0, 2, {3: -1.0}),  # an exact fit at the end is no turn
+        ([27.0, 9.0, 9.0, 3.0, 3.0], 0.0, 2, {}),  # of equal turns the fewest pieces win
+    ],
+)
+def test_the_first_exact_fit_is_the_turn(cost, exact, pieces, known):
+    angles, found = paper_rule(cost, exact=exact)
+    assert found == pieces
+    assert angles.items() >= known.items()
 
 
-def test_an_exact_fit_at_the_end_is_not_answered():
-    angles, pieces = paper_rule([100.0, 20.0, 10.0, 0.0])
-    assert pieces == 2
-    assert angles[3] == -1.0
-
-
-def test_of_equal_turns_the_fewest_pieces_win():
-    assert paper_rule([27.0, 9.0, 9.0, 3.0, 3.0])[1] == 2
-
-
-@pytest.mark.parametrize('cost', [[], [1.0], [2.0, 1.0]])
-def test_two_costs_have_no_turn(cost):
-    with pytest.raises(DataError, match=f'there are costs for {len(cost)}'):
+@pytest.mark.parametrize(
+    ('cost', 'words'),
+    [
+        *((cost, f'there are costs for {len(cost)}') for cost in ([], [1.0], [2.0, 1.0])),
+        *(([3.0, bad, 1.0], 'finite and not negative') for bad in (math.nan, math.inf, -1.0)),
+    ],
+)
+def test_costs_without_a_turn_are_refused(cost, words):
+    with pytest.raises(DataError, match=words):
         paper_rule(cost)
-
-
-@pytest.mark.parametrize('bad', [math.nan, math.inf, -1.0])
-def test_costs_must_be_numbers(bad):
-    with pytest.raises(DataError, match='finite and not negative'):
-        paper_rule([3.0, bad, 1.0])
 
 
 def test_the_paper_s_curve_has_four_pieces():
     u, y = samples('noiseless', N)
     found = partition(u, y + np.random.default_rng(6).normal(0, 0.5, N))
+    assert select(partition(u, y)).pieces == 4
     selection = select(found)
     assert selection.pieces == 4
     assert selection.note == ''
@@ -123,11 +120,6 @@ def test_an_exact_line_is_one_piece(y):
     selection = select(partition(u, y(u)))
     assert selection.pieces == 1
     assert selection.note == 'One line fits exactly.'
-
-
-def test_an_exact_curve_has_its_own_number_of_pieces():
-    u, y = samples('noiseless', N)
-    assert select(partition(u, y)).pieces == 4
 
 
 def test_correlation_makes_chance_larger():

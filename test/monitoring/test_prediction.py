@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 import pytest
+from curves import DYNAMICS, curve
 from hypothesis import given
 from hypothesis import strategies as st
 from naive_stream import naive_curve, naive_respond
 from streams import START_NS, blocks_of, cuts, examples, frozen, grid_ns, steps_and_ramps
-from test_characteristic import DYNAMICS, curve
 
 from valveflow_ros.monitoring.prediction import PredictionState, Predictor, no_prediction
 from valveflow_ros.records import NS_PER_S
@@ -158,53 +158,6 @@ def test_bad_rows_poison_nothing_after_the_settling(seed, harms):
     assert np.isfinite(here.average_mw[-1])
 
 
-def test_rows_missing_without_a_trace_are_a_gap():
-    """Nobody sends rows in an outage: only the times tell."""
-    n = 400
-    time_ns = grid_ns(n)
-    time_ns[200:] += 3600 * NS_PER_S
-    u = np.where(np.arange(n) < 200, 1100.0, 1800.0)
-    c = paper()
-    power = c(u)
-    kinds = np.full(n, SETTLED_STEADY, dtype=np.uint8)
-    block = predictor(c).predict(time_ns, u, power, kinds)
-    assert np.isnan(block.residual_mw[200 : 200 + SETTLE]).all()
-    scored = np.isfinite(block.residual_mw)
-    assert scored[SETTLE:200].all()
-    assert scored[200 + SETTLE :].all()
-    assert np.abs(block.residual_mw[scored]).max() < 1e-9
-
-
-def test_a_plant_that_is_the_model_has_no_residual():
-    c = paper()
-    rng = np.random.default_rng(0)
-    u = 1475.0 + 400.0 * np.sin(np.arange(600) / 40.0) + rng.normal(0.0, 3.0, 600)
-    power, _ = c.model.respond(u, np.ones(600, dtype=np.uint8), 1.0, 0.0)
-    block = predictor(c).predict(grid_ns(600), u, power, np.zeros(600, dtype=np.uint8))
-    assert np.nanmax(np.abs(block.residual_mw)) < 1e-9
-    assert np.abs(block.average_mw[-1]) < 1e-9
-
-
-@examples(20)
-@given(st.integers(0, 2**32 - 1), st.floats(-20.0, 20.0))
-def test_a_constant_error_of_the_power_is_the_residual(seed, error):
-    rows = rows_of(seed, [])
-    here = predictor(paper()).predict(*rows)
-    there = predictor(paper()).predict(rows[0], rows[1], rows[2] + error, rows[3])
-    assert there.residual_mw == pytest.approx(here.residual_mw + error, abs=1e-9, nan_ok=True)
-    assert np.array_equal(there.dynamic_mw, here.dynamic_mw, equal_nan=True)
-
-
-def test_the_mean_of_a_constant_residual_rises_to_it_with_its_time_constant():
-    c = paper(dynamic=False)
-    n = 200
-    u = np.full(n, 1400.0)
-    kinds = np.full(n, SETTLED_STEADY, dtype=np.uint8)
-    block = predictor(c).predict(grid_ns(n), u, c(u) + 5.0, kinds)
-    expected = 5.0 * (1.0 - np.exp(-np.arange(1, n + 1) / AVERAGE))
-    assert block.average_mw == pytest.approx(expected, rel=1e-9)
-
-
 def test_warmed_up_it_goes_on_as_if_it_had_always_run():
     c = paper()
     rows = rows_of(5, [])
@@ -232,15 +185,6 @@ def test_without_a_curve_rows_are_unknown_or_bad():
         assert np.isnan(getattr(block, name)).all()
     assert math.isnan(block.width_mw)
     assert block.model_id == ''
-
-
-@pytest.mark.parametrize('n', [0, 1])
-def test_hardly_any_rows(n):
-    block = predictor(paper()).predict(
-        grid_ns(n), np.full(n, 1400.0), np.full(n, 200.0), np.ones(n, dtype=np.uint8)
-    )
-    assert len(block) == n
-    assert np.isnan(block.residual_mw).all()
 
 
 def test_read_only_and_single_precision_columns():

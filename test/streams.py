@@ -111,6 +111,10 @@ def frozen(thing):
     return thing
 
 
+def of_type(events, kind):
+    return [e for e in events if isinstance(e, kind)]
+
+
 @dataclasses.dataclass
 class Story:
     """Events in a form that does not show how the stream was cut.

@@ -158,21 +158,16 @@ def test_every_block_gives_what_the_slow_truth_gives(seed, n, harms, block, give
         if given_noise or len(slow.stretches):
             noise = fast.noise()
             assert (noise.input, noise.power_mw) == pytest.approx(slow.noise(), rel=1e-9)
+            assert given_noise or noise.learnt == (len(slow.stretches) >= 4)
 
 
-def test_noise_learnt_from_the_data_is_what_the_slow_truth_learns():
-    settings = Settings({**QUICK, 'input_noise': 0.0, 'power_noise': 0.0})
-    stream = plant(3, 700, hold=(100, 200))
-    fast, slow = Segmenter(settings), NaiveSegmenter(settings)
-    assert not fast.noise().learnt
-    for start, end in blocks_of(700, list(range(0, 700, 21))):
-        fast.feed(*stream.part(start, end))
-        slow.feed(*stream.part(start, end))
-        assert fast.noise().learnt == (len(slow.stretches) >= 4)
-        if slow.stretches:
-            assert fast.noise().input == pytest.approx(slow.noise()[0], rel=1e-9)
-    assert fast.noise().input == pytest.approx(0.5, rel=0.3)
-    assert fast.noise().power_mw == pytest.approx(0.15, rel=0.3)
+def test_noise_is_learnt_from_the_data():
+    segmenter = Segmenter(Settings({**QUICK, 'input_noise': 0.0, 'power_noise': 0.0}))
+    assert not segmenter.noise().learnt
+    segmenter.feed(*plant(3, 700, hold=(100, 200)).part(0, 700))
+    noise = segmenter.noise()
+    assert noise.learnt
+    assert (noise.input, noise.power_mw) == pytest.approx((0.5, 0.15), rel=0.3)
 
 
 @examples(40)
@@ -194,22 +189,6 @@ def test_any_cutting_gives_the_same_bits(seed, harms, data):
                 break
     assert kinds == expected.kinds.tolist()
     assert [frozen(f) for f in found] == [frozen(f) for f in expected.found]
-
-
-@examples(30)
-@given(st.integers(0, 2**32 - 1), harm)
-def test_segments_lie_apart_inside_the_rows_and_on_good_data_only(seed, harms):
-    stream = harmed(plant(seed, 600), harms)
-    out, segmenter = whole(Settings(QUICK), stream)
-    usable = np.isfinite(stream.u) & np.isfinite(stream.power)
-    steps = np.diff(stream.time_ns)
-    last_end = 0
-    for row, f in out.found:
-        assert last_end <= f.first_row < f.end_row <= row <= 600
-        assert row - f.first_row <= segmenter.longest_rows
-        assert usable[f.first_row : f.end_row].all()
-        assert (steps[f.first_row : f.end_row - 1] == NS_PER_S).all()
-        last_end = f.end_row
 
 
 @examples(30)
@@ -398,21 +377,17 @@ def test_steady_segments_of_the_simulated_plant_tell_its_true_curve(seed):
     assert abs(measured.mean()) < 4.0 * measured.std() / np.sqrt(len(measured))
 
 
-def test_a_ramp_too_short_for_the_transient_gives_no_slope_segment():
-    rng = np.random.default_rng(1)
-    u, power = hold_ramp_hold(rng, 8000, 4000, 1.0, 300, noise=2.0)
-    out, _ = whole(Settings(), Stream(grid_ns(8000), u, power, np.full(8000, 540.0)))
-    assert out.found
-    assert all(f.segment.kind == SegmentKind.STEADY for _, f in out.found)
-
-
-def test_kinds_say_slope_on_a_long_ramp_and_steady_on_a_hold():
-    rng = np.random.default_rng(2)
-    u, power = hold_ramp_hold(rng, 9000, 4000, 1.0, 1500, noise=2.0)
+@pytest.mark.parametrize('length', [300, 1500])
+def test_kinds_say_slope_on_a_ramp_longer_than_the_transient_and_steady_on_a_hold(length):
+    u, power = hold_ramp_hold(np.random.default_rng(2), 9000, 4000, 1.0, length, noise=2.0)
     out, _ = whole(Settings(), Stream(grid_ns(9000), u, power, np.full(9000, 540.0)))
-    assert (out.kinds[4600:5400] == SETTLED_SLOPE).mean() > 0.95
     assert (out.kinds[3000:3900] == SETTLED_STEADY).mean() > 0.95
     assert (out.kinds[4100:4390] == TRANSIENT).all()
+    kinds = {kind for *_, kind in spans(out.found)}
+    if length == 1500:
+        assert (out.kinds[4600:5400] == SETTLED_SLOPE).mean() > 0.95
+    else:
+        assert kinds == {SegmentKind.STEADY}
 
 
 @pytest.mark.parametrize('extra', range(-3, 4))
@@ -433,17 +408,6 @@ def test_a_gap_right_where_the_longest_segment_is_cut_is_still_a_gap(extra, how)
     assert (out.kinds[first : first + SETTLE - 1] == TRANSIENT).all()
     assert not [s for s in spans(out.found) if first <= s[0] < first + SETTLE]
     assert [s for s in spans(out.found) if s[0] >= first + SETTLE]
-
-
-@pytest.mark.parametrize('at', [41, 42, 43, 84])
-def test_a_gap_while_the_noise_is_learnt_starts_its_stretch_anew(at):
-    settings = Settings({**QUICK, 'input_noise': 0.0, 'power_noise': 0.0})
-    stream = plant(1, 400)
-    stream.time_ns[at:] += 600 * NS_PER_S
-    fast, slow = Segmenter(settings), NaiveSegmenter(settings)
-    fast.feed(*stream.part(0, 400))
-    slow.feed(*stream.part(0, 400))
-    assert fast.noise().input == pytest.approx(slow.noise()[0], rel=1e-9)
 
 
 def test_a_longer_hold_is_cut_and_goes_on_without_a_transient():
@@ -467,26 +431,16 @@ def test_nothing_and_one_row():
     assert out.found == []
 
 
-@pytest.mark.parametrize('offset', [0.0, 1e6, -1e6])
-def test_a_valve_that_never_moves_is_steady_with_no_slope(offset):
-    rng = np.random.default_rng(0)
+@pytest.mark.parametrize(('u', 'noise'), [(1500.0, 0.3), (1e6, 0.3), (-1e6, 0.3), (0.0, 0.0)])
+def test_a_valve_that_never_moves_is_steady_with_no_slope(u, noise):
     n = 8000
-    stream = Stream(grid_ns(n), np.full(n, 1500.0 + offset), 200.0 + rng.normal(0, 0.3, n),
-                    np.full(n, 540.0))  # fmt: skip
-    out, _ = whole(Settings(), stream)
+    power = noise * (600.0 + np.random.default_rng(0).normal(0.0, 1.0, n))
+    out, _ = whole(Settings(), Stream(grid_ns(n), np.full(n, u), power, np.full(n, 540.0)))
     assert out.found
     for _, f in out.found:
         assert f.segment.kind == SegmentKind.STEADY
-        assert f.segment.u_start == f.segment.u_end == 1500.0 + offset
+        assert f.segment.u_start == f.segment.u_end == u
         assert f.segment.u_rms == 0.0
-
-
-def test_everything_constant_gives_steady_segments_with_finite_numbers():
-    n = 8000
-    stream = Stream(grid_ns(n), np.zeros(n), np.zeros(n), np.zeros(n))
-    out, _ = whole(Settings(), stream)
-    assert out.found
-    for _, f in out.found:
         assert all(math.isfinite(v) for v in dataclasses.asdict(f.segment).values())
 
 

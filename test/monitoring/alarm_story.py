@@ -1,13 +1,105 @@
-"""The life of one alarm as a story, row by row, in obvious steps: the slow truth of the alarms."""
+"""Alarms made, fed and operated; and the life of one in obvious steps, the slow truth of them."""
 
 from __future__ import annotations
 
 import re
 
+import numpy as np
 from naive_stream import NaiveAlarm
+from streams import START_NS, grid_ns
+
+from valveflow_ros.curve.shift import PieceShift, Shift
+from valveflow_ros.monitoring.alarm import AlarmAction
+from valveflow_ros.monitoring.alarms import Alarms, Judged, ResidualAlarm, ShiftAlarm
+from valveflow_ros.parameters import Settings
+from valveflow_ros.state import from_bytes, to_bytes
 
 S = 10**9
 DAY = 86_400 * S
+# As nervous as it can be set.
+NERVOUS = {'alarm_on_delay': 0.0, 'alarm_off_delay': 0.0, 'alarm_dead_band': 0.0}
+
+
+def fed(alarm, shares, start_s=0, beside=()):
+    """Let the alarm judge these shares of its limit of 3 MW, a row each second."""
+    time_ns = grid_ns(len(shares), start_ns=START_NS + start_s * S)
+    shares = np.asarray(shares, dtype=np.float64)
+    return alarm.feed(time_ns, shares, 3.0 * shares, 'm', beside)
+
+
+def restored(alarm, settings):
+    """Return another alarm of this kind that goes on where this one is, by way of bytes."""
+    other = type(alarm)(settings)
+    other.restore(from_bytes(to_bytes(alarm.snapshot())))
+    return other
+
+
+def lived(settings, *steps):
+    """Return a residual alarm after these steps, and what it told as (row, change).
+
+    A step is rows ``(share, count)``, where several shares take turns; what an operator
+    does; seconds that the clock leaps; new settings; or ``restore``.
+    """
+    settings = Settings(settings)
+    alarm, told, row, second = ResidualAlarm(settings), [], 0, 0
+    for step in steps:
+        if step == 'restore':
+            alarm = restored(alarm, settings)
+        elif isinstance(step, str):
+            now_ns = START_NS + max(second - 1, 0) * S
+            told += [(row, c) for c in alarm.operate(AlarmAction(step), now_ns, 'm')[1]]
+        elif isinstance(step, int):
+            second += step
+        elif isinstance(step, dict):
+            settings = settings.changed(step)
+            alarm.configure(settings)
+        else:
+            shares = np.resize(step[0], step[1])
+            told += [(row + k, c) for k, c in fed(alarm, shares, second)]
+            row, second = row + len(shares), second + len(shares)
+    return alarm, told
+
+
+def judgement(by_mw, p_value=1e-6):
+    """Return the judgement of one piece that moved by so much."""
+    moved = p_value < 1e-3 and abs(by_mw) >= 0.3
+    piece = PieceShift(1e3, 1.2e3, by_mw, by_mw, by_mw, 0.1, np.nan, np.nan, 200.0, p_value,
+                       moved, 0.4)  # fmt: skip
+    return Shift('then', 'now', START_NS, START_NS, (piece,), 0, 0, 0, f'By {by_mw} MW.')
+
+
+class Desk:
+    """Both alarms in one list, and what they told."""
+
+    def __init__(self, settings):
+        self.settings = settings
+        self.residual, self.shift = ResidualAlarm(settings), ShiftAlarm(settings)
+        self.alarms = Alarms(self.residual, self.shift)
+        self.told = []
+
+    def _tell(self, changes):
+        self.told += changes
+        return changes
+
+    def rows(self, shares, start_s):
+        return self._tell([c for _, c in fed(self.residual, shares, start_s, [self.shift])])
+
+    def judge(self, by_mw, second=0):
+        now_ns = START_NS + second * S
+        return self._tell(self.shift.judge(judgement(by_mw), now_ns, self.settings))
+
+    def press(self, act, second=0):
+        judged = Judged(START_NS + second * S, 0.0, 0.0)
+        return self._tell(self.alarms.operate(AlarmAction(act), judged, 'm'))
+
+    def taken_up(self):
+        """Return the desk as a new process restores it."""
+        other = Desk(self.settings)
+        other.residual = restored(self.residual, self.settings)
+        other.shift = restored(self.shift, self.settings)
+        other.alarms = Alarms(other.residual, other.shift)
+        other.told = self.told
+        return other
 
 
 def held_in(change):

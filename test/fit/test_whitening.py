@@ -11,7 +11,15 @@ from scipy.signal import lfilter
 from streams import examples, needs_jit
 
 from valveflow_ros.curve.regional_model import lagged_products
-from valveflow_ros.fit.whitening import ORDER, fit_ar, inflation, whitened, yule_walker
+from valveflow_ros.fit.kernels import square_sum
+from valveflow_ros.fit.whitening import (
+    ORDER,
+    fit_ar,
+    inflation,
+    normal_equations,
+    whitened,
+    yule_walker,
+)
 from valveflow_ros.numerics import running_average
 
 seeds = st.integers(0, 2**32 - 1)
@@ -63,16 +71,6 @@ def test_whitening_is_the_filter_where_the_history_is_complete(seed, n, columns)
         assert got == pytest.approx(np.array(expected), abs=1e-12)
 
 
-@examples(20)
-@given(seeds, st.floats(-5.0, 5.0))
-def test_whitening_is_linear(seed, factor):
-    rng = np.random.default_rng(seed)
-    a, b, w = rng.normal(0, 1, 100), rng.normal(0, 1, 100), weights(rng, 100)
-    ar = np.array([0.5, -0.2, 0.1, 0.0])
-    both = whitened(a + factor * b, w, ar)
-    assert both == pytest.approx(whitened(a, w, ar) + factor * whitened(b, w, ar), abs=1e-9)
-
-
 @needs_jit
 @pytest.mark.parametrize('true', [[0.7], [0.5, 0.3], [0.6, -0.3, 0.2, 0.1], [0.0]])
 def test_the_coefficients_are_found_and_the_rest_is_white(true):
@@ -108,28 +106,16 @@ def test_white_noise_is_not_inflated_and_correlated_noise_as_theory_says():
     assert inflation(coloured(rng, 60_000, [-0.5]), w, 100) == 1.0
 
 
-@pytest.mark.parametrize('value', [0.0, 3.0])
-def test_a_residual_that_does_not_vary_gives_finite_numbers(value):
-    x, w = np.full(100, value), np.ones(100, dtype=np.uint8)
+@pytest.mark.parametrize('n', [0, 1, 4, 5, 100])
+@pytest.mark.parametrize(('value', 'weight'), [(0.0, 1), (3.0, 1), (3.0, 0)])
+def test_a_residual_without_information_gives_finite_numbers(n, value, weight):
+    x, w = np.full(n, value), np.full(n, weight, dtype=np.uint8)
     ar = fit_ar(x, w)
     assert np.isfinite(ar).all()
-    assert np.isfinite(whitened(x, w, ar)).all()
-    assert math.isfinite(inflation(x, w, 20))
-
-
-@pytest.mark.parametrize('n', [0, 1, 4, 5])
-def test_hardly_any_rows(n):
-    x, w = np.ones(n), np.ones(n, dtype=np.uint8)
-    assert np.isfinite(fit_ar(x, w)).all()
-    assert len(whitened(x, w, np.zeros(ORDER))) == max(0, n - ORDER)
-    assert inflation(x, w, 3) >= 1.0
-
-
-def test_no_weight_at_all():
-    x, w = np.arange(50.0), np.zeros(50, dtype=np.uint8)
-    assert not fit_ar(x, w).any()
-    assert len(whitened(x, w, np.zeros(ORDER))) == 0
-    assert inflation(x, w, 10) == 1.0
+    left = whitened(x, w, ar)
+    assert np.isfinite(left).all()
+    assert len(left) == weight * max(0, n - ORDER)
+    assert 1.0 <= inflation(x, w, min(20, n + 1)) < math.inf
 
 
 @examples(40)
@@ -147,3 +133,28 @@ def test_a_running_average_is_the_filter_of_first_order(seed, n, forget):
     x = np.random.default_rng(seed).normal(0.0, 1.0, n)
     expected = lfilter([1.0 - forget], [1.0, -forget], x)
     assert running_average(x, forget) == pytest.approx(expected, abs=1e-12)
+
+
+@examples(40)
+@given(seeds, st.integers(0, 60), st.integers(1, 4), st.integers(0, 5), st.integers(1, 7))
+def test_normal_equations_are_the_products_of_whitened_columns(seed, rows, columns, order, blocks):
+    rng = np.random.default_rng(seed)
+    table = rng.normal(0.0, 1.0, (rows, columns))
+    residual = rng.normal(0.0, 1.0, rows)
+    weight = (rng.random(rows) < 0.9).astype(np.uint8)
+    ar = rng.normal(0.0, 0.3, order)
+    sums, scores, count = normal_equations(table, residual, weight, ar, blocks)
+    both = whitened(np.column_stack([table, residual]), weight, ar)
+    assert count == len(both)
+    assert sums == pytest.approx(both.T @ both, abs=1e-9)
+    assert scores.shape == (blocks, columns)
+    assert scores.sum(axis=0) == pytest.approx(sums[:-1, -1], abs=1e-9)
+    assert square_sum(residual, weight, ar) == pytest.approx(sums[-1, -1], abs=1e-9)
+
+
+def test_a_block_of_scores_holds_the_rows_of_its_time():
+    residual = np.arange(12.0)
+    weight = np.ones(12, dtype=np.uint8)
+    table = np.ones((12, 1))
+    _, scores, _ = normal_equations(table, residual, weight, np.empty(0), 3)
+    assert scores[:, 0].tolist() == [0 + 1 + 2 + 3, 4 + 5 + 6 + 7, 8 + 9 + 10 + 11]

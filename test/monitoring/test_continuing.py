@@ -25,8 +25,7 @@ from valveflow_ros.monitoring.events import FitRequested
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import CLOCK_BACK, feed_rows
 from valveflow_ros.parameters import Settings
-from valveflow_ros.records import NS_PER_S, Readings, table_to_readings
-from valveflow_ros.signals.align import Aligner
+from valveflow_ros.records import NS_PER_S
 from valveflow_ros.state import from_bytes, to_bytes
 
 SETTINGS = Settings(QUICK_MONITOR)
@@ -102,21 +101,6 @@ def test_a_clock_that_flaps_asks_no_more_fits_than_one_that_stands():
     assert [e for e in events if isinstance(e, FitRequested)]
 
 
-@examples(15)
-@given(seeds, table_harms(N), st.integers(0, 5 * N))
-def test_an_aligner_taken_up_again_closes_the_same_rows(seed, harms, cut):
-    readings = table_to_readings(plant_table(seed, N, harms))
-    cut = min(cut, len(readings))
-    expected = Aligner(SETTINGS).feed(readings)
-    first = Aligner(SETTINGS)
-    before = first.feed(readings.part(0, cut))
-    after = again(first, Aligner(SETTINGS)).feed(readings.part(cut, len(readings)))
-    times = np.concatenate([before.table.time_ns, after.table.time_ns])
-    values = np.concatenate([before.table.values, after.table.values])
-    np.testing.assert_array_equal(times, expected.table.time_ns)
-    np.testing.assert_array_equal(values, expected.table.values)
-
-
 def test_taking_a_snapshot_changes_nothing_and_it_does_not_change_any_more():
     table = plant_table(5, N)
     monitor = Monitor(SETTINGS)
@@ -136,8 +120,7 @@ def test_a_state_of_other_settings_is_refused():
         other.restore(monitor.snapshot())
 
 
-def test_an_empty_aligner_and_monitor_have_a_state_too():
-    assert len(again(Aligner(SETTINGS), Aligner(SETTINGS)).feed(Readings.of([])).table) == 0
+def test_an_empty_monitor_has_a_state_too():
     monitor = again(Monitor(SETTINGS), Monitor(SETTINGS))
     assert monitor.rows == 0
     assert story(feed_rows(monitor, plant_table(2, 50))) == story(

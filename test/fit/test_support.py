@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
+from curves import curve
 from hypothesis import given
 from hypothesis import strategies as st
 from streams import examples, grid_ns
-from test_characteristic import curve
 
 from valveflow_ros.curve.characteristic import Piece
 from valveflow_ros.curve.characteristic_json import from_json, to_json
-from valveflow_ros.errors import DataError
-from valveflow_ros.fit.fit import fit
 from valveflow_ros.fit.result import support_of, with_support
-from valveflow_ros.fit.task import FitTask
-from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.segments.window import WindowContents
 
@@ -108,6 +105,11 @@ def test_a_piece_without_data_of_its_own_is_marked_and_says_what_would_help():
     assert 'an hour at u 1720 (' in second
     assert third.startswith('Piece 3 (u 1800 to 2200) rests on no special sample: ')
     assert 'an hour each at u 1880 (' in third
+    touched = contents((1000.0, 1408.0, SLOPE))
+    (*_, said) = with_support(curve([1000.0, 1400.0, 1800.0], [0.2, 0.1]), touched, NOISE).notes
+    assert re.search(r'rests on no special segment, only on \d+ samples? at their ends', said), (
+        said
+    )
     everywhere = contents(*[(u, u + 90.0, SLOPE) for u in range(1000, 2200, 100)])
     assert with_support(found, everywhere, NOISE).notes == found.notes
 
@@ -127,27 +129,3 @@ def test_what_pieces_rest_on_and_the_confidence_survive_json():
     plain = from_json(raw)
     assert plain.support == ()
     assert plain.choice.confidence == {}
-
-
-@pytest.mark.parametrize('jitter', [0.0, 0.005])
-def test_a_valve_that_stands_still_has_no_characteristic(jitter):
-    """The pressure moves u, and the power with it, but that is no property of the valve."""
-    r = np.random.default_rng(3)
-    n, hold = 3000, 60
-    pressure = np.repeat(r.uniform(10.0, 16.0, n // hold), hold)
-    opening = 80.0 + jitter * r.normal(size=n)
-    u = opening * pressure**1.125
-    power = 0.15 * u + 20.0 + 0.3 * r.normal(size=n)
-    spans = np.array([[k + 15, k + hold, STEADY] for k in range(0, n, hold)])
-    window = WindowContents(grid_ns(n), u, power, np.full(n, 540.0), spans, opening)
-    settings = Settings({'refine': False, 'selection_rule': 'paper', 'min_fit_samples': 100})
-    with pytest.raises(DataError, match=r'The valve did not move: .* transmitter'):
-        fit(FitTask(0, window, settings, NOISE, 0.3))
-    moving = 80.0 + 10.0 * np.repeat(r.uniform(-1.0, 1.0, n // hold), hold)
-    u = moving * pressure**1.125
-    power = 0.15 * u + 20.0 + 0.3 * r.normal(size=n)
-    window = dataclasses.replace(window, u=u, power_mw=power, opening_percent=moving)
-    found = fit(FitTask(0, window, settings, NOISE, 0.3))
-    assert len(found.pieces) == 1
-    assert found.choice.rule == 'paper'
-    assert found.support[0].identifiable
