@@ -13,6 +13,8 @@ from valveflow_ros.numerics import gram
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
 _MOST_BLOCKS = 60
+# Directions of the scaled normal matrix below this are rounding, some of them negative.
+_SINGULAR = 1e-12
 _LEAST_IN_BLOCK_S = 500.0
 # The answer is not smooth in a level: half this many MW to both sides average over what lies near.
 _LEVEL_STEP_MW = 2.0
@@ -64,7 +66,7 @@ def covariance_of(
     used = np.flatnonzero(np.append(moved, True))
     sums, scores = sums[np.ix_(used, used)], np.ascontiguousarray(scores[:, moved])
     scale = np.sqrt(np.maximum(np.diag(sums)[:-1], 1e-300))
-    inverse = np.linalg.pinv(sums[:-1, :-1] / np.outer(scale, scale), hermitian=True)
+    inverse = np.linalg.pinv(sums[:-1, :-1] / np.outer(scale, scale), _SINGULAR, hermitian=True)
     inverse = inverse / np.outer(scale, scale)
     variance = float(sums[-1, -1]) / max(rows - len(inverse), 1)
     robust = inverse @ gram(scores) @ inverse
