@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from valveflow_ros.errors import DataError
 
 State = dict[str, Any]
-_LARGEST = 2**64  # times are nanoseconds in 64 bits, and nothing counts further
+_LARGEST = 2**128  # a generator of random numbers has as many bits, and nothing has more
 
 
 class Memory:
