@@ -43,7 +43,9 @@ def explained(data: Identified) -> float:
 
 
 def doubt(data: Identified) -> str:
-    """Return a warning where the curve explains so little that it is none; empty otherwise."""
+    """Return a warning where the curve is none, or of the wrong form; empty otherwise."""
+    if data.wrong_form is not None:
+        return data.wrong_form.sentence
     share = explained(data)
     if not share < _LITTLE:
         return ''

@@ -9,6 +9,7 @@ import numpy as np
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.shift import Shift
+from valveflow_ros.fit.model_form import ModelForm
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
     FloatArray,
@@ -43,6 +44,8 @@ class Identified:
     shift : Shift, optional
         The judgement against ``reference``, where there was one.
     reference : Characteristic, optional
+    wrong_form : ModelForm, optional
+        Where the power follows another form than that of the curve.
     history : History, optional
         What a monitor published meanwhile, where the log is its recording.
     u : float64 (n,)
@@ -62,6 +65,7 @@ class Identified:
     notes: tuple[str, ...] = ()
     shift: Shift | None = None
     reference: Characteristic | None = None
+    wrong_form: ModelForm | None = None
     history: History | None = None
     u: FloatArray = field(init=False)
     rows: IntArray = field(init=False)
