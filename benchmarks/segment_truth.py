@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from valveflow_ros.parameters import Settings
-from valveflow_ros.plant.plant import Pulses, Source, generator
+from valveflow_ros.plant.plant import ChanceSource, Pulses, generator
 from valveflow_ros.plant.simulator import WARM_UP_S, SimulatedLog
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import SegmentKind
@@ -52,7 +52,7 @@ def true_stretches(
     times_s = WARM_UP_S + np.arange(n) * step_s
     # Drawn for longer than the run, which changes nothing before its end.
     length_s = WARM_UP_S + n * step_s + 86400.0
-    pulses = Pulses.draw(generator(seed, Source.PULSES), length_s, unit.programme)
+    pulses = Pulses.draw(generator(seed, ChanceSource.PULSES), length_s, unit.programme)
     pulsed = pulses.at(times_s) != 0.0
     driven = wanted_input(unit, log.load_mw) if knees else log.load_mw
     rate = np.diff(driven, append=np.nan) / step_s

@@ -11,10 +11,10 @@ from streams import steps_and_ramps
 from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
+    FittedData,
     Piece,
     RegionDynamics,
     ResidualStatistics,
-    Source,
 )
 from valveflow_ros.curve.regional_model import RegionalModel
 
@@ -38,7 +38,7 @@ def curve(knots, slopes, jumps=None, start=0.0, stderr=0.01, samples=100, **more
         'pieces': tuple(pieces),
         'breakpoint_intervals': tuple((p.u_from - 5.0, NAN) for p in pieces[1:]),
         'choice': Choice('paper', {j: 3.0 / j for j in many}, dict.fromkeys(many, 0.5), 'why'),
-        'source': Source(10, 20, 3, 4, 500, 539.5, 2.5, False),
+        'source': FittedData(10, 20, 3, 4, 500, 539.5, 2.5, False),
         'residuals': ResidualStatistics(2.5, 0.4, 300.0, 0.7, 0.3),
         'partition_pieces': tuple(pieces),
         'notes': ('one', 'two'),

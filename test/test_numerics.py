@@ -5,7 +5,7 @@ import threading
 import pytest
 
 from valveflow_ros import numerics
-from valveflow_ros.numerics import ahead, share
+from valveflow_ros.numerics import read_ahead, run_in_threads
 
 
 @pytest.fixture(params=[1, 2, 4])
@@ -31,12 +31,12 @@ def numbers(n, seen, wrong_at=None):
 
 def test_items_made_ahead_are_the_same_in_the_same_order(on_cores):
     seen = []
-    assert list(ahead(numbers(50, seen))) == list(range(50))
+    assert list(read_ahead(numbers(50, seen))) == list(range(50))
     assert (threading.current_thread() in seen) == (on_cores == 1)
 
 
 def test_an_error_comes_behind_what_was_made_before_it(on_cores):
-    items = ahead(numbers(50, [], wrong_at=5))
+    items = read_ahead(numbers(50, [], wrong_at=5))
     assert [next(items) for _ in range(5)] == [0, 1, 2, 3, 4]
     with pytest.raises(ValueError, match='number 5'):
         next(items)
@@ -45,7 +45,7 @@ def test_an_error_comes_behind_what_was_made_before_it(on_cores):
 def test_no_more_is_made_ahead_than_asked_for_and_who_stops_early_ends_the_thread(on_cores):
     seen = []
     before = threading.active_count()
-    items = ahead(numbers(1000, seen), depth=3)
+    items = read_ahead(numbers(1000, seen), depth=3)
     assert [next(items) for _ in range(4)] == [0, 1, 2, 3]
     items.close()
     makers = {t for t in seen if t is not threading.current_thread()}
@@ -65,16 +65,16 @@ def test_every_task_is_done_once_whatever_the_threads():
             with lock:
                 done.append(k)
 
-        share(work, [(k,) for k in range(20)], count)
+        run_in_threads(work, [(k,) for k in range(20)], count)
         assert sorted(done) == list(range(20))
 
 
 def test_no_thread_is_started_for_which_there_is_no_task():
     names = set()
-    share(lambda: names.add(threading.current_thread()), [()], 8)
+    run_in_threads(lambda: names.add(threading.current_thread()), [()], 8)
     assert names == {threading.current_thread()}
 
 
 def test_the_error_of_a_task_is_raised():
     with pytest.raises(ValueError, match='seven'):
-        share(lambda k: int('seven') if k == 7 else None, [(k,) for k in range(9)], 3)
+        run_in_threads(lambda k: int('seven') if k == 7 else None, [(k,) for k in range(9)], 3)

@@ -76,7 +76,9 @@ def runs(count: int, length: int) -> list[tuple[int, int]]:
     return [(first, min(first + length, count)) for first in range(0, count, length)][::-1]
 
 
-def share(work: Callable[..., Any], tasks: Iterable[tuple[int, ...]], threads: int) -> None:
+def run_in_threads(
+    work: Callable[..., Any], tasks: Iterable[tuple[int, ...]], threads: int
+) -> None:
     """Call ``work(*task)`` for every task, on ``threads`` threads; 1 starts none.
 
     Unlike the compiler's own parallel loops this may happen in several places
@@ -112,7 +114,7 @@ def share(work: Callable[..., Any], tasks: Iterable[tuple[int, ...]], threads: i
         raise errors[0]
 
 
-def ahead(items: Iterator[T], depth: int = 2) -> Iterator[T]:
+def read_ahead(items: Iterator[T], depth: int = 2) -> Iterator[T]:
     """Return the same items, made in a thread while the last ones are worked on.
 
     At most ``depth`` of them wait. Where there is one core, they are made when asked for. An

@@ -9,8 +9,8 @@ import pytest
 from streams import needs_jit
 
 from valveflow_ros.baselines.comparison import (
+    ErrorOrder,
     Finding,
-    Outcome,
     Terms,
     everywhere,
     finding_of,
@@ -122,7 +122,7 @@ def test_a_baseline_that_is_better_contradicts_it(curve, data):
     pairs = pairs_on_segments(judge(trial, made), made)
     assert finding_of(pairs) is Finding.CONTRADICTED
     worse = next(p for p in pairs if p.terms is Terms.AS_PAPER)
-    assert (worse.baseline, worse.outcome) == ('hammerstein', Outcome.WORSE)
+    assert (worse.baseline, worse.outcome) == ('hammerstein', ErrorOrder.WORSE)
     # Who is better does not depend on who is called ours.
     j = judge(trial, made)
     there, back = (
@@ -143,7 +143,7 @@ def test_a_simulation_that_runs_away_counts_against_it(curve, data):
     assert j.mse('sparse.dynamic') == np.inf
     pairs = pairs_on_segments(j, made)
     pair = next(p for p in pairs if p.theirs == 'sparse.dynamic')
-    assert pair.outcome is Outcome.BETTER
+    assert pair.outcome is ErrorOrder.BETTER
     # What makes it better stands beside the verdict.
     assert pair.failed == 20
     assert 'theirs has no finite answer in 20 of 30; the others: p' in pairs_table(pairs)
@@ -159,10 +159,10 @@ def test_one_segment_without_an_answer_decides_nothing(curve, data):
     made['sparse.dynamic'][6000:6100] = np.inf
     pairs = pairs_on_segments(judge(trial, made), made)
     pair = next(p for p in pairs if p.theirs == 'sparse.dynamic')
-    assert (pair.failed, pair.judged, pair.outcome) == (1, 30, Outcome.OPEN)
+    assert (pair.failed, pair.judged, pair.outcome) == (1, 30, ErrorOrder.OPEN)
     assert finding_of(pairs) is Finding.OPEN
     rows = everywhere(trial, made)[1]
-    assert next(p for p in rows if p.baseline == 'sparse').outcome is Outcome.OPEN
+    assert next(p for p in rows if p.baseline == 'sparse').outcome is ErrorOrder.OPEN
 
 
 def test_without_dynamics_there_is_nothing_to_simulate(curve, data):

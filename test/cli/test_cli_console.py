@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from valveflow_ros.cli import command
-from valveflow_ros.cli.command import _PARTS, Console, Outcome, columns, share_of_time
+from valveflow_ros.cli.command import _PARTS, Console, VerbResult, columns, share_of_time
 
 
 class Terminal(io.StringIO):
@@ -57,7 +57,7 @@ def test_a_message_takes_the_place_of_the_bar():
     console(0.2, 'second')
     console.warn('Look here.')
     console(0.3, 'third')
-    console.finish(Outcome('done', {}))
+    console.finish(VerbResult('done', {}))
     assert shown(err.getvalue()) == ['Found something.', 'Warning: Look here.', '']
 
 
@@ -78,7 +78,9 @@ def test_quiet_keeps_warnings():
 
 
 def test_results_go_to_stdout_as_text_or_json():
-    outcome = Outcome('A text.', {'a': [1.5, float('nan'), (float('inf'), 'ü')], 'b': {'c': None}})
+    outcome = VerbResult(
+        'A text.', {'a': [1.5, float('nan'), (float('inf'), 'ü')], 'b': {'c': None}}
+    )
     for as_json, expected in ((False, 'A text.\n'), (True, None)):
         out, err = io.StringIO(), io.StringIO()
         Console(out, err, as_json=as_json).finish(outcome)
@@ -96,7 +98,7 @@ def test_nothing_of_others_commands_the_terminal(word):
         console = Console(out, err, as_json=as_json)
         for tell in (console.say, console.warn, console.fail):
             tell(f'Column {word}.')
-        console.finish(Outcome(f'Column {word}.', {word: [word]}))
+        console.finish(VerbResult(f'Column {word}.', {word: [word]}))
         told = out.getvalue() + err.getvalue()
         assert all(c in '\n\t' or unicodedata.category(c) != 'Cc' for c in told)
         assert not set(told) & set('\u2028\u2029\u202a\u202e\u2066\u2069')
@@ -106,7 +108,7 @@ def test_nothing_of_others_commands_the_terminal(word):
 
 def test_a_picture_keeps_its_colours():
     out = io.StringIO()
-    Console(out, io.StringIO()).finish(Outcome('\x1b[1mAlarms\x1b[0m', {}, drawn=True))
+    Console(out, io.StringIO()).finish(VerbResult('\x1b[1mAlarms\x1b[0m', {}, drawn=True))
     assert out.getvalue() == '\x1b[1mAlarms\x1b[0m\n'
 
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import examples
 
-from valveflow_ros.curve.characteristic import Choice, Source
+from valveflow_ros.curve.characteristic import Choice, FittedData
 from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.errors import DataError
 
@@ -158,7 +158,7 @@ def test_json_and_back_is_the_same_to_the_last_bit(c, dynamic):
 @pytest.mark.parametrize('value', [NAN, INF, -INF])
 def test_numbers_that_json_does_not_have_become_absent(value):
     c = curve([0.0, 1.0], [1.0], choice=Choice('paper', {1: value}, {1: value}),
-              source=Source(0, 1, 2, 3, 4, value, value, False))  # fmt: skip
+              source=FittedData(0, 1, 2, 3, 4, value, value, False))  # fmt: skip
     back = through_json(c)
     assert math.isnan(back.choice.cost[1])
     assert math.isnan(back.source.temperature_mean_degc)

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from streams import START_NS, examples
 
 from valveflow_ros.curve.characteristic import (
+    FittedData,
     Piece,
     RegionDynamics,
-    Source,
     curve_error,
     piece_error,
 )
@@ -36,7 +36,7 @@ def curve_of(values=VALUES, knots=KNOTS, end_ns=START_NS, name='now', stderr=STD
     slopes = np.diff(values) / np.diff(knots)
     return curve(
         knots, slopes, start=values[0], stderr=stderr, samples=1000, model_id=name,
-        source=Source(end_ns - 10 * DAY_NS, end_ns, 1, 1, 1000, 540.0, 1.0, False),
+        source=FittedData(end_ns - 10 * DAY_NS, end_ns, 1, 1, 1000, 540.0, 1.0, False),
         dynamics=(RegionDynamics(100.0, 300.0, 60.0, 5.0, 1.0, 1.0),),
     )  # fmt: skip
 

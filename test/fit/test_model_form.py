@@ -40,9 +40,7 @@ def unit(form: str, table: str, seed: int, slides: bool = True, exponent: float 
 @pytest.mark.parametrize('table', TABLES)
 @pytest.mark.parametrize('exponent', [1.0, 1.1])
 @pytest.mark.parametrize('seed', range(4))
-def test_knees_at_fixed_openings_are_found_at_sliding_pressure(
-    table, exponent, seed
-) -> None:
+def test_knees_at_fixed_openings_are_found_at_sliding_pressure(table, exponent, seed) -> None:
     v, p, y, spans = unit('opening', table, seed, exponent=exponent)
     found = find_wrong_form(v, p, y, spans, PERIOD_S)
     assert found is not None

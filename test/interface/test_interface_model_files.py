@@ -18,11 +18,11 @@ from valveflow_ros.curve.characteristic import (
     Characteristic,
     ChartDesign,
     Choice,
+    FittedData,
     HeldCause,
     Piece,
     RegionDynamics,
     ResidualStatistics,
-    Source,
     Support,
 )
 from valveflow_ros.curve.characteristic_json import to_json
@@ -47,7 +47,7 @@ CURVE = to_json(
         pieces=PIECES,
         breakpoint_intervals=((1190.0, 1210.0), (math.nan, math.nan)),
         choice=Choice('paper', {1: 9.0, 2: 3.0}, {2: 0.4}, 'why', {1: 0.1, 2: 0.9}),
-        source=Source(10**18, 2 * 10**18, 8, 3, 1380, 539.0, 2.0, False),
+        source=FittedData(10**18, 2 * 10**18, 8, 3, 1380, 539.0, 2.0, False),
         residuals=ResidualStatistics(
             2.5, 0.4, 300.0, 0.7, 0.3, 4.9,
             ChartDesign(60.0, 0.3, 0.2, (0.2, 1.0), (9.0, 3.0), 30.0),

@@ -13,9 +13,9 @@ from curves import curve
 from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
+    FittedData,
     RegionDynamics,
     ResidualStatistics,
-    Source,
 )
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
@@ -75,7 +75,7 @@ def _characteristic(table: SampleTable, segments: tuple[SpecialSegment, ...]) ->
         choice=Choice(
             'paper', {1: 9e5, 2: 2e5, 3: 1.9e5, 4: 1.85e5}, {2: 0.81, 3: 0.32}, 'A <note>.'
         ),
-        source=Source(
+        source=FittedData(
             int(table.time_ns[0]), int(table.time_ns[-1]),
             sum(s.kind == SegmentKind.STEADY for s in segments),
             sum(s.kind == SegmentKind.SLOPE for s in segments),

@@ -22,7 +22,7 @@ from valveflow_ros.ros.decoding import Row
 from valveflow_ros.ros.node.engine import LiveEngine
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
 from valveflow_ros.ros.simulator_main import effects_of
-from valveflow_ros.ros.worker import Outcome
+from valveflow_ros.ros.worker import WorkerResult
 from valveflow_ros.signals.align import Aligner
 
 SETTINGS = Settings({'refit_period': 3600.0, 'refit_segments': 0, 'alarm_on_delay': 60.0})
@@ -34,7 +34,7 @@ class SlowWorker:
 
     def __init__(self, looks: int) -> None:
         self._looks = looks
-        self._waiting: list[tuple[int, Outcome]] = []
+        self._waiting: list[tuple[int, WorkerResult]] = []
         self._look = 0
         self.refuse_next = False
 
@@ -47,10 +47,10 @@ class SlowWorker:
                 result = fit(task)  # type: ignore[arg-type]
             except DataError as error:
                 result = str(error)
-        outcome = Outcome(task.request_ns, result, 0.5)  # type: ignore[attr-defined,arg-type]
+        outcome = WorkerResult(task.request_ns, result, 0.5)  # type: ignore[attr-defined,arg-type]
         self._waiting.append((self._look + self._looks, outcome))
 
-    def poll(self) -> list[Outcome]:
+    def poll(self) -> list[WorkerResult]:
         self._look += 1
         due = [outcome for look, outcome in self._waiting if look <= self._look]
         self._waiting = [entry for entry in self._waiting if entry[0] > self._look]

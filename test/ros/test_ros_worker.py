@@ -29,7 +29,7 @@ from valveflow_ros.ros.node.engine import example_curve, example_task
 from valveflow_ros.ros.worker import (
     FIT_JOB,
     FitWorker,
-    Outcome,
+    WorkerResult,
     result_from_bytes,
     result_to_bytes,
     task_from_bytes,
@@ -53,7 +53,7 @@ def worker(job: str, timeout_s: float = 120.0) -> Iterator[FitWorker]:
         made.close()
 
 
-def outcome_of(made: FitWorker) -> Outcome:
+def outcome_of(made: FitWorker) -> WorkerResult:
     made.submit(TASK)
     (outcome,) = wait_until(made.poll, 'the outcome')
     assert outcome.request_ns == TASK.request_ns

@@ -46,7 +46,7 @@ class Terms(enum.Enum):
     ALL_ROWS = 'simulation against simulation, all rows'
 
 
-class Outcome(enum.Enum):
+class ErrorOrder(enum.Enum):
     """Which of two has the smaller squared error."""
 
     BETTER = 'better'
@@ -95,15 +95,15 @@ class Pair:
         return self.theirs.partition('.')[0]
 
     @property
-    def outcome(self) -> Outcome:
+    def outcome(self) -> ErrorOrder:
         """Return who is better at the 5 % level.
 
         Where the test tells nothing, theirs loses only if it mostly gives no answer: a few
         segments without one are no evidence about the others.
         """
         if not self.test.zero_is_rejected(_LEVEL):
-            return Outcome.BETTER if 2 * self.failed > self.judged else Outcome.OPEN
-        return Outcome.BETTER if self.test.mean > 0.0 else Outcome.WORSE
+            return ErrorOrder.BETTER if 2 * self.failed > self.judged else ErrorOrder.OPEN
+        return ErrorOrder.BETTER if self.test.mean > 0.0 else ErrorOrder.WORSE
 
 
 def pairs_on_segments(
@@ -185,10 +185,10 @@ def finding_of(pairs: Iterable[Pair]) -> Finding:
     """
     met = [(p.baseline, p.outcome) for p in pairs if p.terms is Terms.AS_PAPER]
     outcomes = {outcome for _, outcome in met}
-    if Outcome.WORSE in outcomes:
+    if ErrorOrder.WORSE in outcomes:
         return Finding.CONTRADICTED
     both = {name for name, _ in met} == set(BASELINES)
-    return Finding.CONFIRMED if both and outcomes == {Outcome.BETTER} else Finding.OPEN
+    return Finding.CONFIRMED if both and outcomes == {ErrorOrder.BETTER} else Finding.OPEN
 
 
 @dataclass(frozen=True, slots=True)

@@ -92,7 +92,7 @@ def share_of_time(verb: str, told: float, what: str) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class VerbResult:
     """What a verb has to say at its end.
 
     Attributes
@@ -154,7 +154,7 @@ class Console(Progress):
         self._line.end()
         self._line.write(_harmless(f'valveflow: {sentence}'))
 
-    def finish(self, outcome: Outcome) -> None:
+    def finish(self, outcome: VerbResult) -> None:
         """Print the result."""
         self._line.end()
         if self._as_json:
@@ -297,7 +297,7 @@ def checked_parameters(options: Namespace) -> dict[str, Any]:
 
 def write_results(
     result: Result, options: Namespace, text: str, data: Mapping[str, Any]
-) -> Outcome:
+) -> VerbResult:
     """Write the files of a result; return its text and data with what was written.
 
     Raises
@@ -308,7 +308,7 @@ def write_results(
     done = result.write(options.output, figures=options.figures, tables=options.table)
     files = {'files': {name: str(path) for name, path in done.files.items()}}
     kept = {'kept': dict(done.kept)} if done.kept else {}
-    return Outcome('\n'.join([text, *done.words]), {**data, **files, **kept})
+    return VerbResult('\n'.join([text, *done.words]), {**data, **files, **kept})
 
 
 def lines(*parts: str) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from valveflow_ros.cli.command import Console, Outcome, columns, lines
+from valveflow_ros.cli.command import Console, VerbResult, columns, lines
 from valveflow_ros.errors import DataError
 from valveflow_ros.report.terminal.text import number, whole
 
@@ -69,7 +69,7 @@ def arguments(parser: ArgumentParser) -> None:
     parser.add_argument('--overwrite', action='store_true', help='replace a table that is there')
 
 
-def run(options: Namespace, console: Console) -> Outcome:
+def run(options: Namespace, console: Console) -> VerbResult:
     """Read, invert, check, write."""
     from valveflow_ros.curve.compensation import compensate
     from valveflow_ros.interface.files import TABLES, check_output
@@ -93,7 +93,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     table = _table(made, pressures)
     _write(table, options.output)
     text = _text(made, pressures, options.tolerance, options.output)
-    return Outcome(text, _data(made, table, pressures, options.tolerance, options.output))
+    return VerbResult(text, _data(made, table, pressures, options.tolerance, options.output))
 
 
 def _check(made: Compensation, tolerance_mw: float, again: Callable[[int], Compensation]) -> None:

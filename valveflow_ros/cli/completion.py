@@ -7,7 +7,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
 from typing import Any
 
-from valveflow_ros.cli.command import Console, Outcome
+from valveflow_ros.cli.command import Console, VerbResult
 
 SHELLS = ('bash', 'zsh', 'fish')
 
@@ -30,12 +30,12 @@ def arguments(parser: ArgumentParser) -> None:
     parser.add_argument('shell', metavar='SHELL', choices=SHELLS, help='bash, zsh or fish')
 
 
-def run(options: Namespace, console: Console) -> Outcome:
+def run(options: Namespace, console: Console) -> VerbResult:
     """Print the script, which calls the command itself at each Tab."""
     from argcomplete.shell_integration import shellcode
 
     text = shellcode(['valveflow'], True, options.shell)
-    return Outcome(text, {'shell': options.shell, 'script': text})
+    return VerbResult(text, {'shell': options.shell, 'script': text})
 
 
 def complete(verbs: list[tuple[str, str]], parser_of: Callable[[str], ArgumentParser]) -> None:

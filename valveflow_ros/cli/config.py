@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from valveflow_ros.cli.command import Console, Outcome, add_mapping, mapping_of
+from valveflow_ros.cli.command import Console, VerbResult, add_mapping, mapping_of
 from valveflow_ros.errors import InputError, ParameterError, UsageError, counted
 
 _DESCRIPTION = """\
@@ -36,7 +36,7 @@ def arguments(parser: ArgumentParser) -> None:
     add_mapping(parser)
 
 
-def run(options: Namespace, console: Console) -> Outcome:
+def run(options: Namespace, console: Console) -> VerbResult:
     """Make or check a parameter file."""
     mapping = mapping_of(options)
     if options.task == 'check':
@@ -61,15 +61,15 @@ def run(options: Namespace, console: Console) -> Outcome:
         'left': list(found.left),
     }
     if options.output is None:
-        return Outcome(text, data)
+        return VerbResult(text, data)
     with whole_file(options.output) as draft:
         draft.write_text(text, encoding='utf-8')
     lines = [f'  {f.name}: {f.shown}  ({f.ground})' for f in found.values()]
     said = ['Fitted to the data:', *lines] if lines else ['Nothing differs from the defaults.']
-    return Outcome('\n'.join([*said, *found.left, f'Wrote {options.output}.']), data)
+    return VerbResult('\n'.join([*said, *found.left, f'Wrote {options.output}.']), data)
 
 
-def _checked(file: Path) -> Outcome:
+def _checked(file: Path) -> VerbResult:
     """Read a parameter file as the monitor would, and say what it changes."""
     from valveflow_ros.interface.settings import read_parameters
     from valveflow_ros.parameters import PARAMETERS, Settings
@@ -91,7 +91,7 @@ def _checked(file: Path) -> Outcome:
     for name, value in changed.items():
         unit, default = PARAMETERS[name].unit, PARAMETERS[name].default
         lines.append(f'  {name}: {_shown(value, unit)}, default {_shown(default, unit)}')
-    return Outcome('\n'.join(lines), {'file': str(file), 'good': True, 'changed': changed})
+    return VerbResult('\n'.join(lines), {'file': str(file), 'good': True, 'changed': changed})
 
 
 def _shown(value: object, unit: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from valveflow_ros.cli.command import Console, Outcome, add_mapping, mapping_of, rejected_words
+from valveflow_ros.cli.command import Console, VerbResult, add_mapping, mapping_of, rejected_words
 
 _DESCRIPTION = """\
 Write a log as a table with one row a sample: the rows the engine sees, in its units. Where a
@@ -31,7 +31,7 @@ def arguments(parser: ArgumentParser) -> None:
     parser.add_argument('--overwrite', action='store_true', help='replace a table that is there')
 
 
-def run(options: Namespace, console: Console) -> Outcome:
+def run(options: Namespace, console: Console) -> VerbResult:
     """Align and write."""
     mapping = mapping_of(options)
     from valveflow_ros.errors import DataError
@@ -72,4 +72,4 @@ def run(options: Namespace, console: Console) -> Outcome:
         'end_ns': last,
         'readings': counts,
     }
-    return Outcome(text, data)
+    return VerbResult(text, data)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from valveflow_ros.cli.command import (
     Console,
-    Outcome,
+    VerbResult,
     add_beside,
     add_mapping,
     add_parameters,
@@ -70,7 +70,7 @@ def arguments(parser: ArgumentParser) -> None:
     add_mapping(parser)
 
 
-def run(options: Namespace, console: Console) -> Outcome:
+def run(options: Namespace, console: Console) -> VerbResult:
     """Open, identify, write."""
     mapping = mapping_of(options)
     console(0.0, 'starting')

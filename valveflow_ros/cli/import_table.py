@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from valveflow_ros.cli.command import (
     Console,
-    Outcome,
     TableOption,
+    VerbResult,
     add_mapping,
     columns,
     mapping_of,
@@ -59,7 +59,7 @@ def arguments(parser: ArgumentParser) -> None:
     parser.add_argument('--overwrite', action='store_true', help='replace a log that is there')
 
 
-def run(options: Namespace, console: Console) -> Outcome:
+def run(options: Namespace, console: Console) -> VerbResult:
     """Read, convert, write, and say what was understood."""
     mapping = mapping_of(options)
     if options.output is None and not options.dry_run:
@@ -85,7 +85,7 @@ def run(options: Namespace, console: Console) -> Outcome:
         raise InputError(_refusal(refused, options)) from None
 
 
-def _imported(options: Namespace, mapping: LogMapping, console: Console) -> Outcome:
+def _imported(options: Namespace, mapping: LogMapping, console: Console) -> VerbResult:
     from valveflow_ros.interface.table_import import Spool, TableImport
 
     console(0.05, 'looking at the table')
@@ -103,7 +103,7 @@ def _imported(options: Namespace, mapping: LogMapping, console: Console) -> Outc
         finally:
             spool.close()
         last = f'Wrote {place}.'
-    return Outcome('\n'.join([*_understood(table), last]), {'log': place, **table.summary()})
+    return VerbResult('\n'.join([*_understood(table), last]), {'log': place, **table.summary()})
 
 
 def _written(options: Namespace, table: TableImport) -> Path:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from valveflow_ros.cli.command import (
     Console,
-    Outcome,
+    VerbResult,
     add_mapping,
     columns,
     lines,
@@ -41,7 +41,7 @@ def arguments(parser: ArgumentParser) -> None:
     add_mapping(parser)
 
 
-def run(options: Namespace, console: Console) -> Outcome:
+def run(options: Namespace, console: Console) -> VerbResult:
     """Read and describe."""
     mapping = mapping_of(options)
     console(0.1, 'reading')
@@ -92,7 +92,7 @@ def run(options: Namespace, console: Console) -> Outcome:
         'damaged_chunks': contents.damaged_chunks,
         'warnings': list(log.notes),
     }
-    return Outcome(_text(data, signals), data)
+    return VerbResult(_text(data, signals), data)
 
 
 def _text(data: dict[str, Any], signals: dict[str, dict[str, Any]]) -> str:

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, Protocol, cast
 
-from valveflow_ros.cli.command import Console, Outcome
+from valveflow_ros.cli.command import Console, VerbResult
 from valveflow_ros.errors import LOADING_BYTES, UsageError, ValveflowError, check_address_space
 from valveflow_ros.interface.files import check_folder, check_readable, check_writable
 
@@ -65,7 +65,7 @@ class Verb(Protocol):
     def arguments(self, parser: ArgumentParser) -> None:
         """Add description, example and options."""
 
-    def run(self, options: Namespace, console: Console) -> Outcome:
+    def run(self, options: Namespace, console: Console) -> VerbResult:
         """Do it."""
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from valveflow_ros.cli.command import Console, Outcome
+from valveflow_ros.cli.command import Console, VerbResult
 
 _DESCRIPTION = """\
 Repair a recording that a crash, a full disk or a bad sector has left: everything that is
@@ -26,7 +26,7 @@ def arguments(parser: ArgumentParser) -> None:
     )
 
 
-def run(options: Namespace, console: Console) -> Outcome:
+def run(options: Namespace, console: Console) -> VerbResult:
     """Recover and say what was kept."""
     from valveflow_ros.interface.files import check_output
     from valveflow_ros.logs.mcap.recover import recover
@@ -60,4 +60,4 @@ def run(options: Namespace, console: Console) -> Outcome:
         'bytes_written': report.bytes_written,
         'warnings': list(report.warnings),
     }
-    return Outcome(text, data)
+    return VerbResult(text, data)

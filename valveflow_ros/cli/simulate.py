@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from valveflow_ros.cli.command import Console, Outcome
+from valveflow_ros.cli.command import Console, VerbResult
 from valveflow_ros.errors import InputError, UsageError
 from valveflow_ros.interface.files import check_log
 from valveflow_ros.report.terminal.text import number, whole
@@ -53,7 +53,7 @@ def arguments(parser: ArgumentParser) -> None:
     parser.add_argument('--overwrite', action='store_true', help='replace a log that is there')
 
 
-def run(options: Namespace, console: Console) -> Outcome:
+def run(options: Namespace, console: Console) -> VerbResult:
     """Simulate and write."""
     if options.effects:
         return _catalogue()
@@ -70,10 +70,10 @@ def run(options: Namespace, console: Console) -> Outcome:
     console(0.6, 'writing')
     log = found.write(options.output, truth=options.truth, overwrite=options.overwrite)
     data = {'log': str(log), 'rows': len(found.data), **found.to_json()}
-    return Outcome(_text(found, log, options.truth), data)
+    return VerbResult(_text(found, log, options.truth), data)
 
 
-def _catalogue() -> Outcome:
+def _catalogue() -> VerbResult:
     from valveflow_ros.plant.effects import catalogue
     from valveflow_ros.plant.spec import describe
 
@@ -90,7 +90,7 @@ def _catalogue() -> Outcome:
             for e in effects
         }
     }
-    return Outcome('\n\n'.join(describe(e) for e in effects), data)
+    return VerbResult('\n\n'.join(describe(e) for e in effects), data)
 
 
 def _text(found: Simulation, written: Path, truth: Path | None) -> str:

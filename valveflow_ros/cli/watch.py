@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn
 
-from valveflow_ros.cli.command import Console, Outcome
+from valveflow_ros.cli.command import Console, VerbResult
 from valveflow_ros.errors import DataError, UsageError
 from valveflow_ros.report.terminal.text import number
 
@@ -60,7 +60,7 @@ def arguments(parser: ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def run(options: Namespace, console: Console) -> Outcome:
+def run(options: Namespace, console: Console) -> VerbResult:
     """Watch until there is nothing more to see."""
     if options.log is None:
         _watch_ros(options)
@@ -76,7 +76,7 @@ def run(options: Namespace, console: Console) -> Outcome:
     return _watch_log(options, console)
 
 
-def _watch_log(options: Namespace, console: Console) -> Outcome:
+def _watch_log(options: Namespace, console: Console) -> VerbResult:
     """Follow a recording; Ctrl-C is the usual end."""
     from valveflow_ros.interface.recording_view import LogWatch
     from valveflow_ros.report.terminal.screen import Screen
@@ -86,7 +86,7 @@ def _watch_log(options: Namespace, console: Console) -> Outcome:
         for _ in watch.read():
             console(watch.share, 'reading what was recorded so far')
         frame = watch.frame()
-        return Outcome(Screen(sys.stdout).text(frame), dataclasses.asdict(frame), drawn=True)
+        return VerbResult(Screen(sys.stdout).text(frame), dataclasses.asdict(frame), drawn=True)
     if options.json:
         raise UsageError('--json goes with --once: one picture is one object.')
     drawn_s = -options.interval
@@ -105,8 +105,8 @@ def _watch_log(options: Namespace, console: Console) -> Outcome:
                 time.sleep(options.interval)
         except KeyboardInterrupt:
             # How one stops looking.
-            return Outcome('', {})
-    return Outcome('', {})
+            return VerbResult('', {})
+    return VerbResult('', {})
 
 
 def _watch_ros(options: Namespace) -> NoReturn:

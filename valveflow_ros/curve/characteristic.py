@@ -104,7 +104,7 @@ class Support:
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class FittedData:
     """The data the curve was fitted to."""
 
     window_start_ns: int
@@ -157,7 +157,7 @@ class Characteristic:
     pieces: tuple[Piece, ...]
     breakpoint_intervals: tuple[tuple[float, float], ...]
     choice: Choice
-    source: Source
+    source: FittedData
     residuals: ResidualStatistics
     dynamics: tuple[RegionDynamics, ...] = ()
     partition_pieces: tuple[Piece, ...] = ()

@@ -10,11 +10,11 @@ from valveflow_ros.curve.characteristic import (
     Characteristic,
     ChartDesign,
     Choice,
+    FittedData,
     HeldCause,
     Piece,
     RegionDynamics,
     ResidualStatistics,
-    Source,
     Support,
 )
 from valveflow_ros.curve.json_schema import (
@@ -275,7 +275,7 @@ def from_json(raw: object) -> Characteristic:
             choice['rule'], choice['cost'], choice['turning_angle'], choice['note'] or '',
             choice['confidence'] or {},
         ),
-        source=Source(
+        source=FittedData(
             window['start_ns'], window['end_ns'], source['steady'], source['slope_response'],
             source['samples'], temperature['mean_degc'], temperature['spread_k'],
             temperature['flag'],

@@ -10,11 +10,11 @@ import numpy as np
 from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
+    FittedData,
     HeldCause,
     Piece,
     RegionDynamics,
     ResidualStatistics,
-    Source,
 )
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import kernels
@@ -203,7 +203,7 @@ class ExtendedModel:
             pieces=_pieces(self.model.base),
             breakpoint_intervals=tuple((nan, nan) for _ in self.model.base.left[1:]),
             choice=Choice('extended_model', {}, {}),
-            source=Source(0, 0, 0, 0, 0, nan, nan, False),
+            source=FittedData(0, 0, 0, 0, 0, nan, nan, False),
             residuals=ResidualStatistics(nan, nan, nan, nan, nan),
             dynamics=_dynamics(self.model.base),
             held=self.held,

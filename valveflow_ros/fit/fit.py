@@ -11,9 +11,9 @@ import numpy as np
 from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
+    FittedData,
     Piece,
     ResidualStatistics,
-    Source,
 )
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.errors import DataError, TooFewSamplesError
@@ -149,7 +149,7 @@ def _no_intervals(pieces: tuple[Piece, ...]) -> tuple[tuple[float, float], ...]:
     return tuple((math.nan, math.nan) for _ in pieces[1:])
 
 
-def _source(task: FitTask, rows: np.ndarray) -> Source:
+def _source(task: FitTask, rows: np.ndarray) -> FittedData:
     """Describe the window, and watch the paper's condition of an unchanged temperature."""
     c = task.contents
     temperature = c.temperature_degc[rows]
@@ -158,7 +158,7 @@ def _source(task: FitTask, rows: np.ndarray) -> Source:
     if len(temperature):
         low, high = np.quantile(temperature, (0.025, 0.975))
         mean, spread = float(temperature.mean()), float(high - low)
-    return Source(
+    return FittedData(
         window_start_ns=int(c.time_ns[0]),
         window_end_ns=int(c.time_ns[-1]),
         steady=c.count(SegmentKind.STEADY),

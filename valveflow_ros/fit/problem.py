@@ -12,7 +12,7 @@ import numpy as np
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.fit.descent import descend, gauss_newton
 from valveflow_ros.fit.kernels import answer_residual, normal_sums, square_sum, tangents
-from valveflow_ros.numerics import cores, runs, share
+from valveflow_ros.numerics import cores, run_in_threads, runs
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
 # What reacts to the power within the rows averaged, as a load controller does, would be
@@ -113,7 +113,7 @@ class Problem:
             )  # fmt: skip
 
         # An answer takes so little that more and shorter stretches would cost more than they gain.
-        share(stretch, self._stretches(model, least=-(-s.means // _FEW)), self._threads)
+        run_in_threads(stretch, self._stretches(model, least=-(-s.means // _FEW)), self._threads)
         return residual, weight
 
     def tangents(
@@ -134,7 +134,7 @@ class Problem:
                 model, begin, first, end, residual[part], jacobian[part], weight[part]
             )  # fmt: skip
 
-        share(stretch, self._stretches(model), self._threads)
+        run_in_threads(stretch, self._stretches(model), self._threads)
         return residual, jacobian, weight
 
     def normal(self, model: RegionalModel, ar: FloatArray) -> tuple[FloatArray, int]:
@@ -161,7 +161,7 @@ class Problem:
                 jacobian, residual, weight, ar, back, n, sums[k], np.empty((0, columns))
             )  # fmt: skip
 
-        share(stretch, [(k, *part) for k, part in enumerate(stretches)], self._threads)
+        run_in_threads(stretch, [(k, *part) for k, part in enumerate(stretches)], self._threads)
         total = np.tril(sums.sum(axis=0))
         return total + np.tril(total, -1).T, int(rows.sum())
 

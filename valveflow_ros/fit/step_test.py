@@ -15,9 +15,9 @@ import numpy as np
 from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
+    FittedData,
     Piece,
     ResidualStatistics,
-    Source,
 )
 from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.fit.step_levels import Level, find_levels
@@ -429,14 +429,14 @@ def _pieces(line: BrokenLine, u: FloatArray) -> tuple[Piece, ...]:
     return tuple(pieces)
 
 
-def _source(table: SampleTable, inside: IntArray, levels: int, settings: Settings) -> Source:
+def _source(table: SampleTable, inside: IntArray, levels: int, settings: Settings) -> FittedData:
     temperature = table.column(Signal.MAIN_STEAM_TEMPERATURE)[inside]
     temperature = temperature[np.isfinite(temperature)]
     mean = spread = math.nan
     if len(temperature):
         low, high = np.quantile(temperature, (0.025, 0.975))
         mean, spread = float(temperature.mean()), float(high - low)
-    return Source(
+    return FittedData(
         window_start_ns=int(table.time_ns[0]), window_end_ns=int(table.time_ns[-1]),
         steady=levels, slope_response=0, samples=len(inside), temperature_mean_degc=mean,
         temperature_spread_k=spread,

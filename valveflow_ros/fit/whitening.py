@@ -6,7 +6,7 @@ import numpy as np
 
 from valveflow_ros.curve.regional_model import lagged_products, whiten
 from valveflow_ros.fit.kernels import normal_sums
-from valveflow_ros.numerics import cores, runs, share
+from valveflow_ros.numerics import cores, run_in_threads, runs
 from valveflow_ros.records import ByteArray, FloatArray
 
 ORDER = 4
@@ -79,7 +79,7 @@ def normal_equations(
     def add(k: int, first: int, end: int) -> None:
         rows[k] = normal_sums(table, residual, weight, ar, first, end, sums[k], scores[k])
 
-    share(add, [(k, *part) for k, part in enumerate(parts)], cores())
+    run_in_threads(add, [(k, *part) for k, part in enumerate(parts)], cores())
     return sums.sum(axis=0), scores.sum(axis=0), int(rows.sum())
 
 

@@ -23,7 +23,7 @@ from valveflow_ros.monitoring.events import FitRequested
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_aligned
 from valveflow_ros.monitoring.rows import Corrector
-from valveflow_ros.numerics import ahead
+from valveflow_ros.numerics import read_ahead
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
     NS_PER_S,
@@ -117,7 +117,7 @@ def observe(
     tables: list[SampleTable] = []
     resets = 0
     blocks = aligned_blocks(aligner, readings, progress, 'finding segments')
-    for aligned in ahead(corrected(blocks, corrector)):
+    for aligned in read_ahead(corrected(blocks, corrector)):
         resets += len(aligned.resets)
         tables.append(aligned.table)
         feed_aligned(monitor, aligned)

@@ -143,7 +143,9 @@ def refresh(group: Group) -> None:
 
 
 @inlined
-def refer(group: Group, core: Moments, value: float, slope: float, limit: float) -> None:
+def bound_about_line(
+    group: Group, core: Moments, value: float, slope: float, limit: float
+) -> None:
     """Bound the tail's cost about a line, with a share of the core's Gram matrix as prior.
 
     The bound holds for this core and for every core that begins farther left.
@@ -185,7 +187,7 @@ def refer(group: Group, core: Moments, value: float, slope: float, limit: float)
 
 
 @inlined
-def refer_nowhere(group: Group) -> None:
+def bound_about_best_line(group: Group) -> None:
     """Bound the tail's cost by its own best line, while there is no core yet."""
     t = group.tail
     excess = group.excess

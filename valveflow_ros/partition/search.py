@@ -20,17 +20,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from valveflow_ros.numerics import inlined, kernel, runs, share
+from valveflow_ros.numerics import inlined, kernel, run_in_threads, runs
 from valveflow_ros.partition.bounds import SLOTS, fill_leaf_bounds, fill_node_bounds, make_priors
 from valveflow_ros.partition.group import (
     Group,
     Near,
+    bound_about_best_line,
+    bound_about_line,
     fill_near,
     make_near,
     new_group,
     open_group,
-    refer,
-    refer_nowhere,
     refresh,
     search_near,
     tail_part,
@@ -134,7 +134,7 @@ def _search_leaf(
         # A reference line of these very candidates leaves less to the box of slopes.
         _, value, slope, firm = fit(joined(leaf_moments(tree, leaf, LEAF // 2), shift, core))
         if firm:
-            refer(group, core, value, slope, layer.limit)
+            bound_about_line(group, core, value, slope, layer.limit)
             kept = _mark_candidates(tree, layer, leaf, core, shift, group)
     if kept == 0:
         return
@@ -176,14 +176,14 @@ def _descend(tree: Tree, layer: Layer, block: int, group: Group) -> int:
     next_wide = 1
     renewed = 0.0
     leaves = 0
-    refer_nowhere(group)
+    bound_about_best_line(group)
     while end > 0:
         cost = value = slope = 0.0
         firm = True
         if end < block:
             cost, value, slope, firm = fit(core)
             if block - end >= _RENEW * renewed and firm:
-                refer(group, core, value, slope, layer.limit)
+                bound_about_line(group, core, value, slope, layer.limit)
                 renewed = float(block - end)
             while block - end >= next_wide:
                 wide += 1
@@ -329,7 +329,7 @@ def prepare(
     def fill(first: int, last: int) -> None:
         fill_near(tree, first, last, near)
 
-    share(fill, runs(len(tree.leaf), _RUN), threads)
+    run_in_threads(fill, runs(len(tree.leaf), _RUN), threads)
     limit = 2.0 * float(np.abs(y).max())
     return Problem(tree, near, make_priors(tree, limit), shortest, slack, limit, threads)
 
@@ -372,14 +372,14 @@ def layers(problem: Problem, pieces: int) -> Iterator[tuple[FloatArray, NDArray[
     blocks = len(tree.leaf)
     before = np.full(LEAF * blocks + 1, np.inf)
     after = np.full(LEAF * blocks + 1, np.inf)
-    share(_first(problem, after), runs(blocks, _RUN), threads)
+    run_in_threads(_first(problem, after), runs(blocks, _RUN), threads)
     yield after, np.zeros(len(after), dtype=np.int32)
     bound = np.empty_like(problem.prior)
     groups = runs(blocks, _RUN)
     for j in range(2, pieces + 1):
         before, after = after, before
         after[0] = np.inf
-        share(_leaf_bounds(problem, before, bound), runs(blocks, _RUN), threads)
+        run_in_threads(_leaf_bounds(problem, before, bound), runs(blocks, _RUN), threads)
         for level in range(1, tree.levels):
             count = int(tree.start[level + 1] - tree.start[level])
             fill_node_bounds(tree, problem.prior, level, 0, count, bound)
@@ -390,7 +390,7 @@ def layers(problem: Problem, pieces: int) -> Iterator[tuple[FloatArray, NDArray[
         breaks: NDArray[np.int32] = np.full(len(after), -1, dtype=np.int32)
         if j == pieces:
             groups = [((tree.n - 1) // LEAF, (tree.n - 1) // LEAF + 1)]
-        share(_groups(tree, layer, after, breaks), groups, threads)
+        run_in_threads(_groups(tree, layer, after, breaks), groups, threads)
         yield after, breaks
 
 

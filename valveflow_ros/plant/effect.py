@@ -18,7 +18,7 @@ DAY_S = 86_400.0
 
 
 @dataclass(frozen=True, slots=True)
-class Forcing:
+class LoopInputs:
     """Rows of the closed loop before it runs; all float64 (n,).
 
     ``time_s`` counts from the first recorded row (the warm-up is negative),
@@ -37,7 +37,7 @@ class Forcing:
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
+class HistorianRows:
     """Rows as the historian is about to keep them; columns are changed in place."""
 
     time_s: FloatArray
@@ -45,7 +45,7 @@ class Written:
 
 
 @dataclass(slots=True)
-class Bank:
+class ActuatorLimits:
     """What stands between two places of the actuator; the defaults let everything through.
 
     Attributes
@@ -91,9 +91,9 @@ class Hooks:
     length_s : float
         Length of the recorded part.
     forcing : list of callables
-        Each changes the `Forcing` of every part of the run.
+        Each changes the `LoopInputs` of every part of the run.
     writing : list of callables
-        Each changes what is `Written` of every part of the run.
+        Each changes what is `HistorianRows` of every part of the run.
     lead_s : float
         How much earlier than the other signals the power is stamped.
     kappa_mpa_per_mw, critical_ratio : float
@@ -105,10 +105,10 @@ class Hooks:
     unit: UnitDescription
     length_s: float
     regions: tuple[Region, ...]
-    forcing: list[Callable[[Forcing], None]] = field(default_factory=list)
-    writing: list[Callable[[Written], None]] = field(default_factory=list)
-    before_sensor: Bank = field(default_factory=Bank)
-    after_sensor: Bank = field(default_factory=Bank)
+    forcing: list[Callable[[LoopInputs], None]] = field(default_factory=list)
+    writing: list[Callable[[HistorianRows], None]] = field(default_factory=list)
+    before_sensor: ActuatorLimits = field(default_factory=ActuatorLimits)
+    after_sensor: ActuatorLimits = field(default_factory=ActuatorLimits)
     added_curves: list[AddedCurve] = field(default_factory=list)
     lead_s: float = 0.0
     kappa_mpa_per_mw: float = 0.0
@@ -122,7 +122,7 @@ class Hooks:
         """Return hooks with nothing on them."""
         return cls(unit, length_s, unit.regions)
 
-    def bank(self, before_sensor: float) -> Bank:
+    def bank(self, before_sensor: float) -> ActuatorLimits:
         """Return the bank on one side of the position sensor."""
         return self.before_sensor if before_sensor else self.after_sensor
 

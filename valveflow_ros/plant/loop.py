@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from valveflow_ros.numerics import jit
-from valveflow_ros.plant.effect import AddedCurve, Bank, Hooks
+from valveflow_ros.plant.effect import ActuatorLimits, AddedCurve, Hooks
 from valveflow_ros.plant.unit import Region
 from valveflow_ros.records import FloatArray
 
@@ -19,7 +19,7 @@ from valveflow_ros.records import FloatArray
 N_POSITIONS = 3
 
 
-def settings(bank: Bank, step_s: float) -> FloatArray:
+def settings(bank: ActuatorLimits, step_s: float) -> FloatArray:
     """Return what `move` wants: largest step, slip-off and slip-to distance, top, half slack."""
     off = (bank.band_percent + bank.jump_percent) / 2.0
     to = (bank.band_percent - bank.jump_percent) / 2.0

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from valveflow_ros.numerics import jit
-from valveflow_ros.plant.effect import DAY_S, Forcing, Hooks
+from valveflow_ros.plant.effect import DAY_S, Hooks, LoopInputs
 from valveflow_ros.plant.loop import ClosedLoop, Series
 from valveflow_ros.plant.unit import Programme, UnitDescription
 from valveflow_ros.records import FloatArray
@@ -22,7 +22,7 @@ from valveflow_ros.records import FloatArray
 # numbers away from anything else.
 
 
-class Source(enum.IntEnum):
+class ChanceSource(enum.IntEnum):
     """The sources of chance; a number once given is never used for another."""
 
     LOAD = 1
@@ -38,7 +38,7 @@ class Source(enum.IntEnum):
     WANDER_NOISE = 11
 
 
-def generator(seed: int, source: Source) -> np.random.Generator:
+def generator(seed: int, source: ChanceSource) -> np.random.Generator:
     """Return the generator of one source."""
     return np.random.default_rng([seed, int(source)])
 
@@ -192,15 +192,15 @@ class LoadProgramme:
         plan, h = unit.programme, unit.sample_period_s
         self._plan = plan
         self._step_s = h
-        self._knots = load_knots(generator(seed, Source.LOAD), length_s, clock_s, plan)
-        self._pulses = Pulses.draw(generator(seed, Source.PULSES), length_s, plan)
+        self._knots = load_knots(generator(seed, ChanceSource.LOAD), length_s, clock_s, plan)
+        self._pulses = Pulses.draw(generator(seed, ChanceSource.PULSES), length_s, plan)
         self._sliding = LowPass(plan.pressure_lag_s, h)
         self._rate = LowPass(_TEMPERATURE_DIP_S, h)
-        self._pressure = Wander(generator(seed, Source.PRESSURE), plan.pressure_wander_s, h)
+        self._pressure = Wander(generator(seed, ChanceSource.PRESSURE), plan.pressure_wander_s, h)
         self._temperature = Wander(
-            generator(seed, Source.TEMPERATURE), plan.temperature_wander_s, h
+            generator(seed, ChanceSource.TEMPERATURE), plan.temperature_wander_s, h
         )
-        self._jitter = Wander(generator(seed, Source.JITTER), plan.jitter_s, h)
+        self._jitter = Wander(generator(seed, ChanceSource.JITTER), plan.jitter_s, h)
 
     @property
     def manual(self) -> bool:
@@ -224,7 +224,7 @@ class LoadProgramme:
         return Outside(load, pressure, temperature, moves)
 
 
-class Rows(NamedTuple):
+class PlantRows(NamedTuple):
     """What happened and what the instruments showed; float64 (n,) each.
 
     ``*_read`` are values with the sensors' noise, not rounded; ``power`` is
@@ -241,13 +241,13 @@ class Rows(NamedTuple):
     plug: FloatArray
     u: FloatArray
 
-    def part(self, start: int, end: int) -> Rows:
+    def part(self, start: int, end: int) -> PlantRows:
         """Return rows ``[start, end)``."""
-        return Rows(*(column[start:end] for column in self))
+        return PlantRows(*(column[start:end] for column in self))
 
-    def followed_by(self, other: Rows) -> Rows:
+    def followed_by(self, other: PlantRows) -> PlantRows:
         """Return these rows and the other ones."""
-        return Rows(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
+        return PlantRows(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
 
 class Disturbance:
@@ -256,9 +256,9 @@ class Disturbance:
     def __init__(self, unit: UnitDescription, seed: int) -> None:
         h, self._noise, self._plan = unit.sample_period_s, unit.noise, unit.programme
         noise = self._noise
-        self._slow = Wander(generator(seed, Source.SLOW_NOISE), noise.slow_time_s, h)
-        self._wander = Wander(generator(seed, Source.WANDER_NOISE), noise.wander_time_s, h)
-        self._white = generator(seed, Source.WHITE_NOISE)
+        self._slow = Wander(generator(seed, ChanceSource.SLOW_NOISE), noise.slow_time_s, h)
+        self._wander = Wander(generator(seed, ChanceSource.WANDER_NOISE), noise.wander_time_s, h)
+        self._white = generator(seed, ChanceSource.WHITE_NOISE)
 
     def advance(self, load_mw: FloatArray) -> FloatArray:
         """Return the next values in MW, one a row of the load."""
@@ -289,17 +289,17 @@ class Plant:
         self._clock_s = clock_s
         self._loop = ClosedLoop(hooks, drive.manual)
         self._disturbance = Disturbance(hooks.unit, seed)
-        self._opening = generator(seed, Source.OPENING_SENSOR)
-        self._pressure = generator(seed, Source.PRESSURE_SENSOR)
-        self._temperature = generator(seed, Source.TEMPERATURE_SENSOR)
+        self._opening = generator(seed, ChanceSource.OPENING_SENSOR)
+        self._pressure = generator(seed, ChanceSource.PRESSURE_SENSOR)
+        self._temperature = generator(seed, ChanceSource.TEMPERATURE_SENSOR)
 
-    def advance(self, count: int) -> Rows:
+    def advance(self, count: int) -> PlantRows:
         """Return the next ``count`` rows."""
         unit, hooks = self._hooks.unit, self._hooks
         outside = self._drive.advance(self._row - self._first_row, count)
         time_s = np.arange(self._row, self._row + count, dtype=np.float64) * unit.sample_period_s
         self._row += count
-        forcing = Forcing(
+        forcing = LoopInputs(
             time_s,
             np.mod(self._clock_s + time_s, DAY_S),
             outside.pressure_mpa,
@@ -325,7 +325,7 @@ class Plant:
             )
         )
         sensors = unit.noise
-        return Rows(
+        return PlantRows(
             motion.command,
             motion.sensor + sensors.opening_percent * self._opening.standard_normal(count),
             outside.pressure_mpa + sensors.pressure_mpa * self._pressure.standard_normal(count),

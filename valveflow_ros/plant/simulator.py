@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from valveflow_ros.errors import InputError
-from valveflow_ros.plant.effect import DAY_S, Hooks, Written, clock_at_ns
-from valveflow_ros.plant.plant import LoadProgramme, Plant, Rows
+from valveflow_ros.plant.effect import DAY_S, HistorianRows, Hooks, clock_at_ns
+from valveflow_ros.plant.plant import LoadProgramme, Plant, PlantRows
 from valveflow_ros.plant.spec import EffectSpec, install
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import NS_PER_S, FloatArray, SampleTable, Signal
@@ -107,7 +107,7 @@ class Recorder:
             window = window.followed_by(plant.advance(count))
             yield self._part(window, first, count)
 
-    def _part(self, window: Rows, first: int, count: int) -> SimulatedLog:
+    def _part(self, window: PlantRows, first: int, count: int) -> SimulatedLog:
         """Write rows ``[first, first + count)``, which begin at ``behind`` in the window."""
         unit = self._hooks.unit
         rows = window.part(self.behind, self.behind + count)
@@ -122,7 +122,7 @@ class Recorder:
         columns = {s: np.round(column, DECIMALS[s]) for s, column in columns.items()}
         time_s = np.arange(first, first + count, dtype=np.float64) * unit.sample_period_s
         for change in self._hooks.writing:
-            change(Written(time_s, columns))
+            change(HistorianRows(time_s, columns))
         time_ns = self._start_ns + np.round(time_s * NS_PER_S).astype(np.int64)
         table = SampleTable.from_columns(time_ns, columns)
         return SimulatedLog(table, rows.u, power, rows.load, unit, noise, rows.plug, self._active)

@@ -9,7 +9,7 @@ import numpy as np
 
 from valveflow_ros.errors import InputError
 from valveflow_ros.plant.effect import DAY_S, Hooks, clock_at_ns
-from valveflow_ros.plant.plant import Outside, Plant, Source, Wander, generator
+from valveflow_ros.plant.plant import ChanceSource, Outside, Plant, Wander, generator
 from valveflow_ros.plant.simulator import (
     DEFAULT_START_NS,
     LONGEST_DAYS,
@@ -80,9 +80,9 @@ class _ByHand:
         self._plan = plan
         self._warm_up = warm_up
         h, usual = unit.sample_period_s, unit.programme
-        self._pressure = Wander(generator(seed, Source.PRESSURE), usual.pressure_wander_s, h)
+        self._pressure = Wander(generator(seed, ChanceSource.PRESSURE), usual.pressure_wander_s, h)
         self._temperature = Wander(
-            generator(seed, Source.TEMPERATURE), usual.temperature_wander_s, h
+            generator(seed, ChanceSource.TEMPERATURE), usual.temperature_wander_s, h
         )
 
     @property

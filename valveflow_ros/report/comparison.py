@@ -9,7 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from valveflow_ros.baselines.comparison import BASELINES, Finding, Outcome, Pair, Terms, finding_of
+from valveflow_ros.baselines.comparison import (
+    BASELINES,
+    ErrorOrder,
+    Finding,
+    Pair,
+    Terms,
+    finding_of,
+)
 from valveflow_ros.baselines.judged import JudgedSegment
 from valveflow_ros.baselines.sparse import NAMES
 from valveflow_ros.records import NS_PER_S, FloatArray, SegmentKind
@@ -69,12 +76,12 @@ _ABOUT = {
     Terms.AS_PAPER: 'predicts the power of special segments',
 }
 _HEADLINE = {
-    Outcome.BETTER: 'better than', Outcome.WORSE: 'worse than',
-    Outcome.OPEN: 'and cannot be told apart from',
+    ErrorOrder.BETTER: 'better than', ErrorOrder.WORSE: 'worse than',
+    ErrorOrder.OPEN: 'and cannot be told apart from',
 }  # fmt: skip
 _TESTED = {
-    Outcome.BETTER: 'significantly more', Outcome.WORSE: 'significantly less',
-    Outcome.OPEN: 'not told apart',
+    ErrorOrder.BETTER: 'significantly more', ErrorOrder.WORSE: 'significantly less',
+    ErrorOrder.OPEN: 'not told apart',
 }  # fmt: skip
 
 

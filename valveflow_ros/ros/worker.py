@@ -60,7 +60,7 @@ _ONE_THREAD = dict.fromkeys(
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class WorkerResult:
     """What became of a request.
 
     Attributes
@@ -270,7 +270,7 @@ class Worker:
         """Return True until the warm-up has ended."""
         return self._warming_since_s is not None
 
-    def start(self, outcomes: list[Outcome] | None = None) -> None:
+    def start(self, outcomes: list[WorkerResult] | None = None) -> None:
         """Start the process; if it cannot be, the task at hand ends with an outcome.
 
         The kernel ends the child when the thread that started it ends, so call this from one that
@@ -329,9 +329,9 @@ class Worker:
             self._warming_since_s = self._clock()
             self._tasks.put((_WARM_UP, task))
 
-    def poll(self) -> list[Outcome]:
+    def poll(self) -> list[WorkerResult]:
         """Return the outcomes there are, and see to the process; never waits."""
-        outcomes: list[Outcome] = []
+        outcomes: list[WorkerResult] = []
         if self._process is None:
             wanted = self.stays or self._running is not None
             if wanted and self._clock() >= self._start_at_s:
@@ -368,7 +368,7 @@ class Worker:
         self._end()
         self._running = None
 
-    def _take_answers(self, outcomes: list[Outcome]) -> None:
+    def _take_answers(self, outcomes: list[WorkerResult]) -> None:
         assert self._process is not None
         while not self._answers.empty():
             number, data = self._answers.get()
@@ -408,15 +408,15 @@ class Worker:
             problem = f'The {self.word} gave a result that cannot be checked ({name}).'
         return problem or result
 
-    def _conclude(self, result: Any, outcomes: list[Outcome]) -> None:
+    def _conclude(self, result: Any, outcomes: list[WorkerResult]) -> None:
         if self._running is None:
             return
         seconds = self._clock() - self._running.begun_s
-        outcomes.append(Outcome(self._running.task.request_ns, result, seconds))
+        outcomes.append(WorkerResult(self._running.task.request_ns, result, seconds))
         self._running = None
         release_memory()
 
-    def _failed(self, sentence: str, outcomes: list[Outcome]) -> None:
+    def _failed(self, sentence: str, outcomes: list[WorkerResult]) -> None:
         self._end()
         self.failures_in_a_row += 1
         self._start_at_s = self._clock() + self._pause_s

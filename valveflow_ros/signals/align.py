@@ -89,7 +89,7 @@ class Rules(NamedTuple):
     spare: int  # rows that may stand open at a time
 
 
-class Rows(NamedTuple):
+class AlignedRows(NamedTuple):
     """Room for what comes out."""
 
     time_ns: IntArray
@@ -137,7 +137,7 @@ def _can_close(state: State, rules: Rules) -> bool:
 
 
 @inlined
-def _close(state: State, rules: Rules, rows: Rows, place: int, coming_ns: int) -> bool:
+def _close(state: State, rules: Rules, rows: AlignedRows, place: int, coming_ns: int) -> bool:
     """Write the next row, if anybody has spoken lately, and go on to the one after it.
 
     ``coming_ns`` is the stamp of a reading that is about to be accepted.
@@ -217,7 +217,7 @@ def _forget(state: State) -> None:
 
 @jit
 def _close_ready(
-    state: State, rules: Rules, rows: Rows, written: int, coming_ns: int, rest: bool
+    state: State, rules: Rules, rows: AlignedRows, written: int, coming_ns: int, rest: bool
 ) -> int:
     """Close rows while there is room; return the rows written by then.
 
@@ -251,7 +251,7 @@ def _refusal(t: int, v: float, q: int, low: float, high: float) -> int:
 
 
 @jit
-def _offer_believed(state: State, rules: Rules, rows: Rows, written: int) -> int:
+def _offer_believed(state: State, rules: Rules, rows: AlignedRows, written: int) -> int:
     """Accept the readings whose leap is confirmed.
 
     Returns the rows written, or -1 - rows when room ended before all were accepted.
@@ -271,7 +271,7 @@ def _offer_believed(state: State, rules: Rules, rows: Rows, written: int) -> int
 
 
 @jit
-def _go_back(state: State, rules: Rules, rows: Rows, written: int) -> int:
+def _go_back(state: State, rules: Rules, rows: AlignedRows, written: int) -> int:
     """Close what was open before the clock went back, as it stands, and begin anew."""
     clock = state.clock
     while clock[_NEXT] <= clock[NEWEST] and written < rows.time_ns.size:
@@ -283,7 +283,7 @@ def _go_back(state: State, rules: Rules, rows: Rows, written: int) -> int:
 
 @jit
 def _far(
-    state: State, rules: Rules, rows: Rows, written: int, t: int, s: int, v: float, q: int
+    state: State, rules: Rules, rows: AlignedRows, written: int, t: int, s: int, v: float, q: int
 ) -> int:
     """Deal with a reading far off in time; return the rows written."""
     leap = _wait(state, rules, t, s, v, q)
@@ -299,7 +299,7 @@ def align(  # noqa: C901 - one loop over all that can meet a reading
     quality: ByteArray,
     state: State,
     rules: Rules,
-    rows: Rows,
+    rows: AlignedRows,
     final: bool,
 ) -> tuple[int, int, int]:
     """Run over readings until they or the room for rows end.
@@ -440,7 +440,7 @@ class Aligner:
         done = before = 0
         room = (self._ROOM if len(readings) > 64 or final else 256) + self._rules.spare
         while True:
-            rows = Rows(
+            rows = AlignedRows(
                 np.empty(room, dtype=np.int64),
                 np.empty((room, N_SIGNALS)),
                 np.empty((room, N_SIGNALS), dtype=np.uint8),

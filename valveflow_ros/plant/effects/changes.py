@@ -11,8 +11,8 @@ from valveflow_ros.plant.effect import (
     DAY_S,
     ONSET,
     Effect,
-    Forcing,
     Hooks,
+    LoopInputs,
     Values,
     at_onset,
     ramp,
@@ -31,7 +31,7 @@ def install_gain_drift(values: Values, hooks: Hooks) -> None:
     """
     g = values['g']
 
-    def change(rows: Forcing) -> None:
+    def change(rows: LoopInputs) -> None:
         rows.gain[:] *= 1.0 + g * ramp(rows.time_s)
 
     hooks.forcing.append(change)
@@ -54,7 +54,7 @@ def install_gain_step(values: Values, hooks: Hooks) -> None:
         x = F(u) (1 + g),  t >= t0
     """
 
-    def change(rows: Forcing) -> None:
+    def change(rows: LoopInputs) -> None:
         rows.gain[:] *= 1.0 + values['g'] * step(rows.time_s, values)
 
     hooks.forcing.append(change)
@@ -79,7 +79,7 @@ def install_input_drift(values: Values, hooks: Hooks) -> None:
     """
     g = values['g']
 
-    def change(rows: Forcing) -> None:
+    def change(rows: LoopInputs) -> None:
         rows.input_gain[:] *= 1.0 + g * ramp(rows.time_s)
 
     hooks.forcing.append(change)
@@ -101,7 +101,7 @@ def install_input_step(values: Values, hooks: Hooks) -> None:
         u_true = u (1 + g),  t >= t0
     """
 
-    def change(rows: Forcing) -> None:
+    def change(rows: LoopInputs) -> None:
         rows.input_gain[:] *= 1.0 + values['g'] * step(rows.time_s, values)
 
     hooks.forcing.append(change)
@@ -126,7 +126,7 @@ def install_output_offset_drift(values: Values, hooks: Hooks) -> None:
     """
     b_mw = values['b_mw']
 
-    def change(rows: Forcing) -> None:
+    def change(rows: LoopInputs) -> None:
         rows.offset_mw[:] += b_mw * ramp(rows.time_s)
 
     hooks.forcing.append(change)
@@ -175,7 +175,7 @@ def install_intervals(values: Values, hooks: Hooks) -> None:
     """
     edges = intervals_s(values, hooks.length_s).ravel()
 
-    def change(rows: Forcing) -> None:
+    def change(rows: LoopInputs) -> None:
         inside = np.searchsorted(edges, rows.time_s, side='right') % 2
         rows.gain[:] *= 1.0 + values['g'] * inside
 
@@ -222,7 +222,7 @@ def install_diurnal(values: Values, hooks: Hooks) -> None:
     """
     peak_s = values['peak_h'] * 3600.0
 
-    def change(rows: Forcing) -> None:
+    def change(rows: LoopInputs) -> None:
         wave = np.cos(2.0 * np.pi * (rows.clock_s - peak_s) / DAY_S)
         rows.gain[:] *= 1.0 + values['a'] * wave
 

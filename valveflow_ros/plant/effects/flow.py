@@ -6,7 +6,7 @@ import numpy as np
 
 from valveflow_ros.errors import InputError
 from valveflow_ros.parameters import Parameter
-from valveflow_ros.plant.effect import Effect, Forcing, Hooks, Values
+from valveflow_ros.plant.effect import Effect, Hooks, LoopInputs, Values
 
 
 def install_exponent(values: Values, hooks: Hooks) -> None:
@@ -20,7 +20,7 @@ def install_exponent(values: Values, hooks: Hooks) -> None:
     """
     dm, reference = values['dm'], values['reference_mpa']
 
-    def change(rows: Forcing) -> None:
+    def change(rows: LoopInputs) -> None:
         rows.input_gain[:] *= (rows.pressure_mpa / reference) ** dm
 
     hooks.forcing.append(change)
@@ -95,7 +95,7 @@ def install_temperature(values: Values, hooks: Hooks) -> None:
     """
     k, reference = values['k'], values['reference_degc']
 
-    def change(rows: Forcing) -> None:
+    def change(rows: LoopInputs) -> None:
         rows.gain[:] *= 1.0 + k * (rows.temperature_degc - reference)
 
     hooks.forcing.append(change)

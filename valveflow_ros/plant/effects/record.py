@@ -12,9 +12,9 @@ from valveflow_ros.plant.effect import (
     ONSET,
     SIGNAL,
     Effect,
+    HistorianRows,
     Hooks,
     Values,
-    Written,
     at_onset,
 )
 from valveflow_ros.records import FloatArray
@@ -49,7 +49,7 @@ def install_flatline(values: Values, hooks: Hooks) -> None:
     end = start + values['minutes'] * 60.0
     held = np.nan
 
-    def change(rows: Written) -> None:
+    def change(rows: HistorianRows) -> None:
         nonlocal held
         first, last = np.searchsorted(rows.time_s, (start, end))
         if first < last:
@@ -82,7 +82,7 @@ def install_quantisation(values: Values, hooks: Hooks) -> None:
     if step == 0.0:
         return
 
-    def change(rows: Written) -> None:
+    def change(rows: HistorianRows) -> None:
         rows.columns[signal] = step * np.round(rows.columns[signal] / step)
 
     hooks.writing.append(change)
@@ -129,7 +129,7 @@ def install_spikes(values: Values, hooks: Hooks) -> None:
     drawn = spikes(values, hooks.length_s)
     row_of_spike, sign = np.floor(drawn[:, 0] / h), drawn[:, 1]
 
-    def change(rows: Written) -> None:
+    def change(rows: HistorianRows) -> None:
         if rows.time_s.size == 0:
             return
         place = row_of_spike - round(rows.time_s[0] / h)

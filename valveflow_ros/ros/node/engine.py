@@ -10,10 +10,10 @@ import numpy as np
 from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
+    FittedData,
     Piece,
     RegionDynamics,
     ResidualStatistics,
-    Source,
 )
 from valveflow_ros.fit.residual_chart import ChartDesign
 from valveflow_ros.fit.task import FitTask
@@ -186,7 +186,7 @@ def example_curve(settings: Settings) -> Characteristic:
         ),
         breakpoint_intervals=((1190.0, 1210.0),),
         choice=Choice('', {}, {}),
-        source=Source(0, 0, 0, 0, 0, 540.0, 0.0, False),
+        source=FittedData(0, 0, 0, 0, 0, 540.0, 0.0, False),
         residuals=ResidualStatistics(1.0, 1.0, average_s, 0.5, 1.0, 2.0, chart),
         dynamics=(RegionDynamics(180.0, 285.0, 30.0, 5.0, 1.0, 1.0),),
     )

@@ -210,7 +210,7 @@ class _Held(NamedTuple):
     message: RawMessage
 
 
-class Source(Protocol):
+class MessageSource(Protocol):
     """Something that messages can be taken from."""
 
     def take(self, most: int = DEPTH) -> list[RawMessage]:
@@ -222,14 +222,14 @@ class Intake:
 
     Parameters
     ----------
-    sources : mapping of str to Source
+    sources : mapping of str to MessageSource
         By the contract's names of the inputs.
     decoder : Decoder
     log_clock : LogClock
         Shared with whoever else writes to the same log.
     stamp_source : str
         'source' or 'receive'; see the parameter of that name.
-    clock : Source, optional
+    clock : MessageSource, optional
         /clock; if given, it gives every plain value its time.
     watch : callable
         Is called with the topic's name and the readings of each message.
@@ -249,11 +249,11 @@ class Intake:
 
     def __init__(
         self,
-        sources: Mapping[str, Source],
+        sources: Mapping[str, MessageSource],
         decoder: Decoder,
         log_clock: LogClock,
         stamp_source: str = 'source',
-        clock: Source | None = None,
+        clock: MessageSource | None = None,
         watch: Callable[[str, list[Row]], None] = lambda _name, _rows: None,
     ) -> None:
         self._sources = dict(sources)
@@ -351,7 +351,7 @@ class Intake:
             rows += found
         return rows
 
-    def _follow_clock(self, clock: Source) -> None:
+    def _follow_clock(self, clock: MessageSource) -> None:
         for message in clock.take(_MOST_CLOCKS):
             self._track.note(message.source_ns, header_time_ns(message.data))
 
