@@ -12,9 +12,9 @@ from valveflow_ros.diagnosis.diagnose import Record
 from valveflow_ros.diagnosis.evidence import colour, rmse
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import Task, held, improve, search_levels, whitening
+from valveflow_ros.diagnosis.grids import ORDER, make_grids
 from valveflow_ros.diagnosis.record_faults import faults
 from valveflow_ros.diagnosis.result import Diagnosis
-from valveflow_ros.diagnosis.scene import ORDER, make_scene
 from valveflow_ros.plant.spec import EffectSpec
 
 
@@ -43,15 +43,15 @@ def oracle(
     if len(true) < len(effects):
         return None
     bad, _ = faults(record.table, record.step_s)
-    scene = make_scene(*record.about, bad)
-    task = Task(scene, scene.open_rows, np.zeros(ORDER), given)
-    task = replace(task, ar=whitening(scene, task.residual(found.extended)))
+    grids = make_grids(*record.about, bad)
+    task = Task(grids, grids.open_rows, np.zeros(ORDER), given)
+    task = replace(task, ar=whitening(grids, task.residual(found.extended)))
     base = found.extended.base if found.extended.active else found.simulation.base
-    model = held(scene, Extended(base, true), task.ar)
+    model = held(grids, Extended(base, true), task.ar)
     model, cost = _others(task, model)
     variance = cost / int(task.rows.sum()) * colour(task, task.innovations(task.residual(model)))
     available = (task.cost(found.simulation) - cost) / (2.0 * variance)
-    return Oracle(available, rmse(task, model, scene.sealed_rows))
+    return Oracle(available, rmse(task, model, grids.sealed_rows))
 
 
 def _active(spec: EffectSpec) -> Active | None:

@@ -32,8 +32,8 @@ from benchmarks.diagnosis_cases import (
 from benchmarks.diagnosis_oracle import Oracle, oracle
 from benchmarks.diagnosis_outside import OUTSIDE, added_to
 from valveflow_ros.diagnosis.diagnose import Record, diagnose
+from valveflow_ros.diagnosis.grids import make_grids
 from valveflow_ros.diagnosis.result import Diagnosis
-from valveflow_ros.diagnosis.scene import make_scene
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.fit.fit import fit, outline
 from valveflow_ros.fit.task import FitTask
@@ -94,10 +94,10 @@ def share_of_oracle(
 def _noise_mw(log: SimulatedLog, record: Record) -> float:
     """Return the root mean square of the noise of ten-second means on the sealed blocks."""
     bad = np.zeros(log.table.values.shape, dtype=bool)
-    scene = make_scene(record.table, record.step_s, record.pressure_exponent, record.settle_s, bad)
-    rows = len(scene.power)
-    per = round(scene.mean_s / record.step_s)
-    noise = log.noise_mw[: rows * per].reshape(rows, per).mean(axis=1)[scene.sealed_rows]
+    grids = make_grids(record.table, record.step_s, record.pressure_exponent, record.settle_s, bad)
+    rows = len(grids.power)
+    per = round(grids.mean_s / record.step_s)
+    noise = log.noise_mw[: rows * per].reshape(rows, per).mean(axis=1)[grids.sealed_rows]
     return float(np.sqrt(np.mean(noise**2)))
 
 

@@ -15,7 +15,7 @@ from benchmarks.torture.trial import Options, Outcome
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.task import FitTask
-from valveflow_ros.monitoring.alarm import AlarmAction
+from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.events import DiagnosisRequested, Event, FitRequested, SegmentClosed
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.prediction import PredictionBlock

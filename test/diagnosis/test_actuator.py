@@ -10,7 +10,7 @@ from streams import needs_jit
 from valveflow_ros.diagnosis import actuator
 from valveflow_ros.diagnosis.actuator import sized
 from valveflow_ros.diagnosis.diagnose import notes
-from valveflow_ros.diagnosis.scene import make_scene
+from valveflow_ros.diagnosis.grids import make_grids
 from valveflow_ros.records import Signal
 
 pytestmark = needs_jit
@@ -25,7 +25,7 @@ FAULTS = {
 
 def scene_of(samples):
     bad = np.zeros(samples.values.shape, dtype=bool)
-    return make_scene(*record(samples).about, bad)
+    return make_grids(*record(samples).about, bad)
 
 
 def judged(*effects, seed):
@@ -58,12 +58,12 @@ def test_every_fault_is_named_with_its_sizes(name):
 def test_what_does_not_matter(change):
     effect, truth = FAULTS['stiction']
     samples = table(DAYS, 45, (effect,), unit())
-    scene = scene_of(masked(samples, 0.01, 3) if change == 'missing rows' else samples)
+    grids = scene_of(masked(samples, 0.01, 3) if change == 'missing rows' else samples)
     if change == 'sensor offset':
-        scene.v[:] += 1.5
+        grids.v[:] += 1.5
     if change == 'mirrored':
-        scene.v[:], scene.command[:] = 100.0 - scene.v, 100.0 - scene.command
-    found = actuator.judge(scene)
+        grids.v[:], grids.command[:] = 100.0 - grids.v, 100.0 - grids.command
+    found = actuator.judge(grids)
     assert found.name == 'stiction'
     sizes = [value for value, _, _ in found.parameters.values()]
     assert sizes == pytest.approx(truth, rel=0.05)
@@ -78,9 +78,9 @@ def test_a_stop_that_holds_most_of_the_time_is_found():
 
 
 def test_a_command_of_another_day_is_no_fault():
-    scene = scene_of(table(DAYS, 45, (FAULTS['stiction'][0],), unit()))
-    scene.command[:] = np.roll(scene.command, len(scene.command) // 2)
-    found = actuator.judge(scene)
+    grids = scene_of(table(DAYS, 45, (FAULTS['stiction'][0],), unit()))
+    grids.command[:] = np.roll(grids.command, len(grids.command) // 2)
+    found = actuator.judge(grids)
     assert found is None or found.name != 'stiction'
 
 
@@ -98,12 +98,12 @@ def test_a_missing_command_is_said(rows, words):
         samples.values[rows, Signal.VALVE_COMMAND].copy(),
     )
     try:
-        scene = scene_of(samples)
+        grids = scene_of(samples)
     finally:
         samples.values[rows, Signal.VALVE_COMMAND] = kept
-    assert words in actuator.hindered(scene)
-    assert actuator.judge(scene) is None
-    (note,) = notes(scene)
+    assert words in actuator.hindered(grids)
+    assert actuator.judge(grids) is None
+    (note,) = notes(grids)
     assert note.startswith('Faults between command and position sensor cannot be judged')
 
 

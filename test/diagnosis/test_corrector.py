@@ -17,7 +17,7 @@ from valveflow_ros.diagnosis.cause import Active
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
-from valveflow_ros.diagnosis.scene import make_scene
+from valveflow_ros.diagnosis.grids import make_grids
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import NS_PER_S, Quality, SampleTable, Signal
 from valveflow_ros.signals.integrated_input import integrated_input
@@ -36,8 +36,8 @@ def rows() -> SampleTable:
 
 
 @pytest.fixture(scope='module')
-def scene(rows):
-    return make_scene(*record(rows).about, np.zeros(rows.values.shape, dtype=bool))
+def grids(rows):
+    return make_grids(*record(rows).about, np.zeros(rows.values.shape, dtype=bool))
 
 
 def active(name: str) -> Active:
@@ -45,9 +45,9 @@ def active(name: str) -> Active:
     return Active(catalogue()[name], VALUES[name], extra)
 
 
-def model_of(scene, *names: str) -> ExtendedModel:
+def model_of(grids, *names: str) -> ExtendedModel:
     extended = Extended(rough_model(), tuple(active(n) for n in names))
-    return ExtendedModel(extended, EXPONENT, scene.start_ns, scene.reference)
+    return ExtendedModel(extended, EXPONENT, grids.start_ns, grids.reference)
 
 
 def corrected(model: ExtendedModel, rows: SampleTable) -> SampleTable:
@@ -71,24 +71,24 @@ def same(a: SampleTable, b: SampleTable) -> bool:
     )
 
 
-def means_of(scene, shown: np.ndarray) -> np.ndarray:
-    return shown[: len(scene.u)].reshape(-1, scene.group).mean(axis=1)
+def means_of(grids, shown: np.ndarray) -> np.ndarray:
+    return shown[: len(grids.u)].reshape(-1, grids.group).mean(axis=1)
 
 
 @pytest.mark.parametrize('names', [*((n,) for n in NAMES), SEVERAL], ids=lambda n: '+'.join(n))
-def test_what_is_left_is_what_the_extended_model_leaves(scene, rows, names):
+def test_what_is_left_is_what_the_extended_model_leaves(grids, rows, names):
     """y' - plain(u') = y - extended(inputs), by the loops the diagnosis itself uses."""
-    model = model_of(scene, *names)
+    model = model_of(grids, *names)
     after = corrected(model, rows)
     measured = rows.column(Signal.GENERATED_POWER)
     left = after.column(Signal.GENERATED_POWER) - plain_answer(after)
     if 'clock' in names:  # the power belongs to inputs two rows later
         left[:-2] = left[2:]
         left[-2:] = 0.0
-    expected = answer(scene, model.model)
-    told = means_of(scene, measured - left)
-    here = np.flatnonzero(scene.scored)[:-1]
-    effect = (expected - answer(scene, model.model.without_causes()))[here]
+    expected = answer(grids, model.model)
+    told = means_of(grids, measured - left)
+    here = np.flatnonzero(grids.scored)[:-1]
+    effect = (expected - answer(grids, model.model.without_causes()))[here]
     assert np.abs(effect).max() > 1e-3
     if 'stiction' in names:
         # The catalogue draws the sensor's noise over the record, this row by row: single slips
@@ -98,18 +98,18 @@ def test_what_is_left_is_what_the_extended_model_leaves(scene, rows, names):
         assert np.abs(told - expected)[here].max() < 1e-8
 
 
-def test_sticking_is_drawn_anew_and_means_the_same(scene, rows):
-    model = model_of(scene, 'stiction')
+def test_sticking_is_drawn_anew_and_means_the_same(grids, rows):
+    model = model_of(grids, 'stiction')
     after = corrected(model, rows).column(Signal.VALVE_OPENING)
-    act = catalogue()['stiction'].act(scene.v, VALUES['stiction'], scene)
+    act = catalogue()['stiction'].act(grids.v, VALUES['stiction'], grids)
     stays = np.std(rows.column(Signal.VALVE_OPENING) - act)
     assert np.std(after - act) < 0.25 * stays
     assert abs(float(np.mean(after - act))) < 0.05 * stays
 
 
-def test_without_causes_rows_pass_bit_for_bit(scene, rows):
-    assert same(corrected(model_of(scene), rows), rows)
-    on_top = replace(model_of(scene), on_top_of=model_of(scene))
+def test_without_causes_rows_pass_bit_for_bit(grids, rows):
+    assert same(corrected(model_of(grids), rows), rows)
+    on_top = replace(model_of(grids), on_top_of=model_of(grids))
     assert same(corrected(on_top, rows), rows)
 
 
@@ -121,7 +121,7 @@ def test_without_causes_rows_pass_bit_for_bit(scene, rows):
     st.lists(st.tuples(st.integers(0, 1499), st.integers(0, 3)), max_size=10),
     st.lists(st.integers(1, 1498), max_size=3, unique=True),
 )  # fmt: skip
-def test_any_cutting_gives_the_same_bits(scene, rows, names, cuts, missing, gaps):
+def test_any_cutting_gives_the_same_bits(grids, rows, names, cuts, missing, gaps):
     part = rows.part(0, 1500)
     values, quality = part.values.copy(), part.quality.copy()
     for row, signal in missing:
@@ -131,7 +131,7 @@ def test_any_cutting_gives_the_same_bits(scene, rows, names, cuts, missing, gaps
     for gap in gaps:
         time_ns[gap:] += 300 * NS_PER_S
     part = SampleTable(time_ns, values, quality)
-    model = model_of(scene, *names)
+    model = model_of(grids, *names)
     whole = corrected(model, part)
     corrector = corrector_of(model, STEP_S)
     edges = [0, *sorted(cuts), len(part)]
@@ -142,8 +142,8 @@ def test_any_cutting_gives_the_same_bits(scene, rows, names, cuts, missing, gaps
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_rows_one_by_one_are_rows_at_once(scene, rows, name):
-    part, model = rows.part(0, 150), model_of(scene, name)
+def test_rows_one_by_one_are_rows_at_once(grids, rows, name):
+    part, model = rows.part(0, 150), model_of(grids, name)
     corrector = corrector_of(model, STEP_S)
     single = [corrector.correct(part.part(k, k + 1)) for k in range(len(part))]
     assert same(SampleTable.concatenate(single), corrected(model, part))
@@ -151,8 +151,8 @@ def test_rows_one_by_one_are_rows_at_once(scene, rows, name):
 
 
 @pytest.mark.parametrize('names', [*((n,) for n in NAMES), SEVERAL], ids=lambda n: '+'.join(n))
-def test_taken_up_where_it_was_left_it_gives_the_same_bits(scene, rows, names):
-    model, cut = model_of(scene, *names), 16 * 700
+def test_taken_up_where_it_was_left_it_gives_the_same_bits(grids, rows, names):
+    model, cut = model_of(grids, *names), 16 * 700
     expected = corrected(model, rows)
     first = corrector_of(model, STEP_S)
     before = first.correct(rows.part(0, cut))
@@ -161,18 +161,18 @@ def test_taken_up_where_it_was_left_it_gives_the_same_bits(scene, rows, names):
     after = second.correct(rows.part(cut, len(rows)))
     assert same(SampleTable.concatenate([before, after]), expected)
     with pytest.raises(DataError, match='another model_file'):
-        corrector_of(model_of(scene), STEP_S).restore(first.snapshot())
+        corrector_of(model_of(grids), STEP_S).restore(first.snapshot())
 
 
-def test_pressure_temperature_and_command_stay(scene, rows):
-    after = corrected(model_of(scene, *SEVERAL), rows)
+def test_pressure_temperature_and_command_stay(grids, rows):
+    after = corrected(model_of(grids, *SEVERAL), rows)
     for signal in (Signal.MAIN_STEAM_PRESSURE, Signal.MAIN_STEAM_TEMPERATURE,
                    Signal.VALVE_COMMAND):  # fmt: skip
         np.testing.assert_array_equal(after.column(signal), rows.column(signal))
 
 
-def test_two_models_on_top_of_each_other_are_one_after_the_other(scene, rows):
-    first, second = model_of(scene, 'backlash', 'gain_step'), model_of(scene, 'reheater')
+def test_two_models_on_top_of_each_other_are_one_after_the_other(grids, rows):
+    first, second = model_of(grids, 'backlash', 'gain_step'), model_of(grids, 'reheater')
     both = replace(second, on_top_of=first)
     assert same(corrected(both, rows), corrected(second, corrected(first, rows)))
     assert [h.name for h in corrector_of(both, STEP_S).held] == [
@@ -192,25 +192,25 @@ def later(rows: SampleTable, days: float) -> SampleTable:
     return replace(rows, time_ns=rows.time_ns + round(days * 86_400 * NS_PER_S))
 
 
-def test_beyond_its_record_a_drift_goes_on_and_steps_stay(scene, rows):
-    drift = model_of(scene, 'gain_drift')
+def test_beyond_its_record_a_drift_goes_on_and_steps_stay(grids, rows):
+    drift = model_of(grids, 'gain_drift')
     grown = shift_of(drift, later(rows, 20.0)) - shift_of(drift, rows)
     assert grown == pytest.approx(2.0 * VALUES['gain_drift'][0], rel=1e-3)
-    step = model_of(scene, 'gain_step')
+    step = model_of(grids, 'gain_step')
     assert shift_of(step, later(rows, 20.0)) == pytest.approx(0.5 * VALUES['gain_step'][0])
-    hidden = model_of(scene, 'intervals')  # 1.5 h of 9.6 on, then on again for good
+    hidden = model_of(grids, 'intervals')  # 1.5 h of 9.6 on, then on again for good
     on = 1.0 - (5400.0 + (0.4 * 86_400.0 - 20_000.0)) / (0.4 * 86_400.0)
     assert shift_of(hidden, later(rows, 20.0)) == pytest.approx(VALUES['intervals'][0] * on)
 
 
-def test_a_gap_is_a_new_beginning_of_the_response_but_not_of_the_plug(scene, rows):
+def test_a_gap_is_a_new_beginning_of_the_response_but_not_of_the_plug(grids, rows):
     """Rows behind a gap come out as those of a corrector that has seen nothing."""
-    held = model_of(scene, 'gain_step', 'reheater')
+    held = model_of(grids, 'gain_step', 'reheater')
     first, behind = rows.part(0, 700), later(rows.part(700, 1400), 0.1)
     corrector = corrector_of(held, STEP_S)
     corrector.correct(first)
     assert same(corrector.correct(behind), corrected(held, behind))
-    slack = model_of(scene, 'backlash')
+    slack = model_of(grids, 'backlash')
     corrector = corrector_of(slack, STEP_S)
     corrector.correct(first)
     assert not same(corrector.correct(behind), corrected(slack, behind))

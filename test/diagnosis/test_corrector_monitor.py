@@ -19,7 +19,7 @@ from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
 from valveflow_ros.diagnosis.from_window import freed, on_top
-from valveflow_ros.diagnosis.scene import make_scene
+from valveflow_ros.diagnosis.grids import make_grids
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.monitoring.events import FitRequested
@@ -39,10 +39,10 @@ HELD = {'backlash': (0.8,), 'exponent': (0.03,), 'gain_step': (0.02, 0.2), 'rehe
 
 
 def model_of(rows: SampleTable, held: dict[str, tuple[float, ...]]) -> ExtendedModel:
-    scene = make_scene(*record(rows).about, np.zeros(rows.values.shape, dtype=bool))
+    grids = make_grids(*record(rows).about, np.zeros(rows.values.shape, dtype=bool))
     active = tuple(Active(catalogue()[n], v) for n, v in held.items())
     return ExtendedModel(
-        Extended(rough_model(), active), EXPONENT, scene.start_ns, scene.reference
+        Extended(rough_model(), active), EXPONENT, grids.start_ns, grids.reference
     )
 
 
@@ -86,11 +86,11 @@ def test_the_prediction_is_that_of_the_extended_model(rows, model):
     said = predicted(model, rows)
     measured = rows.column(Signal.GENERATED_POWER)
     np.testing.assert_array_equal(said['measured_mw'], measured)
-    scene = make_scene(*record(rows).about, np.zeros(rows.values.shape, dtype=bool))
-    expected = answer(scene, model.model)
-    shown = said['dynamic_mw'][: len(scene.u)].reshape(-1, scene.group).mean(axis=1)
-    here = scene.scored & np.isfinite(shown)
-    assert here.sum() > 0.8 * scene.scored.sum()
+    grids = make_grids(*record(rows).about, np.zeros(rows.values.shape, dtype=bool))
+    expected = answer(grids, model.model)
+    shown = said['dynamic_mw'][: len(grids.u)].reshape(-1, grids.group).mean(axis=1)
+    here = grids.scored & np.isfinite(shown)
+    assert here.sum() > 0.8 * grids.scored.sum()
     np.testing.assert_allclose(shown[here], expected[here], atol=1e-8)
     known = np.isfinite(said['dynamic_mw'])
     left = (measured - said['dynamic_mw'])[known]

@@ -19,8 +19,8 @@ from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.evidence import sign_flip
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
 from valveflow_ros.diagnosis.fitting import Task, base_mask, base_tangents, cause_tangents
+from valveflow_ros.diagnosis.grids import ORDER, SEALED_FOLD, make_grids
 from valveflow_ros.diagnosis.result import model_from_json, model_to_json
-from valveflow_ros.diagnosis.scene import ORDER, SEALED_FOLD, make_scene
 from valveflow_ros.diagnosis.search import simplified
 from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.records import SampleTable, Signal
@@ -42,10 +42,10 @@ TYPICAL = {
 
 
 @pytest.fixture(scope='module')
-def scene():
+def grids():
     samples = table(0.4, 2, (), unit())
     bad = np.zeros(samples.values.shape, dtype=bool)
-    return make_scene(*record(samples).about, bad)
+    return make_grids(*record(samples).about, bad)
 
 
 def test_the_catalogue_holds_what_it_promises():
@@ -61,17 +61,17 @@ def test_the_catalogue_holds_what_it_promises():
 
 
 @pytest.mark.parametrize('name', sorted(NAMES))
-def test_every_cause_changes_the_answer_and_nothing_is_nothing(scene, name):
+def test_every_cause_changes_the_answer_and_nothing_is_nothing(grids, name):
     plain = Extended(rough_model())
     cause = catalogue()[name]
     extra = (3600.0, 9000.0) if name == 'intervals' else ()
-    changed = answer(scene, plain.with_cause(Active(cause, TYPICAL[name], extra)))
+    changed = answer(grids, plain.with_cause(Active(cause, TYPICAL[name], extra)))
     assert np.isfinite(changed).all()
-    assert np.abs(changed - answer(scene, plain))[scene.scored].max() > 1e-3
+    assert np.abs(changed - answer(grids, plain))[grids.scored].max() > 1e-3
 
 
 @pytest.mark.parametrize('name', sorted(NAMES))
-def test_tangents_of_causes_predict_small_changes(scene, name):
+def test_tangents_of_causes_predict_small_changes(grids, name):
     cause = catalogue()[name]
     if cause.stage in (Stage.OPENING, Stage.DYNAMICS):
         pytest.skip('not smooth, or it changes regions')
@@ -81,29 +81,29 @@ def test_tangents_of_causes_predict_small_changes(scene, name):
         rough_model(), levels=np.empty(0), time_constants=np.array([20.0]), delays=np.array([4.0])
     )
     here = Extended(model, (Active(cause, TYPICAL[name], extra),))
-    task = Task(scene, scene.whole, np.zeros(ORDER))
+    task = Task(grids, grids.whole, np.zeros(ORDER))
     tangent = cause_tangents(task, here)[:, 0]
     values = list(TYPICAL[name])
     by = 0.3 * cause.unknowns[0].step
     values[0] += by
-    moved = answer(scene, Extended(model, (Active(cause, tuple(values), extra),)))
-    change = moved - answer(scene, here)
+    moved = answer(grids, Extended(model, (Active(cause, tuple(values), extra),)))
+    change = moved - answer(grids, here)
     assert np.abs(change - by * tangent).max() <= 0.1 * np.abs(change).max() + 1e-9
 
 
-def test_tangents_of_the_curve_predict_small_changes(scene):
+def test_tangents_of_the_curve_predict_small_changes(grids):
     model = Extended(replace(
         rough_model(), levels=np.empty(0), time_constants=np.array([20.0]), delays=np.array([4.0])
     ))  # fmt: skip
-    task = Task(scene, scene.whole, np.zeros(ORDER))
+    task = Task(grids, grids.whole, np.zeros(ORDER))
     free = np.flatnonzero(base_mask(task, model))
     columns = base_tangents(task, model)
     packed = model.base.pack()
     rng = np.random.default_rng(3)
     step = rng.normal(size=len(free)) * np.where(free < 5, 0.1, 0.01)
     packed[free] += step
-    change = answer(scene, replace(model, base=model.base.unpack(packed))) - answer(scene, model)
-    rows = scene.scored
+    change = answer(grids, replace(model, base=model.base.unpack(packed))) - answer(grids, model)
+    rows = grids.scored
     assert np.abs(change - columns @ step)[rows].max() < 0.05 * np.abs(change)[rows].max() + 1e-3
 
 
@@ -150,22 +150,22 @@ def test_the_hidden_path_is_the_cheapest(costs, penalty):
     assert price(path) == pytest.approx(best, abs=1e-9)
 
 
-def test_one_pass_and_two_passes_of_the_filter_agree(scene):
-    x = rough_model().static(scene.u)
+def test_one_pass_and_two_passes_of_the_filter_agree(grids):
+    x = rough_model().static(grids.u)
     path = np.zeros(len(x), dtype=np.uint8)
-    taps = rough_model().taps(scene.step_s)
-    usable = scene.usable.copy()
+    taps = rough_model().taps(grids.step_s)
+    usable = grids.usable.copy()
     usable[1000:1010] = 0
-    rows, means = np.empty(len(x)), np.empty(len(scene.power))
+    rows, means = np.empty(len(x)), np.empty(len(grids.power))
     kernels.respond(x, usable, path, taps, rows)
-    kernels.respond_means(x, usable, path, taps, scene.group, means)
-    np.testing.assert_allclose(means, scene.means(rows), rtol=1e-12)
+    kernels.respond_means(x, usable, path, taps, grids.group, means)
+    np.testing.assert_allclose(means, grids.means(rows), rtol=1e-12)
 
 
-def test_every_fifth_block_is_sealed_and_in_no_fit(scene):
-    assert not np.any(scene.open_rows & scene.sealed_rows)
-    assert np.array_equal(scene.open_rows | scene.sealed_rows, scene.whole)
-    assert set(scene.fold_of_sub[scene.sub[scene.sealed_rows]]) == {SEALED_FOLD}
+def test_every_fifth_block_is_sealed_and_in_no_fit(grids):
+    assert not np.any(grids.open_rows & grids.sealed_rows)
+    assert np.array_equal(grids.open_rows | grids.sealed_rows, grids.whole)
+    assert set(grids.fold_of_sub[grids.sub[grids.sealed_rows]]) == {SEALED_FOLD}
 
 
 def test_scores_of_noise_have_even_chances():
@@ -203,18 +203,18 @@ def test_shallow_knees_are_taken_out_and_steep_ones_stay():
     assert simplified(model).pieces == model.pieces
 
 
-def test_the_extended_model_comes_back_from_its_file(scene):
+def test_the_extended_model_comes_back_from_its_file(grids):
     model = Extended(
         rough_model(),
         (Active(catalogue()['gain_step'], (0.006, 0.2)),
          Active(catalogue()['intervals'], (0.01,), (3600.0, 9000.0))),
     )  # fmt: skip
-    raw = json.loads(json.dumps(model_to_json(ExtendedModel(model, 1.125, 5, scene.reference))))
+    raw = json.loads(json.dumps(model_to_json(ExtendedModel(model, 1.125, 5, grids.reference))))
     given = model_from_json(raw)
     back, exponent = given.model, given.pressure_exponent
     start_ns, reference = given.start_ns, given.reference
-    assert (exponent, start_ns, reference) == (1.125, 5, scene.reference)
-    np.testing.assert_array_equal(answer(scene, back), answer(scene, model))
+    assert (exponent, start_ns, reference) == (1.125, 5, grids.reference)
+    np.testing.assert_array_equal(answer(grids, back), answer(grids, model))
 
 
 @pytest.mark.parametrize('raw', [None, {}, {'format': 'valveflow/extended_model', 'version': 9}])
@@ -226,4 +226,4 @@ def test_what_is_no_extended_model_is_refused(raw):
 def test_a_record_of_minutes_is_refused():
     samples = table(0.4, 2, (), unit()).part(0, 600)
     with pytest.raises(TooFewSamplesError, match='longer record'):
-        make_scene(*record(samples).about, np.zeros(samples.values.shape, dtype=bool))
+        make_grids(*record(samples).about, np.zeros(samples.values.shape, dtype=bool))

@@ -13,7 +13,7 @@ from valveflow_ros.diagnosis.cause import Active, Kind
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import Task, beliefs, free, held, whitening
-from valveflow_ros.diagnosis.scene import ORDER, make_scene, sensor_noise
+from valveflow_ros.diagnosis.grids import ORDER, make_grids, sensor_noise
 
 pytestmark = needs_jit
 STICKS = (2.0, 1.4)
@@ -62,17 +62,17 @@ def test_what_predicted_well_is_believed_and_can_be_given_up():
 @pytest.fixture(scope='module')
 def sticking():
     samples = table(1.0, 4, (f'stiction:s_percent={STICKS[0]},j_percent={STICKS[1]}',), unit())
-    scene = make_scene(*record(samples).about, np.zeros(samples.values.shape, dtype=bool))
+    grids = make_grids(*record(samples).about, np.zeros(samples.values.shape, dtype=bool))
     plain = Extended(rough_model())
-    task = Task(scene, scene.open_rows, np.zeros(ORDER))
-    return Task(scene, scene.open_rows, whitening(scene, task.residual(plain))), plain
+    task = Task(grids, grids.open_rows, np.zeros(ORDER))
+    return Task(grids, grids.open_rows, whitening(grids, task.residual(plain))), plain
 
 
 def test_believed_draws_predict_better_than_their_mean_and_than_a_slack(sticking):
     task, plain = sticking
     drawn = plain.with_cause(Active(catalogue()['stiction'], STICKS))
     slack = plain.with_cause(Active(catalogue()['backlash'], (STICKS[0],)))
-    mean = np.mean((task.scene.power - answer(task.scene, drawn))[task.rows] ** 2)
+    mean = np.mean((task.grids.power - answer(task.grids, drawn))[task.rows] ** 2)
     believed = np.mean(task.residual(drawn)[task.rows] ** 2)
     assert believed < mean
     assert task.cost(drawn) < 0.98 * task.cost(slack)
@@ -82,7 +82,7 @@ def test_believed_draws_predict_better_than_their_mean_and_than_a_slack(sticking
 def test_held_draws_say_nearly_the_same_and_come_free_again(sticking):
     task, plain = sticking
     drawn = plain.with_cause(Active(catalogue()['stiction'], STICKS))
-    fixed = held(task.scene, drawn, task.ar)
+    fixed = held(task.grids, drawn, task.ar)
     (active,) = fixed.active
     assert active.values == STICKS
     assert {u.kind for u in active.cause.unknowns} == {Kind.HELD}
@@ -90,4 +90,4 @@ def test_held_draws_say_nearly_the_same_and_come_free_again(sticking):
     apart = (task.residual(fixed) - task.residual(drawn))[rows]
     assert np.std(apart) < 0.5 * np.std(task.residual(plain)[rows] - task.residual(drawn)[rows])
     assert free(fixed, catalogue()) == drawn
-    assert held(task.scene, plain, task.ar) is plain
+    assert held(task.grids, plain, task.ar) is plain

@@ -9,7 +9,7 @@ from naive_stream import NaiveAlarm
 from streams import START_NS, grid_ns
 
 from valveflow_ros.curve.shift import PieceShift, Shift
-from valveflow_ros.monitoring.alarm import AlarmAction
+from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.alarms import Alarms, Judged, ResidualAlarm, ShiftAlarm
 from valveflow_ros.parameters import Settings
 from valveflow_ros.state import from_bytes, to_bytes

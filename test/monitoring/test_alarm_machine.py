@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 from streams import INTERPRETED, START_NS, frozen
 
-from valveflow_ros.monitoring.alarm import AlarmAction
+from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.alarms import AlarmState, ResidualAlarm
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S

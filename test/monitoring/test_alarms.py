@@ -26,7 +26,7 @@ from streams import (
 )
 
 from valveflow_ros.errors import DataError
-from valveflow_ros.monitoring.alarm import BURIED, AlarmAction
+from valveflow_ros.monitoring.alarm_state import BURIED, AlarmAction
 from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState, ResidualAlarm
 from valveflow_ros.monitoring.events import JournalEntry, JournalKind
 from valveflow_ros.monitoring.monitor import Monitor

@@ -23,7 +23,7 @@ from streams import (
 from valveflow_ros.errors import DataError, ParameterError
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.fit.residual_chart import ResidualChart
-from valveflow_ros.monitoring.alarm import AlarmAction
+from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState
 from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.events import (

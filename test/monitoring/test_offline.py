@@ -24,7 +24,7 @@ from streams import (
 
 from valveflow_ros.errors import DataError, ValveflowError
 from valveflow_ros.fit.fit import fit
-from valveflow_ros.monitoring.alarm import AlarmAction
+from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.events import CurveAdopted, FitRequested, JournalEntry, JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import (

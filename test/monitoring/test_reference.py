@@ -20,7 +20,7 @@ from streams import (
 
 from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.errors import DataError
-from valveflow_ros.monitoring.alarm import AlarmAction
+from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState, ShiftAlarm
 from valveflow_ros.monitoring.events import CurveAdopted, JournalEntry, JournalKind, ReferenceSet
 from valveflow_ros.monitoring.monitor import Monitor

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from streams import START_NS, blocks_of, cuts, examples, frozen
 
 from valveflow_ros.errors import DataError
-from valveflow_ros.monitoring.alarm import AlarmAction, AlarmStateMachine, Priority
+from valveflow_ros.monitoring.alarm_state import AlarmAction, AlarmStateMachine, Priority
 from valveflow_ros.monitoring.alarms import AlarmState, ResidualAlarm
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S

@@ -11,10 +11,10 @@ from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import Estimate
 from valveflow_ros.diagnosis.evidence import Gain, SegmentGain
 from valveflow_ros.diagnosis.extended import Extended
+from valveflow_ros.diagnosis.grids import Reference
 from valveflow_ros.diagnosis.result import NAMED, Diagnosis, NamedCause
-from valveflow_ros.diagnosis.scene import Reference
 from valveflow_ros.diagnosis.signature import Answer, ResidualMap, Signature
-from valveflow_ros.monitoring.alarm import AlarmState
+from valveflow_ros.monitoring.alarm_state import AlarmState
 from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.diagnosis import Diagnosed
 from valveflow_ros.report.history import AlarmMoment, CurveMoment, DiagnosisMoment, History

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from report_stories import HOUR_NS, KNOTS, START_NS, STEP_MW, history
 
-from valveflow_ros.monitoring.alarm import AlarmState
+from valveflow_ros.monitoring.alarm_state import AlarmState
 from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.history import AlarmMoment, History, history_sections
 

@@ -11,7 +11,7 @@ from report_stories import HOUR_NS, START_NS, history
 
 from valveflow_ros.interface.monitor import recorded_history
 from valveflow_ros.logs import Definitions, open_log
-from valveflow_ros.monitoring.alarm import AlarmState
+from valveflow_ros.monitoring.alarm_state import AlarmState
 from valveflow_ros.report.history import AlarmMoment
 
 

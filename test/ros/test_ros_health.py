@@ -18,7 +18,7 @@ from std_msgs.msg import Float32, Float64
 from valveflow_ros.curve.characteristic import Characteristic, Support
 from valveflow_ros.curve.shift import judge_shift
 from valveflow_ros.fit.result import NOT_REFINED
-from valveflow_ros.monitoring.alarm import AlarmAction
+from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.alarms import Judged, ResidualAlarm
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_rows

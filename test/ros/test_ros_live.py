@@ -10,7 +10,7 @@ from valveflow_msgs.msg import Alarm
 from valveflow_ros.curve.shift import PieceShift, Shift
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit
-from valveflow_ros.monitoring.alarm import AlarmAction
+from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.alarms import Alarms, ResidualAlarm, ShiftAlarm
 from valveflow_ros.monitoring.events import CurveAdopted, Event, JournalEntry, JournalKind
 from valveflow_ros.monitoring.monitor import Monitor

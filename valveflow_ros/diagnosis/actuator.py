@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from valveflow_ros.diagnosis.evidence import sign_flip
-from valveflow_ros.diagnosis.scene import FOLDS, SEALED_FOLD, SUBS_IN_BLOCK, Scene
+from valveflow_ros.diagnosis.grids import FOLDS, SEALED_FOLD, SUBS_IN_BLOCK, Grids
 from valveflow_ros.records import BoolArray, FloatArray, IntArray
 
 # Sizes of a fault between command and position, from rows the sensor's noise cannot choose.
@@ -236,12 +236,12 @@ class _Fit:
     cost: float
 
 
-def hindered(scene: Scene) -> str:
+def hindered(grids: Grids) -> str:
     """Say why the actuator cannot be judged directly; empty if it can."""
-    both = np.isfinite(scene.command) & np.isfinite(scene.v)
-    if not np.isfinite(scene.command).any():
+    both = np.isfinite(grids.command) & np.isfinite(grids.v)
+    if not np.isfinite(grids.command).any():
         return 'the commanded opening was not logged'
-    if both.sum() < _LEAST_ROWS or float(np.std(scene.command[both])) == 0.0:
+    if both.sum() < _LEAST_ROWS or float(np.std(grids.command[both])) == 0.0:
         return 'the commanded opening hardly changes, or was rarely logged with the position'
     return ''
 
@@ -309,17 +309,17 @@ class _Pairs:
         return _Pairs(self.c[rows], self.before[rows], self.v[rows], self.step_s)
 
 
-def judge(scene: Scene) -> ActuatorFault | None:
+def judge(grids: Grids) -> ActuatorFault | None:
     """Return the fault between command and position sensor, None if there is none."""
-    if hindered(scene):
+    if hindered(grids):
         return None
-    both = np.isfinite(scene.command[1:]) & np.isfinite(scene.v[1:]) & np.isfinite(scene.v[:-1])
-    offset = _offset(scene.command[1:][both], scene.v[1:][both])
+    both = np.isfinite(grids.command[1:]) & np.isfinite(grids.v[1:]) & np.isfinite(grids.v[:-1])
+    offset = _offset(grids.command[1:][both], grids.v[1:][both])
     pairs = _Pairs(
-        scene.command[1:][both] + offset, scene.v[:-1][both], scene.v[1:][both], scene.fine_s
+        grids.command[1:][both] + offset, grids.v[:-1][both], grids.v[1:][both], grids.fine_s
     )
-    sub = np.arange(len(scene.v)) // max(1, len(scene.v) // scene.subs)
-    sub = np.minimum(sub, scene.subs - 1)[1:][both]
+    sub = np.arange(len(grids.v)) // max(1, len(grids.v) // grids.subs)
+    sub = np.minimum(sub, grids.subs - 1)[1:][both]
     sealed = sub // SUBS_IN_BLOCK % FOLDS == SEALED_FOLD
     fitted = pairs.part(~sealed).part(slice(_MOST_ROWS))
     plain, *fits = [_fitted(fitted, plan) for plan in _plans(fitted.c)]
@@ -339,7 +339,7 @@ def judge(scene: Scene) -> ActuatorFault | None:
     if not rms[1] < rms[0]:
         return None
     chance = min(1.0, len(fits) * sign_flip(scores))
-    sharp = sized(best.plan.name, scene.command + offset, scene.v, scene.fine_s, best.values)
+    sharp = sized(best.plan.name, grids.command + offset, grids.v, grids.fine_s, best.values)
     parameters = (
         dict(zip(best.plan.keys, sharp, strict=True))
         if sharp

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
-from valveflow_ros.diagnosis.scene import Scene
+from valveflow_ros.diagnosis.grids import Grids
 from valveflow_ros.records import NS_PER_S, BoolArray
 
 # A number with its 95 % interval, and how a time is told: as dates in UTC.
@@ -107,12 +107,12 @@ class Stage(enum.IntEnum):
 
     What ``act`` of a cause takes and returns:
 
-    - ``OPENING``: (v in % (nn,), values, scene) to the opening behind the fault
-    - ``INPUT``: (u (n,), values, scene, model) to a factor on u
-    - ``FLOW``: (u (n,), values, scene) to MW added to x = F(u)
-    - ``GAIN``: (values, scene, extra) to a factor on x
+    - ``OPENING``: (v in % (nn,), values, grids) to the opening behind the fault
+    - ``INPUT``: (u (n,), values, grids, model) to a factor on u
+    - ``FLOW``: (u (n,), values, grids) to MW added to x = F(u)
+    - ``GAIN``: (values, grids, extra) to a factor on x
     - ``DYNAMICS``: (model, values) to a model with other dynamics
-    - ``OUTPUT``: (y (n,) in MW, values, scene) to the power shown
+    - ``OUTPUT``: (y (n,) in MW, values, grids) to the power shown
     """
 
     OPENING = 0
@@ -226,7 +226,7 @@ class Cause:
     sentence: Callable[[SentenceValues], str]
     confusers: tuple[str, ...]
     experiment: str
-    hindered: Callable[[Scene], str] = field(default=lambda scene: '')
+    hindered: Callable[[Grids], str] = field(default=lambda grids: '')
     slow: bool = False  # a slow wander of the power could be mistaken for it
     # Infers what is hidden (``extra``) from the sub-blocks allowed, for a given size.
     infer: Callable[[Any, Active, BoolArray], Values] | None = None

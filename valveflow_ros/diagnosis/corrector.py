@@ -27,7 +27,7 @@ from valveflow_ros.diagnosis import kernels as flows
 from valveflow_ros.diagnosis import kernels as kernels
 from valveflow_ros.diagnosis.cause import Active, Stage
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
-from valveflow_ros.diagnosis.scene import Reference, Scene
+from valveflow_ros.diagnosis.grids import Grids, Reference
 from valveflow_ros.errors import DataError
 from valveflow_ros.monitoring.rows import Corrector
 from valveflow_ros.records import (
@@ -369,11 +369,11 @@ class ModelCorrector(Memory):
         opening = table.column(Signal.VALVE_OPENING).copy()
         for valve in self._valves:
             opening = valve.feed(opening, table.time_ns)
-        scene = self._scene(table, opening)
-        factor = np.ones(len(scene.u))
-        u = scene.u
+        grids = self._scene(table, opening)
+        factor = np.ones(len(grids.u))
+        u = grids.u
         for a in self._inputs:
-            part = a.cause.act(u, a.values, scene, self._model.base)
+            part = a.cause.act(u, a.values, grids, self._model.base)
             u, factor = u * part, factor * part
         n = len(table)
         jumps, begin = self._beginnings(table.time_ns, u[:n])
@@ -381,10 +381,10 @@ class ModelCorrector(Memory):
         if self._clock is not None:
             power = self._clock.feed(power, jumps)
         if self._differs:
-            power -= self._difference(scene, u, begin)[:n]
+            power -= self._difference(grids, u, begin)[:n]
         return _with(table, opening * factor[:n], power)
 
-    def _scene(self, table: SampleTable, opening: FloatArray) -> Scene:
+    def _scene(self, table: SampleTable, opening: FloatArray) -> Grids:
         """Return the rows as causes without a memory want them, a whole number of handfuls."""
         pressure = np.ascontiguousarray(table.column(Signal.MAIN_STEAM_PRESSURE))
         u = integrated_input(opening, pressure, self._given.pressure_exponent)
@@ -397,7 +397,7 @@ class ModelCorrector(Memory):
         columns = (opening, pressure, u, temperature, time_s)
         v, p, u, temperature, time_s = (_padded(c) for c in columns)
         none = np.zeros(len(u), dtype=bool)
-        return Scene(
+        return Grids(
             start_ns=self._given.start_ns, fine_s=self._step_s, step_s=self._step_s,
             settle_s=0.0, exponent=self._given.pressure_exponent, v=v, density=np.ones(len(u)),
             command=v, u=u, pressure=p, temperature=temperature, time_s=time_s,
@@ -412,25 +412,25 @@ class ModelCorrector(Memory):
         kernels.beginnings(time_ns, u, gap_ns, self._follows, jumps, begin)
         return jumps, begin
 
-    def _difference(self, scene: Scene, u: FloatArray, begin: ByteArray) -> FloatArray:
+    def _difference(self, grids: Grids, u: FloatArray, begin: ByteArray) -> FloatArray:
         """Return by how much the extended model shows more than the plain one, MW."""
         n = len(begin)
         plain = _flow(self._model, u)
         x = plain.copy()
         for a in self._flows:
-            x += a.cause.act(u, a.values, scene)
+            x += a.cause.act(u, a.values, grids)
         for a in self._gains:
-            x *= a.cause.act(a.values, scene, a.extra)
+            x *= a.cause.act(a.values, grids, a.extra)
         y = np.full(len(u), np.nan)
         y[:n] = self._extended.feed(x[:n], begin)
         for a in self._shown:
-            y = self._show(a, y, scene, begin)
+            y = self._show(a, y, grids, begin)
         y[:n] -= self._plain.feed(plain[:n], begin)
         return y
 
-    def _show(self, a: Active, y: FloatArray, scene: Scene, begin: ByteArray) -> FloatArray:
+    def _show(self, a: Active, y: FloatArray, grids: Grids, begin: ByteArray) -> FloatArray:
         if a.name not in self._reheaters:
-            return np.asarray(a.cause.act(y, a.values, scene))
+            return np.asarray(a.cause.act(y, a.values, grids))
         out = y.copy()
         out[: len(begin)] = self._reheaters[a.name].feed(y[: len(begin)], begin)
         return out

@@ -22,6 +22,7 @@ from valveflow_ros.diagnosis.evidence import (
 )
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import Task, improve, search_levels, search_lines
+from valveflow_ros.diagnosis.grids import ORDER, Grids, make_grids
 from valveflow_ros.diagnosis.record_faults import Fault, faults
 from valveflow_ros.diagnosis.result import (
     NAMED,
@@ -31,7 +32,6 @@ from valveflow_ros.diagnosis.result import (
     Disturbance,
     NamedCause,
 )
-from valveflow_ros.diagnosis.scene import ORDER, Scene, make_scene
 from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.diagnosis.search import Found, Progress, search, simplified
 from valveflow_ros.diagnosis.structure import Period, Structure, Wander, period, structure, wander
@@ -85,16 +85,16 @@ _SLACK = 'The valve follows only after a slack of {w_percent:.2g} % of opening i
 
 def actuator_cause(found: Found) -> tuple[NamedCause, ...]:
     """Return the fault between command and position sensor, its size in MW of power."""
-    scene = found.task.scene
-    fault = actuator.judge(scene)
+    grids = found.task.grids
+    fault = actuator.judge(grids)
     if fault is None or fault.name in found.model.names:
         return ()
     cause = catalogue()[fault.name]
     units = {u.name: u.unit for u in cause.unknowns}
     base = found.model.base
-    x = base.static(scene.u[scene.usable > 0])
-    rise = float(np.ptp(x) / max(np.ptp(scene.u[scene.usable > 0]), 1e-9))
-    per_percent = rise * float(np.nanmean(scene.density))
+    x = base.static(grids.u[grids.usable > 0])
+    rise = float(np.ptp(x) / max(np.ptp(grids.u[grids.usable > 0]), 1e-9))
+    per_percent = rise * float(np.nanmean(grids.density))
     gain = Gain(fault.rms_before * per_percent, fault.rms_after * per_percent, fault.p_value)
     values = {k: v for k, (v, _, _) in fault.parameters.items()}
     return (
@@ -114,13 +114,13 @@ def actuator_cause(found: Found) -> tuple[NamedCause, ...]:
 
 
 def record_causes(
-    raw: Scene | None, found: Found, wrong: tuple[Fault, ...]
+    raw: Grids | None, found: Found, wrong: tuple[Fault, ...]
 ) -> tuple[NamedCause, ...]:
     """Return faults of the record as causes; before: with the rows that were not believed."""
     if raw is None:
         return ()
-    before = rmse(replace(found.task, scene=raw), found.model, raw.sealed_rows)
-    after = rmse(found.task, found.model, found.task.scene.sealed_rows)
+    before = rmse(replace(found.task, grids=raw), found.model, raw.sealed_rows)
+    after = rmse(found.task, found.model, found.task.grids.sealed_rows)
     gain = Gain(before, after, float('nan'))
     out = []
     for name in dict.fromkeys(f.name for f in wrong):
@@ -139,9 +139,9 @@ def _fault_parameters(fault: Fault) -> dict[str, Estimate]:
     }
 
 
-def notes(scene: Scene) -> tuple[str, ...]:
+def notes(grids: Grids) -> tuple[str, ...]:
     """Say what could not be judged for want of a command."""
-    why = actuator.hindered(scene)
+    why = actuator.hindered(grids)
     if not why:
         return ()
     return (f'Faults between command and position sensor cannot be judged: {why}.',)
@@ -188,7 +188,7 @@ class Record:
 
     @property
     def about(self) -> tuple[SampleTable, float, float, float]:
-        """Return what `make_scene` wants first."""
+        """Return what `make_grids` wants first."""
         return self.table, self.step_s, self.pressure_exponent, self.settle_s
 
 
@@ -224,9 +224,9 @@ def diagnose(
     """
     progress(0.02, 'the record itself')
     bad, wrong = record.faults()
-    scene, rough = make_scene(*record.about, bad), make_scene(*record.about, bad, rough=True)
-    _moves(scene)
-    task = Task(scene, scene.open_rows, np.zeros(ORDER), given)
+    grids, rough = make_grids(*record.about, bad), make_grids(*record.about, bad, rough=True)
+    _moves(grids)
+    task = Task(grids, grids.open_rows, np.zeros(ORDER), given)
     start = Extended(model if given else simplified(model))
     found = search(task, start, progress, rough)
     progress(0.7, 'the sealed blocks')
@@ -237,9 +237,9 @@ def diagnose(
     return _conclude(record, found, rest, wrong, progress)
 
 
-def _moves(scene: Scene) -> None:
+def _moves(grids: Grids) -> None:
     """Refuse a record in which nothing happens."""
-    low, high = np.quantile(scene.u[scene.usable > 0], (0.01, 0.99))
+    low, high = np.quantile(grids.u[grids.usable > 0], (0.01, 0.99))
     if high - low < _LEAST_SPREAD * abs(high):
         raise DataError(
             f'The valve hardly moves: u stays between {low:.4g} and {high:.4g}. A diagnosis needs '
@@ -247,16 +247,16 @@ def _moves(scene: Scene) -> None:
         )
 
 
-def _wandering(scene: Scene, screening: Screening, slow: Wander) -> FloatArray | None:
+def _wandering(grids: Grids, screening: Screening, slow: Wander) -> FloatArray | None:
     """Return the disturbance in MW of every mean, None if there is none."""
-    return slow.level[scene.sub] * screening.here if slow.there else None
+    return slow.level[grids.sub] * screening.here if slow.there else None
 
 
 def _look_again(found: Found) -> _Rest:
     """Look at what the model with all causes leaves."""
     screening = Screening(found.task, found.model)
     slow = wander(screening)
-    left = structure(found.task, found.model, _wandering(found.task.scene, screening, slow))
+    left = structure(found.task, found.model, _wandering(found.task.grids, screening, slow))
     return _Rest(slow, left, period(found.task, found.model))
 
 
@@ -276,17 +276,17 @@ def _withdraw(found: Found, rest: _Rest) -> None:
 
 def _final(found: Found) -> tuple[Task, Extended]:
     """Fit the extended model to all blocks, the sealed ones too."""
-    task = replace(found.task, rows=found.task.scene.whole)
+    task = replace(found.task, rows=found.task.grids.whole)
     model, cost = improve(task, found.model, _LAST_STEPS)
     model, cost = search_levels(task, model, cost)
     model, _ = search_lines(task, model, cost)
-    return task, inferred(task, model, np.ones(task.scene.subs, dtype=bool))
+    return task, inferred(task, model, np.ones(task.grids.subs, dtype=bool))
 
 
 def _conclude(
     record: Record, found: Found, rest: _Rest, wrong: tuple[Fault, ...], progress: Progress
 ) -> Diagnosis:
-    scene = found.task.scene
+    grids = found.task.grids
     models = steps(found)
     gains = gains_of(found, models)
     task, final = _final(found)
@@ -294,13 +294,13 @@ def _conclude(
     estimates = Certainty(task, final).intervals() if final.active else {}
     causes = tuple(
         NamedCause(
-            a.name, a.sentence(scene.start_ns, estimates[a.name]), estimates[a.name], gain,
+            a.name, a.sentence(grids.start_ns, estimates[a.name]), estimates[a.name], gain,
             a.cause.experiment, found.near.get(a.name, ()), a.extra,
         )
         for a, gain in zip(final.active, gains, strict=True)
     )  # fmt: skip
     raw = (
-        make_scene(*record.about, np.zeros(record.table.values.shape, dtype=bool))
+        make_grids(*record.about, np.zeros(record.table.values.shape, dtype=bool))
         if wrong
         else None
     )
@@ -311,7 +311,7 @@ def _conclude(
         near = tuple(dict.fromkeys((*(c.name for c in causes), *near)))
     causes = () if dropped else causes
     unexplained = _unexplained(rest)
-    before, after = (rmse(found.task, m, scene.sealed_rows) for m in (models[0], models[-1]))
+    before, after = (rmse(found.task, m, grids.sealed_rows) for m in (models[0], models[-1]))
     explained = rest.structure.explained_mw2 if rest.structure.there else 0.0
     result = Diagnosis(
         verdict=verdict, sentence='', causes=causes + outside,
@@ -324,7 +324,7 @@ def _conclude(
         segments=by_segment(found.task, models[0], models[-1], record.spans_ns),
         simulation=models[0], extended=models[0] if dropped else models[-1],
         final=final.without_causes() if dropped else final,
-        reference=scene.reference, notes=notes(scene),
+        reference=grids.reference, notes=notes(grids),
     )  # fmt: skip
     return replace(result, sentence=_sentence(result))
 

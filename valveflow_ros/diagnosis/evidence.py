@@ -18,7 +18,7 @@ from valveflow_ros.diagnosis.fitting import (
     free,
     level_tangents,
 )
-from valveflow_ros.diagnosis.scene import FOLDS, SEALED_FOLD
+from valveflow_ros.diagnosis.grids import FOLDS, SEALED_FOLD
 from valveflow_ros.diagnosis.screening import Screening, nuisance
 from valveflow_ros.fit.whitening import inflation
 from valveflow_ros.records import BoolArray, FloatArray, IntArray
@@ -49,7 +49,7 @@ def fair_residual(task: Task, model: Extended) -> FloatArray:
     state of the odd ones and the other way round, so that no row is judged by a state it helped
     to find. The size of the effect stays as fitted elsewhere.
     """
-    return _crossed(replace(task, rows=task.scene.whole), model)
+    return _crossed(replace(task, rows=task.grids.whole), model)
 
 
 def fair_open_residual(task: Task, model: Extended) -> FloatArray:
@@ -60,10 +60,10 @@ def fair_open_residual(task: Task, model: Extended) -> FloatArray:
 def _crossed(task: Task, model: Extended) -> FloatArray:
     if all(a.cause.infer is None for a in model.active):
         return task.residual(model)
-    odd = np.arange(task.scene.subs) % 2 == 1
+    odd = np.arange(task.grids.subs) % 2 == 1
     by_even = task.residual(inferred(task, model, ~odd))
     by_odd = task.residual(inferred(task, model, odd))
-    return np.where(odd[task.scene.sub], by_even, by_odd)
+    return np.where(odd[task.grids.sub], by_even, by_odd)
 
 
 _LAGS = 3
@@ -75,9 +75,9 @@ _WALD_LEVEL, _WALD_EACH = 10.0, 5.0
 
 def _by_block(task: Task, table: FloatArray) -> tuple[FloatArray, np.ndarray]:
     """Return products summed over blocks (blocks, P, P) and the blocks that have rows."""
-    scene = task.scene
-    block = scene.block_of_sub[scene.sub[task.rows]]
-    edges = np.searchsorted(block, np.arange(scene.block_of_sub[-1] + 2))
+    grids = task.grids
+    block = grids.block_of_sub[grids.sub[task.rows]]
+    edges = np.searchsorted(block, np.arange(grids.block_of_sub[-1] + 2))
     spans = [(a, b) for a, b in itertools.pairwise(edges) if b > a]
     have = np.flatnonzero(np.diff(edges) > 0)
     return np.stack([table[a:b].T @ table[a:b] for a, b in spans]), have
@@ -169,7 +169,7 @@ def colour(task: Task, e: FloatArray) -> float:
     Where the noise has a memory longer than the AR model holds, everything that varies slowly
     looks more certain than it is; log-likelihoods are divided by this.
     """
-    rows = max(2, round(_MEMORY_S / task.scene.mean_s))
+    rows = max(2, round(_MEMORY_S / task.grids.mean_s))
     return inflation(e, np.ones(len(e), dtype=np.uint8), min(rows, max(2, len(e) // 10)))
 
 
@@ -200,12 +200,12 @@ def _hindsight(task: Task, model: Extended, e: FloatArray) -> float:
 
 def _wald(task: Task, without: Extended, model: Extended, e: FloatArray) -> float:
     """Return the squared robust t value of the difference of two models as a column."""
-    scene = task.scene
-    column = task.innovations(answer(scene, model) - answer(scene, without))
+    grids = task.grids
+    column = task.innovations(answer(grids, model) - answer(grids, without))
     n = nuisance(task, without)
     column = column - n @ (np.linalg.pinv(n.T @ n, hermitian=True) @ (n.T @ column))
     before = task.innovations(task.residual(without))
-    block = scene.block_of_sub[scene.sub[task.rows]]
+    block = grids.block_of_sub[grids.sub[task.rows]]
     scores = np.bincount(block, column * e).astype(np.float64)[np.bincount(block) > 0]
     variance = max(long_run_variance(scores), float(e @ e) / len(e) * float(column @ column))
     return float((column @ before) ** 2 / max(variance, 1e-300))
@@ -251,12 +251,12 @@ def rmse(task: Task, model: Extended, rows: BoolArray) -> float:
 
 def sealed_gain(task: Task, before: Extended, after: Extended, tried: int) -> Gain:
     """Compare two models, both fitted to the open blocks, on the sealed ones."""
-    rows = task.scene.sealed_rows
+    rows = task.grids.sealed_rows
     sealed = replace(task, rows=rows)
     old, new = fair_residual(task, before), fair_residual(task, after)
     rest, change = sealed.innovations(old), sealed.innovations(old - new)
-    scores = np.bincount(task.scene.sub[rows], rest * change).astype(np.float64)
-    chance = sign_flip(scores[np.bincount(task.scene.sub[rows]) > 0])
+    scores = np.bincount(task.grids.sub[rows], rest * change).astype(np.float64)
+    chance = sign_flip(scores[np.bincount(task.grids.sub[rows]) > 0])
     chance = min(1.0, chance * max(tried, 1))
     return Gain(rmse(task, before, rows), rmse(task, after, rows), chance)
 
@@ -282,7 +282,7 @@ def noise_floor(task: Task, model: Extended, explained_mw2: float) -> float:
     What the finite record costs in the parameters, and structure that is still there, are
     taken off.
     """
-    rows = task.scene.sealed_rows
+    rows = task.grids.sealed_rows
     columns = np.column_stack([base_tangents(task, model), cause_tangents(task, model)])
     table = task.innovations(columns)
     norm = np.sqrt((table**2).sum(axis=0))
@@ -306,15 +306,15 @@ def by_segment(
     spans_ns : int64 (k, 2)
         First and last time of each segment.
     """
-    scene = task.scene
+    grids = task.grids
     old, new = fair_residual(task, before), fair_residual(task, after)
-    places = (spans_ns - scene.start_ns) / (scene.mean_s * 1e9)
+    places = (spans_ns - grids.start_ns) / (grids.mean_s * 1e9)
     out = []
     for number, (a, b) in enumerate(places):
         first, end = max(0, int(np.ceil(a))), min(len(old), int(b))
         inside = np.zeros(len(old), dtype=bool)
         inside[first:end] = True
-        inside &= scene.sealed_rows
+        inside &= grids.sealed_rows
         if end - first < _LEAST_SEGMENT_MEANS or inside.sum() < end - first:
             continue
         out.append(
@@ -365,9 +365,9 @@ class Certainty:
         self.e = task.innovations(task.residual(model))
         self.variance = float(self.e @ self.e) / len(self.e)
         self.inverse = np.linalg.pinv(self.table.T @ self.table, hermitian=True)
-        scene = task.scene
+        grids = task.grids
         self._colour = colour(task, self.e)
-        self._group = scene.sub[task.rows] // _PROFILE_BLOCK_SUBS
+        self._group = grids.sub[task.rows] // _PROFILE_BLOCK_SUBS
 
     def _widening(self, column: FloatArray) -> float:
         """Return robust over plain variance of the coefficient of a column, at least 1."""
@@ -421,7 +421,7 @@ class Certainty:
             low = _crossing(cost, here, -unknown.step, unknown.low, most)
             high = _crossing(cost, here, unknown.step, unknown.high, most)
         if cause.stage is Stage.OPENING and unknown.unit == '%':
-            margin = _NOISES * self.task.scene.reference.opening_noise
+            margin = _NOISES * self.task.grids.reference.opening_noise
             low, high = max(low - margin, unknown.low), min(high + margin, unknown.high)
         return low, high
 
@@ -442,7 +442,7 @@ class Certainty:
                 column += own is not None
                 out[a.name][unknown.name] = Estimate(
                     value, low, high + unknown.concealed, unknown.unit,
-                    self.task.scene.start_ns if unknown.dated else None,
+                    self.task.grids.start_ns if unknown.dated else None,
                 )  # fmt: skip
         return out
 

@@ -19,7 +19,7 @@ from valveflow_ros.curve.characteristic import (
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import Active, Stage
-from valveflow_ros.diagnosis.scene import Reference, Scene
+from valveflow_ros.diagnosis.grids import Grids, Reference
 from valveflow_ros.records import ByteArray, FloatArray
 
 _REMEMBERED = 24
@@ -77,36 +77,36 @@ class Extended:
         )
 
 
-def _input(scene: Scene, model: Extended) -> FloatArray:
+def _input(grids: Grids, model: Extended) -> FloatArray:
     """Return u behind what the valve does to the opening; the last few are remembered."""
     chain = sorted(model.at(Stage.OPENING), key=lambda a: a.cause.order)
     if not chain:
-        return scene.u
+        return grids.u
     key = tuple((a.name, a.values, a.extra) for a in chain)
-    if key not in scene.cache:
-        v = scene.v
+    if key not in grids.cache:
+        v = grids.v
         for a in chain:
-            v = a.cause.act(v, a.values, scene)
-        inputs = [k for k in scene.cache if isinstance(k, tuple)]
+            v = a.cause.act(v, a.values, grids)
+        inputs = [k for k in grids.cache if isinstance(k, tuple)]
         if len(inputs) >= _REMEMBERED:
-            del scene.cache[inputs[0]]
-        u = scene.coarse(v * scene.density)
-        scene.cache[key] = np.where(scene.usable > 0, u, 0.0)
-    return scene.cache[key]
+            del grids.cache[inputs[0]]
+        u = grids.coarse(v * grids.density)
+        grids.cache[key] = np.where(grids.usable > 0, u, 0.0)
+    return grids.cache[key]
 
 
-def drive(scene: Scene, model: Extended) -> Drive:
+def drive(grids: Grids, model: Extended) -> Drive:
     """Return what acts on the curve and behind it."""
-    u = _input(scene, model)
+    u = _input(grids, model)
     for a in model.at(Stage.INPUT):
-        u = u * a.cause.act(u, a.values, scene, model.base)
+        u = u * a.cause.act(u, a.values, grids, model.base)
     added: FloatArray | None = None
     for a in model.at(Stage.FLOW):
-        part = a.cause.act(u, a.values, scene)
+        part = a.cause.act(u, a.values, grids)
         added = part if added is None else added + part
     gain: FloatArray | None = None
     for a in model.at(Stage.GAIN):
-        factor = a.cause.act(a.values, scene, a.extra)
+        factor = a.cause.act(a.values, grids, a.extra)
         gain = factor if gain is None else gain * factor
     return Drive(u, added, gain)
 
@@ -131,7 +131,7 @@ def region_path(model: Extended, x: FloatArray) -> ByteArray:
 
 
 def answer(
-    scene: Scene, model: Extended, driven: Drive | None = None, path: ByteArray | None = None
+    grids: Grids, model: Extended, driven: Drive | None = None, path: ByteArray | None = None
 ) -> FloatArray:
     """Return the predicted means of the power in MW, shape (m,).
 
@@ -143,20 +143,20 @@ def answer(
         Regions to keep to. While one differentiates they must not flip: a tangent would
         become a row of spikes.
     """
-    x = flow_of(model, driven if driven is not None else drive(scene, model))
+    x = flow_of(model, driven if driven is not None else drive(grids, model))
     if path is None:
         path = region_path(model, x)
-    taps = model.regional.taps(scene.step_s)
+    taps = model.regional.taps(grids.step_s)
     shown = sorted(model.at(Stage.OUTPUT), key=lambda a: a.cause.order)
     if not shown:
-        out = np.empty(len(scene.power))
-        kernels.respond_means(x, scene.usable, path, taps, scene.group, out)
+        out = np.empty(len(grids.power))
+        kernels.respond_means(x, grids.usable, path, taps, grids.group, out)
         return out
     y = np.empty(len(x))
-    kernels.respond(x, scene.usable, path, taps, y)
+    kernels.respond(x, grids.usable, path, taps, y)
     for a in shown:
-        y = a.cause.act(y, a.values, scene)
-    return scene.means(y)
+        y = a.cause.act(y, a.values, grids)
+    return grids.means(y)
 
 
 # An extended model as it is kept: with the zero of its time and what its causes count from.

@@ -12,7 +12,7 @@ import numpy as np
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import Active, Cause, Kind, Stage, Values
 from valveflow_ros.diagnosis.extended import Extended, answer, drive, flow_of, region_path
-from valveflow_ros.diagnosis.scene import ORDER, Scene
+from valveflow_ros.diagnosis.grids import ORDER, Grids
 from valveflow_ros.fit.descent import descend, gauss_newton
 from valveflow_ros.fit.problem import free_parameters, with_level_moved
 from valveflow_ros.fit.whitening import fit_ar
@@ -75,22 +75,22 @@ def drawn(model: Extended) -> Active | None:
 
 
 def _believed(
-    scene: Scene, model: Extended, a: Active, ar: FloatArray
+    grids: Grids, model: Extended, a: Active, ar: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return residuals and beliefs of all draws, both (k, m)."""
-    rest = np.empty((a.cause.draws, len(scene.power)))
+    rest = np.empty((a.cause.draws, len(grids.power)))
     for k in range(a.cause.draws):
         one = replace(model, active=tuple(_single(b, k) if b is a else b for b in model.active))
-        rest[k] = np.where(scene.scored, scene.power - answer(scene, one), 0.0)
+        rest[k] = np.where(grids.scored, grids.power - answer(grids, one), 0.0)
     white = rest.copy()
     for lag, factor in enumerate(ar, start=1):
         white[:, lag:] -= factor * rest[:, :-lag]
     out = np.empty_like(rest)
-    beliefs(white, scene.whole, _variance(white[:, scene.whole]), _SHARED, out)
+    beliefs(white, grids.whole, _variance(white[:, grids.whole]), _SHARED, out)
     return rest, out
 
 
-def believed_residual(scene: Scene, model: Extended, a: Active, ar: FloatArray) -> FloatArray:
+def believed_residual(grids: Grids, model: Extended, a: Active, ar: FloatArray) -> FloatArray:
     """Return the residual of the believed mean of all draws in MW, shape (m,).
 
     Parameters
@@ -100,7 +100,7 @@ def believed_residual(scene: Scene, model: Extended, a: Active, ar: FloatArray) 
     ar : float64 (p,)
         Of the noise.
     """
-    rest, belief = _believed(scene, model, a, ar)
+    rest, belief = _believed(grids, model, a, ar)
     return np.asarray(np.einsum('km,km->m', rest, belief))
 
 
@@ -112,14 +112,14 @@ class _Path:
     values: Values
     usual: Callable[..., FloatArray]
 
-    def __call__(self, v: FloatArray, values: Values, scene: Scene) -> FloatArray:
+    def __call__(self, v: FloatArray, values: Values, grids: Grids) -> FloatArray:
         """Act as found, or as usual for another record or other values."""
         if values == self.values and len(v) == len(self.path):
             return self.path
-        return self.usual(v, values, scene)
+        return self.usual(v, values, grids)
 
 
-def held(scene: Scene, model: Extended, ar: FloatArray) -> Extended:
+def held(grids: Grids, model: Extended, ar: FloatArray) -> Extended:
     """Return the model with the believed path in place of the draws; its parameters stay.
 
     Everything else can then be fitted at the usual speed.
@@ -127,12 +127,12 @@ def held(scene: Scene, model: Extended, ar: FloatArray) -> Extended:
     a = drawn(model)
     if a is None or a.cause.draw is None or a is not _first_of_opening(model):
         return model
-    _, belief = _believed(scene, model, a, ar)
-    rows = np.minimum(np.arange(len(scene.v)) * len(scene.power) // len(scene.v),
-                      len(scene.power) - 1)  # fmt: skip
-    path = np.zeros(len(scene.v))
+    _, belief = _believed(grids, model, a, ar)
+    rows = np.minimum(np.arange(len(grids.v)) * len(grids.power) // len(grids.v),
+                      len(grids.power) - 1)  # fmt: skip
+    path = np.zeros(len(grids.v))
     for k in range(a.cause.draws):
-        path += belief[k][rows] * a.cause.draw(k)(scene.v, a.values, scene)
+        path += belief[k][rows] * a.cause.draw(k)(grids.v, a.values, grids)
     unknowns = tuple(replace(u, kind=Kind.HELD) for u in a.cause.unknowns)
     act = _Path(path, a.values, a.cause.act)
     return model.having(
@@ -179,7 +179,7 @@ class Task:
     ``fixed_dynamics`` holds time constants, delays and levels, as for a given model.
     """
 
-    scene: Scene
+    grids: Grids
     rows: BoolArray
     ar: FloatArray
     fixed_dynamics: bool = False
@@ -194,8 +194,8 @@ class Task:
     def residual(self, model: Extended) -> FloatArray:
         """Return measured minus predicted means in MW, shape (m,); 0 where not scored."""
         if (a := drawn(model)) is not None:
-            return believed_residual(self.scene, model, a, self.ar)
-        return np.where(self.scene.scored, self.scene.power - answer(self.scene, model), 0.0)
+            return believed_residual(self.grids, model, a, self.ar)
+        return np.where(self.grids.scored, self.grids.power - answer(self.grids, model), 0.0)
 
     def cost(self, model: Extended) -> float:
         """Return the sum of squared innovations."""
@@ -203,18 +203,18 @@ class Task:
         return float(e @ e)
 
 
-def whitening(scene: Scene, residual: FloatArray) -> FloatArray:
+def whitening(grids: Grids, residual: FloatArray) -> FloatArray:
     """Return AR coefficients of a residual freed of what wanders over hours, shape (4,).
 
     A misfit that lasts for hours must not be taken for correlation of the noise:
     whitened away it could not be named any more.
     """
-    weight = scene.open_rows.astype(np.float64)
+    weight = grids.open_rows.astype(np.float64)
     kernel = np.ones(min(_SLOW_MEANS, max(1, len(residual) // 4)))
     level = np.convolve(residual * weight, kernel, 'same')
     level /= np.maximum(np.convolve(weight, kernel, 'same'), 1.0)
     ar = fit_ar(
-        np.where(weight > 0, residual - level, 0.0), scene.open_rows.astype(np.uint8), ORDER
+        np.where(weight > 0, residual - level, 0.0), grids.open_rows.astype(np.uint8), ORDER
     )
     total = float(ar.sum())
     return ar * (_LARGEST_SUM / total) if total > _LARGEST_SUM else ar
@@ -243,17 +243,17 @@ def _base_steps(model: RegionalModel) -> FloatArray:
 
 def base_tangents(task: Task, model: Extended) -> FloatArray:
     """Return derivatives of the means by the free parameters of curve and dynamics, (m, P)."""
-    scene = task.scene
-    driven = drive(scene, model)
+    grids = task.grids
+    driven = drive(grids, model)
     path = region_path(model, flow_of(model, driven))
-    here = answer(scene, model, driven, path)
+    here = answer(grids, model, driven, path)
     packed, steps = model.base.pack(), _base_steps(model.base)
     columns = []
     for p in np.flatnonzero(base_mask(task, model)):
         moved = packed.copy()
         moved[p] += steps[p]
         other = replace(model, base=model.base.unpack(moved))
-        columns.append((answer(scene, other, driven, path) - here) / steps[p])
+        columns.append((answer(grids, other, driven, path) - here) / steps[p])
     return np.column_stack(columns)
 
 
@@ -276,11 +276,11 @@ def _shifted(model: Extended, c: int, k: int, by: float) -> Extended:
 
 def cause_tangents(task: Task, model: Extended) -> FloatArray:
     """Return derivatives of the means by the parameters of the causes, (m, Q)."""
-    scene = task.scene
+    grids = task.grids
     slots = _slots(model)
     if not slots:
-        return np.empty((len(scene.power), 0))
-    path = region_path(model, flow_of(model, drive(scene, model)))
+        return np.empty((len(grids.power), 0))
+    path = region_path(model, flow_of(model, drive(grids, model)))
     columns = []
     for c, k in slots:
         stage = model.active[c].cause.stage
@@ -288,7 +288,7 @@ def cause_tangents(task: Task, model: Extended) -> FloatArray:
         h = model.active[c].cause.unknowns[k].step
         up, down = _shifted(model, c, k, h), _shifted(model, c, k, -h)
         width = up.active[c].values[k] - down.active[c].values[k]
-        change = answer(scene, up, None, keep) - answer(scene, down, None, keep)
+        change = answer(grids, up, None, keep) - answer(grids, down, None, keep)
         columns.append(change / max(width, 1e-12))
     return np.column_stack(columns)
 
@@ -296,13 +296,13 @@ def cause_tangents(task: Task, model: Extended) -> FloatArray:
 def level_tangents(task: Task, model: Extended) -> FloatArray:
     """Return differences by the levels of the regions, letting rows change region, (m, I - 1)."""
     if task.fixed_dynamics or not len(model.base.levels):
-        return np.empty((len(task.scene.power), 0))
+        return np.empty((len(task.grids.power), 0))
     columns = []
     for k in range(len(model.base.levels)):
         up, down = model.base.levels.copy(), model.base.levels.copy()
         up[k], down[k] = up[k] + 1.0, down[k] - 1.0
-        high = answer(task.scene, replace(model, base=model.base.with_levels(up)))
-        low = answer(task.scene, replace(model, base=model.base.with_levels(down)))
+        high = answer(task.grids, replace(model, base=model.base.with_levels(up)))
+        low = answer(task.grids, replace(model, base=model.base.with_levels(down)))
         columns.append(0.5 * (high - low))
     return np.column_stack(columns)
 
@@ -328,7 +328,7 @@ def _stepped(task: Task, model: Extended, step: FloatArray) -> Extended | None:
     packed[free] += step[: len(free)]
     i = model.base.regions
     packed[-i:] = np.clip(packed[-i:], 0.0, 600.0)
-    low = np.log(0.1 * task.scene.step_s)
+    low = np.log(0.1 * task.grids.step_s)
     packed[-2 * i : -i] = np.clip(packed[-2 * i : -i], low, np.log(3600.0))
     moved = replace(model, base=_levels_along(model.base, model.base.unpack(packed)))
     for (c, k), by in zip(_slots(model), step[len(free) :], strict=True):
@@ -415,6 +415,6 @@ def settle(task: Task, model: Extended, rounds: int, steps: int) -> tuple[Task, 
         model, cost = improve(task, model, steps)
         model, cost = search_levels(task, model, cost)
         model, cost = search_lines(task, model, cost)
-        task = replace(task, ar=whitening(task.scene, task.residual(model)))
+        task = replace(task, ar=whitening(task.grids, task.residual(model)))
     model, cost = improve(task, model, 2)
     return task, model, cost

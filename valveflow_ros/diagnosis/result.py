@@ -29,7 +29,7 @@ from valveflow_ros.diagnosis.cause import Active, Estimate
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.evidence import Gain, SegmentGain
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
-from valveflow_ros.diagnosis.scene import Reference
+from valveflow_ros.diagnosis.grids import Reference
 from valveflow_ros.errors import DataError
 
 NAMED, NOTHING, UNEXPLAINED = 'named', 'nothing', 'unexplained'

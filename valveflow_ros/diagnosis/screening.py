@@ -22,7 +22,7 @@ from valveflow_ros.diagnosis.fitting import (
     cause_tangents,
     level_tangents,
 )
-from valveflow_ros.diagnosis.scene import DAY_S, Scene
+from valveflow_ros.diagnosis.grids import DAY_S, Grids
 from valveflow_ros.records import FloatArray
 
 # What the model could explain itself, to be taken away before a cause is judged.
@@ -62,16 +62,16 @@ class Screening:
     task : Task
     model : Extended
         At its optimum.
-    rough : Scene, optional
+    rough : Grids, optional
         The record with longer model rows; what a cause would change is computed on them, the
         residual it has to explain is that of the task.
     """
 
-    def __init__(self, task: Task, model: Extended, rough: Scene | None = None) -> None:
+    def __init__(self, task: Task, model: Extended, rough: Grids | None = None) -> None:
         self.e = task.innovations(task.residual(model))
-        task = replace(task, scene=rough) if rough is not None else task
-        self.task, self.model, self.scene = task, model, task.scene
-        self.here = answer(self.scene, model)
+        task = replace(task, grids=rough) if rough is not None else task
+        self.task, self.model, self.grids = task, model, task.grids
+        self.here = answer(self.grids, model)
         self.variance = float(self.e @ self.e) / len(self.e)
         self.n = nuisance(task, model)
         self._inverse = np.linalg.pinv(self.n.T @ self.n, hermitian=True)
@@ -81,7 +81,7 @@ class Screening:
         self._sums: FloatArray | None = None
 
     def _hat_knots(self) -> FloatArray:
-        u = self.scene.u[self.scene.usable > 0]
+        u = self.grids.u[self.grids.usable > 0]
         low, high = np.quantile(u, (0.005, 0.995))
         even = np.linspace(low, high, HATS)
         spread = np.quantile(u, np.linspace(0.005, 0.995, HATS))
@@ -89,13 +89,13 @@ class Screening:
 
     def carriers(self) -> FloatArray:
         """Return d power / d (gain, u, offset, curve at the hats), shape (m, 3 + HATS)."""
-        scene, model = self.scene, self.model
-        driven = drive(scene, model)
+        grids, model = self.grids, self.model
+        driven = drive(grids, model)
         x = flow_of(model, driven)
         path = region_path(model, x)
 
         def scaled(factor: float) -> FloatArray:
-            return answer(scene, model, Drive(driven.u * factor, driven.added, driven.gain))
+            return answer(grids, model, Drive(driven.u * factor, driven.added, driven.gain))
 
         gain = np.ones(len(x)) if driven.gain is None else driven.gain
         columns = [
@@ -114,8 +114,8 @@ class Screening:
         """Return the answer to a small change of the flow, regions held."""
         gain = 1.0 if driven.gain is None else driven.gain
         added = change / gain if driven.added is None else driven.added + change / gain
-        moved = answer(self.scene, self.model, Drive(driven.u, added, driven.gain), path)
-        held = answer(self.scene, self.model, driven, path)
+        moved = answer(self.grids, self.model, Drive(driven.u, added, driven.gain), path)
+        held = answer(self.grids, self.model, driven, path)
         return moved - held
 
     @property
@@ -128,8 +128,8 @@ class Screening:
         if self._sums is None:
             carriers = self.task.innovations(self.carriers())
             table = np.column_stack([self.n, carriers, self.rest])
-            sub = self.scene.sub[self.task.rows]
-            edges = np.searchsorted(sub, np.arange(self.scene.subs + 1))
+            sub = self.grids.sub[self.task.rows]
+            edges = np.searchsorted(sub, np.arange(self.grids.subs + 1))
             self._sums = np.stack(
                 [table[a:b].T @ table[a:b] for a, b in itertools.pairwise(edges)]
             )
@@ -172,7 +172,7 @@ class Screening:
         good = own > 1e-6 * whole
         found = np.where(good, toward / np.where(good, own, 1.0), 0.0)
         gains = found * toward / (2.0 * self.variance)
-        margin = max(1, round(_EDGE_SHARE * self.scene.subs))
+        margin = max(1, round(_EDGE_SHARE * self.grids.subs))
         gains[:margin] = gains[-margin:] = 0.0
         return gains, found
 
@@ -188,8 +188,8 @@ class Screening:
     def _explained(self, model: Extended) -> FloatArray:
         """Return by how much a cause more moves the prediction in MW, shape (m,)."""
         if not model.active[-1].cause.draws:
-            return answer(self.scene, model) - self.here
-        return self.scene.power - self.here - self.task.residual(model)
+            return answer(self.grids, model) - self.here
+        return self.grids.power - self.here - self.task.residual(model)
 
     def best(self, cause: Cause, grid: list[Values], keep: int = 1) -> list[Start]:
         """Return the best of some values."""
@@ -205,7 +205,7 @@ class Screening:
         tried = []
         for sign in (1.0, -1.0):
             model = self.model.with_cause(Active(cause, (sign * size,)))
-            change = self.task.innovations(answer(self.scene, model) - self.here)
+            change = self.task.innovations(answer(self.grids, model) - self.here)
             rest = change - self.n @ (self._inverse @ (self.n.T @ change))
             slope = float(rest @ self.rest) / max(float(rest @ rest), 1e-300)
             tried += [self.displaced(cause, (sign * size * f,)) for f in (slope, 0.5 * slope, 1.0)]
@@ -230,7 +230,7 @@ class Screening:
 
     def sub_start_s(self, sub: int) -> float:
         """Return the beginning of a sub-block in seconds after the first row."""
-        return float(np.searchsorted(self.scene.sub, sub)) * self.scene.mean_s
+        return float(np.searchsorted(self.grids.sub, sub)) * self.grids.mean_s
 
     def gain_by_sub(self) -> tuple[FloatArray, FloatArray]:
         """Return, by sub-block, the square of the gain's column and its product with the rest.
@@ -244,7 +244,7 @@ class Screening:
     def scaled_height(self, cause: Cause, shape: Values) -> Start:
         """Return the start of a cause that is linear in its first parameter."""
         model = self.model.with_cause(Active(cause, (1.0, *shape)))
-        change = self.task.innovations(answer(self.scene, model) - self.here)
+        change = self.task.innovations(answer(self.grids, model) - self.here)
         change = change - self.n @ (self._inverse @ (self.n.T @ change))
         own, toward = float(change @ change), float(change @ self.rest)
         if not own > 0.0:

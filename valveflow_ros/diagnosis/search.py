@@ -21,7 +21,7 @@ from valveflow_ros.diagnosis.fitting import (
     search_lines,
     settle,
 )
-from valveflow_ros.diagnosis.scene import Scene
+from valveflow_ros.diagnosis.grids import Grids
 from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.fit.problem import Samples
@@ -133,18 +133,18 @@ def rebuilt(task: Task, model: Extended) -> tuple[Task, Extended]:
 
 def _seen_through(task: Task, model: Extended) -> Samples:
     """Return the record as it would be without the causes; sealed blocks are left out."""
-    scene = task.scene
-    driven = drive(scene, model)
-    plain = answer(scene, model.without_causes(), Drive(driven.u, None, None))
-    power = scene.power - (answer(scene, model) - plain)
-    rows = np.repeat(task.rows, scene.group)
+    grids = task.grids
+    driven = drive(grids, model)
+    plain = answer(grids, model.without_causes(), Drive(driven.u, None, None))
+    power = grids.power - (answer(grids, model) - plain)
+    rows = np.repeat(task.rows, grids.group)
     return Samples(
         u=driven.u,
-        power_mw=np.repeat(np.where(task.rows, power, 0.0), scene.group),
-        usable=(rows & (scene.usable > 0)).astype(np.uint8),
-        step_s=scene.step_s,
-        settle_s=scene.settle_s,
-        group=scene.group,
+        power_mw=np.repeat(np.where(task.rows, power, 0.0), grids.group),
+        usable=(rows & (grids.usable > 0)).astype(np.uint8),
+        step_s=grids.step_s,
+        settle_s=grids.settle_s,
+        group=grids.group,
     )
 
 
@@ -203,7 +203,7 @@ class Found:
         By name, why a cause was put away.
     tried : int
         Number of causes tried.
-    rough : Scene, optional
+    rough : Grids, optional
         The record with longer model rows, for screening.
     """
 
@@ -214,10 +214,10 @@ class Found:
     near: dict[str, tuple[str, ...]] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
     tried: int = 0
-    rough: Scene | None = None
+    rough: Grids | None = None
 
 
-def search(task: Task, start: Extended, progress: Progress, rough: Scene | None = None) -> Found:
+def search(task: Task, start: Extended, progress: Progress, rough: Grids | None = None) -> Found:
     """Fit the plain model, then add causes while one of them stands up to all tests."""
     progress(0.05, 'simulation fitted to the record')
     task, plain, _ = settle(task, start, rounds=2, steps=4)
@@ -225,7 +225,7 @@ def search(task: Task, start: Extended, progress: Progress, rough: Scene | None 
     found = Found(task, plain, plain, rough=rough)
     barred: set[str] = set()
     for name, cause in catalogue().items():
-        if why := cause.hindered(task.scene):
+        if why := cause.hindered(task.grids):
             found.reasons[name] = f'cannot be judged: {why}'
             barred.add(name)
     found.tried = len(catalogue()) - len(barred)
@@ -288,7 +288,7 @@ def _add(found: Found, barred: set[str]) -> bool:
 def _take(found: Found, rival: Rival, gain: float) -> None:
     """Fit the model with its new cause, and find curve and regions anew where that is due."""
     found.task, settled, _ = settle(found.task, rival.model, rounds=1, steps=3)
-    found.model = held(found.task.scene, settled, found.task.ar)
+    found.model = held(found.task.grids, settled, found.task.ar)
     if gain > STRONG and not found.task.fixed_dynamics:
         found.task, found.model = rebuilt(found.task, found.model)
 

@@ -10,8 +10,8 @@ import numpy as np
 from valveflow_ros.diagnosis.diagnose import Record
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import Task
+from valveflow_ros.diagnosis.grids import ORDER, make_grids
 from valveflow_ros.diagnosis.result import Diagnosis
-from valveflow_ros.diagnosis.scene import ORDER, make_scene
 from valveflow_ros.diagnosis.structure import minutes, variables
 from valveflow_ros.records import BoolArray, FloatArray
 
@@ -68,8 +68,8 @@ def signatures(task: Task, before: Extended, after: Extended) -> tuple[Signature
 
 def _direction(task: Task) -> FloatArray:
     """Return where the opening stands inside a slack: -1 after closing, 1 after opening."""
-    scene = task.scene
-    v = minutes(task, scene.means(scene.coarse(np.where(np.isfinite(scene.v), scene.v, 0.0))))[0]
+    grids = task.grids
+    v = minutes(task, grids.means(grids.coarse(np.where(np.isfinite(grids.v), grids.v, 0.0))))[0]
     out, state, half = np.empty(len(v)), v[0], 0.5 * _PLAY_PERCENT
     for t, here in enumerate(v):
         state = min(max(state, here - half), here + half)
@@ -121,12 +121,12 @@ class Answer:
 
 def after_moves(task: Task, before: Extended, after: Extended) -> tuple[Answer, ...]:
     """Return the mean residual around fast moves, opening and closing apart."""
-    scene = task.scene
-    v = scene.means(scene.coarse(np.where(np.isfinite(scene.v), scene.v, 0.0)))
-    span = max(1, round(_FAST_S / scene.mean_s))
+    grids = task.grids
+    v = grids.means(grids.coarse(np.where(np.isfinite(grids.v), grids.v, 0.0)))
+    span = max(1, round(_FAST_S / grids.mean_s))
     change = np.concatenate([np.zeros(span), v[span:] - v[:-span]])
     old, new = task.residual(before), task.residual(after)
-    first, last = round(_BEFORE_S / scene.mean_s), round(_AFTER_S / scene.mean_s)
+    first, last = round(_BEFORE_S / grids.mean_s), round(_AFTER_S / grids.mean_s)
     offsets = np.arange(-first, last + 1)
     out = []
     for up in (True, False):
@@ -134,13 +134,13 @@ def after_moves(task: Task, before: Extended, after: Extended) -> tuple[Answer, 
         start = np.flatnonzero(fast & ~np.concatenate([[False], fast[:-1]]))
         start = start[(start >= first) & (start + last < len(v))]
         rows = start[:, None] + offsets[None, :]
-        rows = rows[scene.scored[rows].all(axis=1)]
+        rows = rows[grids.scored[rows].all(axis=1)]
         if len(rows) < 10:
             continue
-        noise = float(old[scene.scored].std())
+        noise = float(old[grids.scored].std())
         out.append(
             Answer(
-                up, len(rows), np.asarray(offsets * scene.mean_s, dtype=np.float64),
+                up, len(rows), np.asarray(offsets * grids.mean_s, dtype=np.float64),
                 old[rows].mean(axis=0),
                 new[rows].mean(axis=0), 2.0 * noise / np.sqrt(len(rows)),
             )
@@ -239,8 +239,8 @@ Views = tuple[tuple[Signature, ...], tuple[Answer, ...], tuple[ResidualMap, ...]
 def views(record: Record, found: Diagnosis) -> Views:
     """Return residuals by variable, around fast moves and in maps, before and after extending."""
     bad, _ = record.faults()
-    scene = make_scene(record.table, record.step_s, record.pressure_exponent, record.settle_s, bad)
-    task = Task(scene, scene.whole, np.zeros(ORDER))
+    grids = make_grids(record.table, record.step_s, record.pressure_exponent, record.settle_s, bad)
+    task = Task(grids, grids.whole, np.zeros(ORDER))
     return (
         signatures(task, found.simulation, found.extended),
         after_moves(task, found.simulation, found.extended),

@@ -17,7 +17,7 @@ from scipy.ndimage import median_filter
 
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import Task
-from valveflow_ros.diagnosis.scene import FOLDS, SEALED_FOLD
+from valveflow_ros.diagnosis.grids import FOLDS, SEALED_FOLD
 from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.fit.whitening import inflation
 from valveflow_ros.records import BoolArray, FloatArray
@@ -59,25 +59,25 @@ class Structure:
 
 def minutes(task: Task, series: FloatArray) -> tuple[FloatArray, BoolArray, np.ndarray, int]:
     """Return means of a minute, where they are open and whole, their block, rows in each."""
-    scene = task.scene
-    rows = max(1, round(_MINUTE_S / scene.mean_s))
+    grids = task.grids
+    rows = max(1, round(_MINUTE_S / grids.mean_s))
     m = len(series) // rows
     mean: FloatArray = series[: m * rows].reshape(m, rows).mean(axis=1)
     good: BoolArray = np.asarray(task.rows[: m * rows].reshape(m, rows).all(axis=1), dtype=bool)
-    block = scene.block_of_sub[scene.sub[: m * rows : rows]]
+    block = grids.block_of_sub[grids.sub[: m * rows : rows]]
     return mean, good, block, rows
 
 
 def variables(task: Task, model: Extended) -> dict[str, FloatArray]:
     """Return what the residual might depend on, one value a minute."""
-    scene = task.scene
+    grids = task.grids
 
     def minute(rows: FloatArray) -> FloatArray:
-        return minutes(task, scene.means(rows))[0]
+        return minutes(task, grids.means(rows))[0]
 
-    u, p, t = minute(scene.u), minute(scene.pressure), minute(scene.temperature)
-    time_s = minute(scene.time_s)
-    opening = scene.coarse(np.where(np.isfinite(scene.v), scene.v, 0.0))
+    u, p, t = minute(grids.u), minute(grids.pressure), minute(grids.temperature)
+    time_s = minute(grids.time_s)
+    opening = grids.coarse(np.where(np.isfinite(grids.v), grids.v, 0.0))
     v = minute(opening)
     shape = np.polyfit(u, p, 3)
     busy = minute(np.abs(np.diff(opening, prepend=opening[:1])))
@@ -94,7 +94,7 @@ def variables(task: Task, model: Extended) -> dict[str, FloatArray]:
     return {
         'u': u, 'opening': v, 'pressure': p,
         'pressure given u': p - np.polyval(shape, u), 'temperature': t,
-        'time': time_s, 'time of day': scene.clock_s(time_s), 'ramp': since(u, 3),
+        'time': time_s, 'time of day': grids.clock_s(time_s), 'ramp': since(u, 3),
         'slow ramp': since(u, 15), 'pressure change': since(p, 10),
         'temperature change': since(t, 20), 'valve travel': busy,
         'load of the last hour': past(u, 60),
@@ -238,17 +238,17 @@ def period(task: Task, model: Extended) -> Period:
     of any smooth noise; then ordinates are exponential and the largest of n exceeds
     z by chance with probability n exp(-z).
     """
-    scene = task.scene
-    rows = max(1, round(_MEAN_S / scene.mean_s))
-    m = len(scene.power) // rows
-    rest = np.where(scene.scored, task.residual(model), 0.0)[: m * rows]
+    grids = task.grids
+    rows = max(1, round(_MEAN_S / grids.mean_s))
+    m = len(grids.power) // rows
+    rest = np.where(grids.scored, task.residual(model), 0.0)[: m * rows]
     rest = rest.reshape(m, rows).mean(axis=1)
     rest = rest - rest.mean()
     power = np.abs(np.fft.rfft(rest * np.hanning(m))) ** 2
     width = min(_NEIGHBOURS, max(5, len(power) // 8 * 2 + 1))
     floor = median_filter(power, width, mode='nearest') / np.log(2.0)
     ratio = power / np.maximum(floor, 1e-300)
-    span = m * rows * scene.mean_s
+    span = m * rows * grids.mean_s
     ratio[: int(span / _LONGEST_S) + 1] = 0.0
     ratio[int(span / _SHORTEST_S) :] = 0.0
     k = int(np.argmax(ratio))
@@ -298,7 +298,7 @@ def wander(screening: Screening) -> Wander:
     what the noise does inside it cannot pay.
     """
     own, toward = screening.gain_by_sub()
-    middle_h = screening.scene.sub_middle_s / 3600.0
+    middle_h = screening.grids.sub_middle_s / 3600.0
     distance = np.abs(middle_h[:, None] - middle_h[None, :])
     np.fill_diagonal(distance, np.inf)
     usual = float(np.median(own[own > 0.0])) if np.any(own > 0.0) else 1.0
@@ -311,7 +311,7 @@ def wander(screening: Screening) -> Wander:
                 2.0 * screening.variance
             )
             if gain > best.gain:
-                power = float(np.mean(screening.here[screening.scene.scored]))
+                power = float(np.mean(screening.here[screening.grids.scored]))
                 rms = float(np.sqrt(np.mean(level[own > 0.0] ** 2))) * power
                 best = Wander(gain, rms, width * 3600.0, level)
     return best

@@ -24,7 +24,7 @@ from valveflow_ros.interface.models import load_characteristic, load_extended, w
 from valveflow_ros.interface.observation import check_signals
 from valveflow_ros.interface.settings import settings_for
 from valveflow_ros.logs import LogContents
-from valveflow_ros.monitoring.alarm import AlarmChange, AlarmState
+from valveflow_ros.monitoring.alarm_state import AlarmChange, AlarmState
 from valveflow_ros.monitoring.events import (
     CurveAdopted,
     Diagnosed,

@@ -10,7 +10,7 @@ import numpy as np
 
 from valveflow_ros.curve.shift import PieceShift, Shift
 from valveflow_ros.errors import DataError
-from valveflow_ros.monitoring.alarm import (
+from valveflow_ros.monitoring.alarm_state import (
     Alarm,
     AlarmAction,
     AlarmChange,

@@ -9,7 +9,7 @@ from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.task import FitTask
-from valveflow_ros.monitoring.alarm import AlarmAction
+from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.alarms import Alarms, Judged, ResidualAlarm
 from valveflow_ros.monitoring.curves import CurveStatus, ReferenceCurve, Refits, RunningCurve
 from valveflow_ros.monitoring.diagnosis_requests import DiagnosisRequests

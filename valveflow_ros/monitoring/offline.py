@@ -10,7 +10,7 @@ from valveflow_ros.curve.characteristic_json import from_json
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.fit.task import FitTask
-from valveflow_ros.monitoring.alarm import AlarmAction
+from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.diagnosis_requests import ASKED
 from valveflow_ros.monitoring.events import (
     DiagnosisRequested,

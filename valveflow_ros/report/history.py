@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from valveflow_ros.monitoring.alarm import AlarmState
+from valveflow_ros.monitoring.alarm_state import AlarmState
 from valveflow_ros.records import FloatArray
 from valveflow_ros.report.figure import (
     DAY_HOUR,

@@ -23,7 +23,7 @@ from valveflow_msgs.msg import (
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.shift import Shift
 from valveflow_ros.monitoring import events as engine
-from valveflow_ros.monitoring.alarm import BURIED
+from valveflow_ros.monitoring.alarm_state import BURIED
 from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState
 from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.events import JournalKind

@@ -18,7 +18,7 @@ from valveflow_ros.diagnosis.cause import (
     Unknown,
     Values,
 )
-from valveflow_ros.diagnosis.scene import DAY_S, Scene
+from valveflow_ros.diagnosis.grids import DAY_S, Grids
 from valveflow_ros.diagnosis.screening import GAIN, INPUT, OFFSET, Screening
 from valveflow_ros.errors import counted
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
@@ -30,38 +30,38 @@ TEN_DAYS_S = 10.0 * DAY_S
 ONSET = Unknown('t0_days', 'd', 2.0 / 24.0, 0.0, 400.0, Kind.LINE, dated=True)
 
 
-def ramp(scene: Scene, time_s: FloatArray) -> FloatArray:
+def ramp(grids: Grids, time_s: FloatArray) -> FloatArray:
     """Return a ramp that rises by 1 in ten days and is 0 in the middle of the record.
 
     What changes with time is counted from the record's mean throughout: the curve is then the
     mean curve, and the levels between regions stay where they are while a change is fitted.
     """
-    return np.asarray((time_s - 0.5 * scene.reference.span_s) / TEN_DAYS_S)
+    return np.asarray((time_s - 0.5 * grids.reference.span_s) / TEN_DAYS_S)
 
 
-def since(scene: Scene, t0_days: float) -> FloatArray:
+def since(grids: Grids, t0_days: float) -> FloatArray:
     """Return a step of height 1 at an onset, its mean over the record taken off."""
-    onset, span = t0_days * DAY_S, scene.reference.span_s
+    onset, span = t0_days * DAY_S, grids.reference.span_s
     after = min(max(1.0 - onset / span, 0.0), 1.0)
-    return np.where(scene.time_s >= onset, 1.0, 0.0) - after
+    return np.where(grids.time_s >= onset, 1.0, 0.0) - after
 
 
-def a_day(scene: Scene) -> str:
+def a_day(grids: Grids) -> str:
     """Say that a record is too short for what changes with time."""
-    return _at_least(scene, 1.0)
+    return _at_least(grids, 1.0)
 
 
-def three_days(scene: Scene) -> str:
+def three_days(grids: Grids) -> str:
     """Say that a record is too short for what repeats daily."""
-    return _at_least(scene, 3.0)
+    return _at_least(grids, 3.0)
 
 
-def _at_least(scene: Scene, days: float) -> str:
-    if scene.days >= 0.98 * days:
+def _at_least(grids: Grids, days: float) -> str:
+    if grids.days >= 0.98 * days:
         return ''
     return (
         f'it changes with time, and the record lasts '
-        f'{counted(float(f"{scene.days:.2g}"), "day")}; at least {days:g} are needed'
+        f'{counted(float(f"{grids.days:.2g}"), "day")}; at least {days:g} are needed'
     )
 
 
@@ -70,7 +70,7 @@ def change(share: float) -> str:
     return f'{abs(100.0 * share):.2g} % {"more" if share > 0.0 else "less"}'
 
 
-def apply_gain_drift(values: Values, scene: Scene, extra: Values) -> FloatArray:
+def apply_gain_drift(values: Values, grids: Grids, extra: Values) -> FloatArray:
     """The power per flow drifts.
 
     Erosion and deposits behind the valve, a cycle that loses efficiency, or the scale of the
@@ -78,13 +78,13 @@ def apply_gain_drift(values: Values, scene: Scene, extra: Values) -> FloatArray:
 
         x = F(u) (1 + g (t - middle) / 10 d)
     """
-    return np.asarray(1.0 + values[0] * ramp(scene, scene.time_s))
+    return np.asarray(1.0 + values[0] * ramp(grids, grids.time_s))
 
 
 def gain_drift_starts(screening: Screening) -> Sequence[Start]:
     """Regress on the power times a ramp in time."""
     _, found = screening.modulated(
-        [GAIN], ramp(screening.scene, screening.scene.sub_middle_s)[None, :]
+        [GAIN], ramp(screening.grids, screening.grids.sub_middle_s)[None, :]
     )
     return screening.best(GAIN_DRIFT, [(float(found[0]),)])
 
@@ -108,14 +108,14 @@ GAIN_DRIFT = Cause(
 )  # fmt: skip
 
 
-def apply_gain_step(values: Values, scene: Scene, extra: Values) -> FloatArray:
+def apply_gain_step(values: Values, grids: Grids, extra: Values) -> FloatArray:
     """The power per flow changes at one moment and stays changed.
 
     Maintenance, another power meter, a heater or an extraction taken in or out for good.
 
         x = F(u) (1 + g),  t >= t0
     """
-    return np.asarray(1.0 + values[0] * since(scene, values[1]))
+    return np.asarray(1.0 + values[0] * since(grids, values[1]))
 
 
 def gain_step_starts(screening: Screening) -> Sequence[Start]:
@@ -143,7 +143,7 @@ GAIN_STEP = Cause(
 
 
 def apply_input_drift(
-    u: FloatArray, values: Values, scene: Scene, model: RegionalModel
+    u: FloatArray, values: Values, grids: Grids, model: RegionalModel
 ) -> FloatArray:
     """The flow area that belongs to a reading of u drifts.
 
@@ -152,13 +152,13 @@ def apply_input_drift(
 
         u_true = u (1 + g (t - middle) / 10 d)
     """
-    return np.asarray(1.0 + values[0] * ramp(scene, scene.time_s))
+    return np.asarray(1.0 + values[0] * ramp(grids, grids.time_s))
 
 
 def input_drift_starts(screening: Screening) -> Sequence[Start]:
     """Regress on the input's effect times a ramp in time."""
     _, found = screening.modulated(
-        [INPUT], ramp(screening.scene, screening.scene.sub_middle_s)[None, :]
+        [INPUT], ramp(screening.grids, screening.grids.sub_middle_s)[None, :]
     )
     g = float(found[0])
     return screening.best(INPUT_DRIFT, [(g,), (0.6 * g,)])
@@ -184,7 +184,7 @@ INPUT_DRIFT = Cause(
 
 
 def apply_input_step(
-    u: FloatArray, values: Values, scene: Scene, model: RegionalModel
+    u: FloatArray, values: Values, grids: Grids, model: RegionalModel
 ) -> FloatArray:
     """The pressure or position transmitter is recalibrated.
 
@@ -192,7 +192,7 @@ def apply_input_step(
 
         u_true = u (1 + g),  t >= t0
     """
-    return np.asarray(1.0 + values[0] * since(scene, values[1]))
+    return np.asarray(1.0 + values[0] * since(grids, values[1]))
 
 
 def input_step_starts(screening: Screening) -> Sequence[Start]:
@@ -219,7 +219,7 @@ INPUT_STEP = Cause(
 )  # fmt: skip
 
 
-def apply_output_offset_drift(y: FloatArray, values: Values, scene: Scene) -> FloatArray:
+def apply_output_offset_drift(y: FloatArray, values: Values, grids: Grids) -> FloatArray:
     """The zero of the power drifts.
 
     The zero of the power transducer, or auxiliary load that comes and stays, adds the same
@@ -227,13 +227,13 @@ def apply_output_offset_drift(y: FloatArray, values: Values, scene: Scene) -> Fl
 
         y = G x + b (t - middle) / 10 d
     """
-    return np.asarray(y + values[0] * ramp(scene, scene.time_s))
+    return np.asarray(y + values[0] * ramp(grids, grids.time_s))
 
 
 def output_offset_drift_starts(screening: Screening) -> Sequence[Start]:
     """Regress on a ramp in time."""
     _, found = screening.modulated(
-        [OFFSET], ramp(screening.scene, screening.scene.sub_middle_s)[None, :]
+        [OFFSET], ramp(screening.grids, screening.grids.sub_middle_s)[None, :]
     )
     return screening.best(OUTPUT_OFFSET_DRIFT, [(float(found[0]),)])
 
@@ -265,7 +265,7 @@ _ROUNDS = 8
 _LEAST_SWITCHES = 2
 
 
-def apply_intervals(values: Values, scene: Scene, extra: Values) -> FloatArray:
+def apply_intervals(values: Values, grids: Grids, extra: Values) -> FloatArray:
     """For hours at a time part of the steam or of the heat goes elsewhere.
 
     An extraction or a feed water heater is in or out of service:
@@ -276,9 +276,9 @@ def apply_intervals(values: Values, scene: Scene, extra: Values) -> FloatArray:
     by the method of Viterbi on sums over half hours.
     """
     # Return the factor on x; ``extra`` holds the times of switches in seconds.
-    inside = np.searchsorted(np.asarray(extra), scene.time_s, side='right') % 2
+    inside = np.searchsorted(np.asarray(extra), grids.time_s, side='right') % 2
     # Counted from the record's mean, as everything in time.
-    span = scene.reference.span_s
+    span = grids.reference.span_s
     edges = np.clip(np.append(np.asarray(extra), span if len(extra) % 2 else []), 0.0, span)
     share = float(np.sum(edges[1::2] - edges[::2])) / span
     return np.asarray(1.0 + values[0] * (inside - share))
@@ -340,7 +340,7 @@ def infer(screening: Screening, active: Active, allowed: BoolArray) -> Values:
     """
     own, toward = (np.where(allowed, x, 0.0) for x in screening.gain_by_sub())
     edges = np.asarray(active.extra)
-    middle = screening.scene.sub_middle_s
+    middle = screening.grids.sub_middle_s
     share = float((np.searchsorted(edges, middle, side='right') % 2).mean())
     path = np.zeros(len(own), dtype=np.uint8)
     _path(screening, own, toward, active.values[0], share, path)
@@ -367,7 +367,7 @@ INTERVALS = Cause(
 _HOUR_S = 3600.0
 
 
-def apply_diurnal(values: Values, scene: Scene, extra: Values) -> FloatArray:
+def apply_diurnal(values: Values, grids: Grids, extra: Values) -> FloatArray:
     """The power follows the time of day.
 
     The pressure in the condenser follows the ambient air or the cooling water; auxiliary load
@@ -376,13 +376,13 @@ def apply_diurnal(values: Values, scene: Scene, extra: Values) -> FloatArray:
         x = F(u) (1 + a cos(2 pi (t - t_peak) / 24 h)),  t the time of day, UTC
     """
     a, peak_h = values
-    angle = 2.0 * np.pi * (scene.clock_s(scene.time_s) - peak_h * _HOUR_S) / DAY_S
+    angle = 2.0 * np.pi * (grids.clock_s(grids.time_s) - peak_h * _HOUR_S) / DAY_S
     return np.asarray(1.0 + a * np.cos(angle))
 
 
 def diurnal_starts(screening: Screening) -> Sequence[Start]:
     """Regress on the power times a daily sine and cosine."""
-    angle = 2.0 * np.pi * screening.scene.clock_s(screening.scene.sub_middle_s) / DAY_S
+    angle = 2.0 * np.pi * screening.grids.clock_s(screening.grids.sub_middle_s) / DAY_S
     _, found = screening.modulated([GAIN, GAIN], np.stack([np.cos(angle), np.sin(angle)]))
     peak_h = float(np.mod(np.arctan2(found[1], found[0]) / (2.0 * np.pi) * 24.0, 24.0))
     return screening.best(DIURNAL, [(float(np.hypot(*found)), peak_h)])

@@ -20,7 +20,7 @@ from valveflow_ros.diagnosis.cause import (
     Values,
 )
 from valveflow_ros.diagnosis.causes.changes import ONSET, a_day, since
-from valveflow_ros.diagnosis.scene import Scene
+from valveflow_ros.diagnosis.grids import Grids
 from valveflow_ros.diagnosis.screening import CURVE, HATS, Screening
 from valveflow_ros.records import FloatArray
 
@@ -28,7 +28,7 @@ _KEPT = 3
 _WIDTHS = (0.06, 0.1, 0.16, 0.25)  # of the range of u
 
 
-def apply_curve_shape(u: FloatArray, values: Values, scene: Scene) -> FloatArray:
+def apply_curve_shape(u: FloatArray, values: Values, grids: Grids) -> FloatArray:
     """The curve has a bend that its straight pieces cannot follow.
 
     Where one valve begins to open before the one before it is open, their overlap raises the
@@ -93,7 +93,7 @@ CURVE_SHAPE = Cause(
 _NARROWEST = 5.0
 
 
-def apply_curve_step(u: FloatArray, values: Values, scene: Scene) -> FloatArray:
+def apply_curve_step(u: FloatArray, values: Values, grids: Grids) -> FloatArray:
     """From one moment on, one of several valves no longer takes part.
 
     The curve is the sum of valves that open one after the other. If one sticks, breaks its
@@ -103,7 +103,7 @@ def apply_curve_step(u: FloatArray, values: Values, scene: Scene) -> FloatArray:
     """
     s, low, high, t0 = values
     share = np.clip((u - low) / max(high - low, _NARROWEST), 0.0, 1.0)
-    return np.asarray(s * share * since(scene, t0))
+    return np.asarray(s * share * since(grids, t0))
 
 
 def curve_step_starts(screening: Screening) -> Sequence[Start]:

@@ -11,7 +11,7 @@ from valveflow_ros.curve.regional_model import RegionalModel, make_taps
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import Active, Cause, Kind, Stage, Start, Unknown, Values
 from valveflow_ros.diagnosis.fitting import improve
-from valveflow_ros.diagnosis.scene import Scene
+from valveflow_ros.diagnosis.grids import Grids
 from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.records import FloatArray
 
@@ -37,8 +37,8 @@ def apply_region_lag(model: RegionalModel, values: Values) -> RegionalModel:
 
 def region_lag_starts(screening: Screening) -> Sequence[Start]:
     """Try other time constants above some loads, the model's own levels among them."""
-    scene, base = screening.scene, screening.model.base
-    x = base.static(scene.u[scene.usable > 0][::10])
+    grids, base = screening.grids, screening.model.base
+    x = base.static(grids.u[grids.usable > 0][::10])
     levels = [*np.quantile(x, _TRIED_SHARES).tolist(), *(base.levels + 0.01).tolist()]
     grid: list[Values] = []
     for level in levels:
@@ -76,7 +76,7 @@ _SLOW, _SWALLOWED, _SHORTEST, _STEPS = (0.3, 60.0), 0.7, 0.3, 5
 _REHEATER_TRIED = tuple((alpha, t) for alpha in (0.2, 0.4, 0.7) for t in (8.0, 20.0, 60.0, 200.0))
 
 
-def apply_reheater(y: FloatArray, values: Values, scene: Scene) -> FloatArray:
+def apply_reheater(y: FloatArray, values: Values, grids: Grids) -> FloatArray:
     """Part of the power comes behind the reheater, which fills slowly.
 
     The turbine models of IEEE (IEEEG1, TGOV1) split the power: a share is made in front
@@ -85,9 +85,9 @@ def apply_reheater(y: FloatArray, values: Values, scene: Scene) -> FloatArray:
         y = alpha y1 + (1 - alpha) y1 / (1 + T s),  y1 = G x
     """
     alpha, time_s = values
-    taps = make_taps(np.array([time_s]), np.zeros(1), scene.step_s)
+    taps = make_taps(np.array([time_s]), np.zeros(1), grids.step_s)
     late = np.empty(len(y))
-    kernels.respond(y, scene.usable, np.zeros(len(y), dtype=np.uint8), taps, late)
+    kernels.respond(y, grids.usable, np.zeros(len(y), dtype=np.uint8), taps, late)
     return np.asarray(alpha * y + (1.0 - alpha) * late)
 
 
@@ -138,7 +138,7 @@ _LONGEST_DELAY_S = 15.0
 _TRIED_S = (3.0, 6.0, 10.0, 16.0, 25.0, 40.0)
 
 
-def apply_clock(y: FloatArray, values: Values, scene: Scene) -> FloatArray:
+def apply_clock(y: FloatArray, values: Values, grids: Grids) -> FloatArray:
     """The power carries stamps of another clock, so that the answer comes before its cause.
 
         y in the row of time t was measured at t + d,  d > 0
@@ -147,7 +147,7 @@ def apply_clock(y: FloatArray, values: Values, scene: Scene) -> FloatArray:
     stamped too early only the part shows that the shortest delay does not hide: ``d_s`` is that
     part, and its interval reaches higher by the longest delay a unit may have.
     """
-    late = values[0] / scene.step_s
+    late = values[0] / grids.step_s
     whole = int(np.floor(late))
     part = late - whole
     at = np.minimum(np.arange(len(y)) + whole, len(y) - 1)

@@ -9,13 +9,13 @@ import numpy as np
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import Cause, Stage, Start, Unknown, Values
-from valveflow_ros.diagnosis.scene import Scene
+from valveflow_ros.diagnosis.grids import Grids
 from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.records import FloatArray
 
 
 def apply_exponent(
-    u: FloatArray, values: Values, scene: Scene, model: RegionalModel
+    u: FloatArray, values: Values, grids: Grids, model: RegionalModel
 ) -> FloatArray:
     """The exponent of the pressure differs from the one in eq. (1).
 
@@ -27,8 +27,8 @@ def apply_exponent(
     Under sliding pressure the curve takes up most of it: only the pressure's departure
     from its line over the load tells.
     """
-    log = np.log(np.maximum(scene.pressure, 1e-6))
-    return np.asarray(np.exp(values[0] * (log - scene.reference.log_pressure)))
+    log = np.log(np.maximum(grids.pressure, 1e-6))
+    return np.asarray(np.exp(values[0] * (log - grids.reference.log_pressure)))
 
 
 def exponent_starts(screening: Screening) -> Sequence[Start]:
@@ -45,9 +45,9 @@ def exponent_sentence(values: dict[str, float]) -> str:
     )
 
 
-def hindered(scene: Scene) -> str:
+def hindered(grids: Grids) -> str:
     """Say that the pressure does not change."""
-    spread = float(np.std(scene.pressure)) / max(float(scene.pressure.mean()), 1e-9)
+    spread = float(np.std(grids.pressure)) / max(float(grids.pressure.mean()), 1e-9)
     return '' if spread >= 1e-3 else 'the main steam pressure hardly changes'
 
 
@@ -75,7 +75,7 @@ def _flow(u: FloatArray, model: RegionalModel) -> FloatArray:
     return np.maximum(x, 0.0)
 
 
-def apply_choked(u: FloatArray, values: Values, scene: Scene, model: RegionalModel) -> FloatArray:
+def apply_choked(u: FloatArray, values: Values, grids: Grids, model: RegionalModel) -> FloatArray:
     """Flow that is not choked: the pressure behind the valve throttles it.
 
     Above the critical ratio r_c of pressures (0.546 for superheated steam) the flow follows an
@@ -88,18 +88,18 @@ def apply_choked(u: FloatArray, values: Values, scene: Scene, model: RegionalMod
     IEC 60534 says the same of control valves with an expansion factor.
     """
     x = _flow(u, model)
-    p = np.maximum(scene.pressure, 1e-6)
-    line = np.maximum(scene.reference.pressure_level + scene.reference.pressure_slope * x, 0.1 * p)
+    p = np.maximum(grids.pressure, 1e-6)
+    line = np.maximum(grids.reference.pressure_level + grids.reference.pressure_slope * x, 0.1 * p)
     kappa = values[0]
     return np.asarray(_psi(kappa * x / p) / _psi(kappa * x / line))
 
 
 def choked_starts(screening: Screening) -> Sequence[Start]:
     """Try sizes that reach different pressure ratios at high load."""
-    scene = screening.scene
-    here = scene.usable > 0
-    x = _flow(scene.u[here], screening.model.base)
-    top = float(np.quantile(x / np.maximum(scene.pressure[here], 1e-6), 0.98))
+    grids = screening.grids
+    here = grids.usable > 0
+    x = _flow(grids.u[here], screening.model.base)
+    top = float(np.quantile(x / np.maximum(grids.pressure[here], 1e-6), 0.98))
     if not top > 0.0:
         return []
     return screening.best(CHOKED, [(r / top,) for r in _TRIED_RATIOS])
@@ -125,7 +125,7 @@ CHOKED = Cause(
 _LEAST_SPREAD_K = 0.1
 
 
-def apply_temperature(values: Values, scene: Scene, extra: Values) -> FloatArray:
+def apply_temperature(values: Values, grids: Grids, extra: Values) -> FloatArray:
     """Main steam temperature, which the paper holds constant.
 
     A turbine swallows m ~ p / sqrt(T_K) (the cone law of Stodola and Fluegel): the hotter
@@ -134,7 +134,7 @@ def apply_temperature(values: Values, scene: Scene, extra: Values) -> FloatArray
 
         x = F(u) (1 + k (T - mean T))
     """
-    return np.asarray(1.0 + values[0] * (scene.temperature - scene.reference.temperature_degc))
+    return np.asarray(1.0 + values[0] * (grids.temperature - grids.reference.temperature_degc))
 
 
 def temperature_starts(screening: Screening) -> Sequence[Start]:
@@ -151,9 +151,9 @@ def temperature_sentence(values: dict[str, float]) -> str:
     )
 
 
-def temperature_hindered(scene: Scene) -> str:
+def temperature_hindered(grids: Grids) -> str:
     """Say that the temperature does not change."""
-    spread = float(np.std(scene.temperature))
+    spread = float(np.std(grids.temperature))
     if spread >= _LEAST_SPREAD_K:
         return ''
     return f'the main steam temperature hardly changes (standard deviation {spread:.2g} K)'

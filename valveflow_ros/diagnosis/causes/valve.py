@@ -9,14 +9,14 @@ import numpy as np
 
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import Cause, Kind, Stage, Start, Unknown, Values
-from valveflow_ros.diagnosis.scene import Scene
+from valveflow_ros.diagnosis.grids import Grids
 from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.records import FloatArray
 
 _BACKLASH_TRIED = (0.1, 0.2, 0.35, 0.6, 1.0, 1.6, 2.7, 4.5)
 
 
-def apply_backlash(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
+def apply_backlash(v: FloatArray, values: Values, grids: Grids) -> FloatArray:
     """A loose linkage between the position sensor and the plug.
 
     The plug follows only when one flank of the slack pushes it (the play operator); the loop
@@ -63,27 +63,27 @@ _STEPS = (0.04, 0.02, 0.01, 0.005)
 _SHIFT = 7_919
 
 
-def _noise(v: FloatArray, scene: Scene) -> FloatArray:
+def _noise(v: FloatArray, grids: Grids) -> FloatArray:
     """Return noise like that of the position sensor, the same for every call."""
-    if 'noise of v' not in scene.cache:
+    if 'noise of v' not in grids.cache:
         normal = np.random.default_rng(_SEED).standard_normal(len(v))
-        scene.cache['noise of v'] = scene.reference.opening_noise * normal
-    return scene.cache['noise of v']
+        grids.cache['noise of v'] = grids.reference.opening_noise * normal
+    return grids.cache['noise of v']
 
 
-def draw(number: int) -> Callable[[FloatArray, Values, Scene], FloatArray]:
+def draw(number: int) -> Callable[[FloatArray, Values, Grids], FloatArray]:
     """Return what acts in one draw of the noise."""
 
-    def path(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
+    def path(v: FloatArray, values: Values, grids: Grids) -> FloatArray:
         out = np.empty(len(v))
-        moved = v + np.roll(_noise(v, scene), number * _SHIFT)
+        moved = v + np.roll(_noise(v, grids), number * _SHIFT)
         kernels.stick_slip(moved, values[0], min(values[1], values[0]), out)
         return out
 
     return path
 
 
-def apply_stiction(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
+def apply_stiction(v: FloatArray, values: Values, grids: Grids) -> FloatArray:
     """Friction holds the valve until it slips.
 
     The two-parameter picture of Choudhury in the form of He: the valve stays until the pull
@@ -93,7 +93,7 @@ def apply_stiction(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
     """
     total = np.zeros(len(v))
     for k in range(_DRAWS):
-        total += draw(k)(v, values, scene)
+        total += draw(k)(v, values, grids)
     return np.asarray(total / _DRAWS)
 
 
@@ -157,14 +157,14 @@ STICTION = Cause(
 _RATE_LIMIT_TRIED = (0.05, 0.08, 0.12, 0.18, 0.27, 0.4)
 
 
-def apply_rate_limit(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
+def apply_rate_limit(v: FloatArray, values: Values, grids: Grids) -> FloatArray:
     """The servo is slow.
 
     Oil flow and pump bound the speed of the stem; a fast move takes the longer the larger it
     is, a slow one is not affected.
     """
     out = np.empty(len(v))
-    kernels.rate_limit(v, values[0] * scene.fine_s, out)
+    kernels.rate_limit(v, values[0] * grids.fine_s, out)
     return out
 
 
@@ -192,7 +192,7 @@ RATE_LIMIT = Cause(
 _TRIED_SHARES = (0.6, 0.7, 0.78, 0.85, 0.9, 0.94, 0.97, 0.99)
 
 
-def apply_saturation(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
+def apply_saturation(v: FloatArray, values: Values, grids: Grids) -> FloatArray:
     """A stop keeps the valve from opening fully.
 
     A mechanical or a configured limit behind the position sensor:
@@ -204,7 +204,7 @@ def apply_saturation(v: FloatArray, values: Values, scene: Scene) -> FloatArray:
 
 def saturation_starts(screening: Screening) -> Sequence[Start]:
     """Try some places among the highest openings."""
-    places = np.quantile(screening.scene.v[np.isfinite(screening.scene.v)], _TRIED_SHARES)
+    places = np.quantile(screening.grids.v[np.isfinite(screening.grids.v)], _TRIED_SHARES)
     return screening.best(SATURATION, [(float(p),) for p in places])
 
 

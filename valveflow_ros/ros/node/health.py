@@ -13,7 +13,7 @@ from rclpy.node import Node
 from valveflow_ros.errors import counted
 from valveflow_ros.fit.result import weaknesses
 from valveflow_ros.logs import RecorderState
-from valveflow_ros.monitoring.alarm import Alarm, AlarmState
+from valveflow_ros.monitoring.alarm_state import Alarm, AlarmState
 from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.parameters import Settings

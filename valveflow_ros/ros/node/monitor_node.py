@@ -26,7 +26,7 @@ from std_srvs.srv import Trigger
 
 from valveflow_ros.errors import ParameterError, ValveflowError, counted
 from valveflow_ros.logs import RecorderState, RecorderStatus
-from valveflow_ros.monitoring.alarm import AlarmAction
+from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.parameters import Settings
 from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.ros import declare

@@ -42,7 +42,7 @@ class Reference:
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class Grids:
     """Everything measured, as arrays that the model and the statistics need.
 
     Attributes
@@ -195,7 +195,7 @@ def _lift(v: FloatArray) -> float:
     return 3.0 * lifted[0] - 3.0 * lifted[1] + lifted[2]
 
 
-# From a table of samples to the grids of a `Scene`.
+# From a table of samples to the grids of a `Grids`.
 
 _BRIDGE_S = 30.0
 _BEFORE_GAP_S = 60.0
@@ -205,10 +205,10 @@ MEAN_S = 10.0
 SUB_S = 1800.0
 
 
-def make_scene(
+def make_grids(
     table: SampleTable, step_s: float, exponent: float, settle_s: float, bad: BoolArray,
     rough: bool = False,
-) -> Scene:  # fmt: skip
+) -> Grids:  # fmt: skip
     """Put a table on the grids.
 
     Parameters
@@ -263,7 +263,7 @@ def make_scene(
         whole[k:] &= scored[:-k]
         whole[:k] = False
     pressure, temperature = _everywhere(coarse(p)), _everywhere(coarse(t))
-    return Scene(
+    return Grids(
         start_ns=int(table.time_ns[0]), fine_s=step_s, step_s=step, settle_s=settle_s,
         exponent=exponent, v=v, density=density, command=fine[:, Signal.VALVE_COMMAND],
         u=np.where(usable > 0, u, 0.0), pressure=pressure, temperature=temperature,
