@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import queue
 import threading
+import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from typing import Any, TypeVar, cast
 
@@ -21,7 +22,52 @@ _Function = TypeVar('_Function', bound=Callable[..., Any])
 
 def jit(function: _Function) -> _Function:
     """Compile a loop over arrays, keeping its type for the checker."""
-    return cast(_Function, numba.njit(**JIT)(function))
+    return cast(_Function, _fresh(numba.njit(**JIT)(function)))
+
+
+def _fresh(compiled: Any) -> Any:
+    """Let what was kept of a function be used only while nothing that it calls has changed.
+
+    numba looks at the function's own file alone: after an update it would go on with old loops of
+    other files, and it ends with an error where a type that it kept is called otherwise now.
+    """
+    cache = getattr(compiled, '_cache', None)
+    kept = getattr(getattr(cache, '_cache_file', None), '_index_path', None)
+    if cache is None or kept is None:
+        return compiled
+    load = cache.load_overload
+
+    def load_overload(signature: Any, context: Any) -> Any:
+        try:
+            kept_s, now_s = os.path.getmtime(kept), time.time()
+            # A file from the future, by a clock that was wrong, would always be newer.
+            if any(kept_s < os.path.getmtime(file) <= now_s for file in _sources(compiled)):
+                cache.flush()
+        except OSError:
+            pass  # Nothing is kept, or there are no sources that could change.
+        try:
+            return load(signature, context)
+        except Exception:  # noqa: BLE001 - numba raises what its pickles raise
+            cache.flush()
+            return None
+
+    cache.load_overload = load_overload
+    return compiled
+
+
+def _sources(compiled: Any) -> set[str]:
+    """Return the files of a compiled function and of all compiled ones that it may call."""
+    found, todo = set(), [compiled.py_func.__globals__]
+    seen = {id(todo[0])}
+    while todo:
+        names = todo.pop()
+        found.add(names['__file__'])
+        for callee in names.values():
+            around = getattr(getattr(callee, 'py_func', None), '__globals__', None)
+            if around is not None and id(around) not in seen:
+                seen.add(id(around))
+                todo.append(around)
+    return found
 
 
 # A division by zero gives inf or NaN here instead of an exception, whose test
@@ -31,7 +77,7 @@ _KERNEL_JIT: dict[str, Any] = {**JIT, 'error_model': 'numpy'}
 
 def kernel(function: _Function) -> _Function:
     """Compile a loop made for SIMD: like `jit`, with IEEE division."""
-    return cast(_Function, numba.njit(**_KERNEL_JIT)(function))
+    return cast(_Function, _fresh(numba.njit(**_KERNEL_JIT)(function)))
 
 
 # Not callable from Python, which saves compiling a wrapper for each.
@@ -49,7 +95,7 @@ def inlined(function: _Function) -> _Function:
     A call that hands over records of arrays costs more than a short loop does:
     every array is passed as seven numbers and its reference count goes up and down.
     """
-    return cast(_Function, numba.njit(**_INLINED_JIT)(function))
+    return cast(_Function, _fresh(numba.njit(**_INLINED_JIT)(function)))
 
 
 # Plain threads for kernels that release the interpreter lock.
