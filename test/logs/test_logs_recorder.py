@@ -74,6 +74,10 @@ class FailingFile:
         self.disk.count('sync', b'')
         self.file.sync()
 
+    @property
+    def touched(self):
+        return self.file.touched
+
     def check(self, size):
         self.file.check(size)
 

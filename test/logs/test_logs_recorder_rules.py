@@ -98,7 +98,8 @@ class Writer:
     def check(self) -> None:
         """Nobody touches what is not there."""
 
-    check_finished = check
+    def check_finished(self, most_bytes: int = 0) -> bool:
+        return True
 
     def sync(self) -> None:
         self._called('sync')

@@ -336,6 +336,7 @@ def small(folder: Path) -> None:
 
 
 def part(folder: Path) -> None:
+    (folder / 'a.mcap').unlink(missing_ok=True)
     file = PartFile(folder / 'a.mcap')
     try:
         file.write(b'some')

@@ -415,12 +415,31 @@ def test_closing_twice_lets_nobody_elses_descriptor_go(tmp_path: Path) -> None:
     again.close()
 
 
-def test_a_curve_that_cannot_be_kept_is_in_the_state_that_follows(tmp_path: Path) -> None:
+def test_a_curve_is_kept_in_a_folder_made_again_but_never_in_that_of_another(
+    tmp_path: Path,
+) -> None:
     folder = StateFolder(tmp_path / 'state')
     shutil.rmtree(tmp_path / 'state')
     folder.write_curve(CURVE)
+    assert repr(folder.curve(CURVE.model_id)) == repr(CURVE)
+    shutil.rmtree(tmp_path / 'state')
+    other = StateFolder(tmp_path / 'state')
+    folder.write_curve(CURVE)
+    assert not list((tmp_path / 'state').glob('curve_*'))
     folder.close()
-    assert not (tmp_path / 'state').exists()
+    other.close()
+
+
+def test_a_state_folder_that_cannot_be_asked_is_an_altered_one(tmp_path: Path) -> None:
+    folder = StateFolder(tmp_path / 'state')
+    folder.write(b'x')
+    assert not folder.altered
+    shutil.rmtree(tmp_path / 'state')
+    (tmp_path / 'state').symlink_to('state')
+    assert folder.altered
+    with pytest.raises(RecordingError):
+        folder.keep()
+    folder.close()
 
 
 def test_what_a_killed_writer_left_goes_at_the_next_start(tmp_path: Path) -> None:

@@ -43,8 +43,14 @@ class Writable(Protocol):
     def check_content(self, size: int, crc: int) -> None:
         """Read ``size`` bytes back; raises `AlteredError` if they have another CRC-32."""
 
+    @property
+    def touched(self) -> bool:
+        """Return True if somebody may have written into the file since `write` last did."""
+
+    path: Path
+
     def publish(self) -> None:
-        """Give the file its own name; raises `OSError`."""
+        """Give the file its own name, ``path``; raises `OSError`."""
 
     def close(self) -> None:
         """Let go of the file, finished or not."""
@@ -61,7 +67,8 @@ class PartFile:
     path : Path
         The name of the finished file.
     replace : bool
-        Take the place of an unlocked ``.part`` that a dead writer left.
+        Take the place of an unlocked ``.part`` that a dead writer left, and at the end of a file
+        of the finished one's name.
 
     Raises
     ------
@@ -71,14 +78,18 @@ class PartFile:
 
     def __init__(self, path: Path, replace: bool = False) -> None:
         self.path = path
+        self._replace = replace
         self.part = path.with_name(path.name + PART_SUFFIX)
         if replace and self.part.exists() and not is_held(self.part):
             self.part.unlink()
         self._descriptor = _made(self.part)
+        self._changed_ns = 0
 
     def write(self, data: bytes) -> int:
         """Append bytes and return how many were taken."""
-        return os.write(self._descriptor, data)
+        taken = os.write(self._descriptor, data)
+        self._changed_ns = os.fstat(self._descriptor).st_mtime_ns
+        return taken
 
     def sync(self) -> None:
         """Bring everything to the disk."""
@@ -107,10 +118,30 @@ class PartFile:
         if found != crc:
             raise AlteredError('was changed by another program')
 
+    @property
+    def touched(self) -> bool:
+        """Return True if somebody may have written into the file since `write` last did.
+
+        Once for each change: a file system may put the time of a write right afterwards.
+        """
+        changed_ns = os.fstat(self._descriptor).st_mtime_ns
+        touched, self._changed_ns = changed_ns != self._changed_ns, changed_ns
+        return touched
+
     def publish(self) -> None:
-        """Give the file its own name, durably; raises `OSError`, and as `check` does."""
+        """Give the file its own name, durably.
+
+        Raises
+        ------
+        FileExistsError
+            Somebody else's file has that name and is not to be replaced.
+        AlteredError, OSError
+            As `check`; it cannot be done.
+        """
         os.fsync(self._descriptor)
         self._check_name(self.part)
+        if not self._replace and os.path.lexists(self.path):
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.path))
         os.replace(self.part, self.path)
         # Between the two somebody may have put another file there.
         self._check_name(self.path)
@@ -187,8 +218,13 @@ def sync_folder(folder: Path) -> None:
 def make_folder(folder: Path) -> None:
     """Make a folder, and those above it, that only its owner can enter; one that exists stays."""
     for missing in reversed([folder, *folder.parents]):
-        if not missing.exists():
-            missing.mkdir(mode=FOLDER_MODE, exist_ok=True)
+        if not missing.is_dir():
+            try:
+                missing.mkdir(mode=FOLDER_MODE, exist_ok=True)
+            except FileExistsError:
+                raise NotADirectoryError(
+                    errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(missing)
+                ) from None
 
 
 def is_held(part: Path) -> bool:
@@ -226,11 +262,26 @@ def write_whole(path: Path, data: bytes) -> None:
         while view:
             view = view[os.write(descriptor, view) :]
         os.fsync(descriptor)
+        os.replace(temporary, path)
     except OSError:
         with suppress(OSError):
             temporary.unlink()
         raise
     finally:
         os.close(descriptor)
-    os.replace(temporary, path)
     sync_folder(path.parent)
+
+
+def mark_of(path: Path) -> tuple[int, ...] | None:
+    """Return by what a file is known again without reading it; None if that is not found out.
+
+    Of what a link leads to, and of the link.
+    """
+    try:
+        found, link = path.stat(), path.lstat()
+    except OSError:
+        return None
+    return (
+        found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns,
+        link.st_ino,
+    )  # fmt: skip

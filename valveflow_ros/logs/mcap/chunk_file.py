@@ -11,7 +11,7 @@ import struct
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import PurePath
+from pathlib import Path, PurePath
 
 import numpy as np
 import zstandard
@@ -277,8 +277,14 @@ class ChunkFile:
         self._out.sync()
 
     def check(self) -> None:
-        """See that the file is there as far as it was written; raises `AlteredError` if not."""
+        """See that the file is there as it was written; raises `AlteredError` if not."""
         self._out.check(self.position)
+        if self._out.touched:
+            self._out.check_content(self.position, self._crc)
+
+    def rename(self, path: Path) -> None:
+        """Let the finished file have another name."""
+        self._out.path = path
 
     def finish(self, table: TopicTable) -> None:
         """Write the summary and give the file its own name.
@@ -288,11 +294,15 @@ class ChunkFile:
         AlteredError
             What is in the file is not what was written.
         """
+        # Whatever somebody else writes from now on counts as done by the look after it.
+        self._out.sync()
         self._out.check(self.position)
         self._out.check_content(self.position, self._crc)
         self._append(pack(DataEnd(data_section_crc=self._crc)))
-        self._write(self._summary(table))
+        self._append(self._summary(table))
         self._out.publish()
+        if self._out.touched:
+            self._out.check_content(self.position, self._crc)
         self._out.close()
 
     def abandon(self) -> None:

@@ -74,7 +74,8 @@ def split_number(path: Path) -> int:
 def is_split_of(name: str, recording: str) -> bool:
     """Tell whether a file is called as the splits of a recording are."""
     match = _NUMBERED.match(name)
-    return match is not None and match.group(1) == recording
+    # Not a copy that somebody called alike.
+    return match is not None and name == f'{recording}_{int(match.group(2))}.mcap'
 
 
 def in_order(paths: Iterable[Path]) -> list[Path]:

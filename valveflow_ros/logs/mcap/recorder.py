@@ -28,6 +28,8 @@ from valveflow_ros.logs.source import os_errors
 DROPS_SHOWN_S = 2.0
 # So often somebody looks whether finished files are there as they were left.
 _LOOK_S = 2.0
+# At the end nobody waits long.
+_LAST_LOOK_BYTES = 256 * 1024 * 1024
 # More waiting messages than this wake the thread before its time.
 _WAKE_AT = 4000
 MIB = 1 << 20
@@ -429,16 +431,23 @@ class RecorderLoop:
         writer = self._writer
         if writer is None:
             return 'nothing could be recorded'
+        reason = ''
         try:
             writer.note('valveflow_recorder', self._counters.as_metadata())
             writer.close()
-            writer.check_finished()
         except RecordingError as error:
             writer.abandon()
-            return str(error)
-        finally:
-            self._count()
-        return ''
+            reason = str(error)
+        try:
+            if not writer.check_finished(_LAST_LOOK_BYTES):
+                reason = reason or (
+                    'Files that another program changed were not all read again; '
+                    '`valveflow info` counts what is in them.'
+                )
+        except RecordingError as error:
+            reason = reason or str(error)
+        self._count()
+        return reason
 
 
 def free_bytes_of(folder: Path) -> int:

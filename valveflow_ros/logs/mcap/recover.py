@@ -223,7 +223,13 @@ class _Proven:
     def __post_init__(self) -> None:
         self.write, self.sync = self.out.write, self.out.sync
         self.check, self.check_content = self.out.check, self.out.check_content
+        self.path = self.out.path
         self.close, self.discard = self.out.close, self.out.discard
+
+    @property
+    def touched(self) -> bool:
+        """Return what the file says."""
+        return self.out.touched
 
     def publish(self) -> None:
         """Read every message, and give the file its name; raises `RecordingError`."""

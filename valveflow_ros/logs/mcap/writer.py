@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES, ChunkBuilder, ChunkF
 from valveflow_ros.logs.mcap.definitions import Definitions, parse_all, type_hash
 from valveflow_ros.logs.mcap.folder import (
     LIBRARY,
+    METADATA_NAME,
     Split,
     finish_split,
     finished_files,
@@ -32,6 +34,7 @@ from valveflow_ros.logs.part_file import (
     PartFile,
     Writable,
     make_folder,
+    mark_of,
 )
 from valveflow_ros.logs.source import os_errors
 
@@ -235,6 +238,8 @@ class RecordingWriter:
         self._open_file = open_file
         self._head_messages = head_messages
         self._files: list[_File] = []
+        self._damaged: set[str] = set()
+        self._listed: tuple[int, ...] | None = None
         self._at_hand = _File(Path())
         self._number = -1
         self._begun = 0
@@ -327,19 +332,29 @@ class RecordingWriter:
                 except AlteredError as error:
                     self._give_up(error)
 
-    def check_finished(self) -> None:
+    def check_finished(self, most_bytes: int = 64 << 20) -> bool:
         """See that the finished splits are there as they were left; count what is not.
 
-        `metadata.yaml` is brought in line with them.
+        `metadata.yaml` is brought in line with them. One that was changed is read again, which
+        takes time: when so many bytes were, the others wait for the next call.
+
+        Returns
+        -------
+        bool
+            Whether none has to wait.
         """
-        changed = [
-            file for file in self._files
-            if file is not self._at_hand and file.mark != _mark(file.path)
-        ]  # fmt: skip
-        for file in changed:
-            self._recount(file)
-        if changed:
+        changed, left = False, most_bytes
+        for file in list(self._files):
+            if file is self._at_hand or (file.mark and file.mark == mark_of(file.path)):
+                continue
+            size = 0 if (mark := mark_of(file.path)) is None else mark[2]
+            if left > 0 or not size:
+                left -= size
+                changed = True
+                self._recount(file)
+        if changed or (self._splits and self._listed != mark_of(self.folder / METADATA_NAME)):
             self._list()
+        return left > 0
 
     def sync(self) -> None:
         """Bring what was flushed to the disk itself; a power cut loses it no more."""
@@ -366,9 +381,12 @@ class RecordingWriter:
         """Let go of the split at hand, unfinished; `recover` makes a whole file of it."""
         if self._file is not None:
             self._file.abandon()
-            part = self._at_hand.path.with_name(f'{self._at_hand.path.name}{PART_SUFFIX}')
-            self._at_hand.path, self._at_hand.mark = part, _mark(part)
-            self._at_hand = _File(Path())
+            at_hand, self._at_hand = self._at_hand, _File(Path())
+            part = at_hand.path.with_name(f'{at_hand.path.name}{PART_SUFFIX}')
+            # What is in it nobody has read back: without a mark the next look counts it.
+            at_hand.path, at_hand.mark = part, None
+            if not at_hand.own:
+                self._files.remove(at_hand)
             self._file = self.path = None
 
     def forget(self, name: str) -> None:
@@ -411,7 +429,7 @@ class RecordingWriter:
     def _begin(self) -> ChunkFile:
         if self._file is None:
             number = self._next_number()
-            self.path = self.folder / f'{self.name}_{number}.mcap'
+            self.path = self._split_path(number)
             out = self._open_file(self.path)
             try:
                 file = ChunkFile(out, LIBRARY)
@@ -421,7 +439,7 @@ class RecordingWriter:
             except OSError:
                 out.discard()
                 raise
-            self._begun, self._file, self._number = self._begun + 1, file, number
+            self._begun, self._file = self._begun + 1, file
             self._at_hand = _File(self.path)
             self._files.append(self._at_hand)
         return self._file
@@ -438,6 +456,10 @@ class RecordingWriter:
         if len(head):
             file.put_chunk(head.build(self._topics.packed()))
 
+    def _split_path(self, number: int) -> Path:
+        self._number = number
+        return self.folder / f'{self.name}_{number}.mcap'
+
     def _next_number(self) -> int:
         parts = self.folder.glob(f'*.mcap{PART_SUFFIX}')
         found = max(map(split_number, [*finished_files(self.folder), *parts]), default=-1)
@@ -448,6 +470,10 @@ class RecordingWriter:
         if self._file is not None and self.path is not None:
             # Until this is done, a file may have its name that the list does not name.
             self._list_due = True
+            if os.path.lexists(self.path):
+                # Somebody else's: it stays.
+                self.path = self._at_hand.path = self._split_path(self._next_number())
+                self._file.rename(self.path)
             with self._writing():
                 try:
                     split = finish_split(self._file, self.path.name, self._topics.table)
@@ -457,7 +483,7 @@ class RecordingWriter:
                     self.bytes_finished += self._file.position
                     self.files_finished += 1
                     self._splits[split.name] = split
-                    self._at_hand.mark = _mark(self.path)
+                    self._at_hand.mark = mark_of(self.path)
                     self._at_hand = _File(Path())
                     self._file = self.path = None
         elif not self._list_due:
@@ -468,34 +494,36 @@ class RecordingWriter:
         """Let go of the split at hand, which another program altered; count what it took away."""
         file = self._at_hand
         self.abandon()
-        # Its name may be a link to where it was moved.
-        self._lose(file, intact_messages(file.path), str(error))
+        if file.own:
+            self._recount(file, str(error))
 
-    def _recount(self, file: _File) -> None:
-        """Count the messages of an earlier split again, which another program altered."""
-        whole = file.path.with_suffix('') if file.path.suffix == PART_SUFFIX else file.path
-        for path in (whole, file.path):
-            file.mark = _mark(path)
-            self._splits.pop(path.name, None)
-            if file.mark is not None:
-                file.path = path
-                self._lose(file, intact_messages(path), 'was changed by another program')
-                return
-        # What was finished may have been taken to an archive.
-        self._take_out(file)
-
-    def _lose(self, file: _File, left: int, what: str) -> None:
-        """Count as lost what is not ``left`` of the messages in a file."""
+    def _recount(self, file: _File, what: str = '') -> None:
+        """Count the messages of an earlier split again."""
+        unfinished = file.path.suffix == PART_SUFFIX
+        named = file.path.with_suffix('') if unfinished else file.path
+        if named.exists() and not file.path.exists():
+            # Giving it its name was the last that was done, or it was recovered since.
+            file.path = named
+        file.mark = mark_of(file.path)
+        self._splits.pop(file.path.name, None)
+        if file.mark is None and not unfinished:
+            # What was finished may have been taken to an archive.
+            self._take_out(file)
+            return
+        left = 0 if file.mark is None else intact_messages(file.path)
         lost = min(file.own, max(0, file.messages - left))
-        if lost:
-            self.lost += lost
-            told = counted(lost, 'message in it is', 'messages in it are')
-            self.loss = f"'{file.path}' {what}: {told} lost."
-            if left:
-                self.loss += ' The others need `valveflow recover`.'
         file.own, file.messages = file.own - lost, left
+        self.lost += lost
         if not file.own:
             self._files.remove(file)
+        self._damaged.discard(file.path.name)
+        if not lost and Split.read(file.path) is not None:
+            return
+        self._damaged.add(file.path.name)
+        what = what or ('was not finished' if unfinished else 'was changed by another program')
+        told = counted(lost, 'message in it is', 'messages in it are') if lost else 'nothing is'
+        more = ' What is in it needs `valveflow recover`.' if left else ''
+        self.loss = f"'{file.path}' {what}: {told} lost.{more}"
 
     def _take_out(self, file: _File) -> None:
         """Count the messages of a file that was removed."""
@@ -507,8 +535,10 @@ class RecordingWriter:
         self._list_due = True
         with os_errors(self.path or self.folder, 'cannot be written'):
             # A file may have got its name although finishing it failed after that.
-            self._splits = finished_splits(self.folder, self._splits)
+            found = finished_splits(self.folder, self._splits)
+            self._splits = {n: split for n, split in found.items() if n not in self._damaged}
             write_metadata(self.folder, self._splits.values())
+            self._listed = mark_of(self.folder / METADATA_NAME)
         self._list_due = False
 
     @contextmanager
@@ -520,12 +550,3 @@ class RecordingWriter:
             self.abandon()
             with os_errors(self.path or self.folder, 'cannot be written'):
                 raise error
-
-
-def _mark(path: Path) -> tuple[int, ...] | None:
-    """Return device, inode, size and time of change of a file; None if it is not there."""
-    try:
-        found = path.lstat()
-    except OSError:
-        return None
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns

@@ -202,12 +202,16 @@ class Recording:
         if recorder is None:
             return None
         status = recorder.close(_CLOSE_S)
-        if status.state == RecorderState.DEGRADED or status.queued:
-            self.problem = status.reason or f'{status.queued} messages were not written in time.'
-        elif status.lost or any(status.dropped.values()):
-            missing = status.lost + sum(status.dropped.values())
+        missing = status.lost + sum(status.dropped.values())
+        if status.state != RecorderState.STOPPED or status.queued:
+            self.problem = status.reason or (
+                f'The last file was not finished in time, {status.queued} messages were not '
+                'written; the next start finishes it.'
+            )
+        elif missing or status.loss or status.reason:
             told = f'{counted(missing, "message is", "messages are")} missing from the recording.'
-            self.problem = f'{told} {status.loss or status.reason}'.rstrip()
+            said = (told if missing else '', status.loss, status.reason)
+            self.problem = ' '.join(filter(None, said))
         return status
 
     def _give_up(self, problem: str) -> None:

@@ -171,12 +171,12 @@ class Restart:
         try:
             recover_leftovers(folder)
             self._tail = list(messages_since(folder, self.log_ns))
-            if any(map(is_held, folder.glob(f'*{PART_SUFFIX}'))):
+            if any(map(_written_now, folder.glob(f'*{PART_SUFFIX}'))):
                 self._missing = f'Another process records into {folder}; a new recording is begun.'
             # With the same names on the topics it is one recording, and a replay finds all of it.
             elif saved['topics'] == self._topics and not self._result_lost():
                 self.folder = folder
-        except (RecordingError, DataError, OSError) as error:
+        except (RecordingError, DataError) as error:
             self._missing = f'What was recorded after the state was saved is not there: {error}'
         if self._tail:
             self.log_ns = max(self.log_ns, self._tail[-1].log_time_ns)
@@ -200,3 +200,11 @@ class Restart:
                     yield journal_entry(message.data)
                 except ValueError as error:
                     raise DataError('A line of the recorded journal cannot be read.') from error
+
+
+def _written_now(part: Path) -> bool:
+    """Return True if a living process writes the file; a link, or one just gone, is none."""
+    try:
+        return is_held(part)
+    except OSError:
+        return False

@@ -26,6 +26,7 @@ from valveflow_ros.ros.node.state_store import StateStore
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs, OutputTopic
 from valveflow_ros.ros.polled_subscription import PolledSubscription
 from valveflow_ros.ros.worker import DiagnosisWorker, FitWorker
+from valveflow_ros.state import State
 
 DIAGNOSTICS = '/diagnostics'
 # A look at the graph costs a fraction of a millisecond.
@@ -224,9 +225,11 @@ class Session:
         self._fit_worker.close()
         self._diagnosis_worker.close()
         # Where not all is recorded, nothing else tells what happened since it was saved last.
-        if self._begun and (not self.recording.whole or self._store.altered):
-            self._save_state()
+        whole, state = self.recording.whole, self._state() if self._begun else None
+        # First: what a state holds, a recording holds too.
         status = self.recording.close()
+        if state is not None and (not whole or self._store.altered):
+            self._store.write(state, lambda: True)
         self._store.close()
         if self._store.problem:
             self._log(Level.ERROR, self._store.problem)
@@ -252,18 +255,20 @@ class Session:
         return LiveEngine(settings, self._fit_worker, self._diagnosis_worker, corrector)
 
     def _save_state(self) -> None:
+        self._store.write(self._state(), self.recording.settled())
+
+    def _state(self) -> State:
         recording = self.recording
         folder = recording.folder if recording.on else None
-        state = {
+        return {
             'settings': dict(self._settings),
             'engine': self.engine.snapshot(),
             # Of the newest message that went into it.
             'log_ns': self._log_clock.last_ns,
             'topics': {**self.inputs, **self.outputs},
             'began': recording.began,
-            'recording': None if folder is None else str(folder.resolve()),
+            'recording': None if folder is None else str(folder.absolute()),
         }
-        self._store.write(state, recording.settled())
 
     def _send(self, outputs: Iterable[Output]) -> None:
         for output in outputs:

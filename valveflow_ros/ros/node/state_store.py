@@ -14,7 +14,7 @@ from pathlib import Path
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.errors import DataError, RecordingError, ValveflowError
-from valveflow_ros.logs.part_file import FILE_MODE, make_folder, write_whole
+from valveflow_ros.logs.part_file import FILE_MODE, make_folder, mark_of, write_whole
 from valveflow_ros.monitoring.alarms import AlarmChange
 from valveflow_ros.monitoring.events import (
     CurveAdopted,
@@ -37,11 +37,14 @@ _MAX_BYTES = 4 << 30
 # The file is put in place when the recording has everything that went into it, or after this.
 _PATIENCE_S = 1.0
 _LOOK_S = 0.02
-_LONGEST_S = 30.0
+# At the end this is waited for twice, and a service manager ends what takes longer than 10 s.
+_LONGEST_S = 3.0
 # A window of ten days takes 40 MB.
 _LEAST_S = 1.0
 _RETRY_S = 10.0
 _WATCH_S = 1.0
+# Longer than a state of 40 MB takes on a slow disk.
+_STUCK_S = 20.0
 # What must survive the end of the process.
 _SAVED_EVENTS = (AlarmChange, CurveAdopted, Diagnosed, ReferenceSet)
 _KINDS = {
@@ -76,6 +79,7 @@ class StateFolder:
         self.path, self.aside = folder / STATE, folder / ASIDE
         self._lock = -1
         self._mark: tuple[int, ...] | None = None
+        self._written = False
         self.keep()
         # What a killed process left half written; if it cannot be removed, it does no harm.
         with contextlib.suppress(OSError):
@@ -94,7 +98,7 @@ class StateFolder:
         """
         lock = self.folder / LOCK
         try:
-            if self._lock >= 0 and _mark(lock) == _mark(self._lock):
+            if self._lock >= 0 and _is_named(lock, self._lock):
                 return
             make_folder(self.folder)
             taken = _locked(lock)
@@ -115,7 +119,8 @@ class StateFolder:
     @property
     def altered(self) -> bool:
         """Return True if another program removed or changed the state since it was written."""
-        return self._mark is not None and _mark(self.path) != self._mark
+        mark = mark_of(self.path)
+        return self._written and (mark is None or mark != self._mark)
 
     def read(self, path: Path | None = None) -> bytes | None:
         """Return the bytes at ``path`` (by default) or ``aside``; None if nothing is there.
@@ -172,7 +177,7 @@ class StateFolder:
         """
         self.keep()
         write_whole(self.path, data)
-        self._mark = _mark(self.path)
+        self._mark, self._written = mark_of(self.path), True
 
     def write_curve(self, curve: Characteristic) -> None:
         """Write a curve beside the state, which follows a moment later; older curves are removed.
@@ -180,7 +185,9 @@ class StateFolder:
         It must only outlive the process, so nothing waits for the disk. If it cannot be written,
         the state that follows has it.
         """
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, RecordingError):
+            # If another monitor has taken the folder, its curves stay.
+            self.keep()
             place = self.folder / f'{_CURVE}{curve.model_id}.json'
             draft = self.folder / f'.{place.name}.tmp'
             with open(draft, 'w', encoding='utf-8', opener=_private) as file:
@@ -252,7 +259,7 @@ class StateStore:
         self.problem = ''
         self.saved_s: float | None = None
         self._period_s = settings.real('state_period')
-        self._begun_s = self._watched_s = time.monotonic()
+        self._begun_s = self._watched_s = self._started_s = time.monotonic()
         # At the start too: with any state, however empty, the recording after it is fed again.
         self._urgent = True
         self._thread: threading.Thread | None = None
@@ -357,11 +364,14 @@ class StateStore:
         if self._folder is None:
             return
         self.finish()
+        if self.busy:
+            # The disk does not answer; `item` says so.
+            return
         self._urgent, self._begun_s = False, time.monotonic()
         self._start(self._write, self._folder, state, ready)
 
     def finish(self) -> None:
-        """Wait for the state being written; that is bounded, unless a disk hangs."""
+        """Wait for the state being written; not long, as a disk may hang."""
         if self._thread is not None:
             self._thread.join(_LONGEST_S)
 
@@ -369,6 +379,9 @@ class StateStore:
         """Return how saving goes, for the health."""
         age = '' if self.saved_s is None else f'{time.monotonic() - self.saved_s:.0f}'
         values: dict[str, object] = {'Seconds since it was saved': age}
+        if self.busy and time.monotonic() - self._started_s > _STUCK_S:
+            stuck = 'The state cannot be saved. Its disk does not answer.'
+            return Item('state', Level.ERROR, stuck, values)
         if self.problem:
             return Item('state', Level.ERROR, self.problem, values)
         if not self.on:
@@ -384,10 +397,13 @@ class StateStore:
         """Release the folder after the pending save has finished."""
         if self._folder is not None:
             self.finish()
+            if self.busy:
+                self.problem = f'{self._folder.path}: the disk does not answer; nothing was saved.'
             self._folder.close()
             self._folder = None
 
     def _start(self, work: Callable[..., None], *given: object) -> None:
+        self._started_s = time.monotonic()
         self._thread = threading.Thread(target=work, args=given, name='state writer', daemon=True)
         self._thread.start()
 
@@ -397,9 +413,10 @@ class StateStore:
             if folder.altered:
                 self.problem = f"'{folder.path}' was removed or changed by another program."
                 self._urgent = True
-        except ValveflowError as error:
+        except (ValveflowError, OSError) as error:
             # Saving is tried again, and tells of it as long as it fails.
             self.problem = f'The state cannot be saved. {error}'
+            self._urgent = True
 
     def _write(self, folder: StateFolder, state: State, ready: Callable[[], bool]) -> None:
         try:
@@ -461,13 +478,12 @@ def _fitting(data: bytes | None, settings: Settings) -> State | None:
     return saved
 
 
-def _mark(file: Path | int) -> tuple[int, ...] | None:
-    """Return by what a file is known again; None if it is not there."""
+def _is_named(path: Path, descriptor: int) -> bool:
+    """Return True if ``path`` names the file that is open; raises `OSError`."""
     try:
-        found = os.stat(file) if isinstance(file, int) else file.lstat()
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
+        return os.path.samestat(path.lstat(), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
 
 
 def _locked(path: Path) -> int:
