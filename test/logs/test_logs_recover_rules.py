@@ -323,11 +323,11 @@ def test_a_folder_that_another_makes_at_the_same_moment_is_as_good(
 ) -> None:
     """Between looking and making, each folder on the way may have come into being."""
     (tmp_path / 'a' / 'b').mkdir(parents=True)
-    monkeypatch.setattr(Path, 'exists', lambda _path: False)
+    monkeypatch.setattr(os.path, 'isdir', lambda _path: False)
     make_folder(tmp_path / 'a' / 'b' / 'c')
     assert (tmp_path / 'a' / 'b' / 'c').is_dir()
     (tmp_path / 'file').write_bytes(b'')
-    with pytest.raises(FileExistsError):
+    with pytest.raises(NotADirectoryError):
         make_folder(tmp_path / 'file')
 
 

@@ -218,7 +218,7 @@ def sync_folder(folder: Path) -> None:
 def make_folder(folder: Path) -> None:
     """Make a folder, and those above it, that only its owner can enter; one that exists stays."""
     for missing in reversed([folder, *folder.parents]):
-        if not missing.is_dir():
+        if not os.path.isdir(missing):
             try:
                 missing.mkdir(mode=FOLDER_MODE, exist_ok=True)
             except FileExistsError:
