@@ -132,13 +132,19 @@ def test_every_kind_can_be_followed(tmp_path_factory, kind):
         }
 
 
-@pytest.mark.parametrize('kind', [Kind(topics=t) for t in ('before', 'between', 'own', 'summary')])
+@pytest.mark.parametrize('kind', [
+    *(Kind(topics=t) for t in ('before', 'between', 'own', 'summary')),
+    Kind(outside='some'), Kind(outside='all'), Kind(chunk_crc=False),
+])  # fmt: skip
 def test_info_lists_the_topics_of_every_kind(tmp_path, capsys, kind):
     path = written(tmp_path, kind)
     assert main(['info', str(path), '--json']) == 0
     told = json.loads(capsys.readouterr().out)
     expected = Counter(message.topic for message in kind.truth())
     assert {t['name']: t['messages'] for t in told['topics']} == expected
+    assert [w for w in told['warnings'] if 'checksum' in w or 'chunks' in w] == [
+        *unchecked_sentence(kind)
+    ]
     assert {topic: s['readings'] for topic, s in told['signals'].items()} == {
         topic.lstrip('/'): 4 * kind.chunks for topic in TOPICS
     }
@@ -254,6 +260,19 @@ def test_a_wrong_checksum_of_all_records_is_told(tmp_path, outside):
     [told] = open_log(path).warnings
     assert told.startswith('The checksum of all records of the file is wrong')
     assert recover(path, tmp_path / 'b.mcap').warnings == (told,)
+
+
+def test_a_message_that_cannot_be_one_is_passed_over(tmp_path):
+    raw = bytearray(Kind(topics='before', outside='all').write())
+    truth = in_file(bytes(raw))
+    place = ends_of_messages(bytes(raw))[7]
+    # Its log time is beyond the year 2262.
+    raw[place + 22] = 0xFF
+    path, out = tmp_path / 'a.mcap', tmp_path / 'b.mcap'
+    path.write_bytes(raw)
+    report = recover(path, out)
+    assert f'(the message at byte {place} cannot be one)' in report.warnings[0]
+    assert in_file(out.read_bytes()) == truth[:8] + truth[9:]
 
 
 def test_a_wrong_bit_gives_no_message_where_all_messages_stand_in_chunks(tmp_path):

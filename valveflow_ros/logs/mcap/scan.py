@@ -345,7 +345,9 @@ class Scanner:
     def _inside(self, op: int, position: int, length: int) -> Chunk | None:
         """Look into a record that is no chunk, and for a chunk that a wrong length would hide."""
         if op == Opcode.MESSAGE:
-            self.findings.add_damage(f'the message at byte {position} cannot be one')
+            large = length > self._limits.record_bytes
+            why = 'is larger than can be read' if large else 'cannot be one'
+            self.findings.add_damage(f'the message at byte {position} {why}')
         if op == Opcode.ATTACHMENT:
             self._attachment(position, length)
             return None
