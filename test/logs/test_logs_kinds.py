@@ -117,7 +117,7 @@ def test_what_is_recovered_of_every_kind_is_read_by_the_stock_readers(tmp_path_f
 
 
 @settings(max_examples=80, deadline=None)
-@given(KINDS.filter(lambda kind: kind.outside == 'none'))
+@given(KINDS)
 def test_every_kind_can_be_followed(tmp_path_factory, kind):
     path = written(tmp_path_factory.mktemp('kinds'), kind)
     follower = Follower(path)

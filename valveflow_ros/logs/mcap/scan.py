@@ -171,7 +171,7 @@ class Scanner:
         self._budget = Budget(source.size, limits)
         self._attachment_bytes_left = limits.attachment_bytes
         self._unpacker = Unpacker()
-        self._before: Chunk | None = None
+        self._before = b''
 
     def chunks(self) -> Iterator[Chunk]:
         """Yield the intact chunks, and the runs of messages beside them, in the file's order.
@@ -201,7 +201,6 @@ class Scanner:
             if chunk is not None:
                 yield chunk
                 position = self._behind_indexes(position)
-            self._before = chunk
 
     def _behind_indexes(self, position: int) -> int:
         """Return where the message indexes end that follow a chunk and agree with themselves.
@@ -230,7 +229,7 @@ class Scanner:
         op, length = self._head(position)
         after = position + RECORD_HEAD.size + length
         problem = ''
-        if op == Opcode.MESSAGE and not self._disguised(position, length):
+        if op == Opcode.MESSAGE:
             with suppress(LayoutError):
                 run = self._run(position, length)
                 return run, run.end
@@ -300,6 +299,7 @@ class Scanner:
             raise LayoutError('its checksum is wrong')
         if exact != length or not checked:
             raw = pack(replace(found, uncompressed_crc=actual))
+        self._before = content
         return Chunk(position, raw, content, name, end, checked)
 
     def _run(self, position: int, length: int) -> Chunk:
@@ -308,7 +308,7 @@ class Scanner:
             raise LayoutError(f'its length of {length} bytes is beyond all bounds')
         raw = self._source.read(position, max(CHUNK_BYTES, RECORD_HEAD.size + length))
         number, size = leading_messages(raw)
-        if not number:
+        if not number or self._disguised(position, length):
             raise LayoutError('there is no message')
         self._budget.spend(size)
         self.findings.bare_messages += number
@@ -326,10 +326,10 @@ class Scanner:
         as_chunk = _SHAPE.match(bytes([Opcode.CHUNK]) + raw[1:])
         if as_chunk is not None and _fields_agree(raw, 0, as_chunk.end()):
             return True
-        if len(raw) >= HEAD_SIZE and self._before is not None and self._before.record:
+        if len(raw) >= HEAD_SIZE:
             # As the index behind a chunk: a channel, a length, time and place of a message.
             channel, inner, log_time, place = MESSAGE_HEAD.unpack_from(raw, RECORD_HEAD.size)
-            content = self._before.content[place:][:HEAD_SIZE]
+            content = self._before[place : place + HEAD_SIZE]
             if inner == length - 6 and len(content) == HEAD_SIZE:
                 first = MESSAGE_HEAD.unpack_from(content, RECORD_HEAD.size)
                 if (channel, log_time) == (first[0], first[2]):
