@@ -57,10 +57,12 @@ class Kind:
 
     ``topics``: where schemas and channels stand: 'before' the chunks, 'between' them where first
     needed, in the 'first' chunk, in 'every' one, in a chunk of their 'own', after the chunks in
-    the 'summary' alone.
+    the 'summary' alone. ``outside``: which chunks are not made, so that their messages stand
+    outside: 'none', 'some', 'all'.
     """
 
     topics: str = 'first'
+    outside: str = 'none'
     compression: str = 'zstd'
     chunks: int = 3
     chunk_crc: bool = True
@@ -109,7 +111,18 @@ class Kind:
 
     def legal(self) -> bool:
         """Return whether a reader may hope to learn the topics at all."""
-        return self.topics != 'summary' or (self.summary and self.summary_topics)
+        told_late = self.topics == 'summary'
+        return not told_late or (self.outside == 'none' and self.summary and self.summary_topics)
+
+    def is_chunk(self, number: int) -> bool:
+        """Return whether the messages of this number stand in a chunk."""
+        return self.outside == 'none' or (self.outside == 'some' and number % 2 == 1)
+
+    def unchecked(self) -> tuple[int, int]:
+        """Return how many chunks have no checksum, and how many messages stand outside."""
+        made = [self.is_chunk(number) for number in range(self.chunks)]
+        chunks = 0 if self.chunk_crc else sum(made) + (self.topics == 'own')
+        return chunks, 4 * len(CHANNELS) * (len(made) - sum(made))
 
     def write(self) -> bytes:
         """Return the file."""
@@ -138,7 +151,7 @@ class _File:
             if kind.topics == 'between' and number == 0:
                 self.put(SCHEMA, *CHANNELS)
             here = kind.topics == 'every' or (kind.topics == 'first' and number == 0)
-            self.chunk(tables if here else b'', messages)
+            (self.chunk if kind.is_chunk(number) else self.bare)(tables if here else b'', messages)
             self.extra(f'b{number % 2}')
         data_crc = zlib.crc32(self.out) if kind.data_crc else 0
         self.put(DataEnd(data_section_crc=data_crc))
@@ -171,6 +184,12 @@ class _File:
         self.put(Metadata(name=name, metadata={'of': name}))
         index = MetadataIndex(offset=start, length=len(self.out) - start, name=name)
         self.indexes[Opcode.METADATA_INDEX].append(pack(index))
+
+    def bare(self, head: bytes, messages: list[Message]) -> None:
+        self.out += head
+        for message in messages:
+            self.out += FOREIGN if self.kind.foreign else b''
+            self.out += pack(message)
 
     def chunk(self, head: bytes, messages: list[Message]) -> None:
         kind, places, content = self.kind, {}, bytearray(head)
@@ -239,10 +258,22 @@ SWITCHES = [name for name, default in Kind.__dataclass_fields__.items() if defau
 KINDS = st.builds(
     Kind,
     topics=st.sampled_from(['before', 'between', 'first', 'every', 'own', 'summary']),
+    outside=st.sampled_from(['none', 'some', 'all']),
     compression=st.sampled_from(['', 'lz4', 'zstd']),
     chunks=st.integers(1, 4),
     **dict.fromkeys(SWITCHES, st.booleans()),
 ).filter(Kind.legal)
+
+
+def in_file(raw: bytes) -> list[tuple[str, int, int, int, bytes]]:
+    """Return topic, times, sequence and bytes of each message, in the order of the file."""
+    messages = NonSeekingReader(BytesIO(raw), validate_crcs=True).iter_messages(
+        log_time_order=False
+    )
+    return [
+        (channel.topic, m.log_time, m.publish_time, m.sequence, bytes(m.data))
+        for _, channel, m in messages
+    ]
 
 
 def stock(raw: bytes, seek: bool = True) -> list[Told]:

@@ -59,7 +59,7 @@ def test_a_cut_file_says_so_in_one_sentence(tmp_path, small):
     [warning] = open_log(path).warnings
     assert warning.startswith('The file was not finished and ends at byte ')
     path.write_bytes(raw[: chunk_ends(raw)[7]])
-    assert open_log(path).warnings == ('The file was not finished; all of its chunks were read.',)
+    assert open_log(path).warnings == ('The file was not finished; everything in it was read.',)
 
 
 def test_what_stands_before_a_cut_chunk_is_kept(tmp_path, small):

@@ -9,18 +9,20 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from damage import records
 from hypothesis import example, given, settings
 from log_files import FLOAT64, START_NS, float64
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
-from mcap_kinds import CHANNELS, KINDS, SCHEMA, TOPICS, UNTYPED, Kind, Told, stock
+from mcap_kinds import CHANNELS, KINDS, SCHEMA, TOPICS, UNTYPED, Kind, Told, in_file, stock
 
 from valveflow_ros.cli.main import main
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import open_log, recover
 from valveflow_ros.logs.mcap import recover as recovery
+from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES
 from valveflow_ros.logs.mcap.follow import Follower
 from valveflow_ros.logs.mcap.records import pack
 
@@ -28,9 +30,25 @@ from valveflow_ros.logs.mcap.records import pack
 CHUNK = bytes([Opcode.CHUNK])
 
 
-def read(path: Path, unchecked: bool = True) -> list[Told]:
-    found = open_log(path, unchecked=unchecked)
+def read(path: Path) -> list[Told]:
+    found = open_log(path)
     return [Told(m.topic, m.log_time_ns, m.publish_time_ns, m.data) for m in found.iter_messages()]
+
+
+def unchecked_sentence(kind: Kind) -> tuple[str, ...]:
+    """Return what is told of parts without a checksum, unless one of the whole file is right."""
+    chunks, messages = kind.unchecked()
+    parts = []
+    if chunks:
+        one = 'chunk of the file was' if chunks == 1 else 'chunks of the file were'
+        parts.append(f'{chunks} {one} written without a checksum')
+    if messages:
+        parts.append(
+            f'{messages} messages of the file stand outside of chunks, where there is none'
+        )
+    if not parts or kind.data_crc:
+        return ()
+    return (f'{" and ".join(parts)}; damage there cannot be seen.',)
 
 
 def written(folder: Path, kind: Kind) -> Path:
@@ -47,11 +65,12 @@ def written(folder: Path, kind: Kind) -> Path:
 def test_every_kind_gives_the_messages_that_the_stock_reader_gives(tmp_path_factory, kind):
     path = written(tmp_path_factory.mktemp('kinds'), kind)
     raw, truth = path.read_bytes(), kind.truth()
-    # What follows a file's own reader: without an index of chunks it goes from the beginning.
-    seek = kind.summary and kind.chunk_index and kind.summary_topics
+    # What follows a file's own reader: without an index of chunks it goes from the beginning,
+    # and with one it does not find the messages beside them.
+    seek = kind.summary and kind.chunk_index and kind.summary_topics and kind.outside == 'none'
     if seek or kind.topics != 'summary':
         assert Counter(stock(raw, seek)) == Counter(truth)
-    found = open_log(path, unchecked=True)
+    found = open_log(path)
     assert read(path) == truth
     assert {t.name: t.count for t in found.topics.values()} == Counter(m.topic for m in truth)
     assert {t.name: t.type for t in found.topics.values()} == {
@@ -61,9 +80,7 @@ def test_every_kind_gives_the_messages_that_the_stock_reader_gives(tmp_path_fact
     assert found.log_time_ns.tolist() == [m.log_ns for m in inputs]
     assert [float64(value) for value in found.readings.value] == [m.data for m in inputs]
     assert found.damaged_chunks == 0
-    without = [f'{kind.chunks + (kind.topics == "own")} chunk']
-    told = [] if kind.chunk_crc else without
-    assert [w[: len(without[0])] for w in found.warnings] == told
+    assert found.warnings == unchecked_sentence(kind)
     if kind.extras:
         names = ['a', *(f'b{k % 2}' for k in range(kind.chunks))]
         assert found.attachments == {name: name.encode() for name in names}
@@ -78,17 +95,18 @@ def test_every_kind_gives_the_messages_that_the_stock_reader_gives(tmp_path_fact
 def test_what_is_recovered_of_every_kind_is_read_by_the_stock_readers(tmp_path_factory, kind):
     folder = tmp_path_factory.mktemp('kinds')
     path, out = written(folder, kind), folder / 'b.mcap'
-    if not kind.chunk_crc:
-        with pytest.raises(RecordingError, match='was written without checksums'):
-            recover(path, out)
-        assert [p.name for p in folder.iterdir()] == ['a.mcap']
-        return
     report = recover(path, out)
     raw, truth = out.read_bytes(), kind.truth()
-    assert (report.messages, report.damaged_chunks, report.warnings) == (len(truth), 0, ())
+    assert (report.messages, report.damaged_chunks) == (len(truth), 0)
+    assert (report.bare_messages, report.warnings) == (
+        kind.unchecked()[1], unchecked_sentence(kind)
+    )  # fmt: skip
+    if kind.topics != 'summary':
+        assert in_file(raw) == in_file(path.read_bytes())
     # The two stock readers differ in how they order equal times, and in what they need.
     assert Counter(stock(raw)) == Counter(stock(raw, seek=False)) == Counter(truth)
-    assert read(out, unchecked=False) == truth
+    assert read(out) == truth
+    assert open_log(out).warnings == ()
     with out.open('rb') as stream:
         reader = make_reader(stream, validate_crcs=True)
         assert reader.get_summary().channels == {channel.id: channel for channel in CHANNELS}
@@ -99,7 +117,7 @@ def test_what_is_recovered_of_every_kind_is_read_by_the_stock_readers(tmp_path_f
 
 
 @settings(max_examples=80, deadline=None)
-@given(KINDS.filter(lambda kind: kind.chunk_crc))
+@given(KINDS)
 def test_every_kind_can_be_followed(tmp_path_factory, kind):
     path = written(tmp_path_factory.mktemp('kinds'), kind)
     follower = Follower(path)
@@ -114,13 +132,19 @@ def test_every_kind_can_be_followed(tmp_path_factory, kind):
         }
 
 
-@pytest.mark.parametrize('kind', [Kind(topics=t) for t in ('before', 'between', 'own', 'summary')])
+@pytest.mark.parametrize('kind', [
+    *(Kind(topics=t) for t in ('before', 'between', 'own', 'summary')),
+    Kind(outside='some'), Kind(outside='all'), Kind(chunk_crc=False),
+])  # fmt: skip
 def test_info_lists_the_topics_of_every_kind(tmp_path, capsys, kind):
     path = written(tmp_path, kind)
     assert main(['info', str(path), '--json']) == 0
     told = json.loads(capsys.readouterr().out)
     expected = Counter(message.topic for message in kind.truth())
     assert {t['name']: t['messages'] for t in told['topics']} == expected
+    assert [w for w in told['warnings'] if 'checksum' in w or 'chunks' in w] == [
+        *unchecked_sentence(kind)
+    ]
     assert {topic: s['readings'] for topic, s in told['signals'].items()} == {
         topic.lstrip('/'): 4 * kind.chunks for topic in TOPICS
     }
@@ -171,29 +195,127 @@ def test_every_option_of_the_stock_writer(
         writer.finish()
     assert Counter(stock(path.read_bytes(), seek=False)) == Counter(messages)
     out = tmp_path / 'b.mcap'
-    if chunked:
-        assert read(path) == messages
-        if crcs:
-            assert recover(path, out).messages == len(messages)
-            assert read(out, unchecked=False) == messages
-            return
-    why = 'without checksums' if chunked else 'without chunks'
-    with pytest.raises(RecordingError, match=why):
-        open_log(path)
-    with pytest.raises(RecordingError, match=why):
-        recover(path, out)
-    assert not out.exists()
+    assert read(path) == messages
+    assert bool(open_log(path).warnings) == (not (chunked and crcs) and not data_crcs)
+    report = recover(path, out)
+    assert report.messages == len(messages)
+    assert report.bare_messages == (0 if chunked else len(messages))
+    assert read(out) == messages
+    assert in_file(out.read_bytes()) == in_file(path.read_bytes())
+    assert open_log(out).warnings == ()
 
 
-def test_messages_beside_the_chunks_are_counted_and_told(tmp_path):
-    raw = Kind(topics='before').write()
-    bare = pack(*Kind().messages()[0][:3])
-    head = raw.index(pack(CHANNELS[-1])) + len(pack(CHANNELS[-1]))
+def ends_of_messages(raw: bytes) -> list[int]:
+    """Return where each message outside of chunks ends."""
+    return [end for op, _, end in records(raw) if op == Opcode.MESSAGE]
+
+
+@pytest.mark.parametrize('outside', ['none', 'some', 'all'])
+def test_a_file_without_checksums_that_is_cut_anywhere_keeps_what_stands_before(tmp_path, outside):
+    raw = Kind(topics='before', outside=outside, chunk_crc=False).write()
+    truth, each = in_file(raw), {Opcode.MESSAGE: 1, Opcode.CHUNK: 4 * len(CHANNELS)}
+    ends = [end for op, _, end in records(raw) for _ in range(each.get(op, 0))]
+    path, out = tmp_path / 'a.mcap', tmp_path / 'b.mcap'
+    for size in range(len(raw)):
+        path.write_bytes(raw[:size])
+        whole = sum(end <= size for end in ends)
+        if not whole:
+            with pytest.raises(RecordingError):
+                open_log(path)
+            continue
+        assert len(read(path)) == whole, size
+        report = recover(path, out)
+        assert (report.messages, report.damaged_chunks) == (whole, 0), size
+        assert in_file(out.read_bytes()) == truth[:whole]
+        out.unlink()
+
+
+@pytest.mark.parametrize('wrong', [0, 0x10, 0xFF])
+@pytest.mark.parametrize('field', ['kind', 'length'])
+def test_what_stands_before_the_first_record_that_cannot_be_one_is_kept(tmp_path, field, wrong):
+    raw = bytearray(Kind(topics='before', outside='all').write())
+    truth = in_file(bytes(raw))
+    begins = [begin for op, begin, _ in records(bytes(raw)) if op == Opcode.MESSAGE]
+    place = begins[17]
+    if field == 'kind':
+        raw[place] = wrong
+    raw[place + 6 : place + 9] = bytes([1, 2, 3]) if field == 'kind' else bytes([wrong, 9, wrong])
+    path, out = tmp_path / 'a.mcap', tmp_path / 'b.mcap'
+    path.write_bytes(raw)
+    report = recover(path, out)
+    assert in_file(out.read_bytes()) == truth[:17]
+    assert report.damaged_chunks == 1
+    assert any(f'breaks at byte {place})' in warning for warning in report.warnings)
+    assert len(read(path)) == 17
+
+
+@pytest.mark.parametrize('outside', ['some', 'all'])
+def test_a_wrong_checksum_of_all_records_is_told(tmp_path, outside):
+    kind = Kind(topics='before', outside=outside, data_crc=True)
+    raw = bytearray(kind.write())
+    path = written(tmp_path, kind)
+    assert open_log(path).warnings == ()
+    raw[ends_of_messages(bytes(raw))[3] - 1] ^= 1
+    path.write_bytes(raw)
+    [told] = open_log(path).warnings
+    assert told.startswith('The checksum of all records of the file is wrong')
+    assert recover(path, tmp_path / 'b.mcap').warnings == (told,)
+
+
+def test_a_message_that_cannot_be_one_is_passed_over(tmp_path):
+    raw = bytearray(Kind(topics='before', outside='all').write())
+    truth = in_file(bytes(raw))
+    place = ends_of_messages(bytes(raw))[7]
+    # Its log time is beyond the year 2262.
+    raw[place + 22] = 0xFF
+    path, out = tmp_path / 'a.mcap', tmp_path / 'b.mcap'
+    path.write_bytes(raw)
+    report = recover(path, out)
+    assert f'(the message at byte {place} cannot be one)' in report.warnings[0]
+    assert in_file(out.read_bytes()) == truth[:8] + truth[9:]
+
+
+def test_a_wrong_bit_gives_no_message_where_all_messages_stand_in_chunks(tmp_path):
+    """Of another record's kind, a message's may be one bit away."""
+    kind = Kind(topics='before', extras=True)
+    raw, truth = kind.write(), kind.truth()
     path = tmp_path / 'a.mcap'
-    path.write_bytes(raw[:head] + bare + raw[head:])
-    said = '3 messages of the file stand outside of its chunks'
-    assert any(said in warning for warning in open_log(path).warnings)
-    assert any(said in warning for warning in recover(path, tmp_path / 'b.mcap').warnings)
+    for (_, begin, _), bit in itertools.product(records(raw), range(8)):
+        damaged = bytearray(raw)
+        damaged[begin] ^= 1 << bit
+        path.write_bytes(damaged)
+        try:
+            found = read(path)
+        except RecordingError:
+            found = []
+        assert not Counter(found) - Counter(truth), (begin, bit)
+
+
+def test_messages_outside_of_chunks_are_recovered_into_chunks_of_the_usual_size(tmp_path):
+    path, out = tmp_path / 'a.mcap', tmp_path / 'b.mcap'
+    size = [12, 16, 3000, 200_000]
+    with path.open('wb') as stream:
+        writer = Writer(stream, use_chunking=False)
+        writer.start()
+        numbers = [writer.register_channel(f'/t{k}', 'json', 0) for k in range(4)]
+        for k in range(20_000):
+            kind = 3 if k == 5000 else k // 300 % 3
+            # Numbers as an index behind a chunk has them.
+            data = bytes(size[kind])
+            writer.add_message(numbers[kind], START_NS + k // 7, data, 0, len(data) + 16)
+            if k % 5000 == 0:
+                writer.add_metadata(f'm{k}', {})
+        writer.finish()
+    report = recover(path, out)
+    raw = out.read_bytes()
+    assert in_file(raw) == in_file(path.read_bytes())
+    assert report.bare_messages == report.messages == 20_000
+    with out.open('rb') as stream:
+        sizes = [c.uncompressed_size for c in make_reader(stream).get_summary().chunk_indexes]
+    assert sorted(sizes)[-1] == 200_031
+    assert sorted(sizes)[-2] <= CHUNK_BYTES + 200
+    assert len(sizes) < 2 * path.stat().st_size // CHUNK_BYTES
+    assert Counter(read(path)) == Counter(stock(raw))
 
 
 @pytest.mark.parametrize('summary', [True, False])

@@ -165,20 +165,12 @@ def test_a_file_without_any_index_is_read(tmp_path):
     assert len(open_log(path).readings) == 50
 
 
-def test_a_file_without_checksums_is_read_only_when_asked(tmp_path):
-    path = foreign(tmp_path / 'other.mcap', enable_crcs=False)
-    with pytest.raises(RecordingError, match='without checksums'):
-        open_log(path)
-    contents = open_log(path, unchecked=True)
+@pytest.mark.parametrize('option', ['enable_crcs', 'use_chunking'])
+def test_a_file_without_checksums_is_read_with_a_warning(tmp_path, option):
+    contents = open_log(foreign(tmp_path / 'other.mcap', **{option: False}))
     assert len(contents.readings) == 50
-    assert 'without a checksum' in contents.warnings[0]
+    assert contents.warnings[0].endswith('; damage there cannot be seen.')
     assert len(list(contents.iter_messages())) == 100
-
-
-def test_a_file_without_chunks_is_refused(tmp_path):
-    path = foreign(tmp_path / 'other.mcap', use_chunking=False)
-    with pytest.raises(RecordingError, match=r"without chunks.*'ros2 bag convert'"):
-        open_log(path)
 
 
 def test_foreign_topics_only_are_looked_at_and_not_read(tmp_path):

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from valveflow_ros.errors import RecordingError, ValveflowError
+from valveflow_ros.errors import InputError, RecordingError, ValveflowError
 from valveflow_ros.logs import open_log, read_table
 from valveflow_ros.logs.tables.cells import foreign_quality
 from valveflow_ros.logs.tables.refusal import TableOptions
@@ -351,6 +351,24 @@ def test_cells_of_a_parquet_mean_the_same_as_numbers_as_texts_and_as_categories(
     for other in found[1:]:
         assert other.time_ns.tolist() == found[0].time_ns.tolist()
         assert all((other.columns[n] == found[0].columns[n]).all() for n in found[0].columns)
+
+
+@pytest.mark.parametrize('column', [*WIDE, 'date', 'valve_opening_quality'])
+def test_a_needed_column_that_a_parquet_has_twice_is_named(tmp_path, column):
+    pa = pytest.importorskip('pyarrow')
+    from pyarrow import parquet
+
+    names = [*WIDE, column] + [column] * (column not in WIDE)
+    stamps = [f'2024-01-01 00:00:0{k}' for k in range(9)]
+    arrays = [pa.array(stamps if n in ('time', 'date') else [50.0] * 9) for n in names]
+    parquet.write_table(pa.Table.from_arrays(arrays, names), tmp_path / 'x.parquet')
+    # A date beside a whole time is not needed.
+    if column == 'date':
+        assert len(read_table(tmp_path / 'x.parquet').time_ns) == 9
+        arrays, names = arrays[1:], names[1:]
+        parquet.write_table(pa.Table.from_arrays(arrays, names), tmp_path / 'x.parquet')
+    with pytest.raises(InputError, match=f"there are several columns called '{column}'"):
+        read_table(tmp_path / 'x.parquet')
 
 
 @pytest.mark.parametrize('name', ['x.csv', 'x.csv.gz', 'x.parquet', 'x.feather'])

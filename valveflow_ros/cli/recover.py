@@ -43,7 +43,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
     lost = (
         f'{counted(report.damaged_chunks, "place")} damaged and left out'
         if report.damaged_chunks
-        else f'nothing {"else " if report.warnings else ""}damaged'
+        else f'no {"other " if report.warnings else ""}damage was found'
     )
     text = (
         f'Kept {counted(report.messages, "message")} in {counted(report.chunks, "chunk")}; {lost}.'
@@ -54,6 +54,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
         'source': str(report.source),
         'log': str(report.out),
         'messages': report.messages,
+        'messages_outside_of_chunks': report.bare_messages,
         'chunks': report.chunks,
         'damaged_chunks': report.damaged_chunks,
         'bytes_read': report.bytes_read,

@@ -32,7 +32,6 @@ def open_log(
     *,
     columns: Mapping[str, str] | None = None,
     absent: Collection[str] = (),
-    unchecked: bool = False,
     table: TableOptions = AS_SEEN,
 ) -> LogContents:
     """Return what a log holds.
@@ -46,8 +45,6 @@ def open_log(
         Contract name to the topic or column that is to stand for it.
     absent : collection of str
         Contract names that a table need not have.
-    unchecked : bool
-        Also read chunks that were written without a checksum.
     table : TableOptions
         What a table does not say itself.
 
@@ -66,7 +63,7 @@ def open_log(
         is_folder = False
     if is_folder:
         files, warnings = _files_of(place)
-        contents = read_recording(files, str(path), names, unchecked)
+        contents = read_recording(files, str(path), names)
         return replace(contents, warnings=(*warnings, *contents.warnings))
     if place.suffix.lower() in TABLE_SUFFIXES:
         return open_table(place, names, absent, table)
@@ -78,7 +75,7 @@ def open_log(
                 raise RecordingError(
                     path, 'is neither an .mcap file nor a .csv, .xlsx or .parquet table'
                 )
-    return read_recording([place], str(path), names, unchecked)
+    return read_recording([place], str(path), names)
 
 
 def _files_of(folder: Path) -> tuple[list[Path], list[str]]:

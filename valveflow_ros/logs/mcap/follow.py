@@ -224,7 +224,7 @@ class Follower:
             yield from self._batch(contents, source)
 
     def _next(self, source: Source, scanner: Scanner) -> bytes | None:
-        """Go past one record; return a chunk's content, b'' for another, None at the end."""
+        """Return what a chunk or messages hold, b'' for another record, None at the end."""
         start = self._position
         head = source.read(start, RECORD_HEAD.size)
         if len(head) < RECORD_HEAD.size:
@@ -242,7 +242,7 @@ class Follower:
             if self.written and length <= DEFAULT_LIMITS.record_bytes:
                 return None
             return self._beyond_damage(source, sure=False)
-        if op == Opcode.CHUNK:
+        if op in (Opcode.CHUNK, Opcode.MESSAGE):
             return self._chunk(source, scanner, after)
         self._position = after
         if op == Opcode.ATTACHMENT:
@@ -258,7 +258,7 @@ class Follower:
     def _chunk(self, source: Source, scanner: Scanner, after: int) -> bytes | None:
         start = self._position
         try:
-            content = scanner.chunk_at(start).content
+            chunk = scanner.chunk_at(start)
         except OverBudgetError:
             self.damaged += 1
             self._position = source.size
@@ -268,9 +268,10 @@ class Follower:
             if next(candidates(source, start, start + 1), None) is None:
                 return self._beyond_damage(source)
             self.damaged += 1
-            content = b''
-        self._position = after
-        return content
+            self._position = after
+            return b''
+        self._position = chunk.end
+        return chunk.content
 
     def _beyond_damage(self, source: Source, sure: bool = True) -> bytes | None:
         """Go on with the next chunk; if there is none, and no damage for sure, wait for more."""

@@ -75,7 +75,7 @@ class FileContents:
 
     @property
     def messages(self) -> int:
-        """Messages in intact chunks."""
+        """Messages that were found."""
         return sum(self.counts.values())
 
     @property
@@ -153,7 +153,6 @@ def gather(
     source: Source,
     choice: TopicChoice,
     limits: Limits = DEFAULT_LIMITS,
-    unchecked: bool = False,
 ) -> FileContents:
     """Return what one file holds.
 
@@ -162,10 +161,10 @@ def gather(
     RecordingError
         If the file contradicts itself or claims what cannot be.
     """
-    summary = read_summary(source, unchecked=True)
+    summary = read_summary(source)
     seed = TopicTable(limits) if summary is None else summary.table
     while True:
-        collector = _Collector(source, choice, seed, Scanner(source, limits, unchecked))
+        collector = _Collector(source, choice, seed, Scanner(source, limits))
         contents = collector.run()
         if not collector.unnamed & collector.known and not contents.table.replaced:
             break
@@ -223,10 +222,13 @@ class _Collector:
     def _group(self, chunks: list[Chunk]) -> None:
         content = b''.join(chunk.content for chunk in chunks)
         table, others = walk(content)
+        checked = chunks[0].checked
         for op, record in others:
             try:
-                self.contents.table.add(op, record)
+                self.contents.table.add(op, record, checked)
             except LayoutError as error:
+                if not checked:
+                    raise
                 problem = f'cannot be used: {error}'
                 raise RecordingError(self.contents.path, problem) from None
         if others:
@@ -300,9 +302,13 @@ class _Collector:
 
 
 def _grouped(chunks: Iterator[Chunk]) -> Iterator[list[Chunk]]:
+    """Join chunks; those without a checksum stand apart from those that have one."""
     group: list[Chunk] = []
     size = 0
     for chunk in chunks:
+        if group and chunk.checked != group[0].checked:
+            yield group
+            group, size = [], 0
         group.append(chunk)
         size += len(chunk.content)
         if size >= GROUP_BYTES:

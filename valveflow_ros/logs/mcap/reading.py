@@ -52,9 +52,8 @@ def _columns(batch: _Batch) -> tuple[NDArray[np.generic], ...]:
 class MessageReader:
     """The raw messages of the files that `gather` read; holds only what overlaps in time."""
 
-    def __init__(self, files: list[FileContents], unchecked: bool = False) -> None:
+    def __init__(self, files: list[FileContents]) -> None:
         self._files = files
-        self._unchecked = unchecked
 
     def messages(self, topics: Collection[str] | None) -> Iterator[LoggedMessage]:
         """Yield messages; see `LogContents.iter_messages`."""
@@ -124,7 +123,7 @@ class MessageReader:
     def _content(self, file: FileContents, group: Group) -> bytes:
         try:
             with Source.open(file.path) as source:
-                scanner = Scanner(source, unchecked=self._unchecked)
+                scanner = Scanner(source)
                 return b''.join(scanner.chunk_at(offset).content for offset in group.chunks)
         except (LayoutError, OverBudgetError):
             raise RecordingError(file.path, 'has changed while it was read') from None
@@ -151,7 +150,6 @@ def read_recording(
     paths: list[Path],
     name: str,
     columns: Mapping[str, str],
-    unchecked: bool = False,
     limits: Limits = DEFAULT_LIMITS,
 ) -> LogContents:
     """Return what the files, in this order, hold together.
@@ -169,7 +167,7 @@ def read_recording(
     for path in paths:
         try:
             with Source.open(path) as source:
-                contents = gather(source, choice, limits, unchecked)
+                contents = gather(source, choice, limits)
             if not contents.messages:
                 raise RecordingError(path, why_empty(contents.findings))
             files.append(contents)
@@ -208,7 +206,7 @@ def read_recording(
         min(group.first_ns for group in groups),
         max(group.last_ns for group in groups),
         sum(file.findings.damaged for file in files),
-        MessageReader(files, unchecked).messages,
+        MessageReader(files).messages,
     )
 
 

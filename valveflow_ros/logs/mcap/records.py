@@ -201,7 +201,7 @@ def definition(op: int, content: bytes) -> Schema | Channel | None:
 
 @dataclass(slots=True)
 class Summary:
-    """What a finished file says about itself; without a checksum, the topics alone."""
+    """What a finished file says about itself."""
 
     table: TopicTable = field(default_factory=TopicTable)
     messages: int = 0
@@ -219,11 +219,8 @@ def ends_well(source: Source) -> bool:
     return raw.startswith(RECORD_HEAD.pack(Opcode.FOOTER, 20)) and raw.endswith(MAGIC)
 
 
-def read_summary(source: Source, unchecked: bool = False) -> Summary | None:
-    """Return the summary, or ``None`` if there is none whose checksum is right.
-
-    With ``unchecked`` one that was written without a checksum is returned too.
-    """
+def read_summary(source: Source) -> Summary | None:
+    """Return the summary, or ``None`` if there is none or its checksum is wrong."""
     if not ends_well(source):
         return None
     footer_at = source.size - len(MAGIC) - FOOTER_SIZE
@@ -234,14 +231,14 @@ def read_summary(source: Source, unchecked: bool = False) -> Summary | None:
         return None
     raw = source.read(footer.summary_start, size)
     checked = zlib.crc32(raw_footer[:-4], zlib.crc32(raw)) == footer.summary_crc
-    if not checked and (footer.summary_crc or not unchecked):
+    if footer.summary_crc and not checked:
         return None
     summary, position = Summary(), 0
     try:
         while position < len(raw):
             op, content = record_at(raw, position)
             position += RECORD_HEAD.size + len(content)
-            if op == Opcode.STATISTICS and checked:
+            if op == Opcode.STATISTICS:
                 found = unpack(Statistics.read, content)
                 summary.messages, summary.counts = (
                     found.message_count,
@@ -336,6 +333,26 @@ def walk(content: bytes) -> tuple[MessageTable, list[tuple[int, bytes]]]:
     if table.log_time.min() < 0 or table.publish_time.min() < 0:
         raise LayoutError('a message claims a time after the year 2262')
     return table, others
+
+
+def leading_messages(content: bytes) -> tuple[int, int]:
+    """Return how many messages stand at the beginning of some bytes, and where they end."""
+    starts: list[int] = []
+    position, end, probe = 0, len(content), True
+    unpack = RECORD_HEAD.unpack_from
+    while position + HEAD_SIZE <= end:
+        op, length = unpack(content, position)
+        after = position + RECORD_HEAD.size + length
+        if op != 5 or length < MESSAGE_HEAD.size or after > end:
+            break
+        count = _run(content, position, after - position) if probe else 1
+        probe = count >= RUN_PROBE
+        last = position + count * (after - position)
+        starts += range(position, last, after - position)
+        position = last
+    heads = rows(content, HEAD_DTYPE, 0, np.array(starts, dtype=np.int64))
+    late = np.flatnonzero((heads['log_time'] < 0) | (heads['publish_time'] < 0))
+    return (int(late[0]), starts[late[0]]) if len(late) else (len(starts), position)
 
 
 def rows(

@@ -2,6 +2,8 @@
 
 Intact chunks are copied as they are and get a new index. A chunk whose
 checksum is wrong is left out and counted: nothing is repaired by guessing.
+Messages that stood outside of chunks come into new ones, and what had no
+checksum gets one.
 """
 
 from __future__ import annotations
@@ -20,7 +22,14 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Channel, Schema
 
 from valveflow_ros.errors import RecordingError, counted
-from valveflow_ros.logs.mcap.chunk_file import ChunkBuilder, ChunkFile, PackedChunk
+from valveflow_ros.logs.mcap.chunk_file import (
+    CHUNK_BYTES,
+    ChunkBuilder,
+    ChunkFile,
+    PackedChunk,
+    compressor,
+    pack_content,
+)
 from valveflow_ros.logs.mcap.folder import (
     LIBRARY,
     finish_split,
@@ -53,13 +62,15 @@ from valveflow_ros.records import IntArray
 class RecoveryReport:
     """What a recovery kept and what it had to leave.
 
-    ``messages`` and ``chunks`` were copied; ``damaged_chunks`` counts the places where something
-    was lost, apart from a cut-off end; ``warnings`` are sentences about what was met.
+    ``messages`` and ``chunks`` were written, ``bare_messages`` of the source stood outside of
+    chunks; ``damaged_chunks`` counts the places where something was lost, apart from a cut-off
+    end; ``warnings`` are sentences about what was met.
     """
 
     source: Path
     out: Path
     messages: int
+    bare_messages: int
     chunks: int
     damaged_chunks: int
     bytes_read: int
@@ -89,7 +100,7 @@ def recover(
     Raises
     ------
     RecordingError
-        If ``path`` holds no intact chunk, ``out`` exists or cannot be written, or other programs
+        If ``path`` holds no message, ``out`` exists or cannot be written, or other programs
         could not read it.
     """
     target = Path(out)
@@ -186,7 +197,7 @@ def _recover(
         chunks = copier.chunks(progress)
         first = next(chunks, None)
         if first is None:
-            why = why_empty(scanner.findings, '')
+            why = why_empty(scanner.findings)
             raise RecordingError(path, f'{why}; nothing was recovered')
         with os_errors(target, 'cannot be written'), new_file(target) as out:
             file = ChunkFile(_Proven(out, path) if proven else out, LIBRARY)
@@ -205,6 +216,7 @@ def _recover(
         path,
         target,
         file.messages,
+        findings.bare_messages,
         file.chunks,
         findings.damaged,
         source.size,
@@ -269,10 +281,11 @@ class _Copier:
         self._told: set[tuple[int, int]] = set()
         self._whole = False
         self._left_out = 0
+        self._packer = compressor()
 
     def chunks(self, progress: Progress | None) -> Iterator[PackedChunk]:
         """Yield them; what contradicts an earlier chunk is left out and counted as damage."""
-        for chunk in self._scanner.chunks():
+        for chunk in _joined(self._scanner.chunks()):
             if not chunk.content:
                 continue
             try:
@@ -298,8 +311,8 @@ class _Copier:
         for chunk in scanner.chunks():
             with suppress(LayoutError):
                 for op, content in walk(chunk.content)[1]:
-                    self.table.add(op, content)
-        summary = read_summary(self._source, unchecked=True)
+                    self.table.add(op, content, chunk.checked)
+        summary = read_summary(self._source)
         if summary is not None:
             try:
                 self.table.take_over(summary.table)
@@ -325,7 +338,7 @@ class _Copier:
     def _copied(self, chunk: Chunk) -> Iterator[PackedChunk]:
         messages, others = walk(chunk.content)
         for op, content in others:
-            self.table.add(op, content)
+            self.table.add(op, content, chunk.checked)
         here = {(op, _id(content)) for op, content in others}
         present = np.flatnonzero(np.bincount(messages.channel)).tolist()
         if any(self._records(number) is None for number in present):
@@ -338,7 +351,10 @@ class _Copier:
             yield ChunkBuilder().build(pack(*missing.values()))
         named = np.isin(messages.channel, list(known))
         self._left_out += len(messages) - int(named.sum())
-        if named.all():
+        if named.all() and not chunk.record:
+            m = messages
+            yield pack_content(chunk.content, m.channel, m.log_time, m.offset, self._packer)
+        elif named.all():
             yield PackedChunk(
                 chunk.record, messages.channel, messages.log_time, messages.offset,
                 len(chunk.content), chunk.compression,
@@ -356,6 +372,22 @@ class _Copier:
             return own
         schema = self.table.schemas.get(channel.schema_id)
         return None if schema is None else {(Opcode.SCHEMA, schema.id): schema, **own}
+
+
+def _joined(chunks: Iterator[Chunk]) -> Iterator[Chunk]:
+    """Join the messages outside of chunks to the usual size of a chunk."""
+    run: list[Chunk] = []
+    size = 0
+    for chunk in chain(chunks, [None]):
+        if run and (chunk is None or chunk.record or size + len(chunk.content) > CHUNK_BYTES):
+            content = b''.join(part.content for part in run)
+            yield replace(run[0], content=content, end=run[-1].end)
+            run, size = [], 0
+        if chunk is not None and not chunk.record:
+            run.append(chunk)
+            size += len(chunk.content)
+        elif chunk is not None:
+            yield chunk
 
 
 def _id(content: bytes) -> int:

@@ -5,6 +5,9 @@ that look like the head of a chunk are sought and tried. A chunk counts only if
 its content has the checksum it was written with: nothing is repaired, so a
 damaged file yields fewer values and never wrong ones. Indexes are not used,
 because an unfinished file has none.
+
+What a file's writer gave no checksum, a chunk or messages that stand outside of
+chunks, is taken as it is and counted, since damage in it cannot be seen.
 """
 
 from __future__ import annotations
@@ -13,22 +16,28 @@ import re
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
 from mcap.records import Chunk as ChunkRecord
 
 from valveflow_ros.errors import counted
+from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES
 from valveflow_ros.logs.mcap.records import (
     FIRST_FOREIGN,
+    HEAD_SIZE,
     MAGIC,
+    MESSAGE_HEAD,
     RECORD_HEAD,
     LayoutError,
     TopicTable,
     Unpacker,
     definition,
     ends_well,
+    leading_messages,
+    pack,
     unpack,
     unpack_attachment,
 )
@@ -91,8 +100,6 @@ def is_foreign(source: Source, position: int) -> bool:
 _INDEX_HEAD = struct.Struct('<BQHI')
 _INDEX_BLOCK = 4096
 _KINDS = frozenset(int(op) for op in Opcode)
-# So many messages outside of chunks before the first chunk: there will be none.
-_BARE_ENOUGH = 1000
 # Shorter records cannot hide a chunk.
 _SMALLEST_CHUNK = RECORD_HEAD.size + CHUNK_HEAD_SIZE + 12
 
@@ -102,7 +109,9 @@ class Chunk:
     """An intact chunk: where it stands, its record as it is, what it holds.
 
     ``end`` is where the next record begins. Fields that a later version of the format added to
-    the record are not part of ``record``.
+    the record are not part of ``record``. A ``record`` of no bytes: ``content`` is a run of
+    messages outside of chunks. Where the writer gave no checksum, ``checked`` is False, and
+    ``record`` has the one that fits its content.
     """
 
     offset: int
@@ -110,16 +119,23 @@ class Chunk:
     content: bytes
     compression: str
     end: int
+    checked: bool = True
 
 
 @dataclass(slots=True)
 class Findings:
-    """What a scan met besides intact chunks."""
+    """What a scan met besides intact chunks.
+
+    ``unchecked`` of the ``chunks`` have no checksum; ``bare_messages`` stand outside of chunks.
+    Where there are such, ``whole`` is whether the checksum of all records is right, None if the
+    file has none.
+    """
 
     chunks: int = 0
     damaged: int = 0
     unchecked: int = 0
     bare_messages: int = 0
+    whole: bool | None = None
     finished: bool = False
     cut_off_at: int | None = None
     begins_well: bool = True
@@ -138,8 +154,6 @@ class Findings:
 class Scanner:
     """Goes once through a file; `findings` is complete when `chunks` is exhausted.
 
-    With ``unchecked`` it also accepts chunks that were written without a checksum.
-
     Attributes
     ----------
     findings : Findings
@@ -147,22 +161,20 @@ class Scanner:
         Those met so far that stand outside of chunks, each once.
     """
 
-    def __init__(
-        self, source: Source, limits: Limits = DEFAULT_LIMITS, unchecked: bool = False
-    ) -> None:
+    def __init__(self, source: Source, limits: Limits = DEFAULT_LIMITS) -> None:
         self.findings = Findings()
         self.outside: list[Schema | Channel] = []
         self._outside_table = TopicTable(limits)
         self._in_summary = False
         self._source = source
         self._limits = limits
-        self._unchecked = unchecked
         self._budget = Budget(source.size, limits)
         self._attachment_bytes_left = limits.attachment_bytes
         self._unpacker = Unpacker()
+        self._before = b''
 
     def chunks(self) -> Iterator[Chunk]:
-        """Yield the intact chunks in the order of the file.
+        """Yield the intact chunks, and the runs of messages beside them, in the file's order.
 
         Raises
         ------
@@ -176,8 +188,8 @@ class Scanner:
 
     def chunk_at(self, offset: int) -> Chunk:
         """Return the chunk that was found at ``offset`` before; raises `LayoutError`."""
-        _, length = self._head(offset)
-        return self._chunk(offset, length)
+        op, length = self._head(offset)
+        return self._chunk(offset, length) if op == Opcode.CHUNK else self._run(offset, length)
 
     def _follow(self) -> Iterator[Chunk]:
         source, findings = self._source, self.findings
@@ -189,8 +201,6 @@ class Scanner:
             if chunk is not None:
                 yield chunk
                 position = self._behind_indexes(position)
-            elif findings.bare_messages >= _BARE_ENOUGH and not findings.chunks:
-                return
 
     def _behind_indexes(self, position: int) -> int:
         """Return where the message indexes end that follow a chunk and agree with themselves.
@@ -219,6 +229,10 @@ class Scanner:
         op, length = self._head(position)
         after = position + RECORD_HEAD.size + length
         problem = ''
+        if op == Opcode.MESSAGE:
+            with suppress(LayoutError):
+                run = self._run(position, length)
+                return run, run.end
         if op == Opcode.CHUNK:
             try:
                 return self._accept(position, length), after
@@ -257,6 +271,7 @@ class Scanner:
     def _accept(self, position: int, length: int) -> Chunk:
         chunk = self._chunk(position, length)
         self.findings.chunks += 1
+        self.findings.unchecked += not chunk.checked
         return chunk
 
     def _chunk(self, position: int, length: int) -> Chunk:
@@ -277,27 +292,71 @@ class Scanner:
             raise LayoutError(f'it claims to unpack to {size} bytes, which is beyond all bounds')
         self._budget.spend(size)
         content = self._unpacker.unpack(name, found.data, size)
-        if zlib.crc32(content) != crc:
-            if crc != 0:
-                raise LayoutError('its checksum is wrong')
-            self.findings.unchecked += 1
-            if not self._unchecked:
-                raise LayoutError('it was written without a checksum')
-        if exact != length:
-            raw = RECORD_HEAD.pack(Opcode.CHUNK, exact) + raw[RECORD_HEAD.size :][:exact]
-        return Chunk(position, raw, content, name, end)
+        actual = zlib.crc32(content)
+        checked = actual == crc
+        # The format has 0 for a checksum that is not available.
+        if crc and not checked:
+            raise LayoutError('its checksum is wrong')
+        if exact != length or not checked:
+            raw = pack(replace(found, uncompressed_crc=actual))
+        self._before = content
+        return Chunk(position, raw, content, name, end, checked)
+
+    def _run(self, position: int, length: int) -> Chunk:
+        """Return the messages from a position on, about as many as a chunk has."""
+        if length > self._limits.record_bytes:
+            raise LayoutError(f'its length of {length} bytes is beyond all bounds')
+        raw = self._source.read(position, max(CHUNK_BYTES, RECORD_HEAD.size + length))
+        number, size = leading_messages(raw)
+        if not number or self._disguised(position, length):
+            raise LayoutError('there is no message')
+        self._budget.spend(size)
+        self.findings.bare_messages += number
+        return Chunk(position, b'', raw[:size], '', position + size, checked=False)
+
+    def _disguised(self, position: int, length: int) -> bool:
+        """Tell whether a message is a record of another kind, whose first byte was damaged.
+
+        A file whose messages have checksums is not to get one that has none by a wrong bit.
+        """
+        if position <= len(MAGIC) or self._in_summary:
+            # The header comes first, and the summary has no messages.
+            return True
+        raw = self._source.read(position, max(SHAPE_SIZE, HEAD_SIZE))
+        as_chunk = _SHAPE.match(bytes([Opcode.CHUNK]) + raw[1:])
+        if as_chunk is not None and _fields_agree(raw, 0, as_chunk.end()):
+            return True
+        if len(raw) >= HEAD_SIZE:
+            # As the index behind a chunk: a channel, a length, time and place of a message.
+            channel, inner, log_time, place = MESSAGE_HEAD.unpack_from(raw, RECORD_HEAD.size)
+            content = self._before[place : place + HEAD_SIZE]
+            if inner == length - 6 and len(content) == HEAD_SIZE:
+                first = MESSAGE_HEAD.unpack_from(content, RECORD_HEAD.size)
+                if (channel, log_time) == (first[0], first[2]):
+                    return True
+        if length > self._limits.definition_bytes:
+            return False
+        content = self._source.read(position + RECORD_HEAD.size, length)
+        try:
+            return pack(unpack(Channel.read, content))[RECORD_HEAD.size :] == content
+        except LayoutError:
+            return False
 
     def _inside(self, op: int, position: int, length: int) -> Chunk | None:
         """Look into a record that is no chunk, and for a chunk that a wrong length would hide."""
         if op == Opcode.MESSAGE:
-            self.findings.bare_messages += 1
+            large = length > self._limits.record_bytes
+            why = 'is larger than can be read' if large else 'cannot be one'
+            self.findings.add_damage(f'the message at byte {position} {why}')
         if op == Opcode.ATTACHMENT:
             self._attachment(position, length)
             return None
         if op == Opcode.METADATA and length <= self._limits.definition_bytes:
             self._metadata(position, length)
         # The summary, which follows, repeats what it says with a checksum.
-        self._in_summary |= op == Opcode.DATA_END
+        if op == Opcode.DATA_END and not self._in_summary:
+            self._in_summary = True
+            self._data_end(position)
         if op in (Opcode.SCHEMA, Opcode.CHANNEL) and not self._in_summary:
             self._definition(op, position, length)
         if length < _SMALLEST_CHUNK or (
@@ -306,6 +365,16 @@ class Scanner:
             return None
         start = position + RECORD_HEAD.size
         return self._seek(start, start + length)
+
+    def _data_end(self, position: int) -> None:
+        """Compare the checksum of all records, if some have none of their own."""
+        raw = self._source.read(position + RECORD_HEAD.size, 4)
+        wanted = int.from_bytes(raw, 'little')
+        if wanted and (self.findings.unchecked or self.findings.bare_messages):
+            found = 0
+            for start in range(0, position, _WINDOW):
+                found = zlib.crc32(self._source.read(start, min(_WINDOW, position - start)), found)
+            self.findings.whole = found == wanted
 
     def _is_index(self, position: int, length: int) -> bool:
         """Tell whether a message index agrees with its own length, which a wrong one does not."""
@@ -383,20 +452,10 @@ class Scanner:
         return next(candidates(self._source, position, position + 1), None) is not None
 
 
-def why_empty(findings: Findings, asked: str = ', or ask for it to be read unchecked') -> str:
-    """Return why a file gave no message; ``asked`` is what may be done without checksums."""
-    if findings.unchecked:
-        return (
-            'was written without checksums, so damage in it could not be seen; '
-            f'record with checksums{asked}'
-        )
+def why_empty(findings: Findings) -> str:
+    """Return why a file gave no message."""
     if findings.over_budget:
         return 'unpacks to far more than its size justifies and was not read'
-    if findings.bare_messages:
-        return (
-            'was written without chunks, so damage in it could not be seen; '
-            "rewrite it with 'ros2 bag convert' to the preset zstd_small"
-        )
     if not findings.begins_well and not findings.damaged:
         return 'is not an MCAP file'
     if findings.damaged:
@@ -415,28 +474,30 @@ def scan_warnings(findings: Findings, what: str) -> tuple[str, ...]:
             'everything before it was read.'
         )
     elif not findings.finished:
-        sentences.append(f'The {what} was not finished; all of its chunks were read.')
+        sentences.append(f'The {what} was not finished; everything in it was read.')
     if findings.damaged:
         places = 'place' if findings.damaged == 1 else 'places'
         sentences.append(
             f'The {what} is damaged in {findings.damaged} {places}, what stood there was left out '
             f'({"; ".join(findings.reasons)}).'
         )
-    if findings.bare_messages:
-        one = findings.bare_messages == 1
-        sentences.append(
-            f'{counted(findings.bare_messages, "message")} of the {what} '
-            f'{"stands" if one else "stand"} outside of its chunks, where damage cannot be seen, '
-            f'and {"was" if one else "were"} left out.'
-        )
     if findings.over_budget:
         sentences.append(
             f'The {what} unpacks to far more than its size justifies; the rest of it was not read.'
         )
-    if findings.unchecked:
+    if findings.whole is False:
         sentences.append(
-            f'{counted(findings.unchecked, "chunk")} of the {what} '
-            f'{"was" if findings.unchecked == 1 else "were"} written without a checksum, '
-            'so damage in it cannot be seen.'
+            f'The checksum of all records of the {what} is wrong; damage in what has no checksum '
+            'of its own cannot be located.'
         )
+    chunks, messages = findings.unchecked, findings.bare_messages
+    unchecked = []
+    if chunks:
+        one = f'chunk of the {what} was', f'chunks of the {what} were'
+        unchecked.append(f'{counted(chunks, *one)} written without a checksum')
+    if messages:
+        one = f'message of the {what} stands', f'messages of the {what} stand'
+        unchecked.append(f'{counted(messages, *one)} outside of chunks, where there is none')
+    if unchecked and findings.whole is None:
+        sentences.append(f'{" and ".join(unchecked)}; damage there cannot be seen.')
     return tuple(sentences)

@@ -119,8 +119,12 @@ def _parquet(path: Path, places: Sequence[int]) -> Iterator[tuple[Any, list[str]
     from pyarrow import parquet
 
     with parquet.ParquetFile(path) as file:
+        every = file.schema_arrow.names
         fields = [file.schema_arrow.field(k) for k in places]
     for field in fields:
+        # The library takes columns by their names only, and gives all of one name.
+        if every.count(field.name) > 1:
+            raise InputError(f"{path}: there are several columns called '{field.name}'.")
         if pa.types.is_nested(field.type):
             raise RecordingError(
                 path, f"the column '{field.name}' holds a {field.type} in each cell, no value"
