@@ -16,10 +16,14 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
+import zstandard
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import NonSeekingReader, make_reader
+from mcap.reader import make_reader
 from mcap.records import Channel, Schema
+from mcap.records import Chunk as ChunkRecord
+from mcap.stream_reader import get_chunk_data_stream
 
 from valveflow_ros.errors import RecordingError, counted
 from valveflow_ros.logs.mcap.chunk_file import (
@@ -244,21 +248,29 @@ class _Proven:
         return self.out.touched
 
     def publish(self) -> None:
-        """Read every message, and give the file its name; raises `RecordingError`."""
+        """Read every chunk, and give the file its name; raises `RecordingError`."""
         try:
             with self.out.part.open('rb') as stream:
-                # From end to end; a reader that seeks would hold all messages at once.
-                messages = NonSeekingReader(stream, validate_crcs=True).iter_messages(
-                    log_time_order=False
-                )
-                topics = {channel.id for _, channel, _ in messages}
-                stream.seek(0)
-                reader = make_reader(stream, validate_crcs=True)
-                next(reader.iter_messages(), None)
-                summary = reader.get_summary()
-                if summary is None or not topics <= summary.channels.keys():
-                    raise McapError('its summary does not name all topics')
-        except (McapError, ValueError, KeyError, EOFError, struct.error) as error:
+                summary = make_reader(stream, validate_crcs=True).get_summary()
+                if summary is None:
+                    raise McapError('it has no summary')
+                # Not message by message: a chunk of a hundred kilobytes may hold a million.
+                for index in summary.chunk_indexes:
+                    stream.seek(index.chunk_start_offset + RECORD_HEAD.size)
+                    get_chunk_data_stream(
+                        ChunkRecord.read(ReadDataStream(stream)), validate_crc=True
+                    )
+                    if not index.message_index_offsets.keys() <= summary.channels.keys():
+                        raise McapError('its summary does not name all topics')
+        except (
+            McapError,
+            ValueError,
+            KeyError,
+            EOFError,
+            RuntimeError,
+            struct.error,
+            zstandard.ZstdError,
+        ) as error:
             reason = str(error) or type(error).__name__
             problem = f'what is intact in it makes no file that other programs read ({reason})'
             raise RecordingError(self.source, f'{problem}; nothing was written') from None

@@ -235,7 +235,7 @@ class Scanner:
                 return run, run.end
         if op == Opcode.CHUNK:
             try:
-                return self._accept(position, length), after
+                chunk = self._accept(position, length)
             except LayoutError as error:
                 if after <= self._source.size:
                     self._budget.spend_in_vain(length)
@@ -245,6 +245,8 @@ class Scanner:
                 if agreed and self._plausible(after):
                     self.findings.add_damage(problem)
                     return None, after
+            else:
+                return chunk, chunk.end
         elif self._known(op, position) and after <= self._source.size and self._plausible(after):
             hidden = self._inside(op, position, length)
             return hidden, (after if hidden is None else hidden.end)
@@ -285,8 +287,12 @@ class Scanner:
         size, crc, name = found.uncompressed_size, found.uncompressed_crc, found.compression
         exact = CHUNK_HEAD_SIZE + 12 + len(name.encode()) + len(found.data)
         end = position + RECORD_HEAD.size + length
-        # A later version of the format may have added fields at the end.
-        if exact != length and not self._plausible(end):
+        # A later version of the format may have added fields at the end, but a damaged length must
+        # not swallow the chunks that follow.
+        inner_end = position + RECORD_HEAD.size + exact
+        if exact > length or (
+            exact < length and (self._begins_record(inner_end) or not self._plausible(end))
+        ):
             raise LayoutError('its length disagrees with its content')
         if size > self._limits.chunk_bytes:
             raise LayoutError(f'it claims to unpack to {size} bytes, which is beyond all bounds')
@@ -435,6 +441,12 @@ class Scanner:
         size = self._source.size
         return position == size - len(MAGIC) and self._source.read(position, 8) == MAGIC
 
+    def _begins_record(self, position: int) -> bool:
+        """Tell whether a record of a known kind begins here and is not cut off."""
+        op, length = self._head(position)
+        fits = position + RECORD_HEAD.size + length <= self._source.size
+        return fits and self._known(op, position)
+
     def _plausible(self, position: int) -> bool:
         """Tell whether a record, or the end of the file, may begin here."""
         size = self._source.size
@@ -443,10 +455,10 @@ class Scanner:
         if not self.findings.finished and 0 <= size - position < SHAPE_SIZE:
             # Too little of a last record to be judged.
             return True
+        if self._begins_record(position):
+            return True
         op, length = self._head(position)
-        if position + RECORD_HEAD.size + length <= size:
-            return self._known(op, position)
-        if op not in _KINDS:
+        if position + RECORD_HEAD.size + length <= size or op not in _KINDS:
             return False
         # The last chunk of an unfinished file may be cut off, with a head that agrees.
         return next(candidates(self._source, position, position + 1), None) is not None
