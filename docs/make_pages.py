@@ -27,6 +27,7 @@ PARTS: dict[str, Callable[[], str]] = {
     'messages': page_tables.messages,
     'effects': page_effects.index,
     'measured': page_claims.measured,
+    'acts': page_claims.acts,
     'diagnostics': page_health.diagnostics,
     'reasons': page_health.reasons,
 }

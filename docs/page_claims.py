@@ -126,6 +126,17 @@ def _speed() -> list[tuple[str, str, str]]:
     ]  # fmt: skip
 
 
+def acts() -> str:
+    """Return what other programs did to a running monitor, what it claimed, and what is there."""
+    rows = [
+        (name.replace('_', ' '), str(act['runs']), _count(act['claimed']), _count(act['found']),
+         str(act['false']))
+        for name, act in result('torture_adversary')['counts']['acts'].items()
+    ]  # fmt: skip
+    head = ('act, among others', 'runs', 'messages claimed', 'found', 'runs with a false claim')
+    return table(head, rows)
+
+
 def measured() -> str:
     """Return what the studies found, with the command of each."""
     rows = [*_paper(), *_partition(), *_coverage(), *_rivals(), *_alarm(),
