@@ -840,3 +840,28 @@ def test_who_lost_its_lock_to_another_monitor_says_so_and_writes_nothing(tmp_pat
     assert found.saved is not None
     assert found.saved['whose'] == 'second'
     found.close()
+
+
+def test_a_disk_that_does_not_answer_is_told_and_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers = threading.Event()
+    write = StateFolder.write
+
+    def hanging(self: StateFolder, data: bytes) -> None:
+        answers.wait(60.0)
+        write(self, data)
+
+    monkeypatch.setattr(StateFolder, 'write', hanging)
+    monkeypatch.setattr(state_store, '_LONGEST_S', 0.05)
+    monkeypatch.setattr(state_store, '_STUCK_S', 0.0)
+    store = StateStore(settings(tmp_path))
+    store.write({'first': 1}, lambda: True)
+    assert store.item().level == Level.ERROR
+    assert 'does not answer' in store.item().sentence
+    store.write({'second': 2}, lambda: True)
+    assert sum(t.name == 'state writer' for t in threading.enumerate()) == 1
+    assert not store.altered
+    store.close()
+    assert 'does not answer' in store.problem
+    answers.set()
