@@ -90,7 +90,8 @@ def recover(
 ) -> RecoveryReport:
     """Copy the intact chunks of ``path`` into a finished file ``out``.
 
-    It gets its name when the library `mcap` has read it from end to end.
+    It gets its name when the library `mcap` has read its summary and every chunk, by their
+    checksums.
 
     Parameters
     ----------
