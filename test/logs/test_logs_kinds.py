@@ -44,7 +44,7 @@ def unchecked_sentence(kind: Kind) -> tuple[str, ...]:
         parts.append(f'{chunks} {one} written without a checksum')
     if messages:
         parts.append(
-            f'{messages} messages of the file stand outside of chunks, where there is none'
+            f'{messages} messages of the file stand outside of chunks and without a checksum'
         )
     if not parts or kind.data_crc:
         return ()

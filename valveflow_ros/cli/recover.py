@@ -43,7 +43,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
     lost = (
         f'{counted(report.damaged_chunks, "place")} damaged and left out'
         if report.damaged_chunks
-        else f'no {"other " if report.warnings else ""}damage was found'
+        else f'no damage was found{" beyond that" if report.warnings else ""}'
     )
     text = (
         f'Kept {counted(report.messages, "message")} in {counted(report.chunks, "chunk")}; {lost}.'

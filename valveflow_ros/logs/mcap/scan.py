@@ -509,7 +509,7 @@ def scan_warnings(findings: Findings, what: str) -> tuple[str, ...]:
         unchecked.append(f'{counted(chunks, *one)} written without a checksum')
     if messages:
         one = f'message of the {what} stands', f'messages of the {what} stand'
-        unchecked.append(f'{counted(messages, *one)} outside of chunks, where there is none')
+        unchecked.append(f'{counted(messages, *one)} outside of chunks and without a checksum')
     if unchecked and findings.whole is None:
         sentences.append(f'{" and ".join(unchecked)}; damage there cannot be seen.')
     return tuple(sentences)
