@@ -345,9 +345,10 @@ class RecordingWriter:
         """
         changed, left = False, most_bytes
         for file in list(self._files):
-            if file is self._at_hand or (file.mark and file.mark == mark_of(file.path)):
+            mark = mark_of(file.path)
+            if file is self._at_hand or (mark is not None and file.mark == mark):
                 continue
-            size = 0 if (mark := mark_of(file.path)) is None else mark[2]
+            size = 0 if mark is None else mark[2]
             if left > 0 or not size:
                 left -= size
                 changed = True
