@@ -24,6 +24,9 @@ class RegionalModel:
         Flow in MW at which one region gives way to the next.
     time_constants, delays : float64 (I,)
         Seconds. ``I = 0`` (empty) means the dynamics are not known.
+    offset_mw : float or None
+        c of P = p^e F(V) + c; None where P = F(V p^m). With it, what is said in MW of pieces is
+        in MW / MPa^e, and of flow in MW.
     """
 
     knots: FloatArray
@@ -32,6 +35,7 @@ class RegionalModel:
     levels: FloatArray
     time_constants: FloatArray
     delays: FloatArray
+    offset_mw: float | None = None
 
     @property
     def pieces(self) -> int:
@@ -43,6 +47,22 @@ class RegionalModel:
         """Return I."""
         return len(self.time_constants)
 
+    @property
+    def offset(self) -> float:
+        """Return c in MW, 0 where the form has none."""
+        return self.offset_mw or 0.0
+
+    @property
+    def size(self) -> int:
+        """Return the number of packed parameters."""
+        return 3 * self.pieces - 1 + 2 * self.regions + (self.offset_mw is not None)
+
+    @property
+    def delay_places(self) -> slice:
+        """Return where the delays stand among the packed parameters."""
+        first = 3 * self.pieces - 1 + self.regions
+        return slice(first, first + self.regions)
+
     def slopes(self) -> FloatArray:
         """Return K_f, MW per unit of u, shape (J,)."""
         return np.asarray((self.right - self.left) / np.diff(self.knots))
@@ -51,7 +71,17 @@ class RegionalModel:
         """Return C, MW at u = 0, shape (J,)."""
         return np.asarray(self.left - self.slopes() * self.knots[:-1])
 
-    def static(self, u: FloatArray) -> FloatArray:
+    def static(self, u: FloatArray, scale: FloatArray | float = 1.0) -> FloatArray:
+        """Return ``scale`` F(u) + c in MW, shape of ``u``; NaN in gives NaN out.
+
+        Parameters
+        ----------
+        scale : float64, shape of ``u``, or float
+            p^e; 1 where P = F(u).
+        """
+        return np.asarray(scale * self.shape(u) + self.offset)
+
+    def shape(self, u: FloatArray) -> FloatArray:
         """Evaluate F; NaN in gives NaN out."""
         piece = np.clip(np.searchsorted(self.knots, u, side='right') - 1, 0, self.pieces - 1)
         width = np.diff(self.knots)[piece]
@@ -63,14 +93,15 @@ class RegionalModel:
         return make_taps(self.time_constants, self.delays, step_s)
 
     def respond(
-        self, u: FloatArray, usable: ByteArray, step_s: float, settle_s: float
-    ) -> tuple[FloatArray, ByteArray]:
+        self, u: FloatArray, usable: ByteArray, step_s: float, settle_s: float,
+        scale: FloatArray | float = 1.0,
+    ) -> tuple[FloatArray, ByteArray]:  # fmt: skip
         """Return the dynamic prediction in MW and where it has settled, shapes (n,)."""
         answer = np.empty(len(u))
         settled = np.empty(len(u), dtype=np.uint8)
 
         respond(
-            self.static(u), usable, self.levels, self.taps(step_s),
+            self.static(u, scale), usable, self.levels, self.taps(step_s),
             round(settle_s / step_s), answer, settled,
         )  # fmt: skip
         return answer, settled
@@ -83,8 +114,9 @@ class RegionalModel:
         """Return the parameters in the order of the kernel's columns."""
         values = np.append(self.left[0], self.right)
         jumps = self.left[1:] - self.right[:-1]
+        offset = [] if self.offset_mw is None else [self.offset_mw]
         return np.concatenate(
-            [values, self.knots[1:-1], jumps, np.log(self.time_constants), self.delays]
+            [values, self.knots[1:-1], jumps, np.log(self.time_constants), self.delays, offset]
         )
 
     def unpack(self, parameters: FloatArray) -> RegionalModel:
@@ -98,7 +130,8 @@ class RegionalModel:
         left[1:] += jumps
         return replace(
             self, knots=knots, left=left, right=values[1:].copy(),
-            time_constants=np.exp(rest[:i]), delays=rest[i:].copy(),
+            time_constants=np.exp(rest[:i]), delays=rest[i : 2 * i].copy(),
+            offset_mw=None if self.offset_mw is None else float(rest[2 * i]),
         )  # fmt: skip
 
 

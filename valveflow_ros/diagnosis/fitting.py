@@ -222,7 +222,7 @@ def whitening(grids: Grids, residual: FloatArray) -> FloatArray:
 
 def base_mask(task: Task, model: Extended) -> BoolArray:
     """Return which packed parameters of curve and dynamics may move."""
-    free = free_parameters(model.base.pieces, model.base.regions)
+    free = free_parameters(model.base)
     if task.fixed_dynamics:
         free[-2 * model.base.regions :] = False
     elif 'clock' in model.names:

@@ -49,6 +49,13 @@ def flow_of(u: FloatArray, knots: FloatArray, left: FloatArray, right: FloatArra
 
 
 @inlined
+def scale_flow(flow: FloatArray, scale: FloatArray, offset: float) -> None:
+    """Turn F(u) into the flow in MW, both (n,)."""
+    for i in range(flow.size):
+        flow[i] = scale[i] * flow[i] + offset
+
+
+@inlined
 def region_of_each(
     flow: FloatArray, usable: ByteArray, levels: FloatArray, region: ByteArray
 ) -> None:
@@ -117,6 +124,8 @@ def _feed(
 @kernel
 def answer_residual(
     u: FloatArray,
+    scale: FloatArray,
+    offset: float,
     usable: ByteArray,
     power: FloatArray,
     knots: FloatArray,
@@ -136,7 +145,8 @@ def answer_residual(
 
     Parameters
     ----------
-    u, usable : (n,)
+    u, scale, usable : (n,)
+        The flow is ``scale`` F(u) + ``offset``.
     power, residual, weight : (m,)
         Means over ``group`` rows. The latter two are written: ``weight`` is 1 where all rows of
         the mean are usable and settled; elsewhere the residual is 0.
@@ -160,6 +170,7 @@ def answer_residual(
         t = (mean - begin) * group
         now = flow[t : t + n]
         flow_of(u[row + t : row + t + n], knots, left, right, now)
+        scale_flow(now, scale[row + t : row + t + n], offset)
         region_of_each(now, usable[row + t : row + t + n], levels, region[:n])
         age = _feed(flow, t, region[:n], taps, settle, age, fed, decay, settled)
         for i in range(n):
@@ -218,7 +229,7 @@ def _bend(row: FloatArray, k: int, slope: FloatArray, down: float, up: float) ->
 
 @inlined
 def _fill(
-    flow: FloatArray, share: FloatArray, piece: ByteArray, t: int, region: ByteArray,
+    flow: FloatArray, scale: FloatArray, share: FloatArray, piece: ByteArray, t: int, region: ByteArray,
     slope: FloatArray, taps: FloatArray, part: FloatArray, slowing: FloatArray, step_s: float,
     settle: int, group: int, state: float, age: int,
     answer: FloatArray, settled: ByteArray, decay: FloatArray, table: FloatArray,
@@ -252,6 +263,7 @@ def _fill(
             # In equilibrium the curve's derivatives have been what they are for ever.
             state, decay[i] = x0, 0.0
             w0, w1, w2 = w0 / (1.0 - a), w1 / (1.0 - a), w2 / (1.0 - a)
+        w0, w1, w2 = w0 * scale[t0], w1 * scale[t1], w2 * scale[t2]
         up, down = w0 * share[t0], w0 * (1.0 - share[t0])
         if piece[t0] == piece[t1] == piece[t2]:
             up += w1 * share[t1] + w2 * share[t2]
@@ -276,6 +288,8 @@ def _fill(
 @kernel
 def tangents(
     u: FloatArray,
+    scale: FloatArray,
+    offset: float,
     usable: ByteArray,
     power: FloatArray,
     knots: FloatArray,
@@ -298,15 +312,15 @@ def tangents(
 
     Parameters
     ----------
-    u, usable, power, settle, group, begin
-        As for `answer_kernel.answer_residual`.
+    u, scale, offset, usable, power, settle, group, begin
+        As for `answer_residual`.
     knots : (J + 1,); left, right : (J,)
     levels : (I - 1,); time_constants, delays : (I,) seconds
     residual, weight : (end - first,)
         Written, as there.
     jacobian : (end - first, P)
         Written, of the answer. P = (J + 1) + (J - 1) + (J - 1) + 2 I: values, knots, jumps, then
-        ln T and tau of each region.
+        ln T and tau of each region; where there is one column more it is that of the offset.
     """
     slope = (right - left) / (knots[1:] - knots[:-1])
     regions = time_constants.size
@@ -331,9 +345,10 @@ def tangents(
             u[row + t : row + t + n], knots, left, right,
             flow[t : t + n], share[t : t + n], piece[t : t + n],
         )  # fmt: skip
+        scale_flow(flow[t : t + n], scale[row + t : row + t + n], offset)
         region_of_each(flow[t : t + n], usable[row + t : row + t + n], levels, region[:n])
         state, age = _fill(
-            flow, share, piece, t, region[:n], slope, taps, part, slowing, step_s, settle, group,
+            flow, scale[row : row + rows], share, piece, t, region[:n], slope, taps, part, slowing, step_s, settle, group,
             state, age, answer, settled, decay, table,
         )  # fmt: skip
         for i in range(n):
@@ -346,6 +361,8 @@ def tangents(
             weight[place] = 1 if good else 0
             residual[place] = power[mean + k] - answer[k] * each if good else 0.0
             out, now = jacobian[place], table[k * group + 1]
+            if out.size > columns:
+                out[columns] = 1.0
             for p in range(columns):
                 out[p] = each * now[p]
             for i in range(k * group + 2, (k + 1) * group + 1):

@@ -58,7 +58,7 @@ class Grown:
 def _insert(model: RegionalModel, knot: float) -> RegionalModel:
     """Put a knot onto the curve without changing it."""
     k = int(np.clip(np.searchsorted(model.knots, knot) - 1, 0, model.pieces - 1))
-    value = float(model.static(np.array([knot]))[0])
+    value = float(model.shape(np.array([knot]))[0])
     return replace(
         model,
         knots=np.insert(model.knots, k + 1, knot),
@@ -103,7 +103,7 @@ def _best_knee(problem: Problem, model: RegionalModel, ar: FloatArray) -> tuple[
         np.ascontiguousarray(hats), np.maximum(dense.knots[:, None] - places[None, :], 0.0)
     )
     residual, own, weight = problem.tangents(model)
-    own = own[:, free_parameters(model.pieces, model.regions)]
+    own = own[:, free_parameters(model)]
     table = whitened(np.column_stack([own, hinges, residual]), weight, ar)
     # What the model explains already is taken out of hinges and residual alike.
     n = own.shape[1]
@@ -168,7 +168,7 @@ def _grown(
         if gain < KNEE_GAIN:
             break
         trial = _insert(model, place)
-        trial, _ = move(problem, trial, ar, free_parameters(trial.pieces, trial.regions), 8)
+        trial, _ = move(problem, trial, ar, free_parameters(trial), 8)
         worth[model.pieces + 1] = gain = min(gain, _gain(problem, model, trial, ar))
         if gain < KNEE_GAIN:
             break
@@ -184,7 +184,7 @@ def _pruned(
         certainty = bend_certainty(problem, model, ar)
         weakest = int(np.argmin(certainty))
         trial = _remove(model, weakest)
-        trial, _ = move(problem, trial, ar, free_parameters(trial.pieces, trial.regions), 8)
+        trial, _ = move(problem, trial, ar, free_parameters(trial), 8)
         least = min(float(certainty[weakest]), _gain(problem, trial, model, ar))
         # With J pieces each bend was worth at least this: taking more away costs more.
         others = np.sort(np.delete(certainty, weakest))
@@ -205,7 +205,7 @@ def _split(problem: Problem, model: RegionalModel, ar: FloatArray) -> tuple[Regi
     best, most = model, -math.inf
     for place in 0.5 * (model.knots[:-1] + model.knots[1:]):
         trial = _insert(model, float(place))
-        trial, _ = move(problem, trial, ar, free_parameters(trial.pieces, trial.regions), 12)
+        trial, _ = move(problem, trial, ar, free_parameters(trial), 12)
         gain = _gain(problem, model, trial, ar)
         if gain > most:
             best, most = trial, gain
@@ -357,7 +357,7 @@ def _settle(
     problem: Problem, model: RegionalModel, jumps: BoolArray, ar: FloatArray, knot: int
 ) -> tuple[RegionalModel, float]:
     """Alternate between the knot's place and everything else."""
-    free = free_parameters(model.pieces, model.regions, jumps)
+    free = free_parameters(model, jumps)
     free[model.pieces + 1 :][: model.pieces - 1][jumps] = False
     cost = problem.cost(model, ar)
     for _ in range(3):

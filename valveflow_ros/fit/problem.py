@@ -42,6 +42,8 @@ class Samples:
         Rows this long after a gap are not scored.
     group : int
         Rows averaged before scoring.
+    scale : float64 (n,), optional
+        p^e of P = p^e F(u) + c; without it P = F(u).
     """
 
     u: FloatArray
@@ -50,6 +52,7 @@ class Samples:
     step_s: float
     settle_s: float
     group: int
+    scale: FloatArray | None = None
 
     @property
     def means(self) -> int:
@@ -82,6 +85,7 @@ class Samples:
             usable=usable,
             step_s=self.step_s * factor,
             group=2,
+            scale=None if self.scale is None else mean(self.scale),
         )
 
 
@@ -95,6 +99,8 @@ class Problem:
         self.settle = round(samples.settle_s / samples.step_s)
         self.u = np.ascontiguousarray(samples.u[:cut])
         self.usable = np.ascontiguousarray(samples.usable[:cut])
+        scale = np.ones(cut) if samples.scale is None else samples.scale[:cut]
+        self.scale = np.ascontiguousarray(scale)
         power = np.where(self.usable > 0, samples.power_mw[:cut], 0.0)
         self.power = power.reshape(m, samples.group).mean(axis=1)
         self._threads = cores()
@@ -108,7 +114,7 @@ class Problem:
 
         def stretch(begin: int, first: int, end: int) -> None:
             answer_residual(
-                self.u, self.usable, self.power, model.knots, model.left, model.right,
+                self.u, self.scale, model.offset, self.usable, self.power, model.knots, model.left, model.right,
                 model.levels, taps, self.settle, s.group, begin, first, end, residual, weight,
             )  # fmt: skip
 
@@ -125,7 +131,7 @@ class Problem:
         """
         s = self.samples
         residual = np.empty(s.means)
-        jacobian = np.empty((s.means, 3 * model.pieces - 1 + 2 * model.regions + also))
+        jacobian = np.empty((s.means, model.size + also))
         weight = np.empty(s.means, dtype=np.uint8)
 
         def stretch(begin: int, first: int, end: int) -> None:
@@ -146,7 +152,7 @@ class Problem:
             The residual is the last column.
         rows : int
         """
-        order, columns = len(ar), 3 * model.pieces - 1 + 2 * model.regions
+        order, columns = len(ar), model.size
         stretches = self._stretches(model, order)
         sums = np.zeros((len(stretches), columns + 1, columns + 1))
         rows = np.zeros(len(stretches), dtype=np.int64)
@@ -171,7 +177,7 @@ class Problem:
     ) -> None:  # fmt: skip
         s = self.samples
         tangents(
-            self.u, self.usable, self.power, model.knots, model.left, model.right,
+            self.u, self.scale, model.offset, self.usable, self.power, model.knots, model.left, model.right,
             model.levels, model.time_constants, model.delays, s.step_s, self.settle, s.group,
             begin, first, end, residual, jacobian, weight,
         )  # fmt: skip
@@ -195,13 +201,11 @@ class Problem:
         return [(max(0, first - lead), first, end) for first, end in runs(s.means, length)]
 
 
-def free_parameters(pieces: int, regions: int, jumps: BoolArray | None = None) -> BoolArray:
+def free_parameters(model: RegionalModel, jumps: BoolArray | None = None) -> BoolArray:
     """Return the mask of free parameters in packed order; no jumps unless ``jumps`` (J - 1,)."""
-    if jumps is None:
-        jumps = np.zeros(pieces - 1, dtype=bool)
-    return np.concatenate(
-        [np.ones(2 * pieces, dtype=bool), jumps, np.ones(2 * regions, dtype=bool)]
-    )
+    free = np.ones(model.size, dtype=bool)
+    free[2 * model.pieces : 3 * model.pieces - 1] = False if jumps is None else jumps
+    return free
 
 
 def in_bounds(model: RegionalModel, samples: Samples) -> bool:
@@ -228,7 +232,7 @@ def move(
     def shifted(model: RegionalModel, step: FloatArray) -> RegionalModel | None:
         packed = model.pack()
         packed[free] += step
-        packed[-model.regions :] = np.maximum(packed[-model.regions :], 0.0)
+        packed[model.delay_places] = np.maximum(packed[model.delay_places], 0.0)
         trial = model.unpack(packed)
         return trial if in_bounds(trial, problem.samples) else None
 

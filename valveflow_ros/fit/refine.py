@@ -85,14 +85,21 @@ def corrected(
 
     The extrapolation is linear. Where it would leave what a plant can have, the model stays.
     """
-    share = relative_noise(samples.u, samples.usable)
-    if share == 0.0:
+    r = np.random.default_rng(_SEED)
+
+    def noisier(values: FloatArray) -> FloatArray | None:
+        share = relative_noise(values, samples.usable)
+        return values * (1.0 + share * r.standard_normal(len(values))) if share else None
+
+    u = noisier(samples.u)
+    scale = None if samples.scale is None else noisier(samples.scale)
+    if u is None and scale is None:
         return model
-    drawn = np.random.default_rng(_SEED).standard_normal(len(samples.u))
-    noisier = Problem(replace(problem.samples, u=samples.u * (1.0 + share * drawn)))
-    moved, _ = move(noisier, model, ar, free, 2)
+    more = {name: x for name, x in (('u', u), ('scale', scale)) if x is not None}
+    problem_with_noise = Problem(replace(problem.samples, **more))
+    moved, _ = move(problem_with_noise, model, ar, free, 2)
     packed = 2.0 * model.pack() - moved.pack()
-    packed[-model.regions :] = np.maximum(packed[-model.regions :], 0.0)
+    packed[model.delay_places] = np.maximum(packed[model.delay_places], 0.0)
     trial = model.unpack(packed)
     return trial if in_bounds(trial, problem.samples) else model
 
@@ -117,7 +124,7 @@ def _first_regions(problem: Problem, model: RegionalModel) -> list[RegionalModel
     filter's memory across a level is neglected here.
     """
     pairs = [(t, d) for t in _GRID_T_S for d in _GRID_DELAY_S if d <= t]
-    flow = model.static(np.where(problem.usable > 0, problem.u, np.nan))
+    flow = model.static(np.where(problem.usable > 0, problem.u, np.nan), problem.scale)
     flow = flow.reshape(-1, problem.samples.group).mean(axis=1)
     squares = []
     for t, d in pairs:
@@ -182,7 +189,8 @@ def _settle_down(
 
 def _thinnest(problem: Problem, model: RegionalModel) -> float:
     """Return the least share of rows that a region has."""
-    flow = model.static(problem.u[problem.usable > 0])
+    used = problem.usable > 0
+    flow = model.static(problem.u[used], problem.scale[used])
     region = np.searchsorted(model.levels, flow, side='right')
     return float(np.bincount(region, minlength=model.regions).min() / max(len(flow), 1))
 
@@ -198,7 +206,7 @@ def find_regions(problem: Problem, model: RegionalModel) -> tuple[RegionalModel,
     """
     best: tuple[RegionalModel, FloatArray] | None = None
     for candidate in _first_regions(problem, model):
-        free = free_parameters(model.pieces, candidate.regions)
+        free = free_parameters(candidate)
         trial, _, ar = _settle_down(problem, candidate, free, rounds=3)
         if best is not None:
             # Judged under one whitening, that of the larger model.
@@ -288,7 +296,7 @@ def refine(samples: Samples, start: RegionalModel, most_pieces: int | None = Non
     searched = model.pieces
     fine = Problem(samples.finer())
     order = int(np.clip(round(_MEMORY_S / (fine.samples.step_s * fine.samples.group)), ORDER, 20))
-    free = free_parameters(model.pieces, model.regions)
+    free = free_parameters(model)
     for steps in (2, 3):
         residual, weight = fine.answer(model)
         ar = fit_ar(residual, weight, order)
@@ -299,7 +307,7 @@ def refine(samples: Samples, start: RegionalModel, most_pieces: int | None = Non
         jumps = supported_jumps(fine, model, ar)
     else:
         model, jumps, cost = find_jumps(fine, model, ar, cost)
-    free = free_parameters(model.pieces, model.regions, jumps)
+    free = free_parameters(model, jumps)
     if jumps.any():
         model, cost = move(fine, model, ar, free, 4)
     model = corrected(samples, fine, model, ar, free)

@@ -29,6 +29,7 @@ from valveflow_ros.records import FloatArray, IntArray
 _SAME_U = 1e-9
 # Beyond this, or over a range below its inverse, sums of squares leave the range of floats.
 _LARGEST = 1e100
+_HEAVIEST = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,8 +38,8 @@ class Levels:
 
     Attributes
     ----------
-    u, y : float64 (n,)
-        The samples in ascending order of u, of y within equal u; read-only.
+    u, y, each : float64 (n,)
+        The samples in ascending order of u, of y within equal u, and their weights; read-only.
     first : int64 (levels + 1,)
         The first sample of each level, and n.
     x : float64 (levels,)
@@ -47,7 +48,7 @@ class Levels:
     residual : float64 (levels,)
         Mean y of each level about one line through all, over `scale`.
     weight : float64 (levels,)
-        Number of samples.
+        Sum of the samples' weights.
     scale : float
         Root mean square of the levels' residual in the unit of y, or 1 if that is 0.
     within : float
@@ -60,6 +61,7 @@ class Levels:
 
     u: FloatArray
     y: FloatArray
+    each: FloatArray
     first: IntArray
     x: FloatArray
     residual: FloatArray
@@ -74,14 +76,14 @@ class Levels:
         return len(self.x)
 
 
-def make_levels(u: ArrayLike, y: ArrayLike) -> Levels:
-    """Check, sort, merge and scale samples.
+def make_levels(u: ArrayLike, y: ArrayLike, weight: ArrayLike | None = None) -> Levels:
+    """Check, sort, merge and scale samples; without ``weight`` each counts once.
 
     Raises
     ------
     DataError
         The arrays do not match, hold something that is not a finite number below
-        1e100, or u never changes.
+        1e100, u never changes, or a weight is not between 1e-6 and 1e6.
     TooFewSamplesError
         There are fewer than two samples.
     """
@@ -93,15 +95,30 @@ def make_levels(u: ArrayLike, y: ArrayLike) -> Levels:
         )
     for name, values in (('u', a), ('y', b)):
         _check_values(name, values)
+    each = np.ones(len(a)) if weight is None else _weights(weight, a.shape)
     if len(a) < 2:
         raise TooFewSamplesError('Samples', len(a), 2)
     if float(a.max()) - float(a.min()) <= 1.0 / _LARGEST:
         raise DataError(f'u is {a[0]:g} in all {len(a)} samples: a slope needs it to change.')
-    order = np.lexsort((b, a))
-    a, b = a[order], b[order]
-    a.flags.writeable = False
-    b.flags.writeable = False
-    return _merged(a, b, grain)
+    order = np.lexsort((each, b, a))
+    a, b, each = a[order], b[order], each[order]
+    for values in (a, b, each):
+        values.flags.writeable = False
+    return _merged(a, b, each, grain)
+
+
+def _weights(weight: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    """Check weights: far smaller or larger ones would leave no digits to the others."""
+    each = _numbers('weight', weight)
+    if each.shape != shape:
+        raise DataError(f'weight must be as long as u, {shape}, not {each.shape}.')
+    bad = np.flatnonzero(~((each >= 1.0 / _HEAVIEST) & (each <= _HEAVIEST)))
+    if len(bad):
+        raise DataError(
+            f'weight[{bad[0]}] is {each[bad[0]]:g}: every weight must lie between '
+            f'{1.0 / _HEAVIEST:g} and {_HEAVIEST:g}.'
+        )
+    return each
 
 
 def _numbers(name: str, values: ArrayLike) -> FloatArray:
@@ -145,7 +162,7 @@ def _level_starts(u: FloatArray, tolerance: float, first: IntArray) -> int:
     return count
 
 
-def _merged(u: FloatArray, y: FloatArray, grain: float) -> Levels:
+def _merged(u: FloatArray, y: FloatArray, each: FloatArray, grain: float) -> Levels:
     """Merge sorted samples into levels."""
     n = len(u)
     span = float(u[-1] - u[0])
@@ -154,31 +171,33 @@ def _merged(u: FloatArray, y: FloatArray, grain: float) -> Levels:
     first = first[: count + 1].copy()
     first[count] = n
     size = np.diff(first)
-    weight = size.astype(np.float64)
+    weight = np.add.reduceat(each, first[:-1])
+    total = float(weight.sum())
     x = u[first[:-1]]
     rough = bool((u != np.repeat(x, size)).any())
     if rough:
         # Relative to the first sample: a mean of large u would round to their last digit.
-        x = np.add.reduceat(u - u[0], first[:-1]) / weight
+        x = np.add.reduceat(each * (u - u[0]), first[:-1]) / weight
     # Two lines' worth of digits are kept by never adding an offset back.
-    dx = x - float((weight * (x - x[0])).sum() / n + x[0])
-    dy = y - float((y - y[0]).mean() + y[0])
-    mean = np.add.reduceat(dy, first[:-1]) / weight
+    dx = x - float((weight * (x - x[0])).sum() / total + x[0])
+    dy = y - float((each * (y - y[0])).sum() / total + y[0])
+    mean = np.add.reduceat(each * dy, first[:-1]) / weight
     slope = float((weight * dx * mean).sum() / (weight * dx * dx).sum())
     residual = mean - slope * dx
-    scale = math.sqrt(float((weight * residual * residual).sum()) / n) or 1.0
+    scale = math.sqrt(float((weight * residual * residual).sum()) / total) or 1.0
     inside = dy - np.repeat(mean, size)
     return Levels(
         u=u,
         y=y,
+        each=each,
         first=first,
         x=np.ldexp(x, -math.frexp(span)[1]),
         residual=residual / scale,
         weight=weight,
         scale=scale,
-        within=float((inside * inside).sum()),
+        within=float((each * inside * inside).sum()),
         rough=rough,
-        floor=n * (4.0 * grain * (np.abs(y).max() + abs(slope) * np.abs(u).max())) ** 2,
+        floor=total * (4.0 * grain * (np.abs(y).max() + abs(slope) * np.abs(u).max())) ** 2,
     )
 
 
@@ -233,8 +252,8 @@ class Partition:
     cost : float64 (J_max,)
         Omega(J) of eq. (19) in MW^2, recomputed in two passes from the samples.
         Where the smallest piece binds, it can rise with J.
-    u, y : float64 (n,)
-        The samples in ascending order of u; read-only.
+    u, y, weight : float64 (n,)
+        The samples in ascending order of u, and their weights; read-only.
     starts : tuple of int64 arrays
         For each J the first sample of each piece, and n.
     n_distinct : int
@@ -251,6 +270,7 @@ class Partition:
     cost: FloatArray
     u: FloatArray
     y: FloatArray
+    weight: FloatArray
     starts: tuple[IntArray, ...]
     n_distinct: int
     certified: bool
@@ -280,7 +300,7 @@ class Partition:
         starts = self.breaks(pieces)
         ends = [*self.u[starts[1:-1]].tolist(), float(self.u[-1])]
         return tuple(
-            _fit_piece(self.u[a:b], self.y[a:b], float(self.u[a]), end)
+            _fit_piece(self.u[a:b], self.y[a:b], self.weight[a:b], float(self.u[a]), end)
             for a, b, end in zip(starts[:-1], starts[1:], ends, strict=True)
         )
 
@@ -291,6 +311,7 @@ def partition(
     max_pieces: int = 10,
     min_distinct: int = 2,
     *,
+    weight: ArrayLike | None = None,
     threads: int | None = None,
 ) -> Partition:
     """Partition samples into 1 .. ``max_pieces`` straight pieces, each exactly.
@@ -304,6 +325,8 @@ def partition(
         says so, when there are fewer than ``max_pieces * min_distinct`` distinct u.
     min_distinct : int
         Fewest distinct u in a piece, at least 2: with one, a piece has no slope.
+    weight : array_like (n,), optional
+        Of each sample's square in the cost, between 1e-6 and 1e6; 1 without it.
     threads : int, optional
         1 starts none. By default as many as the process may use, for large inputs.
         The result does not depend on it.
@@ -311,8 +334,8 @@ def partition(
     Raises
     ------
     DataError
-        The arrays do not match, hold something that is not a finite number, or u
-        never changes.
+        The arrays do not match, hold something that is not a finite number or no
+        weight, or u never changes.
     TooFewSamplesError
         There are fewer distinct u than one piece needs.
     ParameterError
@@ -334,21 +357,22 @@ def partition(
     _at_least('max_pieces', max_pieces, 1)
     _at_least('min_distinct', min_distinct, 2)
     _at_least('threads', 1 if threads is None else threads, 1)
-    levels = make_levels(u, y)
+    levels = make_levels(u, y, weight)
     if len(levels) < min_distinct:
         raise TooFewSamplesError('Distinct values of u for one piece', len(levels), min_distinct)
     most = min(max_pieces, len(levels) // min_distinct)
     if threads is None:
         threads = cores() if len(levels) >= _SERIAL_BELOW else 1
-    slack = _SLACK * len(levels.u)  # the scaled sum of squares about one line
+    slack = _SLACK * float(levels.weight.sum())  # the scaled sum of squares about one line
     problem = prepare(levels.x, levels.residual, levels.weight, min_distinct, slack, threads)
     found, starts = best_partitions(problem, most)
     original = tuple(levels.first[s] for s in starts)
-    cost = np.array([_cost(levels.u, levels.y, s) for s in original])
+    cost = np.array([_cost(levels.u, levels.y, levels.each, s) for s in original])
     return Partition(
         cost=cost,
         u=levels.u,
         y=levels.y,
+        weight=levels.each,
         starts=original,
         n_distinct=len(levels),
         certified=_agree(levels, found, cost, starts),
@@ -362,7 +386,7 @@ def _agree(levels: Levels, found: FloatArray, cost: FloatArray, starts: list[Int
     if levels.rough:
         # The search takes nearly equal u for equal: judge it on the problem it solved.
         flat = np.repeat(levels.x, np.diff(levels.first))
-        cost = np.array([_cost(flat, levels.y, levels.first[s]) for s in starts])
+        cost = np.array([_cost(flat, levels.y, levels.each, levels.first[s]) for s in starts])
     claimed = found * levels.scale**2 + levels.within
     return bool(np.all(np.abs(claimed - cost) <= _AGREE * cost[0] + levels.floor))
 
@@ -381,28 +405,33 @@ def _limit(distinct: int, most: int, asked: int, least: int) -> str:
     )
 
 
-def _centred(u: FloatArray, y: FloatArray) -> tuple[float, float, float, float, float]:
+def _centred(
+    u: FloatArray, y: FloatArray, weight: FloatArray
+) -> tuple[float, float, float, float, float]:
     """Return mean u, mean y, slope, spread of u and sum of squares about the line, in two passes.
 
     No dot products: their last bits would depend on the number of threads.
     """
-    mean_u = float((u - u[0]).mean() + u[0])
-    mean_y = float((y - y[0]).mean() + y[0])
+    total = weight.sum()
+    mean_u = float((weight * (u - u[0])).sum() / total + u[0])
+    mean_y = float((weight * (y - y[0])).sum() / total + y[0])
     du, dy = u - mean_u, y - mean_y
-    spread = float((du * du).sum())
-    slope = float((du * dy).sum()) / spread if spread > 0.0 else 0.0
+    spread = float((weight * du * du).sum())
+    slope = float((weight * du * dy).sum()) / spread if spread > 0.0 else 0.0
     rest = dy - slope * du
-    return mean_u, mean_y, slope, spread, float((rest * rest).sum())
+    return mean_u, mean_y, slope, spread, float((weight * rest * rest).sum())
 
 
-def _cost(u: FloatArray, y: FloatArray, starts: IntArray) -> float:
+def _cost(u: FloatArray, y: FloatArray, weight: FloatArray, starts: IntArray) -> float:
     """Return the cost of a partition from the samples themselves."""
-    return sum(_centred(u[a:b], y[a:b])[4] for a, b in itertools.pairwise(starts))
+    return sum(_centred(u[a:b], y[a:b], weight[a:b])[4] for a, b in itertools.pairwise(starts))
 
 
-def _fit_piece(u: FloatArray, y: FloatArray, begin: float, end: float) -> FittedPiece:
+def _fit_piece(
+    u: FloatArray, y: FloatArray, weight: FloatArray, begin: float, end: float
+) -> FittedPiece:
     """Fit one piece."""
-    mean_u, mean_y, slope, spread, sse = _centred(u, y)
+    mean_u, mean_y, slope, spread, sse = _centred(u, y, weight)
     n = len(u)
     variance = sse / (n - 2) if n > 2 else math.nan
     return FittedPiece(
@@ -413,5 +442,7 @@ def _fit_piece(u: FloatArray, y: FloatArray, begin: float, end: float) -> Fitted
         samples=n,
         sse=sse,
         slope_stderr=math.sqrt(variance / spread),
-        intercept_stderr=math.sqrt(variance * (1.0 / n + mean_u * mean_u / spread)),
+        intercept_stderr=math.sqrt(
+            variance * (1.0 / float(weight.sum()) + mean_u * mean_u / spread)
+        ),
     )
