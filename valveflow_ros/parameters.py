@@ -171,7 +171,13 @@ _TIME_BASE = (
 )  # fmt: skip
 
 _MODEL = (
-    Parameter('pressure_exponent', 1.125, '', 'Exponent m of u = V p^m, eq. (1) of the paper.',
+    Parameter('axis', 'auto', '',
+              'What the curve is a function of: V p^m with m = pressure_exponent, eq. (1) of the '
+              'paper, or the opening alone, the power being p^m F(V) + c. By default the data '
+              'choose axis and m.',
+              choices=('auto', 'integrated_input', 'opening')),
+    Parameter('pressure_exponent', 1.125, '',
+              'Exponent m of u = V p^m, eq. (1) of the paper, unless the data choose another.',
               0.5, 2.0),
     Parameter('time_constant', 80.0, 's',
               'Largest time constant T expected; with delay it sets the transient 5 T + tau '

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from valveflow_ros.curve.regional_model import RegionalModel
+from valveflow_ros.curve.static_form import INTEGRATED_INPUT, OPENING, StaticForm
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import FloatArray, IntArray
 
@@ -118,6 +119,41 @@ class FittedData:
 
 
 @dataclass(frozen=True, slots=True)
+class FormEvidence:
+    """How the form of the curve compares with the other one, on stretches of time held out.
+
+    Attributes
+    ----------
+    chosen : str
+        'integrated_input' or 'opening'.
+    told : bool
+        The data tell the two apart in favour of the one chosen.
+    log_likelihood_gain : float
+        Of the one chosen.
+    rmse_mw, rmse_other_mw : float
+        Errors of means over a minute.
+    other : str
+        The other form with the exponent that suits it best.
+    apart_mw : float
+        Root mean square of the difference between the two over what was visited.
+    worst : tuple of float
+        Opening in %, pressure in MPa and difference in MW where 1 % of the means differ more.
+    contradicted : bool
+        The form was given, and the data tell that it is the wrong one.
+    """
+
+    chosen: str
+    told: bool
+    log_likelihood_gain: float
+    rmse_mw: float
+    rmse_other_mw: float
+    other: str = ''
+    apart_mw: float = math.nan
+    worst: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    contradicted: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class HeldCause:
     """A cause of the diagnosis that was taken out of the rows before the curve was fitted.
 
@@ -148,9 +184,22 @@ class ResidualStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Characteristic:
-    """A fitted flow characteristic x = F(u).
+    """A fitted flow characteristic: static power is p^e F(u) + c.
 
     Where causes were ``held`` the curve is that of the plant without them.
+
+    Attributes
+    ----------
+    pressure_exponent : float
+        q of u = V p^q: m of the paper's form, 0 where the knees stand at fixed openings.
+    axis : str
+        'integrated_input' (the paper's: e = 0, c = 0) or 'opening' (q = 0).
+    pressure_scale_exponent, offset_mw : float
+        e and c.
+    reference_pressure_mpa : float
+        Median pressure of the data; what is shown of a curve with e > 0 is at this pressure.
+    form : FormEvidence or None
+        How this form compares with the other; None where they were not compared.
     """
 
     pressure_exponent: float
@@ -165,6 +214,24 @@ class Characteristic:
     support: tuple[Support, ...] = ()
     model_id: str = field(default='')
     held: tuple[HeldCause, ...] = field(default=(), repr=False)
+    axis: str = field(default=INTEGRATED_INPUT, repr=False)
+    pressure_scale_exponent: float = field(default=0.0, repr=False)
+    offset_mw: float = field(default=0.0, repr=False)
+    reference_pressure_mpa: float = field(default=math.nan, repr=False)
+    form: FormEvidence | None = field(default=None, repr=False)
+
+    @property
+    def static_form(self) -> StaticForm:
+        """Return the form with its exponent."""
+        scaled = self.axis == OPENING
+        return StaticForm(
+            self.axis, self.pressure_scale_exponent if scaled else self.pressure_exponent
+        )
+
+    @property
+    def reference_scale(self) -> float:
+        """Return p^e at the reference pressure; 1 for the paper's form."""
+        return float(self.static_form.scale(self.reference_pressure_mpa))
 
     @property
     def breakpoints(self) -> FloatArray:
@@ -184,33 +251,48 @@ class Characteristic:
             levels=np.array([d.power_to for d in self.dynamics[:-1]]),
             time_constants=np.array([d.time_constant_s for d in self.dynamics]),
             delays=np.array([d.delay_s for d in self.dynamics]),
+            offset_mw=self.offset_mw if self.axis == OPENING else None,
         )
 
     def values(self) -> FloatArray:
-        """Return F at the breakpoints in MW, shape (J + 1,); at a jump the mean of both ends."""
-        m = self.model
+        """Return the power at the breakpoints in MW, (J + 1,); at a jump the mean of both ends.
+
+        At the reference pressure where the form has p^e.
+        """
+        m = self.at_reference()
         inner = 0.5 * (m.right[:-1] + m.left[1:])
         return np.concatenate([m.left[:1], inner, m.right[-1:]])
 
-    def __call__(self, u: FloatArray) -> FloatArray:
-        """Evaluate F(u) in MW, eq. (26); NaN outside the identified range.
+    def at_reference(self) -> RegionalModel:
+        """Return the model of the power at the reference pressure as a curve over u alone, MW."""
+        m, scale = self.model, self.reference_scale
+        return replace(
+            m, left=scale * m.left + m.offset, right=scale * m.right + m.offset, offset_mw=None
+        )
 
-        Nothing is known beyond the outer breakpoints, so nothing is said there.
+    def __call__(
+        self, u: FloatArray, pressure_mpa: FloatArray | float | None = None
+    ) -> FloatArray:
+        """Return the static power in MW, eq. (26); NaN outside the identified range.
+
+        Nothing is known beyond the outer breakpoints, so nothing is said there. The pressure
+        is that of reference unless given; in the paper's form u contains it.
         """
         u = np.asarray(u, dtype=np.float64)
         knots = self.breakpoints
         inside = (u >= knots[0]) & (u <= knots[-1])
-        return np.where(inside, self.model.static(u), np.nan)
+        p = self.reference_pressure_mpa if pressure_mpa is None else pressure_mpa
+        return np.where(inside, self.model.static(u, self.static_form.scale(p)), np.nan)
 
     def inverse(self, power_mw: FloatArray) -> FloatArray:
-        """Return u = F^-1(x); NaN for a power the curve does not reach.
+        """Return u at which the power is x, at the reference pressure; NaN where it is none.
 
         Raises
         ------
         DataError
             The curve does not rise throughout, so it has no inverse.
         """
-        m = self.model
+        m = self.at_reference()
         if np.any(m.slopes() <= 0.0):
             falling = int(np.argmin(m.slopes())) + 1
             raise DataError(
@@ -239,15 +321,15 @@ class Characteristic:
         Returns
         -------
         float64
-            F(V p^m). NaN outside the identified range of u = V p^m, where the pressure is not
-            positive, and where an argument is NaN.
+            p^e F(V p^q) + c. NaN outside the identified range of u = V p^q, where the pressure
+            is not positive, and where an argument is NaN.
         """
         opening, pressure = np.broadcast_arrays(
             np.asarray(opening_percent, dtype=np.float64),
             np.asarray(pressure_mpa, dtype=np.float64),
         )
         positive = np.where(pressure > 0.0, pressure, np.nan)
-        return self(opening * positive**self.pressure_exponent)
+        return self(opening * positive**self.pressure_exponent, positive)
 
     def opening(self, power_mw: ArrayLike, pressure_mpa: ArrayLike) -> FloatArray:
         """Return the opening that gives a power at a main steam pressure in %.
@@ -274,14 +356,16 @@ class Characteristic:
             np.asarray(power_mw, dtype=np.float64), np.asarray(pressure_mpa, dtype=np.float64)
         )
         m = self.model
+        positive = np.where(pressure > 0.0, pressure, np.nan)
+        flow = (power - m.offset) / self.static_form.scale(positive)
         found = np.full(power.shape, np.nan)
         for k, slope in enumerate(m.slopes()):
             low, high = float(m.knots[k]), float(m.knots[k + 1])
             rounding = 1e-9 * max(abs(low), abs(high))
             if slope == 0.0:
-                found[power == m.left[k]] = np.inf
+                found[flow == m.left[k]] = np.inf
                 continue
-            at = low + (power - m.left[k]) / slope
+            at = low + (flow - m.left[k]) / slope
             here = (at >= low - rounding) & (at <= high + rounding)
             at = np.clip(at, low, high)
             # At a knot the pieces on both sides give the same answer, unless there is a jump.
@@ -290,8 +374,9 @@ class Characteristic:
             found[other] = np.inf
         # What is at the lower end of a jump belongs to the other side of it: F counts.
         with np.errstate(invalid='ignore', divide='ignore'):
-            reached = np.abs(self(found) - power) <= 1e-9 * np.maximum(1.0, np.abs(power))
-            opening = found / np.where(pressure > 0.0, pressure, np.nan) ** self.pressure_exponent
+            back = self(found, positive)
+            reached = np.abs(back - power) <= 1e-9 * np.maximum(1.0, np.abs(power))
+            opening = found / positive**self.pressure_exponent
         known = reached & (opening >= 0.0) & (opening <= 100.0 * (1.0 + 1e-12))
         return np.where(known, np.minimum(opening, 100.0), np.nan)
 
@@ -299,6 +384,8 @@ class Characteristic:
         """Return a copy whose `model_id` is a hash of its numbers."""
         # Held causes count where there are some; the names of other curves stay what they were.
         told = repr(replace(self, model_id='')) + (repr(self.held) if self.held else '')
+        if self.axis == OPENING:
+            told += repr((self.axis, self.pressure_scale_exponent, self.offset_mw))
         digest = hashlib.sha256(told.encode()).hexdigest()
         return replace(self, model_id=digest[:12])
 
@@ -325,7 +412,7 @@ def _rising_points(m: RegionalModel) -> tuple[FloatArray, FloatArray]:
 
 
 def piece_error(piece: Piece, u: FloatArray) -> FloatArray:
-    """Return the standard error of a piece's line at ``u`` in MW.
+    """Return the standard error of a piece's line at ``u`` in MW (MW / MPa^e where e > 0).
 
     Parameters
     ----------
@@ -356,10 +443,13 @@ def piece_of(curve: Characteristic, u: FloatArray) -> IntArray:
 
 
 def curve_error(curve: Characteristic, u: FloatArray) -> FloatArray:
-    """Return the standard error of F(u) in MW, shape of ``u``; see `piece_error`."""
+    """Return the standard error of the curve in MW, shape of ``u``; see `piece_error`.
+
+    At the reference pressure where the form has p^e.
+    """
     u = np.asarray(u, dtype=np.float64)
     index = piece_of(curve, u)
     error = np.full(u.shape, math.nan)
     for k, piece in enumerate(curve.pieces):
         error[index == k] = piece_error(piece, u[index == k])
-    return error
+    return curve.reference_scale * error

@@ -12,11 +12,14 @@ from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
     FittedData,
+    FormEvidence,
     Piece,
     ResidualStatistics,
 )
 from valveflow_ros.curve.regional_model import RegionalModel
+from valveflow_ros.curve.static_form import INTEGRATED_INPUT, StaticForm, pressure_of
 from valveflow_ros.errors import DataError, TooFewSamplesError
+from valveflow_ros.fit.model_form import find_form
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.fit.refine import refine, search
 from valveflow_ros.fit.result import NOT_REFINED, from_refined, residual_statistics, with_support
@@ -31,7 +34,7 @@ from valveflow_ros.fit.task import (
 from valveflow_ros.fit.whitening import inflation
 from valveflow_ros.partition.paper_rule import select
 from valveflow_ros.partition.partition import Partition, partition
-from valveflow_ros.records import ByteArray, FloatArray, SegmentKind
+from valveflow_ros.records import ByteArray, FloatArray, IntArray, SegmentKind
 from valveflow_ros.segments.window import WindowContents
 
 _RICHER = 3  # pieces more than the paper's rule takes, before pruning
@@ -41,9 +44,37 @@ Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
+class _Formed:
+    """A task whose ``contents.u`` is what the curve is a function of, and the form's other parts.
+
+    ``scale`` (n,) is p^e; without it the power is F(u).
+    """
+
+    task: FitTask
+    form: StaticForm
+    offset_mw: float = 0.0
+    scale: FloatArray | None = None
+    evidence: FormEvidence | None = None
+
+    @property
+    def contents(self) -> WindowContents:
+        """Return the rows."""
+        return self.task.contents
+
+    def scales(self, rows: IntArray | slice) -> FloatArray | float:
+        """Return p^e of rows."""
+        return 1.0 if self.scale is None else self.scale[rows]
+
+    def static(self, pieces: tuple[Piece, ...], rows: IntArray | slice) -> FloatArray:
+        """Return the power of a curve in rows, MW."""
+        return self.scales(rows) * evaluate(pieces, self.contents.u[rows]) + self.offset_mw
+
+
+@dataclass(frozen=True, slots=True)
 class _Begun:
     """The exact partition of the special segments, and the static curve taken from it."""
 
+    formed: _Formed
     static: Characteristic
     part: Partition
     u_special: FloatArray
@@ -58,9 +89,10 @@ def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
         The data do not carry a curve; the sentence says why and what would help.
     """
     begun = _begin(task, progress)
+    task = begun.formed.task
     if not task.settings.flag('refine'):
         return with_support(begun.static, task.contents, task.input_noise).with_id()
-    refined = _refined(task, begun, progress)
+    refined = _refined(begun, progress)
     return with_support(refined, task.contents, task.input_noise).with_id()
 
 
@@ -77,38 +109,86 @@ def outline(task: FitTask, progress: Progress = lambda _: None) -> RegionalModel
     begun = _begin(task, progress)
     progress('curve and dynamics together')
     try:
-        return search(_samples(task), *_refinement(task, begun))
+        return search(_samples(begun.formed), *_refinement(begun))
     except np.linalg.LinAlgError as error:
         raise DataError(f'Curve and dynamics could not be found together: {error}.') from None
 
 
 def _begin(task: FitTask, progress: Progress) -> _Begun:
     """Partition the special segments and choose the number of pieces."""
-    settings, contents = task.settings, task.contents
-    rows = contents.special_rows()
+    settings = task.settings
+    rows = task.contents.special_rows()
     enough_samples(task, len(rows))
-    u, power = contents.u[rows], contents.power_mw[rows]
     progress('exact partition')
+    formed = _formed(task)
+    contents = formed.contents
+    rows = rows[np.isfinite(contents.u[rows])]
+    u, scale = contents.u[rows], formed.scales(rows)
     least = max(2, math.ceil(settings.real('min_piece_share') * len(np.unique(u))))
-    part = partition(u, power, settings.whole('max_pieces'), least)
-    growth = _inflation(contents, part)
+    part = partition(
+        u, (contents.power_mw[rows] - formed.offset_mw) / scale, settings.whole('max_pieces'),
+        least, weight=None if formed.scale is None else np.asarray(scale**2),
+    )  # fmt: skip
+    growth = _inflation(formed, part)
     selection = select(part, growth)
-    input_moved(task, u)
+    input_moved(formed.task, u)
     valve_moved(task, rows)
     chosen = _pieces_of(part, selection.pieces, growth)
-    carries_a_curve(task, rows, chosen)
+    carries_a_curve(formed.task, rows, len(chosen), formed.static(chosen, rows))
     choice = Choice('paper', selection.cost, selection.turning_angle, selection.note)
     static = Characteristic(
-        pressure_exponent=settings.real('pressure_exponent'),
+        pressure_exponent=formed.form.input_exponent,
         pieces=chosen,
         breakpoint_intervals=_no_intervals(chosen),
         choice=choice,
         source=_source(task, rows),
-        residuals=_static_residuals(task, chosen),
+        residuals=_static_residuals(formed, chosen),
         partition_pieces=chosen,
         held=task.held,
+        axis=formed.form.axis,
+        pressure_scale_exponent=formed.form.scale_exponent,
+        offset_mw=formed.offset_mw,
+        reference_pressure_mpa=_pressure(task, rows),
+        form=formed.evidence,
     )
-    return _Begun(static, part, u)
+    return _Begun(formed, static, part, u)
+
+
+def _formed(task: FitTask) -> _Formed:
+    """Choose the form, unless the task or a parameter gives it, and put the rows into it."""
+    contents, exponent = task.contents, task.settings.real('pressure_exponent')
+    paper = _Formed(task, StaticForm(INTEGRATED_INPUT, exponent))
+    if not len(contents.opening_percent):
+        return paper
+    pressure = pressure_of(contents.u, contents.opening_percent, exponent)
+    found = find_form(
+        contents.opening_percent, pressure, contents.power_mw, contents.spans[:, :2],
+        task.settings.real('sample_period'), exponent, task.settings.text('axis'), task.form,
+    )  # fmt: skip
+    if found is None:
+        return paper
+    u, scale = found.form.of_rows(contents.opening_percent, pressure)
+    if found.form == paper.form:
+        return replace(paper, evidence=found.evidence)
+    # The noise of u is told in the unit of the axis.
+    rows = contents.special_rows()
+    with np.errstate(invalid='ignore', divide='ignore'):
+        ratio = float(np.nanmedian(u[rows] / contents.u[rows]))
+    formed = replace(
+        task, contents=replace(contents, u=u), input_noise=task.input_noise * abs(ratio)
+    )
+    return _Formed(formed, found.form, found.offset_mw, scale, found.evidence)
+
+
+def _pressure(task: FitTask, rows: IntArray) -> float:
+    """Return the median pressure in rows, NaN where it is not known."""
+    if not len(task.contents.opening_percent):
+        return math.nan
+    c = task.contents
+    exponent = task.settings.real('pressure_exponent')
+    known = pressure_of(c.u[rows], c.opening_percent[rows], exponent)
+    known = known[np.isfinite(known)]
+    return float(np.median(known)) if len(known) else math.nan
 
 
 def _pieces_of(part: Partition, pieces: int, inflation: float = 1.0) -> tuple[Piece, ...]:
@@ -121,27 +201,29 @@ def _pieces_of(part: Partition, pieces: int, inflation: float = 1.0) -> tuple[Pi
     )  # fmt: skip
 
 
-def _inflation(contents: WindowContents, part: Partition) -> float:
+def _inflation(formed: _Formed, part: Partition) -> float:
     """Return how much correlation in time widens the errors of this fit.
 
     Judged on the residual of the richest partition, so that a missing piece is
     not taken for correlation, within segments only.
     """
-    residual, weight = _special_residual(contents, _pieces_of(part, len(part.cost)))
-    lengths = contents.spans[:, 1] - contents.spans[:, 0]
+    residual, weight = _special_residual(formed, _pieces_of(part, len(part.cost)))
+    spans = formed.contents.spans
+    lengths = spans[:, 1] - spans[:, 0]
     longest = int(min(300, max(1, np.median(lengths) // 2)))
     return inflation(residual, weight, longest)
 
 
-def _special_residual(
-    contents: WindowContents, pieces: tuple[Piece, ...]
-) -> tuple[FloatArray, ByteArray]:
+def _special_residual(formed: _Formed, pieces: tuple[Piece, ...]) -> tuple[FloatArray, ByteArray]:
     """Return the residual of the segments one after the other, a row of weight 0 in between."""
     series: list[FloatArray] = []
     weights: list[ByteArray] = []
-    for a, b, _ in contents.spans:
-        series += [contents.power_mw[a:b] - evaluate(pieces, contents.u[a:b]), np.zeros(1)]
-        weights.append(np.append(np.ones(b - a, dtype=np.uint8), np.uint8(0)))
+    power = formed.contents.power_mw
+    for a, b, _ in formed.contents.spans:
+        rest = power[a:b] - formed.static(pieces, slice(a, b))
+        known = np.isfinite(rest)
+        series += [np.where(known, rest, 0.0), np.zeros(1)]
+        weights.append(np.append(known.astype(np.uint8), np.uint8(0)))
     return np.concatenate(series), np.concatenate(weights)
 
 
@@ -170,9 +252,10 @@ def _source(task: FitTask, rows: np.ndarray) -> FittedData:
     )
 
 
-def _static_residuals(task: FitTask, pieces: tuple[Piece, ...]) -> ResidualStatistics:
+def _static_residuals(formed: _Formed, pieces: tuple[Piece, ...]) -> ResidualStatistics:
     """Calibrate on the special segments alone."""
-    rest, weight = _special_residual(task.contents, pieces)
+    task = formed.task
+    rest, weight = _special_residual(formed, pieces)
     rows = rest[weight > 0]
     # A static curve has no error of its own that is known here: that of its mean is the least.
     sd = float(np.std(rows))
@@ -181,22 +264,20 @@ def _static_residuals(task: FitTask, pieces: tuple[Piece, ...]) -> ResidualStati
     )
 
 
-def _only_straight(
-    task: FitTask, static: Characteristic, part: Partition, why: str
-) -> Characteristic:
+def _only_straight(begun: _Begun, why: str) -> Characteristic:
     """Return one straight piece where the dynamics could not be estimated.
 
     Few samples lie in a few clusters, and each cluster's own slope is mostly noise
     of the valve: pieces of their own would run far off between the clusters.
     """
     notes = (f'{NOT_REFINED}one straight piece, without dynamics. {why}',)
-    pieces = _pieces_of(part, 1, _inflation(task.contents, part))
+    pieces = _pieces_of(begun.part, 1, _inflation(begun.formed, begun.part))
     return replace(
-        static,
+        begun.static,
         pieces=pieces,
-        choice=replace(static.choice, confidence={}),
+        choice=replace(begun.static.choice, confidence={}),
         breakpoint_intervals=(),
-        residuals=_static_residuals(task, pieces),
+        residuals=_static_residuals(begun.formed, pieces),
         notes=notes,
     )
 
@@ -206,9 +287,10 @@ def _rich(part: Partition, pieces: int) -> tuple[Piece, ...]:
     return _pieces_of(part, min(len(part.cost), pieces + _RICHER))
 
 
-def _samples(task: FitTask) -> Samples:
+def _samples(formed: _Formed) -> Samples:
     """Return all rows of the window."""
-    c, step = task.contents, task.settings.real('sample_period')
+    task, c = formed.task, formed.contents
+    step = task.settings.real('sample_period')
     usable = (np.isfinite(c.u) & np.isfinite(c.power_mw)).astype(np.uint8)
     # A jump in time is a gap even where no row stands in it.
     usable[1:][np.diff(c.time_ns) > 1.5e9 * step] = 0
@@ -219,24 +301,25 @@ def _samples(task: FitTask) -> Samples:
         step_s=step,
         settle_s=task.settings.settle_s,
         group=max(1, round(task.settings.real('block') / step)),
+        scale=None if formed.scale is None else np.where(usable > 0, formed.scale, 1.0),
     )
 
 
-def _refinement(task: FitTask, begun: _Begun) -> tuple[RegionalModel, int | None]:
+def _refinement(begun: _Begun) -> tuple[RegionalModel, int | None]:
     """Return the curve to begin with, and how many pieces it may get (None: those it has)."""
-    static = begun.static
+    task, static = begun.formed.task, begun.static
     if task.settings.text('selection_rule') != 'prediction_error':
         return static.model, None
     rich = replace(static, pieces=_rich(begun.part, len(static.pieces)))
     return rich.model, task.settings.whole('max_pieces')
 
 
-def _refined(task: FitTask, begun: _Begun, progress: Progress) -> Characteristic:
+def _refined(begun: _Begun, progress: Progress) -> Characteristic:
     """Refine on all rows; where that is not possible the partition's curve stands, and says so."""
     progress('curve and dynamics together')
-    samples = _samples(task)
+    samples = _samples(begun.formed)
     try:
-        result = refine(samples, *_refinement(task, begun))
+        result = refine(samples, *_refinement(begun))
     except (np.linalg.LinAlgError, TooFewSamplesError) as error:
-        return _only_straight(task, begun.static, begun.part, str(error))
-    return from_refined(task, begun.static, result, samples, begun.u_special)
+        return _only_straight(begun, str(error))
+    return from_refined(begun.formed.task, begun.static, result, samples, begun.u_special)

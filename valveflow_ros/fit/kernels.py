@@ -229,7 +229,8 @@ def _bend(row: FloatArray, k: int, slope: FloatArray, down: float, up: float) ->
 
 @inlined
 def _fill(
-    flow: FloatArray, scale: FloatArray, share: FloatArray, piece: ByteArray, t: int, region: ByteArray,
+    flow: FloatArray, scale: FloatArray, share: FloatArray, piece: ByteArray, t: int,
+    region: ByteArray,
     slope: FloatArray, taps: FloatArray, part: FloatArray, slowing: FloatArray, step_s: float,
     settle: int, group: int, state: float, age: int,
     answer: FloatArray, settled: ByteArray, decay: FloatArray, table: FloatArray,
@@ -348,7 +349,8 @@ def tangents(
         scale_flow(flow[t : t + n], scale[row + t : row + t + n], offset)
         region_of_each(flow[t : t + n], usable[row + t : row + t + n], levels, region[:n])
         state, age = _fill(
-            flow, scale[row : row + rows], share, piece, t, region[:n], slope, taps, part, slowing, step_s, settle, group,
+            flow, scale[row : row + rows], share, piece, t, region[:n],
+            slope, taps, part, slowing, step_s, settle, group,
             state, age, answer, settled, decay, table,
         )  # fmt: skip
         for i in range(n):

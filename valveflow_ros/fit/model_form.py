@@ -1,70 +1,96 @@
-"""Where the knees of a valve stand: at fixed integrated input V p^m, or at fixed opening V.
+"""Which form the static power has: P = F(V p^m), or P = p^m F(V) + c.
 
-The paper has P = F(V p^m) (Eq. 1). A choked valve passes flow in proportion to the pressure, which
-gives P = p^m F(V) + c. Both are fitted to means inside special segments, which carry no dynamics,
-with the same number of knots, and judged on stretches of time that were held out.
+Both are fitted to means inside special segments with the same number of knots, and judged on
+stretches of time that were held out, under one whitening. What a ramp adds, the power being late,
+is a column of its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
-from valveflow_ros.records import FloatArray, IntArray
+from valveflow_ros.curve.characteristic import FormEvidence
+from valveflow_ros.curve.static_form import INTEGRATED_INPUT, OPENING, StaticForm
+from valveflow_ros.errors import TooFewSamplesError
+from valveflow_ros.partition.partition import partition
+from valveflow_ros.records import BoolArray, FloatArray, IntArray
 
 _MEAN_S = 60.0
-_KNOTS = 8
+_KNOTS = 10
 _FOLDS, _STRETCHES = 5, 40
 _LEAST_MEANS = 200
-# Both forms are tried with each: a wrong exponent is another matter than a wrong form.
-_EXPONENTS = (1.0, 1.0625, 1.125, 1.1875, 1.25)
-# The worst are left out of an error: a held-out stretch may lie beyond what the others visit.
+_MOST_MEANS = 6000
+_LOWEST_EXPONENT, _HIGHEST_EXPONENT = 0.8, 1.4
+_EXPONENT_STEP = 0.1
+# Held-out errors count as Student's t with so many degrees of freedom: a stretch beyond what the
+# others visit would otherwise outweigh all of them.
+_FREEDOM = 4.0
+# One form is told from the other by so much log-likelihood, so many standard errors of it over
+# stretches, and where the two differ by such a share of the power's range.
+_LEAST_GAIN, _LEAST_Z, _LEAST_APART = 12.0, 2.5, 0.003
 _WORST = 0.05
-# The paper's form is doubted where the other one has so much less error, and less in such a share
-# of the stretches, and where the two differ by such a share of the power's range.
-_LEAST_RATIO, _LEAST_SURE, _LEAST_APART = 1.5, 0.6, 0.005
-
-Columns = Callable[[FloatArray, FloatArray, float], FloatArray]
+_PROFILE_MEANS, _PROFILE_PIECES = 1500, 6
 
 
 @dataclass(frozen=True, slots=True)
-class ModelForm:
-    """The paper's form and the other one, on stretches held out.
+class FoundForm:
+    """The form that the data ask for.
 
     Attributes
     ----------
-    rmse_mw, rmse_other_mw : float
-        Error of the paper's form and of the one with knees at fixed opening.
-    apart_mw : float
-        Root mean square of the difference between the two over what was visited.
-    worst : tuple of float
-        Opening in %, pressure in MPa and difference in MW where 1 % of the means differ more.
+    form : StaticForm
+    offset_mw : float
+        c to begin a fit with; 0 for a form without.
+    evidence : FormEvidence
     """
 
-    rmse_mw: float
-    rmse_other_mw: float
-    apart_mw: float
-    worst: tuple[float, float, float]
-
-    @property
-    def sentence(self) -> str:
-        """Return what to think of the curve."""
-        opening, pressure, error = self.worst
-        return (
-            'Do not rely on this curve where the pressure differs: on stretches held out the '
-            f'power follows p^m F(V) + c to {self.rmse_other_mw:.2g} MW and the form of this '
-            f'curve, F(V p^m), only to {self.rmse_mw:.2g} MW. The knees of this valve stand at '
-            f'fixed openings. The two differ by {self.apart_mw:.2g} MW (root mean square), at '
-            f'{opening:.0f} % and {pressure:.1f} MPa by {error:.2g} MW.'
-        )
+    form: StaticForm
+    offset_mw: float
+    evidence: FormEvidence
 
 
-def find_wrong_form(
-    opening: FloatArray, pressure: FloatArray, power: FloatArray, spans: IntArray, period_s: float
-) -> ModelForm | None:
-    """Return how much better the knees stand at fixed openings; None unless that is sure.
+@dataclass(frozen=True, slots=True)
+class _Means:
+    """Means over a minute inside special segments; all (b,).
+
+    ``goes_on`` says that a mean follows the one before without gap.
+    """
+
+    opening: FloatArray
+    pressure: FloatArray
+    power: FloatArray
+    rate: FloatArray
+    goes_on: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.power)
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """A form with its best exponent."""
+
+    form: StaticForm
+    error: FloatArray
+    static: FloatArray
+    offset: float
+
+
+def find_form(
+    opening: FloatArray,
+    pressure: FloatArray,
+    power: FloatArray,
+    spans: IntArray,
+    period_s: float,
+    exponent: float,
+    axis: str = 'auto',
+    held: StaticForm | None = None,
+) -> FoundForm | None:
+    """Return the form that the data ask for; None where they are too few to compare forms.
 
     Parameters
     ----------
@@ -74,62 +100,128 @@ def find_wrong_form(
         First and end row of each special segment.
     period_s : float
         From row to row.
+    exponent : float
+        m of the paper's form unless the data ask for another.
+    axis : str
+        'auto', or the one to take: 'integrated_input' with the exponent given, or 'opening'.
+    held : StaticForm, optional
+        Take this one, and say how it compares with the other.
+
+    Raises
+    ------
+    DataError
+        The axis is to be the opening, and the means are too few to find its exponent.
     """
-    v, p, y = _means(np.column_stack([opening, pressure, power]), spans, period_s).T
-    if len(y) < _LEAST_MEANS:
+    means = _means_of(opening, pressure, power, spans, period_s)
+    if len(means) < _LEAST_MEANS:
+        if axis == OPENING and held is None:
+            raise TooFewSamplesError(
+                'Means over a minute inside special segments, to find the exponent of p^m F(V) + c',
+                len(means), _LEAST_MEANS, 'A longer log would help.',
+            )  # fmt: skip
         return None
-    paper, other = _best(v, p, y, _paper_columns), _best(v, p, y, _opening_columns)
-    error, error_other = paper[0], other[0]
-    rmse, rmse_other = _root(error), _root(error_other)
-    if not rmse > _LEAST_RATIO * rmse_other:
-        return None
-    # Not by the mean: a stretch far from the others outweighs all of them.
-    stretches = np.array_split(error**2 - error_other**2, _STRETCHES)
-    if not np.mean([part.mean() > 0.0 for part in stretches]) > _LEAST_SURE:
-        return None
-    apart = np.abs(paper[1] - other[1])
-    if not _root(apart) > _LEAST_APART * np.ptp(y):
-        return None
+    if axis == INTEGRATED_INPUT and held is None:
+        held = StaticForm(INTEGRATED_INPUT, exponent)
+    given = _fitted(means, StaticForm(INTEGRATED_INPUT, exponent))
+    paper, scaled = _best(means, INTEGRATED_INPUT), _best(means, OPENING)
+    if not _told(means, paper, given)[2]:
+        paper = given
+    if held is not None:
+        paper, scaled = (
+            _fitted(means, held) if fit.form.axis == held.axis else fit for fit in (paper, scaled)
+        )
+    elif axis == OPENING:
+        held = scaled.form
+    gain, _, told = _told(means, scaled, paper)
+    takes_scaled = told if held is None else held.scaled
+    chosen, other = (scaled, paper) if takes_scaled else (paper, scaled)
+    if not takes_scaled:
+        gain, _, told = _told(means, paper, scaled)
+    apart = np.abs(chosen.static - other.static)
     at = int(np.argsort(apart)[int(0.99 * len(apart))])
-    return ModelForm(
-        rmse, rmse_other, _root(apart), (float(v[at]), float(p[at]), float(apart[at]))
+    evidence = FormEvidence(
+        chosen=chosen.form.axis,
+        told=told,
+        log_likelihood_gain=gain,
+        rmse_mw=_root(chosen.error),
+        rmse_other_mw=_root(other.error),
+        other=other.form.words,
+        apart_mw=_root(apart, 0.0),
+        worst=(float(means.opening[at]), float(means.pressure[at]), float(apart[at])),
+        contradicted=held is not None and _told(means, other, chosen)[2],
     )
+    offset = _offset(means, chosen) if chosen.form.scaled else 0.0
+    return FoundForm(chosen.form, offset, evidence)
 
 
-def _means(rows: FloatArray, spans: IntArray, period_s: float) -> FloatArray:
-    """Return means of a minute inside segments, without those that hold a NaN; shape (b, 3)."""
+def _means_of(
+    opening: FloatArray, pressure: FloatArray, power: FloatArray, spans: IntArray, period_s: float
+) -> _Means:
+    """Return means of a minute inside segments, without those that hold a NaN."""
+    rows = np.column_stack([opening, pressure, power])
     length = max(1, round(_MEAN_S / period_s))
-    found = [np.empty((0, rows.shape[1]))]
+    parts = []
     for first, end in spans.tolist():
         whole = (end - first) // length
-        part = rows[first : first + whole * length]
-        found.append(part.reshape(whole, length, -1).mean(axis=1))
-    means = np.concatenate(found)
-    return means[np.isfinite(means).all(axis=1)]
+        if whole < 1:
+            continue
+        mean = rows[first : first + whole * length].reshape(whole, length, 3).mean(axis=1)
+        rate = np.gradient(mean[:, 2], length * period_s) if whole > 1 else np.zeros(1)
+        goes_on = np.arange(whole) > 0
+        parts.append(np.column_stack([mean, rate, goes_on]))
+    table = np.concatenate([np.empty((0, 5)), *parts])
+    known = np.isfinite(table).all(axis=1) & (table[:, 1] > 0.0)
+    table[1:, 4] *= known[:-1]
+    table = table[known]
+    if len(table) > _MOST_MEANS:
+        # Whole runs, so that the whitening finds neighbours.
+        run = np.arange(len(table)) // 20
+        keep = run % -(-len(table) // _MOST_MEANS) == 0
+        table[1:, 4] *= keep[:-1]
+        table = table[keep]
+    v, p, y, rate, goes_on = table.T
+    return _Means(v, p, y, rate, goes_on > 0.0)
 
 
-def _best(
-    v: FloatArray, p: FloatArray, y: FloatArray, columns: Columns
-) -> tuple[FloatArray, FloatArray]:
-    """Return held-out errors and the fit to all, with the exponent that has the least error."""
+def _best(means: _Means, axis: str) -> _Fit:
+    """Return a form with the exponent that has the least error on stretches held out."""
+
+    def cost(exponent: float) -> float:
+        return float(_surprise(_fitted(means, StaticForm(axis, exponent)).error).sum())
+
+    grid = np.arange(_LOWEST_EXPONENT, _HIGHEST_EXPONENT + 1e-9, _EXPONENT_STEP)
+    least = float(min(grid, key=cost))
+    bounds = max(_LOWEST_EXPONENT, least - 0.1), min(_HIGHEST_EXPONENT, least + 0.1)
+    found = minimize_scalar(cost, bounds=bounds, method='bounded', options={'xatol': 1e-3})
+    return _fitted(means, StaticForm(axis, round(float(found.x), 4)))
+
+
+def _fitted(means: _Means, form: StaticForm) -> _Fit:
+    """Return errors on stretches held out, and the fit to all."""
+    u, scale = form.of_rows(means.opening, means.pressure)
+    shape = _hinges(u)
+    x = shape if scale is None else np.column_stack([scale[:, None] * shape, np.ones(len(u))])
+    x = np.column_stack([x, -means.rate])
+    y = means.power
     fold = np.arange(len(y)) * _STRETCHES // len(y) % _FOLDS
-    tried = []
-    for exponent in _EXPONENTS:
-        x = columns(v, p, exponent)
-        error = np.empty(len(y))
-        for k in range(_FOLDS):
-            out = fold == k
-            error[out] = y[out] - x[out] @ np.linalg.lstsq(x[~out], y[~out], rcond=None)[0]
-        tried.append((error, x @ np.linalg.lstsq(x, y, rcond=None)[0]))
-    return min(tried, key=lambda each: _root(each[0]))
+    norm = np.sqrt((x**2).mean(axis=0))
+    x = x / np.where(norm > 0.0, norm, 1.0)
+    sums = np.array([x[fold == k].T @ np.column_stack([x, y])[fold == k] for k in range(_FOLDS)])
+    error = np.empty(len(y))
+    for k in range(_FOLDS):
+        rest = sums.sum(axis=0) - sums[k]
+        out = fold == k
+        error[out] = y[out] - x[out] @ _solved(rest)
+    best = _solved(sums.sum(axis=0))
+    lag = x[:, -1] * best[-1]
+    offset = 0.0 if scale is None else float(best[-2] / norm[-2])
+    return _Fit(form, error, x @ best - lag, offset)
 
 
-def _paper_columns(v: FloatArray, p: FloatArray, exponent: float) -> FloatArray:
-    return _hinges(v * p**exponent)
-
-
-def _opening_columns(v: FloatArray, p: FloatArray, exponent: float) -> FloatArray:
-    return np.column_stack([np.ones(len(v)), p[:, None] ** exponent * _hinges(v)])
+def _solved(sums: FloatArray) -> FloatArray:
+    """Solve normal equations whose last column is the right hand side."""
+    n = sums.shape[0]
+    return np.asarray(np.linalg.lstsq(sums[:, :n], sums[:, n], rcond=1e-12)[0])
 
 
 def _hinges(x: FloatArray) -> FloatArray:
@@ -138,7 +230,63 @@ def _hinges(x: FloatArray) -> FloatArray:
     return np.column_stack([np.ones(len(x)), x, np.maximum(x[:, None] - knots, 0.0)])
 
 
-def _root(error: FloatArray) -> float:
+def _surprise(error: FloatArray, scale: float | None = None) -> FloatArray:
+    """Return minus the log-likelihood of each error, its scale being the median of all."""
+    s = 1.4826 * float(np.median(np.abs(error))) if scale is None else scale
+    s = max(s, 1e-9)
+    return np.asarray(0.5 * (_FREEDOM + 1.0) * np.log1p((error / s) ** 2 / _FREEDOM) + math.log(s))
+
+
+def _told(means: _Means, one: _Fit, other: _Fit) -> tuple[float, float, bool]:
+    """Return the log-likelihood that ``one`` gains, its standard errors, and whether that is sure.
+
+    Both errors are whitened alike, by the correlation from mean to mean of the smaller one.
+    """
+    best = min((one, other), key=lambda fit: float(np.median(np.abs(fit.error))))
+    pairs = np.flatnonzero(means.goes_on)
+    before, now = best.error[pairs - 1], best.error[pairs]
+    power = float((before * before).sum())
+    share = float(np.clip((before * now).sum() / power, 0.0, 0.95)) if power > 0.0 else 0.0
+    white = []
+    for fit in (one, other):
+        e = fit.error.copy()
+        e[pairs] -= share * fit.error[pairs - 1]
+        white.append(e)
+    scale = 1.4826 * min(float(np.median(np.abs(e))) for e in white)
+    gains = _surprise(white[1], scale) - _surprise(white[0], scale)
+    stretches = np.array([part.sum() for part in np.array_split(gains, _STRETCHES)])
+    spread = float(stretches.std(ddof=1)) * math.sqrt(_STRETCHES)
+    gain = float(stretches.sum())
+    sure = gain / spread if spread > 0.0 else 0.0
+    apart = _root(one.static - other.static, 0.0)
+    enough = apart > _LEAST_APART * float(np.ptp(means.power))
+    return gain, sure, bool(gain > _LEAST_GAIN and sure > _LEAST_Z and enough)
+
+
+def _offset(means: _Means, fit: _Fit) -> float:
+    """Return c of the best partition, searched about that of the hinges.
+
+    For each c the partition is exact.
+    """
+    step = max(1, len(means) // _PROFILE_MEANS)
+    u, scale = fit.form.of_rows(means.opening[::step], means.pressure[::step])
+    assert scale is not None
+    y = means.power[::step]
+    room = 0.1 * float(np.ptp(means.power))
+
+    def cost(c: float) -> float:
+        part = partition(u, (y - c) / scale, _PROFILE_PIECES, max(2, len(u) // 50),
+                         weight=scale**2, threads=1)  # fmt: skip
+        return float(part.cost[-1])
+
+    found = minimize_scalar(
+        cost, bounds=(fit.offset - room, fit.offset + room), method='bounded',
+        options={'xatol': 0.02},
+    )  # fmt: skip
+    return float(found.x)
+
+
+def _root(error: FloatArray, without: float = _WORST) -> float:
     """Return the root mean square without the worst."""
-    least = np.sort(np.abs(error))[: max(1, round((1.0 - _WORST) * len(error)))]
+    least = np.sort(np.abs(error))[: max(1, round((1.0 - without) * len(error)))]
     return float(np.sqrt(np.mean(least**2)))

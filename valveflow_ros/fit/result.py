@@ -93,7 +93,8 @@ def from_refined(
         (float(b - _Z95 * s), float(b + _Z95 * s))
         for b, s in zip(knots[1:-1], knot_se, strict=True)
     )
-    ends = np.concatenate([m.left, m.right, m.levels])
+    flow = _flow_at_ends(m, samples)
+    ends = np.concatenate([flow, m.levels])
     edges = [float(ends.min()), *m.levels.tolist(), float(ends.max())]
     error = error[3 * j - 1 :]
     level_errors = np.append(result.level_stderr, math.nan)
@@ -126,6 +127,7 @@ def from_refined(
         pieces=pieces,
         breakpoint_intervals=intervals,
         dynamics=dynamics,
+        offset_mw=m.offset,
         residuals=residual_statistics(
             task,
             result.residual_mw,
@@ -135,6 +137,15 @@ def from_refined(
             result.prediction_mw,
         ),
     )
+
+
+def _flow_at_ends(m: RegionalModel, samples: Samples) -> FloatArray:
+    """Return the least and the largest flow in MW, of F alone the ends of all pieces."""
+    if samples.scale is None:
+        return np.concatenate([m.left, m.right])
+    used = samples.usable > 0
+    flow = m.static(samples.u[used], samples.scale[used])
+    return np.array([flow.min(), flow.max()])
 
 
 def _line_errors(m: RegionalModel, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:

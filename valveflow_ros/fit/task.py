@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from valveflow_ros.curve.characteristic import HeldCause, Piece
-from valveflow_ros.errors import DataError, TooFewSamplesError
+from valveflow_ros.curve.static_form import StaticForm
+from valveflow_ros.errors import DataError, TooFewSamplesError, counted
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import FloatArray, IntArray
 from valveflow_ros.segments.window import WindowContents
@@ -27,6 +28,8 @@ class FitTask:
         The segmenter's noise levels at that moment.
     held : tuple of HeldCause
         Causes that were taken out of the rows.
+    form : StaticForm, optional
+        The form of the curve; without it the data choose.
     """
 
     request_ns: int
@@ -35,6 +38,7 @@ class FitTask:
     input_noise: float
     power_noise_mw: float
     held: tuple[HeldCause, ...] = ()
+    form: StaticForm | None = None
 
 
 # Windows that cannot carry a curve, and what would help.
@@ -103,15 +107,17 @@ def valve_moved(task: FitTask, rows: IntArray) -> None:
         )
 
 
-def carries_a_curve(task: FitTask, rows: IntArray, pieces: tuple[Piece, ...]) -> None:
-    """Refuse a relation so loose that a curve through it would mislead."""
-    u, power = task.contents.u[rows], task.contents.power_mw[rows]
-    rest = power - evaluate(pieces, u)
+def carries_a_curve(task: FitTask, rows: IntArray, pieces: int, static_mw: FloatArray) -> None:
+    """Refuse a relation so loose that a curve through it, of some pieces, would mislead."""
+    power = task.contents.power_mw[rows]
+    rest = power - static_mw
     total = float(np.var(power))
     explained = 1.0 - float(np.mean(rest**2)) / total if total > 0.0 else 0.0
     if explained >= _EXPLAINED_LEAST:
         return
-    opening = task.contents.opening_percent[rows] if len(task.contents.opening_percent) else u[:0]
+    opening = (
+        task.contents.opening_percent[rows] if len(task.contents.opening_percent) else power[:0]
+    )
     known = opening[np.isfinite(opening)]
     if len(known) and np.ptp(np.quantile(known, (0.01, 0.99))) < _ONE_LEVEL_PERCENT:
         raise DataError(
@@ -119,8 +125,8 @@ def carries_a_curve(task: FitTask, rows: IntArray, pieces: tuple[Piece, ...]) ->
             'A curve needs several loads: hours at other openings would help.'
         )
     raise DataError(
-        f'The power hardly follows the valve: the best curve of {len(pieces)} '
-        f'piece{"s" if len(pieces) > 1 else ""} explains {100.0 * explained:.0f} % of its '
+        f'The power hardly follows the valve: the best curve of {counted(pieces, "piece")} '
+        f'explains {100.0 * explained:.0f} % of its '
         f'variance (at least {100.0 * _EXPLAINED_LEAST:.0f} % needed). An input that is not '
         'measured moves it, or a signal is mapped wrongly.'
     )

@@ -37,15 +37,13 @@ def explained(data: Identified) -> float:
         return math.nan
     power = data.power[rows]
     # Outside the identified range the outer pieces are taken to go on.
-    rest = power - data.characteristic.model.static(data.u[rows])
+    rest = power - data.static_mw[rows]
     total = float(np.var(power))
     return 1.0 - float(np.mean(rest**2)) / total if total > 0.0 else math.nan
 
 
 def doubt(data: Identified) -> str:
     """Return a warning where the curve is none, or of the wrong form; empty otherwise."""
-    if data.wrong_form is not None:
-        return data.wrong_form.sentence
     share = explained(data)
     if not share < _LITTLE:
         return ''

@@ -9,7 +9,6 @@ import numpy as np
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.shift import Shift
-from valveflow_ros.fit.model_form import ModelForm
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
     FloatArray,
@@ -20,7 +19,6 @@ from valveflow_ros.records import (
     SpecialSegment,
 )
 from valveflow_ros.report.history import History
-from valveflow_ros.signals.integrated_input import integrated_input
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +42,12 @@ class Identified:
     shift : Shift, optional
         The judgement against ``reference``, where there was one.
     reference : Characteristic, optional
-    wrong_form : ModelForm, optional
-        Where the power follows another form than that of the curve.
     history : History, optional
         What a monitor published meanwhile, where the log is its recording.
     u : float64 (n,)
-        Integrated input of each row, made from the table.
+        What the curve is a function of, in each row: integrated input or opening.
+    static_mw : float64 (n,)
+        Power of the curve in each row; beyond its ends the outer pieces go on.
     rows : int64 (k, 2)
         First and end row of each segment.
     special : int64 (m,)
@@ -65,20 +63,21 @@ class Identified:
     notes: tuple[str, ...] = ()
     shift: Shift | None = None
     reference: Characteristic | None = None
-    wrong_form: ModelForm | None = None
     history: History | None = None
     u: FloatArray = field(init=False)
+    static_mw: FloatArray = field(init=False)
     rows: IntArray = field(init=False)
     special: IntArray = field(init=False)
 
     def __post_init__(self) -> None:
         """Derive what several parts need."""
-        u = integrated_input(
+        u, scale = self.characteristic.static_form.of_rows(
             self.table.column(Signal.VALVE_OPENING),
             self.table.column(Signal.MAIN_STEAM_PRESSURE),
-            self.characteristic.pressure_exponent,
         )
         object.__setattr__(self, 'u', u)
+        static = self.characteristic.model.static(u, 1.0 if scale is None else scale)
+        object.__setattr__(self, 'static_mw', static)
         first = np.searchsorted(self.table.time_ns, [s.start_ns for s in self.segments])
         end = np.searchsorted(self.table.time_ns, [s.end_ns for s in self.segments], 'right')
         rows = np.column_stack([first, end]).astype(np.int64)

@@ -1,0 +1,94 @@
+"""How static power depends on opening and pressure: P = p^e F(V p^q) + c.
+
+The paper has e = c = 0 and q = m (Eq. 1): the knees stand at fixed integrated input u = V p^m.
+A choked valve passes flow in proportion to p^m times an area that depends on the opening alone
+(e = m, q = 0): the knees stand at fixed openings, and c is the power without flow, which the
+paper's F contains.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from valveflow_ros.records import FloatArray
+from valveflow_ros.signals.integrated_input import integrated_input
+
+INTEGRATED_INPUT = 'integrated_input'
+OPENING = 'opening'
+AXES = (INTEGRATED_INPUT, OPENING)
+PAPER_EXPONENT = 1.125
+
+
+@dataclass(frozen=True, slots=True)
+class StaticForm:
+    """What the curve is a function of, and what it is multiplied by.
+
+    Attributes
+    ----------
+    axis : str
+        'integrated_input': P = F(V p^m). 'opening': P = p^m F(V) + c.
+    exponent : float
+        m.
+    """
+
+    axis: str = INTEGRATED_INPUT
+    exponent: float = PAPER_EXPONENT
+
+    @property
+    def scaled(self) -> bool:
+        """Return whether the curve is multiplied by p^m."""
+        return self.axis == OPENING
+
+    @property
+    def input_exponent(self) -> float:
+        """Return q of u = V p^q."""
+        return 0.0 if self.scaled else self.exponent
+
+    @property
+    def scale_exponent(self) -> float:
+        """Return e of P = p^e F(u) + c."""
+        return self.exponent if self.scaled else 0.0
+
+    def scale(self, pressure_mpa: FloatArray | float) -> FloatArray | float:
+        """Return p^e; 1 for a form without."""
+        return pressure_mpa**self.exponent if self.scaled else 1.0
+
+    def of_rows(
+        self, opening_percent: FloatArray, pressure_mpa: FloatArray
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Return u and p^e of rows, (n,) each; None for a form without p^e.
+
+        NaN where an input is NaN or the pressure is not positive.
+        """
+        if not self.scaled:
+            return integrated_input(opening_percent, pressure_mpa, self.exponent), None
+        ones = np.ones(len(opening_percent))
+        scale = integrated_input(ones, pressure_mpa, self.exponent)
+        u = np.where(np.isfinite(scale), opening_percent, np.nan)
+        return u, np.where(np.isfinite(u), scale, np.nan)
+
+    def of_integrated_input(
+        self, u: FloatArray, opening_percent: FloatArray, exponent: float
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Do the same from V p^``exponent`` and the opening, of which the pressure is told.
+
+        NaN where the opening is not positive and the form needs the pressure.
+        """
+        if self == StaticForm(INTEGRATED_INPUT, exponent):
+            return u, None
+        return self.of_rows(opening_percent, pressure_of(u, opening_percent, exponent))
+
+    @property
+    def words(self) -> str:
+        """Return the form as a person writes it."""
+        m = f'{self.exponent:.4g}'
+        return f'p^{m} F(V) + c' if self.scaled else f'F(V p^{m})'
+
+
+def pressure_of(u: FloatArray, opening_percent: FloatArray, exponent: float) -> FloatArray:
+    """Return the pressure that stands in u = V p^``exponent``, MPa; NaN where V is not positive."""
+    with np.errstate(divide='ignore', invalid='ignore'):
+        density = np.where((opening_percent > 0.0) & (u > 0.0), u / opening_percent, np.nan)
+    return np.asarray(density ** (1.0 / exponent))
