@@ -22,7 +22,7 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.unit import random_unit
 from valveflow_ros.records import NS_PER_S, Signal
-from valveflow_ros.signals.integrated_input import integrated_input
+from valveflow_ros.signals.static_form import integrated_input
 
 _MOMENTS = 50
 

@@ -40,6 +40,7 @@ from valveflow_ros.fit.task import FitTask
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import SimulatedLog, simulate
 from valveflow_ros.records import IntArray
+from valveflow_ros.signals.static_form import StaticForm
 
 KINDS = ('hidden', 'null', 'pair', 'confounded', 'outside')
 # Four fifths of 64, which is four times the 16 that just reach detection.
@@ -63,12 +64,13 @@ def run(case: Case, days: float) -> tuple[Diagnosis, SimulatedLog, Record, dict[
     begin = time.process_time()
     task, spans, settings = watched(log, days)
     if case.given:
-        model = fit(watched(simulate(days, case.seed + OTHER_SEED, case.unit), days)[0]).model
+        other = watched(simulate(days, case.seed + OTHER_SEED, case.unit), days)[0]
+        model = fit(replace(other, form=StaticForm())).model
     else:
-        model = outline(task)
+        model = outline(replace(task, form=StaticForm()))
     middle = time.process_time()
     record = Record(
-        log.table, settings.real('sample_period'), settings.real('pressure_exponent'),
+        log.table, settings.real('sample_period'), StaticForm(),
         settings.settle_s, spans,
     )  # fmt: skip
     again = time.process_time()
@@ -94,7 +96,7 @@ def share_of_oracle(
 def _noise_mw(log: SimulatedLog, record: Record) -> float:
     """Return the root mean square of the noise of ten-second means on the sealed blocks."""
     bad = np.zeros(log.table.values.shape, dtype=bool)
-    grids = make_grids(record.table, record.step_s, record.pressure_exponent, record.settle_s, bad)
+    grids = make_grids(*record.about, bad)
     rows = len(grids.power)
     per = round(grids.mean_s / record.step_s)
     noise = log.noise_mw[: rows * per].reshape(rows, per).mean(axis=1)[grids.sealed_rows]

@@ -17,7 +17,7 @@ from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.records import NS_PER_S, SampleTable, Signal
-from valveflow_ros.signals.integrated_input import integrated_input
+from valveflow_ros.signals.static_form import integrated_input
 
 START_NS = 1_700_006_400 * NS_PER_S
 INTERPRETED = os.environ.get('NUMBA_DISABLE_JIT', '0') not in ('', '0')

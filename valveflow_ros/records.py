@@ -8,6 +8,7 @@ the Unix epoch.
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -217,7 +218,8 @@ class SegmentKind(enum.IntEnum):
 class SpecialSegment:
     """A stretch of samples that carries static information only.
 
-    ``u`` is the integrated input V p^(9/8) in % MPa^(9/8), eq. (1).
+    ``u`` is the integrated input V p^m in % MPa^m, eq. (1). Opening and pressure at its ends and
+    the exponent m are NaN where they are not known.
     """
 
     number: int
@@ -233,3 +235,8 @@ class SpecialSegment:
     power_end_mw: float
     power_rms_mw: float
     temperature_mean_degc: float
+    opening_start_percent: float = math.nan
+    opening_end_percent: float = math.nan
+    pressure_start_mpa: float = math.nan
+    pressure_end_mpa: float = math.nan
+    exponent: float = math.nan

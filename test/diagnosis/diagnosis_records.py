@@ -13,6 +13,7 @@ from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.plant.unit import Noise, Programme, UnitDescription
 from valveflow_ros.records import SampleTable
+from valveflow_ros.signals.static_form import StaticForm
 
 STEP_S, EXPONENT, SETTLE_S = 2.0, 1.125, 300.0
 
@@ -48,7 +49,9 @@ def table(days: float, seed: int, effects: tuple[str, ...], of: UnitDescription)
 
 def record(samples: SampleTable) -> Record:
     """A record without special segments."""
-    return Record(samples, STEP_S, EXPONENT, SETTLE_S, np.empty((0, 2), dtype=np.int64))
+    return Record(
+        samples, STEP_S, StaticForm(exponent=EXPONENT), SETTLE_S, np.empty((0, 2), dtype=np.int64)
+    )
 
 
 def diagnosed(

@@ -20,7 +20,7 @@ from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
 from valveflow_ros.diagnosis.grids import make_grids
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import NS_PER_S, Quality, SampleTable, Signal
-from valveflow_ros.signals.integrated_input import integrated_input
+from valveflow_ros.signals.static_form import integrated_input
 from valveflow_ros.state import from_bytes, to_bytes
 
 pytestmark = needs_jit
@@ -47,7 +47,7 @@ def active(name: str) -> Active:
 
 def model_of(grids, *names: str) -> ExtendedModel:
     extended = Extended(rough_model(), tuple(active(n) for n in names))
-    return ExtendedModel(extended, EXPONENT, grids.start_ns, grids.reference)
+    return ExtendedModel(extended, StaticForm(exponent=EXPONENT), grids.start_ns, grids.reference)
 
 
 def corrected(model: ExtendedModel, rows: SampleTable) -> SampleTable:

@@ -29,6 +29,7 @@ from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.monitoring.rows import Correction, Corrector
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import Quality, SampleTable, Signal
+from valveflow_ros.signals.static_form import StaticForm
 
 pytestmark = needs_jit
 OFF = {'refit_period': 0.0, 'refit_segments': 0, 'diagnosis_hour': -1}
@@ -42,7 +43,7 @@ def model_of(rows: SampleTable, held: dict[str, tuple[float, ...]]) -> ExtendedM
     grids = make_grids(*record(rows).about, np.zeros(rows.values.shape, dtype=bool))
     active = tuple(Active(catalogue()[n], v) for n, v in held.items())
     return ExtendedModel(
-        Extended(rough_model(), active), EXPONENT, grids.start_ns, grids.reference
+        Extended(rough_model(), active), StaticForm(exponent=EXPONENT), grids.start_ns, grids.reference
     )
 
 

@@ -24,6 +24,7 @@ from valveflow_ros.diagnosis.result import model_from_json, model_to_json
 from valveflow_ros.diagnosis.search import simplified
 from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.records import SampleTable, Signal
+from valveflow_ros.signals.static_form import StaticForm
 
 pytestmark = needs_jit
 NAMES = {
@@ -209,7 +210,9 @@ def test_the_extended_model_comes_back_from_its_file(grids):
         (Active(catalogue()['gain_step'], (0.006, 0.2)),
          Active(catalogue()['intervals'], (0.01,), (3600.0, 9000.0))),
     )  # fmt: skip
-    raw = json.loads(json.dumps(model_to_json(ExtendedModel(model, 1.125, 5, grids.reference))))
+    raw = json.loads(
+        json.dumps(model_to_json(ExtendedModel(model, StaticForm(), 5, grids.reference)))
+    )
     given = model_from_json(raw)
     back, exponent = given.model, given.pressure_exponent
     start_ns, reference = given.start_ns, given.reference

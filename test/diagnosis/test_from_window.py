@@ -17,7 +17,7 @@ from valveflow_ros.monitoring.offline import feed_rows
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SampleTable, Signal
 from valveflow_ros.segments.window import WindowContents
-from valveflow_ros.signals.integrated_input import integrated_input
+from valveflow_ros.signals.static_form import integrated_input
 
 
 def contents_of(samples: SampleTable) -> WindowContents:
@@ -65,7 +65,7 @@ def test_the_window_is_diagnosed_as_the_record_is() -> None:
         [(task.contents.time_ns[a], task.contents.time_ns[b - 1])
          for a, b, _ in task.contents.spans]
     )  # fmt: skip
-    record = Record(samples, STEP_S, EXPONENT, Settings().settle_s, spans)
+    record = Record(samples, STEP_S, StaticForm(exponent=EXPONENT), Settings().settle_s, spans)
     truth = to_json(diagnose(record, curve.model))
     content = json.loads(found.text)
     assert found.window_end_ns == task.window_end_ns

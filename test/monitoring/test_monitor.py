@@ -39,7 +39,7 @@ from valveflow_ros.monitoring.prediction import PredictionBlock, PredictionState
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SampleTable, Signal
 from valveflow_ros.segments.segmenter import Segmenter
-from valveflow_ros.signals.integrated_input import integrated_input
+from valveflow_ros.signals.static_form import integrated_input
 
 SETTINGS = Settings(QUICK_MONITOR)
 N = 700

@@ -12,7 +12,7 @@ from valveflow_ros.records import Signal
 from valveflow_ros.report.curve import segments_figure, shift_section
 from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.identification import identification_report
-from valveflow_ros.signals.integrated_input import integrated_input
+from valveflow_ros.signals.static_form import integrated_input
 
 
 def with_means(data):

@@ -146,7 +146,7 @@ def test_the_tail_is_the_newest_rows(plan, wanted):
         window.append(time_ns, np.arange(n) + len(seen), np.zeros(n), np.zeros(n))
         seen += list(range(len(seen), len(seen) + n))
         last = int(time_ns[-1]) if n else last
-    newest = window.tail(wanted)[-2]
+    newest = window.tail(wanted)[1]
     assert newest.tolist() == (seen[-len(newest) :] if len(newest) else [])
     assert len(newest) >= min(wanted, len(seen), 101)
 

@@ -11,7 +11,7 @@ from streams import examples
 from valveflow_ros.errors import InputError
 from valveflow_ros.parameters import PARAMETERS
 from valveflow_ros.records import SIGNALS, Signal
-from valveflow_ros.signals.integrated_input import integrated_input
+from valveflow_ros.signals.static_form import integrated_input
 from valveflow_ros.signals.units import UNITS, convert, unit_of
 
 # The same state of a plant, told in every unit there is (NIST SP 811 for the definitions).

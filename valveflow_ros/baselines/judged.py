@@ -18,6 +18,7 @@ from valveflow_ros.fit.whitening import inflation
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray, IntArray, SegmentKind
 from valveflow_ros.segments.window import WindowContents
+from valveflow_ros.signals.static_form import PAPER_EXPONENT, StaticForm
 
 _LONGEST_S = 300.0
 _LEAST_ROWS = 10  # of a segment that can be judged
@@ -163,11 +164,39 @@ class OtherData:
     time_ns : int64 (n,)
     spans : int64 (k, 3)
         Special segments as first row, end row and kind.
+    opening_percent : float64 (n,), optional
+    exponent : float
+        m of the u = V p^m of the samples.
     """
 
     samples: Samples
     time_ns: IntArray
     spans: IntArray
+    opening_percent: FloatArray | None = None
+    exponent: float = PAPER_EXPONENT
+
+    def on_axis(self, form: StaticForm) -> OtherData:
+        """Return the data with the u and the p^e that a curve of this form is a function of.
+
+        Raises
+        ------
+        DataError
+            That is another u, and the openings are not known.
+        """
+        s, opening = self.samples, self.opening_percent
+        if form == StaticForm(exponent=self.exponent):
+            return self
+        if opening is None:
+            raise DataError(
+                f'The curve and the rows are over different inputs, {form.words} and V p^'
+                f'{self.exponent:g}, and the rows come without openings.'
+            )
+        u, scale = form.of_integrated_input(s.u, opening, self.exponent)
+        usable = s.usable * np.isfinite(u).astype(np.uint8)
+        return replace(self, samples=replace(
+            s, u=np.where(usable > 0, u, 0.0), usable=usable,
+            scale=None if scale is None else np.where(usable > 0, scale, 1.0),
+        ))  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -400,7 +429,11 @@ def samples_of(contents: WindowContents, settings: Settings) -> Samples:
 
 def other_data(contents: WindowContents, settings: Settings) -> OtherData:
     """Return the rows of a window with its special segments, to judge by."""
-    return OtherData(samples_of(contents, settings), contents.time_ns, contents.spans)
+    opening = contents.opening_percent
+    return OtherData(
+        samples_of(contents, settings), contents.time_ns, contents.spans,
+        opening if len(opening) else None, settings.real('pressure_exponent'),
+    )  # fmt: skip
 
 
 class Runnable(Protocol):
@@ -473,8 +506,9 @@ def run_mse(model: Runnable, samples: Samples) -> float:
 
 def dynamic(characteristic: Characteristic, samples: Samples) -> FloatArray:
     """Return the power that curve and regional dynamics simulate, MW, shape (n,)."""
-    model = characteristic.model
-    return model.respond(samples.u, samples.usable, samples.step_s, samples.settle_s)[0]
+    s, model = samples, characteristic.model
+    scale = 1.0 if s.scale is None else s.scale
+    return model.respond(s.u, s.usable, s.step_s, s.settle_s, scale)[0]
 
 
 def trial_of(other: OtherData, characteristic: Characteristic) -> Trial:

@@ -20,7 +20,6 @@ from valveflow_ros.baselines.judged import (
     trial_of,
 )
 from valveflow_ros.curve.characteristic import Characteristic
-from valveflow_ros.errors import DataError
 from valveflow_ros.records import FloatArray
 
 CURVE, SIMULATED = 'curve', 'simulated'
@@ -130,18 +129,15 @@ def validate(
     DataError
         No special segment can be judged, or the two curves are over different inputs.
     """
-    trial = trial_of(other, characteristic)
+    data = other.on_axis(characteristic.static_form)
+    trial = trial_of(data, characteristic)
     outside = _outside(trial, characteristic)
-    predictions = _predictions(characteristic, other, trial)
+    predictions = _predictions(characteristic, data, trial)
     if against is not None:
-        if abs(characteristic.pressure_exponent - against.pressure_exponent) > 1e-9:
-            raise DataError(
-                f'The two characteristics are curves over different inputs, V p^'
-                f'{characteristic.pressure_exponent:g} and V p^{against.pressure_exponent:g}: '
-                'they cannot be held against each other.'
-            )
-        trial = replace(trial, good=trial.good & trial_of(other, against).good)
-        theirs = _predictions(against, other, trial)
+        theirs_data = other.on_axis(against.static_form)
+        theirs_trial = trial_of(theirs_data, against)
+        trial = replace(trial, good=trial.good & theirs_trial.good)
+        theirs = _predictions(against, theirs_data, theirs_trial)
         predictions |= {OTHER + name: values for name, values in theirs.items()}
     judgement = judge(trial, predictions)
     by = SIMULATED if SIMULATED in predictions else CURVE
@@ -159,7 +155,8 @@ def validate(
 def _predictions(
     characteristic: Characteristic, other: OtherData, trial: Trial
 ) -> dict[str, FloatArray]:
-    found = {CURVE: characteristic.model.static(trial.u)}
+    scale = 1.0 if other.samples.scale is None else other.samples.scale
+    found = {CURVE: characteristic.model.static(trial.u, scale)}
     if characteristic.dynamics:
         found[SIMULATED] = dynamic(characteristic, other.samples)
     return found

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from valveflow_ros.cli.command import Console, VerbResult, columns, lines
-from valveflow_ros.errors import DataError
+from valveflow_ros.errors import DataError, UsageError
 from valveflow_ros.report.terminal.text import number, whole
 
 if TYPE_CHECKING:
@@ -74,9 +74,20 @@ def run(options: Namespace, console: Console) -> VerbResult:
     from valveflow_ros.curve.compensation import compensate
     from valveflow_ros.interface.files import TABLES, check_output
     from valveflow_ros.interface.models import load_characteristic
+    from valveflow_ros.signals.static_form import OPENING
 
     check_output(options.output, TABLES, source=options.model, overwrite=options.overwrite)
     curve = load_characteristic(options.model)
+    pressures = sorted(set(options.pressure))
+    if curve.axis == OPENING:
+        # Its knees stand at other powers at each pressure.
+        if len(pressures) > 1:
+            raise UsageError(
+                'The knees of this curve stand at fixed openings, and at another power for each '
+                'pressure: make one table for each --pressure.'
+            )
+        curve = curve.at_pressure(*pressures)
+        pressures = [curve.reference_pressure_mpa]
 
     def make(points: int) -> Compensation:
         return compensate(
@@ -87,7 +98,6 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
     made = make(options.points)
     _check(made, options.tolerance, make)
-    pressures = sorted(set(options.pressure))
     for sentence in made.notes[1:]:
         console.warn(sentence)
     table = _table(made, pressures)

@@ -83,7 +83,7 @@ def _text(found: DiagnosisResult) -> str:
     }  # fmt: skip
     d = found.diagnosis
     rows = [
-        [c.name, key, *cells(e, found.exponent)]
+        [c.name, key, *cells(e, found.form.input_exponent)]
         for c in d.causes
         for key, e in c.parameters.items()
     ]

@@ -122,7 +122,7 @@ def _data(found: Identification) -> dict[str, Any]:
 
 
 def _text(found: Identified) -> str:
-    from valveflow_ros.report.answer import doubt, explained, temperature_words
+    from valveflow_ros.report.answer import doubt, explained, form_words, temperature_words
     from valveflow_ros.report.data import rejected
     from valveflow_ros.report.words import counted, held_words, moment, percent, plain
 
@@ -132,8 +132,9 @@ def _text(found: Identified) -> str:
         f'The flow characteristic has {counted(len(c.pieces), "piece")} and explains '
         f'{percent(explained(found))} of the variance of the power.',
         doubt(found),
+        form_words(c),
         _pieces(found),
-        _breakpoints(c),
+        _breakpoints(found.shown),
         _dynamics(c),
         'Behind ± stands one standard error; 95 % lie within 1.96 of them.',
         f'Found in {counted(c.source.steady, "steady-state segment")} and '
@@ -152,7 +153,7 @@ def _pieces(found: Identified) -> str:
     from valveflow_ros.report.answer import opening_gain
     from valveflow_ros.report.words import count, decimals, input_unit_plain, plain, with_error
 
-    c = found.characteristic
+    c = found.shown
     rows = []
     for k, piece in enumerate(c.pieces):
         gain, pressure = opening_gain(found, piece)
@@ -168,8 +169,8 @@ def _pieces(found: Identified) -> str:
             ]
         )
     unit = input_unit_plain(c.pressure_exponent)
-    head = ['piece', f'u ({unit})', 'slope (MW per u)', 'intercept (MW)', 'MW per 1 % opening',
-            'samples']  # fmt: skip
+    head = ['piece', f'u ({unit})', f'slope{found.at_pressure} (MW per u)', 'intercept (MW)',
+            'MW per 1 % opening', 'samples']  # fmt: skip
     return columns(rows, head)
 
 

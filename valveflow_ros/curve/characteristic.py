@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from valveflow_ros.curve.regional_model import RegionalModel
-from valveflow_ros.curve.static_form import INTEGRATED_INPUT, OPENING, StaticForm
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import FloatArray, IntArray
+from valveflow_ros.signals.static_form import INTEGRATED_INPUT, OPENING, StaticForm
 
 # What a chart was designed for; apart from its kernels, for whoever only reads models.
 
@@ -259,16 +259,33 @@ class Characteristic:
 
         At the reference pressure where the form has p^e.
         """
-        m = self.at_reference()
+        m = self.at_pressure().model
         inner = 0.5 * (m.right[:-1] + m.left[1:])
         return np.concatenate([m.left[:1], inner, m.right[-1:]])
 
-    def at_reference(self) -> RegionalModel:
-        """Return the model of the power at the reference pressure as a curve over u alone, MW."""
-        m, scale = self.model, self.reference_scale
+    def at_pressure(self, pressure_mpa: float | None = None) -> Characteristic:
+        """Return the curve at one pressure, that of reference unless given: power is F(u) alone.
+
+        What is told in MW is in MW then. The paper's form is such a curve at every pressure.
+        """
+        if self.axis != OPENING:
+            return self
+        p = self.reference_pressure_mpa if pressure_mpa is None else pressure_mpa
+        scale = float(self.static_form.scale(p))
+
+        def there(piece: Piece) -> Piece:
+            return replace(
+                piece, slope=scale * piece.slope,
+                intercept=scale * piece.intercept + self.offset_mw,
+                slope_stderr=scale * piece.slope_stderr,
+                intercept_stderr=scale * piece.intercept_stderr,
+            )  # fmt: skip
+
         return replace(
-            m, left=scale * m.left + m.offset, right=scale * m.right + m.offset, offset_mw=None
-        )
+            self, pieces=tuple(map(there, self.pieces)),
+            partition_pieces=tuple(map(there, self.partition_pieces)), axis=INTEGRATED_INPUT,
+            pressure_scale_exponent=0.0, offset_mw=0.0, reference_pressure_mpa=p,
+        )  # fmt: skip
 
     def __call__(
         self, u: FloatArray, pressure_mpa: FloatArray | float | None = None
@@ -292,7 +309,7 @@ class Characteristic:
         DataError
             The curve does not rise throughout, so it has no inverse.
         """
-        m = self.at_reference()
+        m = self.at_pressure().model
         if np.any(m.slopes() <= 0.0):
             falling = int(np.argmin(m.slopes())) + 1
             raise DataError(

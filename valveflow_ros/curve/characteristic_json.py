@@ -11,6 +11,7 @@ from valveflow_ros.curve.characteristic import (
     ChartDesign,
     Choice,
     FittedData,
+    FormEvidence,
     HeldCause,
     Piece,
     RegionDynamics,
@@ -34,6 +35,7 @@ from valveflow_ros.curve.json_schema import (
     fail,
 )
 from valveflow_ros.errors import DataError
+from valveflow_ros.signals.static_form import AXES, INTEGRATED_INPUT, OPENING, StaticForm
 
 # Causes held while a curve was fitted, as JSON.
 
@@ -70,7 +72,12 @@ def _held(found: list[dict[str, Any]] | None) -> tuple[HeldCause, ...]:
 
 FORMAT = 'valveflow/characteristic'
 _WHOLE = 'characteristic'
-VERSION = 1
+VERSION = 2
+_READABLE = (1, 2)
+
+
+_LEAST_EXPONENT = 0.5
+_COMMON_MPA = 10.0
 
 
 def _number(value: float) -> float | None:
@@ -123,13 +130,37 @@ def _chart_json(chart: ChartDesign | None) -> dict[str, Any]:
     }
 
 
+def _form_json(form: FormEvidence | None) -> dict[str, Any]:
+    """Return the evidence under its key; a curve without any has no such key."""
+    if form is None:
+        return {}
+    return {
+        'form': {
+            'chosen': form.chosen,
+            'told': form.told,
+            'log_likelihood_gain': form.log_likelihood_gain,
+            'rmse_mw': form.rmse_mw,
+            'rmse_other_mw': form.rmse_other_mw,
+            'other': form.other,
+            'apart_mw': form.apart_mw,
+            'worst': dict(zip(_WORST, form.worst, strict=True)),
+            'contradicted': form.contradicted,
+        }
+    }
+
+
 def to_json(c: Characteristic) -> dict[str, Any]:
     """Return the content of ``characteristic.json``."""
     return {
         'format': FORMAT,
         'version': VERSION,
         'model_id': c.model_id,
+        'axis': c.axis,
         'pressure_exponent': c.pressure_exponent,
+        'pressure_scale_exponent': c.pressure_scale_exponent,
+        'offset_mw': c.offset_mw,
+        'reference_pressure_mpa': _number(c.reference_pressure_mpa),
+        **_form_json(c.form),
         'pieces': _supported_json(c),
         'breakpoint_intervals': [[_number(lo), _number(hi)] for lo, hi in c.breakpoint_intervals],
         'selection': {
@@ -194,9 +225,22 @@ _SUPPORT = {
 _SUM = {'slack': Number(0.0, 1e6), 'limit': Number(1e-6, 1e9)}
 _COST = Members(Number(0.0, 1e30, null=True), pieces=True)
 _ANGLE = Members(Number(-360.0, 360.0, null=True), pieces=True)
+_WORST = ('opening_percent', 'pressure_mpa', 'apart_mw')
+_MANY_MW = Number(0.0, 1e12)
+_FORM = {
+    'chosen': Text(AXES), 'told': Maybe(Flag()), 'log_likelihood_gain': Number(-1e15, 1e15),
+    'rmse_mw': Maybe(_MANY_MW), 'rmse_other_mw': _MANY_MW, 'other': Maybe(Text()),
+    'apart_mw': Maybe(_MANY_MW), 'worst': Maybe({name: Number(-1e12, 1e12) for name in _WORST}),
+    'contradicted': Maybe(Flag()),
+}  # fmt: skip
 _SCHEMA = {
     'model_id': Maybe(Text()),
-    'pressure_exponent': Number(0.5, 2.0),
+    'axis': Maybe(Text(AXES)),
+    'pressure_exponent': Number(0.0, 2.0),
+    'pressure_scale_exponent': Maybe(Number(0.0, 2.0)),
+    'offset_mw': Maybe(Number(*MW)),
+    'reference_pressure_mpa': Maybe(Number(1e-3, 100.0, null=True)),
+    'form': Maybe(_FORM),
     'pieces': ListOf(
         {**PIECE, 'identifiable': Maybe(Flag()), 'support': Maybe(_SUPPORT)}, 1, MOST_PIECES
     ),
@@ -251,12 +295,13 @@ def from_json(raw: object) -> Characteristic:
     """
     if not isinstance(raw, dict) or raw.get('format') != FORMAT:
         raise DataError(f"This is no flow characteristic: 'format' must be '{FORMAT}'.")
-    if raw.get('version') is not VERSION:
+    if not any(raw.get('version') is readable for readable in _READABLE):
         raise DataError(
             f'The characteristic has version {_told(raw.get("version"))}, this program reads '
-            f'{VERSION}.'
+            f'{" and ".join(map(str, _READABLE))}.'
         )
     top = checked(raw, _SCHEMA, _WHOLE)
+    form = form_of(top, _WHOLE)
     check_pieces(top['pieces'], _WHOLE, 'pieces', Joint.SAME)
     partition = top['partition'] or {'pieces': []}
     check_pieces(partition['pieces'], _WHOLE, 'partition.pieces', Joint.FREE)
@@ -268,7 +313,8 @@ def from_json(raw: object) -> Characteristic:
     window = window or {'start_ns': 0, 'end_ns': 0}
     temperature = temperature or {'mean_degc': math.nan, 'spread_k': math.nan, 'flag': False}
     return Characteristic(
-        pressure_exponent=top['pressure_exponent'],
+        # Where the knees stand at fixed openings u is V, whatever another program wrote.
+        pressure_exponent=form.input_exponent,
         pieces=tuple(map(_piece, top['pieces'])),
         breakpoint_intervals=tuple((low, high) for low, high in top['breakpoint_intervals']),
         choice=Choice(
@@ -290,6 +336,57 @@ def from_json(raw: object) -> Characteristic:
         support=_support(top['pieces']),
         model_id=top['model_id'] or '',
         held=_held(top['held']),
+        axis=form.axis,
+        pressure_scale_exponent=form.scale_exponent,
+        offset_mw=top['offset_mw'] or 0.0,
+        reference_pressure_mpa=_reference_pressure(top),
+        form=_form(top['form']),
+    )  # fmt: skip
+
+
+def form_of(top: dict[str, Any], whole: str, inside: str = '') -> StaticForm:
+    """Return the form that a model's keys name, and refuse what does not belong to the axis.
+
+    Raises
+    ------
+    DataError
+        The sentence names the key, which lies ``inside`` another one.
+    """
+    axis = top['axis'] or INTEGRATED_INPUT
+    scale, offset = top['pressure_scale_exponent'] or 0.0, top['offset_mw'] or 0.0
+    if axis == INTEGRATED_INPUT:
+        if not top['pressure_exponent'] >= _LEAST_EXPONENT:
+            raise fail(whole, f'{inside}pressure_exponent', f'is below {_LEAST_EXPONENT:g}')
+        for name, value in (('pressure_scale_exponent', scale), ('offset_mw', offset)):
+            if value != 0.0:
+                problem = f'is {value:g}, but must be 0 for the axis integrated_input'
+                raise fail(whole, f'{inside}{name}', problem)
+        return StaticForm(axis, top['pressure_exponent'])
+    if not scale >= _LEAST_EXPONENT:
+        problem = f'is below {_LEAST_EXPONENT:g}'
+        raise fail(whole, f'{inside}pressure_scale_exponent', problem)
+    return StaticForm(axis, scale)
+
+
+def _reference_pressure(top: dict[str, Any]) -> float:
+    """Return the pressure a curve is shown at; a common one where the file does not say."""
+    pressure = top['reference_pressure_mpa']
+    scaled = top['axis'] == OPENING
+    if pressure is None or math.isnan(pressure):
+        return _COMMON_MPA if scaled else math.nan
+    return float(pressure)
+
+
+def _form(found: dict[str, Any] | None) -> FormEvidence | None:
+    if found is None:
+        return None
+    nan = math.nan
+    return FormEvidence(
+        found['chosen'], bool(found['told']), found['log_likelihood_gain'],
+        nan if found['rmse_mw'] is None else found['rmse_mw'], found['rmse_other_mw'],
+        found['other'] or '', nan if found['apart_mw'] is None else found['apart_mw'],
+        (nan, nan, nan) if found['worst'] is None else tuple(found['worst'].values()),
+        bool(found['contradicted']),
     )  # fmt: skip
 
 

@@ -5,12 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri, stdtr
 
 from valveflow_ros.curve.characteristic import Characteristic, piece_of
-from valveflow_ros.records import FloatArray, IntArray, SegmentKind, SpecialSegment
+from valveflow_ros.records import (
+    NS_PER_S,
+    FloatArray,
+    IntArray,
+    SegmentKind,
+    SpecialSegment,
+)
+from valveflow_ros.signals.static_form import StaticForm
 
 # At which moment a series changed its mean, and how sure that is.
 
@@ -230,39 +238,69 @@ def segment_residuals(
     """
     known = bool(curve.dynamics)
     knots = curve.breakpoints
-    kept = [
-        s for s in segments
-        if min(s.u_start, s.u_end) >= knots[0] and max(s.u_start, s.u_end) <= knots[-1]
+    placed = [(s, _ends(curve.static_form, s)) for s in segments]
+    placed = [
+        (s, ends) for s, ends in placed
+        if ends.u.min() >= knots[0] and ends.u.max() <= knots[-1]
         and (known or s.kind == SegmentKind.STEADY)
     ]  # fmt: skip
-    kept.sort(key=lambda s: s.end_ns)
-    middle = np.array([0.5 * (s.u_start + s.u_end) for s in kept])
+    placed.sort(key=lambda each: each[0].end_ns)
+    kept = [s for s, _ in placed]
+    u = np.array([ends.u for _, ends in placed]).reshape(-1, 2)
+    scale = np.array([ends.scale for _, ends in placed]).reshape(-1, 2)
+    middle = u.mean(axis=1)
     measured = np.array([0.5 * (s.power_start_mw + s.power_end_mw) for s in kept])
     return SegmentResiduals(
         np.array([(s.start_ns + s.end_ns) // 2 for s in kept], dtype=np.int64),
         middle,
-        measured - _expected(curve, kept, middle),
+        measured - _expected(curve, kept, u, scale),
         np.array([s.samples for s in kept], dtype=np.int64),
     )
 
 
+class _Ends(NamedTuple):
+    """What a curve is a function of at both ends of a segment, and what it is multiplied by."""
+
+    u: FloatArray
+    scale: FloatArray
+
+
+def _ends(form: StaticForm, segment: SpecialSegment) -> _Ends:
+    """Return the ends of a segment on the axis of a curve; NaN where they are not known."""
+    s = segment
+    if not form.scaled and (math.isnan(s.exponent) or s.exponent == form.exponent):
+        return _Ends(np.array([s.u_start, s.u_end]), np.ones(2))
+    u, scale = form.of_rows(
+        np.array([s.opening_start_percent, s.opening_end_percent]),
+        np.array([s.pressure_start_mpa, s.pressure_end_mpa]),
+    )
+    return _Ends(u, np.ones(2) if scale is None else scale)
+
+
 def _expected(
-    curve: Characteristic, segments: Sequence[SpecialSegment], middle: FloatArray
-) -> FloatArray:
-    """Return the mean power the curve gives along each segment."""
+    curve: Characteristic, segments: Sequence[SpecialSegment], ends: FloatArray,
+    scales: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """Return the mean power the curve gives along each segment; both (k, 2)."""
     if not segments:
         return np.empty(0)
     model = curve.model
     share = (np.arange(_POINTS) + 0.5) / _POINTS
-    ends = np.array([[s.u_start, s.u_end] for s in segments])
-    u = ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * share
-    flow = model.static(u).mean(axis=1)
+    u, scale = (x[:, :1] + (x[:, 1:] - x[:, :1]) * share for x in (ends, scales))
+    flow = model.static(u, scale).mean(axis=1)
     if not curve.dynamics:
         return np.asarray(flow)
     region = np.searchsorted(model.levels, flow)
     behind_s = (model.time_constants + model.delays)[region]
-    rate = np.array([s.u_rate_per_s if s.kind == SegmentKind.SLOPE else 0.0 for s in segments])
-    return np.asarray(flow - model.slopes()[piece_of(curve, middle)] * rate * behind_s)
+    sloping = np.array([s.kind == SegmentKind.SLOPE for s in segments])
+    middle, factor = ends.mean(axis=1), scales.mean(axis=1)
+    rate = np.array([s.u_rate_per_s for s in segments])
+    duration_s = np.array([max(s.end_ns - s.start_ns, 1) / NS_PER_S for s in segments])
+    if curve.static_form.scaled:
+        rate = (ends[:, 1] - ends[:, 0]) / duration_s
+    by_pressure = model.shape(middle) * (scales[:, 1] - scales[:, 0]) / duration_s
+    climb = factor * model.slopes()[piece_of(curve, middle)] * rate + by_pressure
+    return np.asarray(flow - np.where(sloping, climb, 0.0) * behind_s)
 
 
 def after_known_changes(series: SegmentResiduals, known_ns: int) -> SegmentResiduals:

@@ -261,11 +261,14 @@ def judge_shift(
     Raises
     ------
     DataError
-        Both curves have different exponents of the pressure, or no u in common.
+        Both curves have different axes, or V p^m with different m, or no u in common.
     """
     limits = limits or ShiftLimits()
     _comparable(reference, current)
     found = segment_residuals(reference, segments)
+    # Curves are held against each other at one pressure, at which their power is F(u) alone.
+    pressure = reference.reference_pressure_mpa
+    reference, current = reference.at_pressure(pressure), current.at_pressure(pressure)
     series = [
         after_known_changes(found.inside(p.u_from, p.u_to), reference.source.window_end_ns)
         for p in current.pieces
@@ -291,6 +294,11 @@ def judge_shift(
 
 
 def _comparable(reference: Characteristic, current: Characteristic) -> None:
+    if reference.axis != current.axis:
+        raise DataError(
+            f'The reference is a curve of {reference.static_form.words} and the current one of '
+            f'{current.static_form.words}: they cannot be held against each other.'
+        )
     if reference.pressure_exponent != current.pressure_exponent:
         raise DataError(
             f'The reference has the pressure exponent {reference.pressure_exponent:g} and the '

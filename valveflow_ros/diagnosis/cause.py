@@ -98,6 +98,8 @@ def _step_s(width_s: float) -> int:
 
 
 Values = tuple[float, ...]
+U_UNIT = '% MPa^m'
+_OPENING_UNIT = 0.04  # % of opening move as much as one unit of V p^m does
 # So near to the end of what a plant can have the data ask for something else.
 _END = 0.95
 
@@ -160,6 +162,10 @@ class Unknown:
     kind: Kind = Kind.SMOOTH
     concealed: float = 0.0
     dated: bool = False
+
+    def step_on(self, grids: Grids) -> float:
+        """Return the step for differences; a place on the curve counts in the unit of its axis."""
+        return self.step * (_OPENING_UNIT if self.unit == U_UNIT and grids.form.scaled else 1.0)
 
 
 class SentenceValues(dict[str, float]):

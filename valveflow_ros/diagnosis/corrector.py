@@ -23,10 +23,9 @@ import numpy as np
 
 from valveflow_ros.curve.characteristic import HeldCause
 from valveflow_ros.curve.regional_model import RegionalModel, make_taps
-from valveflow_ros.diagnosis import kernels as flows
-from valveflow_ros.diagnosis import kernels as kernels
+from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import Active, Stage
-from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
+from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, acts_on_scale
 from valveflow_ros.diagnosis.grids import Grids, Reference
 from valveflow_ros.errors import DataError
 from valveflow_ros.monitoring.rows import Corrector
@@ -39,7 +38,6 @@ from valveflow_ros.records import (
     SampleTable,
     Signal,
 )
-from valveflow_ros.signals.integrated_input import integrated_input
 from valveflow_ros.state import Memory, State, put_back
 
 # What a cause with a memory does to rows as they come.
@@ -311,16 +309,21 @@ class ModelCorrector(Memory):
         check_streams(given.model.active)
         self._given, self._step_s = given, step_s
         self._model = given.model
-        self.held = ExtendedModel(
-            given.model, given.pressure_exponent, given.start_ns, given.reference
-        ).held
+        self.held = ExtendedModel(given.model, given.form, given.start_ns, given.reference).held
         self._inputs = self._model.at(Stage.INPUT)
+        on_scale = [a for a in self._inputs if acts_on_scale(a, given.form)]
         self._flows, self._gains = self._model.at(Stage.FLOW), self._model.at(Stage.GAIN)
         self._shown = sorted(
             (a for a in self._model.at(Stage.OUTPUT) if a.name != CLOCK),
             key=lambda a: a.cause.order,
         )
-        differs = (*self._flows, *self._gains, *self._shown, *self._model.at(Stage.DYNAMICS))
+        differs = (
+            *on_scale,
+            *self._flows,
+            *self._gains,
+            *self._shown,
+            *self._model.at(Stage.DYNAMICS),
+        )
         self._differs = bool(differs)
         self.restart()
 
@@ -370,37 +373,41 @@ class ModelCorrector(Memory):
         for valve in self._valves:
             opening = valve.feed(opening, table.time_ns)
         grids = self._scene(table, opening)
-        factor = np.ones(len(grids.u))
+        factor, scale = np.ones(len(grids.u)), grids.scale
         u = grids.u
         for a in self._inputs:
             part = a.cause.act(u, a.values, grids, self._model.base)
-            u, factor = u * part, factor * part
+            if acts_on_scale(a, grids.form):
+                scale = scale * part
+            else:
+                u, factor = u * part, factor * part
         n = len(table)
         jumps, begin = self._beginnings(table.time_ns, u[:n])
         power = table.column(Signal.GENERATED_POWER).copy()
         if self._clock is not None:
             power = self._clock.feed(power, jumps)
         if self._differs:
-            power -= self._difference(grids, u, begin)[:n]
+            power -= self._difference(grids, u, scale, begin)[:n]
         return _with(table, opening * factor[:n], power)
 
     def _scene(self, table: SampleTable, opening: FloatArray) -> Grids:
         """Return the rows as causes without a memory want them, a whole number of handfuls."""
         pressure = np.ascontiguousarray(table.column(Signal.MAIN_STEAM_PRESSURE))
-        u = integrated_input(opening, pressure, self._given.pressure_exponent)
+        u, scale = self._given.form.of_rows(opening, pressure)
+        scale = np.ones(len(u)) if scale is None else scale
         temperature = np.empty(len(table))
         kernels.filled(
             np.ascontiguousarray(table.column(Signal.MAIN_STEAM_TEMPERATURE)),
             self._temperature, temperature,
         )  # fmt: skip
         time_s = (table.time_ns - self._given.start_ns) / NS_PER_S
-        columns = (opening, pressure, u, temperature, time_s)
-        v, p, u, temperature, time_s = (_padded(c) for c in columns)
+        columns = (opening, pressure, u, scale, temperature, time_s)
+        v, p, u, scale, temperature, time_s = (_padded(c) for c in columns)
         none = np.zeros(len(u), dtype=bool)
         return Grids(
             start_ns=self._given.start_ns, fine_s=self._step_s, step_s=self._step_s,
-            settle_s=0.0, exponent=self._given.pressure_exponent, v=v, density=np.ones(len(u)),
-            command=v, u=u, pressure=p, temperature=temperature, time_s=time_s,
+            settle_s=0.0, form=self._given.form, v=v, density=np.ones(len(u)),
+            command=v, u=u, scale=scale, pressure=p, temperature=temperature, time_s=time_s,
             usable=np.isfinite(u).astype(np.uint8), power=np.zeros(len(u)), scored=none,
             whole=none, sub=np.zeros(len(u), dtype=np.int64), reference=self._given.reference,
         )  # fmt: skip
@@ -412,11 +419,12 @@ class ModelCorrector(Memory):
         kernels.beginnings(time_ns, u, gap_ns, self._follows, jumps, begin)
         return jumps, begin
 
-    def _difference(self, grids: Grids, u: FloatArray, begin: ByteArray) -> FloatArray:
+    def _difference(
+        self, grids: Grids, u: FloatArray, scale: FloatArray, begin: ByteArray
+    ) -> FloatArray:
         """Return by how much the extended model shows more than the plain one, MW."""
         n = len(begin)
-        plain = _flow(self._model, u)
-        x = plain.copy()
+        plain, x = _flow(self._model, u, grids.scale), _flow(self._model, u, scale)
         for a in self._flows:
             x += a.cause.act(u, a.values, grids)
         for a in self._gains:
@@ -436,11 +444,11 @@ class ModelCorrector(Memory):
         return out
 
 
-def _flow(model: Extended, u: FloatArray) -> FloatArray:
-    """Return F(u) in MW."""
+def _flow(model: Extended, u: FloatArray, scale: FloatArray) -> FloatArray:
+    """Return the flow without causes in MW."""
     x = np.empty(len(u))
     m = model.base
-    flows.flow(u, m.knots, m.left, m.right, x)
+    kernels.flow(u, scale, m.offset, m.knots, m.left, m.right, x)
     return x
 
 

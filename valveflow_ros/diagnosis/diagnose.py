@@ -15,6 +15,7 @@ from valveflow_ros.diagnosis.evidence import (
     Certainty,
     Gain,
     by_segment,
+    gain_of_form,
     inferred,
     noise_floor,
     rmse,
@@ -37,6 +38,7 @@ from valveflow_ros.diagnosis.search import Found, Progress, search, simplified
 from valveflow_ros.diagnosis.structure import Period, Structure, Wander, period, structure, wander
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import BoolArray, FloatArray, IntArray, SampleTable
+from valveflow_ros.signals.static_form import StaticForm
 
 # The sealed blocks, opened once: what each cause is worth there, and whether that stands.
 #
@@ -92,7 +94,7 @@ def actuator_cause(found: Found) -> tuple[NamedCause, ...]:
     cause = catalogue()[fault.name]
     units = {u.name: u.unit for u in cause.unknowns}
     base = found.model.base
-    x = base.static(grids.u[grids.usable > 0])
+    x = base.static(grids.u[grids.usable > 0], grids.scale[grids.usable > 0])
     rise = float(np.ptp(x) / max(np.ptp(grids.u[grids.usable > 0]), 1e-9))
     per_percent = rise * float(np.nanmean(grids.density))
     gain = Gain(fault.rms_before * per_percent, fault.rms_after * per_percent, fault.p_value)
@@ -164,7 +166,7 @@ class Record:
     table : SampleTable
     step_s : float
         Step of its rows.
-    pressure_exponent : float
+    form : StaticForm
         Of the model.
     settle_s : float
         Time after a gap until the model can be believed.
@@ -177,7 +179,7 @@ class Record:
 
     table: SampleTable
     step_s: float
-    pressure_exponent: float
+    form: StaticForm
     settle_s: float
     spans_ns: IntArray
     measured: SampleTable | None = None
@@ -187,9 +189,9 @@ class Record:
         return faults(self.table if self.measured is None else self.measured, self.step_s)
 
     @property
-    def about(self) -> tuple[SampleTable, float, float, float]:
+    def about(self) -> tuple[SampleTable, float, StaticForm, float]:
         """Return what `make_grids` wants first."""
-        return self.table, self.step_s, self.pressure_exponent, self.settle_s
+        return self.table, self.step_s, self.form, self.settle_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,6 +237,53 @@ def diagnose(
     rest = _look_again(found)
     _withdraw(found, rest)
     return _conclude(record, found, rest, wrong, progress)
+
+
+def diagnose_form(
+    record: Record, model: RegionalModel, asked: Record, found_model: RegionalModel,
+    progress: Progress = _quiet,
+) -> Diagnosis:  # fmt: skip
+    """Diagnose a record whose static power has another form than the model given.
+
+    The form is the first cause; the others are looked for in the form that the data ask for.
+
+    Parameters
+    ----------
+    record, model
+        The form and the model given.
+    asked, found_model
+        The same rows in the form that the data ask for, and a model of it found in them.
+
+    Raises
+    ------
+    TooFewSamplesError, DataError
+        As `diagnose`.
+    """
+    found = diagnose(asked, found_model, progress=progress)
+    bad, _ = record.faults()
+    before, after = make_grids(*record.about, bad), make_grids(*asked.about, bad)
+    plain = Task(before, before.open_rows, np.zeros(ORDER)), Extended(model)
+    better = Task(after, after.open_rows, np.zeros(ORDER)), found.simulation
+    gain = gain_of_form(*plain, *better)
+    words = record.form.words, asked.form.words
+    nan = float('nan')
+    cause = NamedCause(
+        'form',
+        f'The static power has another form than the model: it follows {words[1]}, not '
+        f'{words[0]}.' + (_AT_OPENINGS if asked.form.scaled else ''),
+        {'exponent': Estimate(asked.form.exponent, nan, nan, ''),
+         'offset_mw': Estimate(found.final.base.offset, nan, nan, 'MW')},
+        gain,
+        'Move the pressure by a tenth at two openings, each held.',
+    )  # fmt: skip
+    verdict = NAMED if found.verdict == NOTHING else found.verdict
+    result = replace(
+        found, verdict=verdict, causes=(cause, *found.causes), rmse_simulation=gain.rmse_before
+    )
+    return replace(result, sentence=_sentence(result))
+
+
+_AT_OPENINGS = ' The knees of this valve stand at fixed openings.'
 
 
 def _moves(grids: Grids) -> None:

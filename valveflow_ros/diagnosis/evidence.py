@@ -18,9 +18,9 @@ from valveflow_ros.diagnosis.fitting import (
     free,
     level_tangents,
 )
-from valveflow_ros.diagnosis.grids import FOLDS, SEALED_FOLD
+from valveflow_ros.diagnosis.grids import FOLDS, ORDER, SEALED_FOLD
 from valveflow_ros.diagnosis.screening import Screening, nuisance
-from valveflow_ros.fit.whitening import inflation
+from valveflow_ros.fit.whitening import fit_ar, inflation
 from valveflow_ros.records import BoolArray, FloatArray, IntArray
 
 # States that are not measured: inferred again where a model is to be judged or used.
@@ -261,6 +261,22 @@ def sealed_gain(task: Task, before: Extended, after: Extended, tried: int) -> Ga
     return Gain(rmse(task, before, rows), rmse(task, after, rows), chance)
 
 
+def gain_of_form(task: Task, model: Extended, task_new: Task, new: Extended) -> Gain:
+    """Compare models of two forms on the sealed blocks of the same rows.
+
+    Both residuals are whitened as the newer one asks for.
+    """
+    rows = task.grids.sealed_rows & task_new.grids.sealed_rows
+    old_rest, new_rest = fair_residual(task, model), fair_residual(task_new, new)
+    scored = rows.astype(np.uint8)
+    sealed = replace(task_new, rows=rows, ar=fit_ar(new_rest, scored, ORDER))
+    rest, change = sealed.innovations(old_rest), sealed.innovations(old_rest - new_rest)
+    count = np.bincount(task.grids.sub[rows])
+    scores = np.bincount(task.grids.sub[rows], rest * change).astype(np.float64)
+    before, after = (float(np.sqrt(np.mean(e[rows] ** 2))) for e in (old_rest, new_rest))
+    return Gain(before, after, sign_flip(scores[count > 0]))
+
+
 def sign_flip(scores: FloatArray) -> float:
     """Return the chance that scores of either sign would sum to as much.
 
@@ -411,15 +427,16 @@ class Certainty:
 
         cause = self.model.active[c].cause
         unknown, here = cause.unknowns[k], self.model.active[c].values[k]
+        step = unknown.step_on(self.task.grids)
         if unknown.kind is Kind.LINE:
             most = cost(here) + _JUMP95 * self.variance * self._colour
-            low, high = (_last_place(cost, here, sign * unknown.step, unknown, most)
+            low, high = (_last_place(cost, here, sign * step, unknown, most)
                          for sign in (-1.0, 1.0))  # fmt: skip
         else:
             influence = self.table @ self.inverse[:, own] if own is not None else np.ones(1)
             most = cost(here) + _CHI95 * self.variance * self._widening(influence)
-            low = _crossing(cost, here, -unknown.step, unknown.low, most)
-            high = _crossing(cost, here, unknown.step, unknown.high, most)
+            low = _crossing(cost, here, -step, unknown.low, most)
+            high = _crossing(cost, here, step, unknown.high, most)
         if cause.stage is Stage.OPENING and unknown.unit == '%':
             margin = _NOISES * self.task.grids.reference.opening_noise
             low, high = max(low - margin, unknown.low), min(high + margin, unknown.high)

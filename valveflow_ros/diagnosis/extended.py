@@ -21,15 +21,17 @@ from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import Active, Stage
 from valveflow_ros.diagnosis.grids import Grids, Reference
 from valveflow_ros.records import ByteArray, FloatArray
+from valveflow_ros.signals.static_form import StaticForm
 
 _REMEMBERED = 24
 
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """What causes make of the inputs: u (n,), MW added to F(u), factor on x (None: nothing)."""
+    """What causes make of the inputs, (n,): u, p^e, MW added, factor on x (None: nothing)."""
 
     u: FloatArray
+    scale: FloatArray
     added: FloatArray | None
     gain: FloatArray | None
 
@@ -97,9 +99,13 @@ def _input(grids: Grids, model: Extended) -> FloatArray:
 
 def drive(grids: Grids, model: Extended) -> Drive:
     """Return what acts on the curve and behind it."""
-    u = _input(grids, model)
+    u, scale = _input(grids, model), grids.scale
     for a in model.at(Stage.INPUT):
-        u = u * a.cause.act(u, a.values, grids, model.base)
+        factor = a.cause.act(u, a.values, grids, model.base)
+        if acts_on_scale(a, grids.form):
+            scale = scale * factor
+        else:
+            u = u * factor
     added: FloatArray | None = None
     for a in model.at(Stage.FLOW):
         part = a.cause.act(u, a.values, grids)
@@ -108,14 +114,19 @@ def drive(grids: Grids, model: Extended) -> Drive:
     for a in model.at(Stage.GAIN):
         factor = a.cause.act(a.values, grids, a.extra)
         gain = factor if gain is None else gain * factor
-    return Drive(u, added, gain)
+    return Drive(u, scale, added, gain)
+
+
+def acts_on_scale(a: Active, form: StaticForm) -> bool:
+    """Return whether a cause of the input changes p^e: one of the pressure does, if there is e."""
+    return form.scaled and a.cause.family == 'nozzle'
 
 
 def flow_of(model: Extended, driven: Drive) -> FloatArray:
     """Return the steam power x in MW, shape (n,)."""
     x = np.empty(len(driven.u))
     m = model.base
-    kernels.flow(driven.u, m.knots, m.left, m.right, x)
+    kernels.flow(driven.u, driven.scale, m.offset, m.knots, m.left, m.right, x)
     if driven.added is not None:
         x += driven.added
     if driven.gain is not None:
@@ -169,8 +180,7 @@ class ExtendedModel:
     Attributes
     ----------
     model : Extended
-    pressure_exponent : float
-        Of u in eq. (1).
+    form : StaticForm
     start_ns : int
         Time that drifts and onsets count from.
     reference : Reference
@@ -181,10 +191,15 @@ class ExtendedModel:
     """
 
     model: Extended
-    pressure_exponent: float
+    form: StaticForm
     start_ns: int
     reference: Reference
     on_top_of: ExtendedModel | None = None
+
+    @property
+    def pressure_exponent(self) -> float:
+        """Return q of u = V p^q."""
+        return self.form.input_exponent
 
     @property
     def held(self) -> tuple[HeldCause, ...]:
@@ -205,8 +220,14 @@ class ExtendedModel:
             choice=Choice('extended_model', {}, {}),
             source=FittedData(0, 0, 0, 0, 0, nan, nan, False),
             residuals=ResidualStatistics(nan, nan, nan, nan, nan),
-            dynamics=_dynamics(self.model.base),
+            dynamics=_dynamics(
+                self.model.base, self.form.scale(math.exp(self.reference.log_pressure))
+            ),
             held=self.held,
+            axis=self.form.axis,
+            pressure_scale_exponent=self.form.scale_exponent,
+            offset_mw=self.model.base.offset,
+            reference_pressure_mpa=math.exp(self.reference.log_pressure),
         ).with_id()
 
 
@@ -219,8 +240,9 @@ def _pieces(m: RegionalModel) -> tuple[Piece, ...]:
     )  # fmt: skip
 
 
-def _dynamics(m: RegionalModel) -> tuple[RegionDynamics, ...]:
-    ends = [*m.left.tolist(), *m.right.tolist(), *m.levels.tolist()]
+def _dynamics(m: RegionalModel, scale: FloatArray | float) -> tuple[RegionDynamics, ...]:
+    flow = scale * np.concatenate([m.left, m.right]) + m.offset
+    ends = [*flow.tolist(), *m.levels.tolist()]
     edges = [min(ends), *m.levels.tolist(), max(ends)]
     return tuple(
         RegionDynamics(

@@ -224,10 +224,11 @@ def base_mask(task: Task, model: Extended) -> BoolArray:
     """Return which packed parameters of curve and dynamics may move."""
     free = free_parameters(model.base)
     if task.fixed_dynamics:
-        free[-2 * model.base.regions :] = False
+        delays = model.base.delay_places
+        free[delays.start - model.base.regions : delays.stop] = False
     elif 'clock' in model.names:
         # Only delay minus lead shows, so the shortest delay stays where it is.
-        free[len(free) - model.base.regions + int(np.argmin(model.base.delays))] = False
+        free[model.base.delay_places.start + int(np.argmin(model.base.delays))] = False
     return free
 
 
@@ -237,7 +238,7 @@ def _base_steps(model: RegionalModel) -> FloatArray:
     span = float(model.knots[-1] - model.knots[0])
     return np.concatenate(
         [np.ones(j + 1), np.full(j - 1, 1e-3 * span), np.ones(j - 1), np.full(i, 0.02),
-         np.full(i, 0.2)]
+         np.full(i, 0.2), np.ones(model.size - (3 * j - 1 + 2 * i))]
     )  # fmt: skip
 
 
@@ -285,7 +286,7 @@ def cause_tangents(task: Task, model: Extended) -> FloatArray:
     for c, k in slots:
         stage = model.active[c].cause.stage
         keep = None if stage == Stage.DYNAMICS else path
-        h = model.active[c].cause.unknowns[k].step
+        h = model.active[c].cause.unknowns[k].step_on(grids)
         up, down = _shifted(model, c, k, h), _shifted(model, c, k, -h)
         width = up.active[c].values[k] - down.active[c].values[k]
         change = answer(grids, up, None, keep) - answer(grids, down, None, keep)
@@ -307,17 +308,21 @@ def level_tangents(task: Task, model: Extended) -> FloatArray:
     return np.column_stack(columns)
 
 
-def _levels_along(before: RegionalModel, after: RegionalModel) -> RegionalModel:
+def _levels_along(
+    before: RegionalModel, after: RegionalModel, scale: float = 1.0
+) -> RegionalModel:
     """Move the levels with the curve, so that the regions change at the same u as before.
 
-    A level that stays while the curve moves by a MW costs more than most causes gain.
+    A level that stays while the curve moves by a MW costs more than most causes gain. Where the
+    flow depends on the pressure besides, that holds at one pressure, whose p^e is ``scale``.
     """
     if not len(before.levels) or np.any(before.right <= before.left):
         return after
-    x = np.append(before.left, before.right[-1])
+    x = scale * np.append(before.left, before.right[-1]) + before.offset
     inside = (before.levels > x[0]) & (before.levels < x[-1])
     u = np.interp(before.levels, x, before.knots)
-    levels = np.where(inside, before.levels + after.static(u) - before.static(u), before.levels)
+    moved = after.static(u, scale) - before.static(u, scale)
+    levels = np.where(inside, before.levels + moved, before.levels)
     return after.with_levels(levels) if np.all(np.diff(levels) > 0.0) else after
 
 
@@ -326,11 +331,12 @@ def _stepped(task: Task, model: Extended, step: FloatArray) -> Extended | None:
     free = np.flatnonzero(base_mask(task, model))
     packed = model.base.pack()
     packed[free] += step[: len(free)]
-    i = model.base.regions
-    packed[-i:] = np.clip(packed[-i:], 0.0, 600.0)
-    low = np.log(0.1 * task.grids.step_s)
-    packed[-2 * i : -i] = np.clip(packed[-2 * i : -i], low, np.log(3600.0))
-    moved = replace(model, base=_levels_along(model.base, model.base.unpack(packed)))
+    delays = model.base.delay_places
+    lags = slice(delays.start - model.base.regions, delays.start)
+    packed[delays] = np.clip(packed[delays], 0.0, 600.0)
+    packed[lags] = np.clip(packed[lags], np.log(0.1 * task.grids.step_s), np.log(3600.0))
+    scale = float(np.median(task.grids.scale))
+    moved = replace(model, base=_levels_along(model.base, model.base.unpack(packed), scale))
     for (c, k), by in zip(_slots(model), step[len(free) :], strict=True):
         moved = _shifted(moved, c, k, float(by))
     knots = moved.base.knots

@@ -20,7 +20,7 @@ from valveflow_ros.fit.refine import refine
 from valveflow_ros.monitoring.events import DiagnosisContent, DiagnosisTask
 from valveflow_ros.records import FloatArray, IntArray, Quality, SampleTable, Signal
 from valveflow_ros.segments.window import WindowContents
-from valveflow_ros.signals.integrated_input import integrated_input
+from valveflow_ros.signals.static_form import StaticForm, pressure_of
 
 # A model to begin with where special segments give none.
 
@@ -29,7 +29,7 @@ _LEAST_SPREAD = 0.02
 
 
 def first_model(
-    table: SampleTable, step_s: float, exponent: float, settle_s: float
+    table: SampleTable, step_s: float, form: StaticForm, settle_s: float
 ) -> RegionalModel:
     """Fit curve and dynamics to all rows, beginning with a regression on hats of u.
 
@@ -38,8 +38,8 @@ def first_model(
     DataError
         The valve hardly moves, or too little was measured.
     """
-    u = integrated_input(
-        table.column(Signal.VALVE_OPENING), table.column(Signal.MAIN_STEAM_PRESSURE), exponent
+    u, scale = form.of_rows(
+        table.column(Signal.VALVE_OPENING), table.column(Signal.MAIN_STEAM_PRESSURE)
     )
     power = table.column(Signal.GENERATED_POWER)
     usable = np.isfinite(u) & np.isfinite(power)
@@ -48,24 +48,31 @@ def first_model(
     knots = np.quantile(u[usable], np.linspace(0.0, 1.0, _PIECES + 1))
     if knots[-1] - knots[0] < _LEAST_SPREAD * abs(knots[-1]):
         raise DataError('The valve hardly moves in this record: there is nothing to compare.')
-    values = _hats(u[usable], knots, power[usable])
+    values, offset = _hats(
+        u[usable], knots, power[usable], None if scale is None else scale[usable]
+    )
     start = RegionalModel(
-        knots, values[:-1].copy(), values[1:].copy(), np.empty(0), np.ones(1), np.zeros(1)
+        knots, values[:-1].copy(), values[1:].copy(), np.empty(0), np.ones(1), np.zeros(1), offset
     )
     flags = usable.astype(np.uint8)
     flags[1:][np.diff(table.time_ns) > 1.5e9 * step_s] = 0
     samples = Samples(
         np.where(usable, u, 0.0), np.where(usable, power, 0.0), flags, step_s, settle_s,
-        max(1, round(10.0 / step_s)),
+        max(1, round(10.0 / step_s)), None if scale is None else np.where(usable, scale, 1.0),
     )  # fmt: skip
     return refine(samples, start, _MOST).model
 
 
-def _hats(u: FloatArray, knots: FloatArray, power: FloatArray) -> FloatArray:
-    """Return the least squares values at the knots."""
+def _hats(
+    u: FloatArray, knots: FloatArray, power: FloatArray, scale: FloatArray | None
+) -> tuple[FloatArray, float | None]:
+    """Return the least squares values at the knots, and c where the form has one."""
     knots += np.arange(len(knots)) * 1e-6 * (knots[-1] - knots[0])
     table = np.column_stack([np.interp(u, knots, row) for row in np.eye(len(knots))])
-    return np.asarray(np.linalg.lstsq(table, power, rcond=None)[0])
+    if scale is not None:
+        table = np.column_stack([scale[:, None] * table, np.ones(len(u))])
+    found = np.asarray(np.linalg.lstsq(table, power, rcond=None)[0])
+    return (found, None) if scale is None else (found[:-1], float(found[-1]))
 
 
 # A record freed of the causes of an earlier model, to be diagnosed on top of it.
@@ -135,12 +142,12 @@ def diagnose_window(task: DiagnosisTask) -> DiagnosisContent:
     follow the window, as those of `valveflow diagnose` without a model do.
     """
     settings, contents = task.settings, task.contents
-    exponent, step_s = task.curve.pressure_exponent, settings.real('sample_period')
-    table = table_of(contents, exponent)
+    form, step_s = task.curve.static_form, settings.real('sample_period')
+    table = table_of(contents, settings.real('pressure_exponent'))
     model: RegionalModel = task.curve.model
     if not task.curve.dynamics:
-        model = first_model(table, step_s, exponent, settings.settle_s)
-    record = Record(table, step_s, exponent, settings.settle_s, _spans_ns(contents))
+        model = first_model(table, step_s, form, settings.settle_s)
+    record = Record(table, step_s, form, settings.settle_s, _spans_ns(contents))
     record = freed(record, task.curve.held)
     text = json.dumps(to_json(diagnose(record, model)), allow_nan=False)
     return DiagnosisContent(task.window_end_ns, text)
@@ -151,20 +158,15 @@ def table_of(contents: WindowContents, exponent: float) -> SampleTable:
     opening = contents.opening_percent
     columns = {
         Signal.VALVE_OPENING: opening,
-        Signal.MAIN_STEAM_PRESSURE: _pressure(contents.u, opening, exponent),
+        Signal.MAIN_STEAM_PRESSURE: np.round(
+            pressure_of(contents.u, opening, exponent), _DECIMALS
+        ),
         Signal.MAIN_STEAM_TEMPERATURE: contents.temperature_degc,
         Signal.GENERATED_POWER: contents.power_mw,
     }
     if len(contents.command_percent):
         columns[Signal.VALVE_COMMAND] = contents.command_percent
     return SampleTable.from_columns(contents.time_ns, columns)
-
-
-def _pressure(u: FloatArray, opening: FloatArray, exponent: float) -> FloatArray:
-    """Return p of u = V p^m; NaN where V or u is not positive."""
-    open_ = (opening > 0.0) & (u > 0.0)
-    ratio = np.divide(u, opening, out=np.full(len(u), np.nan), where=open_)
-    return np.asarray(np.round(ratio ** (1.0 / exponent), _DECIMALS))
 
 
 def _spans_ns(contents: WindowContents) -> IntArray:

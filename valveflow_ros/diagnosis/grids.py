@@ -9,6 +9,7 @@ import numpy as np
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.records import NS_PER_S, BoolArray, ByteArray, FloatArray, SampleTable, Signal
+from valveflow_ros.signals.static_form import StaticForm
 
 DAY_S = 86_400.0
 SUBS_IN_BLOCK = 8
@@ -49,12 +50,15 @@ class Grids:
     ----------
     start_ns, fine_s, step_s : int, float, float
         Time of the first row, step of the fine rows and of the model rows.
+    form : StaticForm
     v, density : float64 (nn,)
-        Opening in % and p^m on the fine grid, NaN where there is none.
+        Opening in % and p^q on the fine grid, NaN where there is none.
     command : float64 (nn,)
         Commanded opening in %, NaN where there is none.
     u, pressure, temperature, time_s : float64 (n,)
-        Model rows: integrated input, MPa, degC, seconds since the first row.
+        Model rows: V p^q, MPa, degC, seconds since the first row.
+    scale : float64 (n,)
+        Model rows: p^e.
     usable : uint8 (n,)
     power : float64 (m,)
         Scored means of the power in MW; 0 where not scored.
@@ -71,11 +75,12 @@ class Grids:
     fine_s: float
     step_s: float
     settle_s: float
-    exponent: float
+    form: StaticForm
     v: FloatArray
     density: FloatArray
     command: FloatArray
     u: FloatArray
+    scale: FloatArray
     pressure: FloatArray
     temperature: FloatArray
     time_s: FloatArray
@@ -206,7 +211,7 @@ SUB_S = 1800.0
 
 
 def make_grids(
-    table: SampleTable, step_s: float, exponent: float, settle_s: float, bad: BoolArray,
+    table: SampleTable, step_s: float, form: StaticForm, settle_s: float, bad: BoolArray,
     rough: bool = False,
 ) -> Grids:  # fmt: skip
     """Put a table on the grids.
@@ -242,7 +247,9 @@ def make_grids(
         for s in (Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE, Signal.MAIN_STEAM_TEMPERATURE)
     )
     with np.errstate(invalid='ignore'):
-        density = np.where(p > 0.0, p, np.nan) ** exponent
+        positive = np.where(p > 0.0, p, np.nan)
+        # Where p is not known the first power of it is not either, nor is then u.
+        density = np.where(np.isfinite(positive), positive**form.input_exponent, np.nan)
 
     def coarse(x: FloatArray) -> FloatArray:
         return np.asarray(x.reshape(-1, factor).mean(axis=1)) if len(x) else x
@@ -265,8 +272,10 @@ def make_grids(
     pressure, temperature = _everywhere(coarse(p)), _everywhere(coarse(t))
     return Grids(
         start_ns=int(table.time_ns[0]), fine_s=step_s, step_s=step, settle_s=settle_s,
-        exponent=exponent, v=v, density=density, command=fine[:, Signal.VALVE_COMMAND],
-        u=np.where(usable > 0, u, 0.0), pressure=pressure, temperature=temperature,
+        form=form, v=v, density=density, command=fine[:, Signal.VALVE_COMMAND],
+        u=np.where(usable > 0, u, 0.0),
+        scale=np.where(usable > 0, coarse(positive**form.scale_exponent), 1.0),
+        pressure=pressure, temperature=temperature,
         time_s=np.asarray((np.arange(len(u)) + 0.5) * step - 0.5 * step_s, dtype=np.float64),
         usable=usable,
         power=np.where(scored, power, 0.0), scored=scored, whole=whole,

@@ -11,11 +11,12 @@ from valveflow_ros.records import NS_PER_S, ByteArray, FloatArray, IntArray
 
 @jit
 def flow(
-    u: FloatArray, knots: FloatArray, left: FloatArray, right: FloatArray, out: FloatArray
-) -> None:
-    """Write x = F(u), shape (n,)."""
+    u: FloatArray, scale: FloatArray, offset: float, knots: FloatArray, left: FloatArray,
+    right: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Write x = ``scale`` F(u) + ``offset``, shape (n,)."""
     for t in range(u.size):
-        out[t] = curve(u[t], knots, left, right)
+        out[t] = scale[t] * curve(u[t], knots, left, right) + offset
 
 
 @jit

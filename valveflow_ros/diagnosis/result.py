@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from valveflow_ros.curve.characteristic_json import form_of
 from valveflow_ros.curve.json_schema import (
     DEGC,
     MOST_PIECES,
@@ -31,6 +32,7 @@ from valveflow_ros.diagnosis.evidence import Gain, SegmentGain
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
 from valveflow_ros.diagnosis.grids import Reference
 from valveflow_ros.errors import DataError
+from valveflow_ros.signals.static_form import AXES, OPENING
 
 NAMED, NOTHING, UNEXPLAINED = 'named', 'nothing', 'unexplained'
 
@@ -120,7 +122,10 @@ def model_to_json(given: ExtendedModel) -> dict[str, Any]:
     return {
         'format': MODEL_FORMAT,
         'version': MODEL_VERSION,
+        'axis': given.form.axis,
         'pressure_exponent': given.pressure_exponent,
+        'pressure_scale_exponent': given.form.scale_exponent,
+        'offset_mw': m.offset,
         'start_ns': given.start_ns,
         'reference': dataclasses.asdict(given.reference),
         'curve': {'knots': m.knots.tolist(), 'left': m.left.tolist(), 'right': m.right.tolist()},
@@ -143,7 +148,10 @@ def is_model(raw: object) -> bool:
 
 _TIME = Number(-4e7, 4e7)  # seconds from the model's start, 400 days and more
 _SCHEMA = {
-    'pressure_exponent': Number(0.5, 2.0),
+    'axis': Maybe(Text(AXES)),
+    'pressure_exponent': Number(0.0, 2.0),
+    'pressure_scale_exponent': Maybe(Number(0.0, 2.0)),
+    'offset_mw': Maybe(Number(*MW)),
     'start_ns': Count(NS),
     'reference': {
         'span_s': Number(1.0, 4e7), 'temperature_degc': Number(*DEGC),
@@ -191,10 +199,10 @@ def model_from_json(raw: object, depth: int = 0) -> ExtendedModel:
     noise = reference.pop('opening_noise') or 0.0
     given = ExtendedModel(
         Extended(_base(top, inside), _causes(top['causes'], f'{inside}causes')),
-        top['pressure_exponent'], top['start_ns'], Reference(**reference, opening_noise=noise),
+        form_of(top, _WHOLE, inside), top['start_ns'], Reference(**reference, opening_noise=noise),
         earlier,
     )  # fmt: skip
-    if earlier is not None and earlier.pressure_exponent != given.pressure_exponent:
+    if earlier is not None and earlier.form != given.form:
         raise fail(_WHOLE, f'{inside}on_top_of', 'is a model over another input u')
     return given
 
@@ -211,7 +219,8 @@ def _base(top: dict[str, Any], inside: str) -> RegionalModel:
     if not len(times) == len(delays) == len(levels) + 1:
         problem = 'must have one level less than time constants and delays'
         raise fail(_WHOLE, f'{inside}dynamics', problem)
-    return RegionalModel(knots, left, right, levels, times, delays)
+    offset = top['offset_mw'] or 0.0 if top['axis'] == OPENING else None
+    return RegionalModel(knots, left, right, levels, times, delays, offset)
 
 
 def _causes(found: list[dict[str, Any]], path: str) -> tuple[Active, ...]:

@@ -35,10 +35,11 @@ def nuisance(task: Task, model: Extended) -> FloatArray:
     """
     free = np.flatnonzero(base_mask(task, model))
     base = base_tangents(task, model)
-    first_delay = len(model.base.pack()) - model.base.regions
+    first_delay = model.base.delay_places.start
     at_bound = [
         k for k, p in enumerate(free)
-        if p >= first_delay and model.base.delays[p - first_delay] <= 0.0
+        if first_delay <= p < model.base.delay_places.stop
+        and model.base.delays[p - first_delay] <= 0.0
     ]  # fmt: skip
     base = np.delete(base, at_bound, axis=1)
     table = task.innovations(
@@ -95,7 +96,7 @@ class Screening:
         path = region_path(model, x)
 
         def scaled(factor: float) -> FloatArray:
-            return answer(grids, model, Drive(driven.u * factor, driven.added, driven.gain))
+            return answer(grids, model, replace(driven, u=driven.u * factor))
 
         gain = np.ones(len(x)) if driven.gain is None else driven.gain
         columns = [
@@ -114,7 +115,7 @@ class Screening:
         """Return the answer to a small change of the flow, regions held."""
         gain = 1.0 if driven.gain is None else driven.gain
         added = change / gain if driven.added is None else driven.added + change / gain
-        moved = answer(self.grids, self.model, Drive(driven.u, added, driven.gain), path)
+        moved = answer(self.grids, self.model, replace(driven, added=added), path)
         held = answer(self.grids, self.model, driven, path)
         return moved - held
 

@@ -126,8 +126,8 @@ def rebuilt(task: Task, model: Extended) -> tuple[Task, Extended]:
     task_new, other, cost = settle(task, replace(model, base=base), rounds=1, steps=4)
     # Both under one whitening: the better model's.
     variance = cost / max(int(task.rows.sum()), 1)
-    before = task_new.cost(model) / (2.0 * variance) + _EACH * len(model.base.pack())
-    after = task_new.cost(other) / (2.0 * variance) + _EACH * len(other.base.pack())
+    before = task_new.cost(model) / (2.0 * variance) + _EACH * model.base.size
+    after = task_new.cost(other) / (2.0 * variance) + _EACH * other.base.size
     return (task_new, other) if after < before else (task, model)
 
 
@@ -135,7 +135,7 @@ def _seen_through(task: Task, model: Extended) -> Samples:
     """Return the record as it would be without the causes; sealed blocks are left out."""
     grids = task.grids
     driven = drive(grids, model)
-    plain = answer(grids, model.without_causes(), Drive(driven.u, None, None))
+    plain = answer(grids, model.without_causes(), Drive(driven.u, driven.scale, None, None))
     power = grids.power - (answer(grids, model) - plain)
     rows = np.repeat(task.rows, grids.group)
     return Samples(
@@ -145,6 +145,7 @@ def _seen_through(task: Task, model: Extended) -> Samples:
         step_s=grids.step_s,
         settle_s=grids.settle_s,
         group=grids.group,
+        scale=driven.scale if grids.form.scaled else None,
     )
 
 

@@ -239,7 +239,7 @@ Views = tuple[tuple[Signature, ...], tuple[Answer, ...], tuple[ResidualMap, ...]
 def views(record: Record, found: Diagnosis) -> Views:
     """Return residuals by variable, around fast moves and in maps, before and after extending."""
     bad, _ = record.faults()
-    grids = make_grids(record.table, record.step_s, record.pressure_exponent, record.settle_s, bad)
+    grids = make_grids(*record.about, bad)
     task = Task(grids, grids.whole, np.zeros(ORDER))
     return (
         signatures(task, found.simulation, found.extended),

@@ -17,7 +17,6 @@ from valveflow_ros.curve.characteristic import (
     ResidualStatistics,
 )
 from valveflow_ros.curve.regional_model import RegionalModel
-from valveflow_ros.curve.static_form import INTEGRATED_INPUT, StaticForm, pressure_of
 from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.fit.model_form import find_form
 from valveflow_ros.fit.problem import Samples
@@ -36,6 +35,7 @@ from valveflow_ros.partition.paper_rule import select
 from valveflow_ros.partition.partition import Partition, partition
 from valveflow_ros.records import ByteArray, FloatArray, IntArray, SegmentKind
 from valveflow_ros.segments.window import WindowContents
+from valveflow_ros.signals.static_form import INTEGRATED_INPUT, StaticForm, pressure_of
 
 _RICHER = 3  # pieces more than the paper's rule takes, before pruning
 
@@ -94,6 +94,20 @@ def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
         return with_support(begun.static, task.contents, task.input_noise).with_id()
     refined = _refined(begun, progress)
     return with_support(refined, task.contents, task.input_noise).with_id()
+
+
+def form_of_data(task: FitTask) -> StaticForm:
+    """Return the form that the rows of a task ask for; the paper's where they cannot tell."""
+    try:
+        return _formed(task).form
+    except DataError:
+        return StaticForm(exponent=task.settings.real('pressure_exponent'))
+
+
+def form_contradicted(task: FitTask, given: StaticForm) -> bool:
+    """Return whether the rows of a task tell that the static power has another form."""
+    found = _formed(replace(task, form=given)).evidence
+    return found is not None and found.contradicted
 
 
 def outline(task: FitTask, progress: Progress = lambda _: None) -> RegionalModel:

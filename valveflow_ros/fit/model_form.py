@@ -14,10 +14,10 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from valveflow_ros.curve.characteristic import FormEvidence
-from valveflow_ros.curve.static_form import INTEGRATED_INPUT, OPENING, StaticForm
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.partition.partition import partition
 from valveflow_ros.records import BoolArray, FloatArray, IntArray
+from valveflow_ros.signals.static_form import INTEGRATED_INPUT, OPENING, StaticForm
 
 _MEAN_S = 60.0
 _KNOTS = 10
@@ -33,6 +33,8 @@ _FREEDOM = 4.0
 # stretches, and where the two differ by such a share of the power's range.
 _LEAST_GAIN, _LEAST_Z, _LEAST_APART = 12.0, 2.5, 0.003
 _WORST = 0.05
+_LEAST_IN_CELL = 5
+_MISFIT = 0.01  # of the power's range
 _PROFILE_MEANS, _PROFILE_PIECES = 1500, 6
 
 
@@ -116,7 +118,7 @@ def find_form(
     if len(means) < _LEAST_MEANS:
         if axis == OPENING and held is None:
             raise TooFewSamplesError(
-                'Means over a minute inside special segments, to find the exponent of p^m F(V) + c',
+                'Means over a minute in special segments, to find the exponent of p^m F(V) + c',
                 len(means), _LEAST_MEANS, 'A longer log would help.',
             )  # fmt: skip
         return None
@@ -152,6 +154,79 @@ def find_form(
     )
     offset = _offset(means, chosen) if chosen.form.scaled else 0.0
     return FoundForm(chosen.form, offset, evidence)
+
+
+@dataclass(frozen=True, slots=True)
+class Misfit:
+    """What a curve gets wrong again and again at the same openings and pressures.
+
+    Attributes
+    ----------
+    rms_mw : float
+        Root mean square over what was visited; noise that does not come again is not in it.
+    worst : tuple of float
+        Opening in %, pressure in MPa and MW by which the measured power differs there.
+    """
+
+    rms_mw: float
+    worst: tuple[float, float, float]
+
+
+def find_misfit(
+    opening: FloatArray,
+    pressure: FloatArray,
+    residual: FloatArray,
+    power: FloatArray,
+    spans: IntArray,
+    period_s: float,
+) -> Misfit | None:
+    """Return what a curve gets wrong, None where that is less than a hundredth of the range.
+
+    Parameters
+    ----------
+    opening, pressure, residual, power : float64 (n,)
+        Rows in %, MPa and MW; the residual is measured power less static power of the curve.
+    spans, period_s
+        As for `find_form`.
+
+    Notes
+    -----
+    Cells of opening and pressure get a mean from even and one from odd stretches of time. What
+    both have in common is the curve's; the product of independent noise has the mean 0.
+    """
+    means = _means_of(opening, pressure, residual, spans, period_s)
+    ramp = _means_of(opening, pressure, power, spans, period_s)
+    if len(means) < _LEAST_MEANS or len(means) != len(ramp):
+        return None
+    square = float((ramp.rate**2).sum())
+    rest = means.power - ramp.rate * (float((ramp.rate * means.power).sum()) / max(square, 1e-12))
+    cell = _place(means.opening, 6) * 5 + _place(means.pressure, 5)
+    odd = np.arange(len(rest)) * _STRETCHES // len(rest) % 2 > 0
+    halves = []
+    for half in (odd, ~odd):
+        count = np.bincount(cell[half], minlength=30)
+        total = np.bincount(cell[half], rest[half], minlength=30)
+        halves.append((count, total / np.maximum(count, 1)))
+    (n1, m1), (n2, m2) = halves
+    n = np.where((n1 >= _LEAST_IN_CELL) & (n2 >= _LEAST_IN_CELL), n1 + n2, 0)
+    if not n.any():
+        return None
+    common = m1 * m2
+    rms = math.sqrt(max(0.0, float((n * common).sum() / n.sum())))
+    if not rms > _MISFIT * float(np.ptp(ramp.power)):
+        return None
+    worst = int(np.argmax(np.where(n > 0, common, -np.inf)))
+    there = cell == worst
+    return Misfit(rms, (
+        float(np.median(means.opening[there])), float(np.median(means.pressure[there])),
+        float(rest[there].mean()),
+    ))  # fmt: skip
+
+
+def _place(x: FloatArray, parts: int) -> IntArray:
+    """Return in which of some equally filled parts each value lies."""
+    edges = np.quantile(x, np.linspace(0.0, 1.0, parts + 1)[1:-1])
+    return np.asarray(np.searchsorted(edges, x, side='right'))
 
 
 def _means_of(

@@ -114,8 +114,9 @@ class Problem:
 
         def stretch(begin: int, first: int, end: int) -> None:
             answer_residual(
-                self.u, self.scale, model.offset, self.usable, self.power, model.knots, model.left, model.right,
-                model.levels, taps, self.settle, s.group, begin, first, end, residual, weight,
+                self.u, self.scale, model.offset, self.usable, self.power,
+                model.knots, model.left, model.right, model.levels, taps, self.settle, s.group,
+                begin, first, end, residual, weight,
             )  # fmt: skip
 
         # An answer takes so little that more and shorter stretches would cost more than they gain.
@@ -177,8 +178,9 @@ class Problem:
     ) -> None:  # fmt: skip
         s = self.samples
         tangents(
-            self.u, self.scale, model.offset, self.usable, self.power, model.knots, model.left, model.right,
-            model.levels, model.time_constants, model.delays, s.step_s, self.settle, s.group,
+            self.u, self.scale, model.offset, self.usable, self.power,
+            model.knots, model.left, model.right, model.levels,
+            model.time_constants, model.delays, s.step_s, self.settle, s.group,
             begin, first, end, residual, jacobian, weight,
         )  # fmt: skip
 

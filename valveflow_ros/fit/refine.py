@@ -95,8 +95,10 @@ def corrected(
     scale = None if samples.scale is None else noisier(samples.scale)
     if u is None and scale is None:
         return model
-    more = {name: x for name, x in (('u', u), ('scale', scale)) if x is not None}
-    problem_with_noise = Problem(replace(problem.samples, **more))
+    s = problem.samples
+    problem_with_noise = Problem(
+        replace(s, u=s.u if u is None else u, scale=s.scale if scale is None else scale)
+    )
     moved, _ = move(problem_with_noise, model, ar, free, 2)
     packed = 2.0 * model.pack() - moved.pack()
     packed[model.delay_places] = np.maximum(packed[model.delay_places], 0.0)

@@ -30,7 +30,7 @@ from valveflow_ros.records import (
     Signal,
     SpecialSegment,
 )
-from valveflow_ros.signals.integrated_input import integrated_input
+from valveflow_ros.signals.static_form import integrated_input
 
 # A rising broken line through the levels of a step test.
 

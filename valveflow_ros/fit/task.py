@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from valveflow_ros.curve.characteristic import HeldCause, Piece
-from valveflow_ros.curve.static_form import StaticForm
 from valveflow_ros.errors import DataError, TooFewSamplesError, counted
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import FloatArray, IntArray
 from valveflow_ros.segments.window import WindowContents
+from valveflow_ros.signals.static_form import StaticForm
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,6 +42,7 @@ from valveflow_ros.report.validation import (
     verdict_words,
 )
 from valveflow_ros.report.words import held_words, percent
+from valveflow_ros.signals.static_form import INTEGRATED_INPUT
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +140,8 @@ def compare(
     RecordingError, InputError, DataError
         A log cannot be read, carries no curve, or holds nothing to judge by.
     """
-    given = dict(parameters or {})
+    # The other methods are the paper's: they simulate from V p^m.
+    given = {'axis': INTEGRATED_INPUT, **(parameters or {})}
     if truth is not None and not isinstance(truth, Truth):
         truth = load_truth(truth)
     log = _not_empty(as_log(log, progress))

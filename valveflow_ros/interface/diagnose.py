@@ -25,12 +25,13 @@ from valveflow_ros.interface.files import Result, signed
 from valveflow_ros.interface.logs import Log, as_log
 from valveflow_ros.interface.models import Model, load_model, with_exponent
 from valveflow_ros.interface.monitor import recorded_history
-from valveflow_ros.interface.observation import observe_log, settings_of
+from valveflow_ros.interface.observation import Observed, observe_log, settings_of
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SIGNALS, IntArray, SampleTable
 from valveflow_ros.report.diagnosis import Diagnosed, diagnosis_page
 from valveflow_ros.report.page import Page
 from valveflow_ros.report.words import held_words
+from valveflow_ros.signals.static_form import StaticForm
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,15 +42,15 @@ class DiagnosisResult(Result):
     ----------
     data : Diagnosed
         Everything the report is made from.
-    exponent : float
-        Of the pressure in u.
+    form : StaticForm
+        Of the model.
     on_top_of : ExtendedModel or None
         The model whose causes were taken out of the rows before.
     """
 
     verb = 'diagnose'
     data: Diagnosed
-    exponent: float
+    form: StaticForm
     on_top_of: ExtendedModel | None = None
 
     @property
@@ -61,9 +62,7 @@ class DiagnosisResult(Result):
     def extended_model(self) -> ExtendedModel:
         """Return the model extended by the causes that were found."""
         d = self.diagnosis
-        return ExtendedModel(
-            d.final, self.exponent, self.data.start_ns, d.reference, self.on_top_of
-        )
+        return ExtendedModel(d.final, self.form, self.data.start_ns, d.reference, self.on_top_of)
 
     def page(self) -> Page:
         """Return the report."""
@@ -91,8 +90,25 @@ class _Rows:
     table: SampleTable
     spans_ns: IntArray
     model: RegionalModel | None
+    form: StaticForm
     why: str = ''
     places: IntArray | None = None
+    observed: Observed | None = None
+
+    def asked(self, given: StaticForm) -> tuple[StaticForm, RegionalModel] | None:
+        """Return the form that the data ask for instead of the one given, and a model of it.
+
+        None where they do not, or carry no model.
+        """
+        if self.observed is None or not self.observed.contradicts(given):
+            return None
+        form = self.observed.form()
+        if form.axis == given.axis:
+            return None
+        try:
+            return form, self.observed.outline(form)
+        except DataError:
+            return None
 
 
 def load_diagnosable(path: str | Path) -> Model:
@@ -153,29 +169,36 @@ def diagnose(
         progress.warn(rows.why)
         notes.append(rows.why)
     step, settle = settings.real('sample_period'), settings.settle_s
-    exponent = settings.real('pressure_exponent')
-    regional = rows.model
+    form, regional = rows.form, rows.model
     if model is not None:
-        exponent = model.pressure_exponent
+        form = model.form if isinstance(model, ExtendedModel) else model.static_form
         regional = model.model.base if isinstance(model, ExtendedModel) else model.model
     if regional is None:
-        regional = first_model(rows.table, step, exponent, settle)
-    record = search.Record(rows.table, step, exponent, settle, rows.spans_ns)
+        regional = first_model(rows.table, step, form, settle)
+    record = search.Record(rows.table, step, form, settle, rows.spans_ns)
     if earlier is not None:
         measured = align(log.readings, settings)[0]
         record = on_top(
             record, earlier, measured if rows.places is None else measured.take(rows.places)
         )
         notes.append(held_words(earlier.held))
-    found = search.diagnose(record, regional, model is not None, progress.part(0.4, 0.5))
+    part = progress.part(0.4, 0.5)
+    asked = None if model is None or earlier is not None else rows.asked(form)
+    if asked is None:
+        found = search.diagnose(record, regional, model is not None, part)
+    else:
+        form, there = asked
+        other = replace(record, form=form)
+        found = search.diagnose_form(record, regional, other, there, part)
+        record = other
     signatures, answers, maps = views(record, found)
     found = replace(found, notes=(*log.contents.warnings, *notes, *found.notes))
     times = rows.table.time_ns
     data = Diagnosed(
         log.name, int(times[0]), int(times[-1]), found, signatures, answers, maps,
-        recorded_history(log.contents), exponent,
+        recorded_history(log.contents), form.input_exponent,
     )  # fmt: skip
-    return DiagnosisResult(data, exponent, earlier)
+    return DiagnosisResult(data, form, earlier)
 
 
 def _rows(
@@ -192,12 +215,16 @@ def _rows(
         if not len(table) or not all(np.isfinite(table.column(s)).any() for s in needed):
             raise
         why = f'{error} The model is found from all rows instead, without special segments.'
-        return _Rows(table, np.empty((0, 2), dtype=np.int64), None, why)
+        form = StaticForm(exponent=settings.real('pressure_exponent'))
+        return _Rows(table, np.empty((0, 2), dtype=np.int64), None, form, why)
     spans = np.array([(s.start_ns, s.end_ns) for s in observed.segments], dtype=np.int64)
-    rows = _Rows(observed.table, spans.reshape(-1, 2), None, places=observed.rows)
+    form = observed.form()
+    rows = _Rows(
+        observed.table, spans.reshape(-1, 2), None, form, places=observed.rows, observed=observed
+    )
     if not wanted:
         return rows
     try:
-        return replace(rows, model=observed.outline(progress))
+        return replace(rows, model=observed.outline(form, progress))
     except DataError as error:
         return replace(rows, why=f'{error} All rows are used instead.')

@@ -14,6 +14,7 @@ from valveflow_ros.curve.shift import ShiftLimits, judge_shift, shift_json
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
 from valveflow_ros.diagnosis.result import model_to_json
 from valveflow_ros.errors import DataError, UsageError
+from valveflow_ros.fit.model_form import find_misfit
 from valveflow_ros.fit.step_levels import looks_like_step_test
 from valveflow_ros.fit.step_test import identify_step_test
 from valveflow_ros.interface import SILENT, Progress
@@ -23,7 +24,7 @@ from valveflow_ros.interface.logs import Log, as_log
 from valveflow_ros.interface.models import load_characteristic, load_extended, with_exponent
 from valveflow_ros.interface.monitor import recorded_history
 from valveflow_ros.interface.observation import check_signals, observe_log, settings_of
-from valveflow_ros.records import SampleTable, SpecialSegment
+from valveflow_ros.records import SampleTable, Signal, SpecialSegment
 from valveflow_ros.report.identification import identification_page
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import Page
@@ -171,11 +172,19 @@ def _identified(
         told.append(STEP_TEST_ADVICE)
     for sentence in told:
         progress.warn(sentence)
-    return Identified(
+    found = Identified(
         source=log.name, characteristic=characteristic, table=observed.table,
         segments=observed.segments, counts=observed.counts, settings=settings,
         notes=(*log.notes, *notes, *told), history=recorded_history(log.contents),
     )  # fmt: skip
+    opening, pressure = (
+        observed.table.column(s) for s in (Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE)
+    )
+    misfit = find_misfit(
+        opening, pressure, found.power - found.static_mw, found.power, found.rows,
+        settings.real('sample_period'),
+    )  # fmt: skip
+    return replace(found, misfit=misfit)
 
 
 def _step_test(log: Log, given: Mapping[str, Any], progress: Progress) -> Identified:

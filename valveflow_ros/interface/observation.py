@@ -13,7 +13,7 @@ from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.errors import WORKING_BYTES, DataError, check_address_space
-from valveflow_ros.fit.fit import fit, outline
+from valveflow_ros.fit.fit import fit, form_contradicted, form_of_data, outline
 from valveflow_ros.fit.task import FitTask
 from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.alignment import Counts, aligned_blocks, corrected
@@ -38,6 +38,7 @@ from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.report.words import duration
 from valveflow_ros.segments.kernel import WARM_UP, WINDOW
 from valveflow_ros.signals.align import Aligner
+from valveflow_ros.signals.static_form import StaticForm
 
 _NEEDED = tuple(i for i in SIGNALS if i.required and i.topic != 'main_steam_temperature')
 LEARN_SHARE = 2.0 / 3.0
@@ -72,9 +73,25 @@ class Observed:
         """Return the curve; raises `DataError` with the reason if the data carry none."""
         return fit(self.task, lambda what: progress(0.6, what))
 
-    def outline(self, progress: Callable[[float, str], None] = SILENT) -> RegionalModel:
+    def form(self) -> StaticForm:
+        """Return the form to begin a diagnosis with.
+
+        Where the data do not ask for knees at fixed openings it is the paper's with the exponent
+        of the settings: another one is a cause, and is to be named.
+        """
+        asked = form_of_data(self.task)
+        paper = StaticForm(exponent=self.task.settings.real('pressure_exponent'))
+        return asked if asked.scaled else paper
+
+    def contradicts(self, given: StaticForm) -> bool:
+        """Return whether the data tell that the static power has another form."""
+        return form_contradicted(self.task, given)
+
+    def outline(
+        self, form: StaticForm, progress: Callable[[float, str], None] = SILENT
+    ) -> RegionalModel:
         """Return curve and dynamics to begin a diagnosis with; raises `DataError` as `fit`."""
-        return outline(self.task, lambda what: progress(0.6, what))
+        return outline(replace(self.task, form=form), lambda what: progress(0.6, what))
 
 
 def settings_of(

@@ -17,6 +17,7 @@ from valveflow_ros.monitoring.rows import Rows
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, ByteArray, IntArray, SpecialSegment
 from valveflow_ros.segments.window import RollingWindow
+from valveflow_ros.signals.static_form import INTEGRATED_INPUT
 from valveflow_ros.state import Memory, State
 
 # What the running curve is worth.
@@ -90,7 +91,7 @@ class RunningCurve:
         columns = rows.time_ns, rows.u, rows.power_mw, kinds
         if self._predictor is None:
             return rows.shown(no_prediction(*columns))
-        return rows.shown(self._predictor.predict(*columns))
+        return rows.shown(self._predictor.predict(*columns, rows.opening_percent))
 
     def snapshot(self) -> State:
         """Return what is remembered."""
@@ -150,7 +151,7 @@ class ReferenceCurve:
             The curve's input u is not the one of this monitor.
         """
         exponent = settings.real('pressure_exponent')
-        if curve.pressure_exponent != exponent:
+        if curve.axis == INTEGRATED_INPUT and curve.pressure_exponent != exponent:
             raise DataError(
                 f'The reference has the pressure exponent {curve.pressure_exponent:g}, the '
                 f'monitor {exponent:g}: their inputs u are not the same thing.'

@@ -16,6 +16,7 @@ from valveflow_ros.numerics import jit
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, ByteArray, FloatArray, IntArray
 from valveflow_ros.segments.kernel import NO_DATA, SETTLED_SLOPE, SETTLED_STEADY
+from valveflow_ros.signals.static_form import PAPER_EXPONENT
 from valveflow_ros.state import Memory
 
 _LONGEST_DELAY_S = 600.0
@@ -42,7 +43,7 @@ class PredictionBlock:
     ----------
     time_ns : int64
     u : float64
-        Integrated input, % MPa^m.
+        What the curve is a function of: integrated input, % MPa^m, or opening, %.
     measured_mw, static_mw, dynamic_mw, residual_mw : float64
         NaN where unknown. The residual is measured minus dynamic prediction, or
         minus static prediction in settled rows when no dynamics are known.
@@ -83,6 +84,7 @@ class _Filter(NamedTuple):
     knots: FloatArray
     left: FloatArray
     right: FloatArray
+    offset: float  # MW
     levels: FloatArray
     taps: FloatArray  # (I, 7), empty when the dynamics are not known
     settle: int  # rows
@@ -129,8 +131,9 @@ def _state_of(inside: bool, kind: int) -> int:
 
 @jit
 def _predict(
-    time_ns: IntArray, u: FloatArray, y: FloatArray, kinds: ByteArray, f: _Filter, out: _Columns
-) -> None:
+    time_ns: IntArray, u: FloatArray, scale: FloatArray, y: FloatArray, kinds: ByteArray,
+    f: _Filter, out: _Columns,
+) -> None:  # fmt: skip
     """Predict rows."""
     known = f.taps.shape[0] > 0
     for t in range(u.size):
@@ -146,7 +149,7 @@ def _predict(
             f.place[_AGE] = 0
             out.state[t] = 5
             continue
-        x = curve(u[t], f.knots, f.left, f.right)
+        x = scale[t] * curve(u[t], f.knots, f.left, f.right) + f.offset
         inside = f.knots[0] <= u[t] <= f.knots[-1]
         _filter(f, x)
         out.state[t] = _state_of(inside, kinds[t])
@@ -180,6 +183,8 @@ class Predictor(Memory):
     limit_mw : float
         Where above zero, the evidence is the running mean's share of this limit; otherwise it is
         that of the chart that came with the curve.
+    exponent : float
+        m of the u = V p^m that rows come with.
     """
 
     REMEMBERED = ('_place', '_memory', '_past', '_chart')
@@ -191,8 +196,10 @@ class Predictor(Memory):
         settle_s: float,
         average_s: float,
         limit_mw: float = 0.0,
+        exponent: float = PAPER_EXPONENT,
     ) -> None:
         self.characteristic = characteristic
+        self._form, self._exponent = characteristic.static_form, exponent
         self.limit_mw = limit_mw
         design = characteristic.residuals.chart
         self._chart = None if design is None else ResidualChart(design, step_s)
@@ -201,7 +208,7 @@ class Predictor(Memory):
         self._memory = np.array([0.0, math.nan])
         self._past = np.zeros(int(_LONGEST_DELAY_S / step_s) + 4)
         self._filter = _Filter(
-            m.knots, m.left, m.right, m.levels, m.taps(step_s),
+            m.knots, m.left, m.right, m.offset, m.levels, m.taps(step_s),
             settle=round(settle_s / step_s),
             forget=math.exp(-step_s / average_s),
             gap_ns=round(1.5 * step_s * NS_PER_S),
@@ -216,6 +223,7 @@ class Predictor(Memory):
         return cls(
             characteristic, settings.real('sample_period'), settings.settle_s,
             settings.real('alarm_average'), settings.real('alarm_limit'),
+            settings.real('pressure_exponent'),
         )  # fmt: skip
 
     @property
@@ -228,17 +236,25 @@ class Predictor(Memory):
         if self._chart is not None and other._chart is not None:
             self._chart.follow(other._chart)
 
-    def warm_up(self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray) -> None:
+    def warm_up(
+        self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray,
+        opening_percent: FloatArray | None = None,
+    ) -> None:  # fmt: skip
         """Run over rows of the past; the residual's mean starts afresh afterwards."""
         kinds = np.full(len(u), SETTLED_STEADY, dtype=np.uint8)
-        self._rows(time_ns, u, power_mw, kinds)
+        self._rows(time_ns, *self._input(u, opening_percent), power_mw, kinds)
         self._filter.memory[_AVERAGE] = math.nan
 
     def predict(
-        self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray, kinds: ByteArray
-    ) -> PredictionBlock:
-        """Predict rows of shape (n,); ``kinds`` are the segmenter's."""
-        out = self._rows(time_ns, u, power_mw, kinds)
+        self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray, kinds: ByteArray,
+        opening_percent: FloatArray | None = None,
+    ) -> PredictionBlock:  # fmt: skip
+        """Predict rows of shape (n,); ``kinds`` are the segmenter's.
+
+        ``u`` is V p^m. Another form than that needs the opening, and has no data without.
+        """
+        u, scale = self._input(u, opening_percent)
+        out = self._rows(time_ns, u, scale, power_mw, kinds)
         evidence = shift = np.full(len(u), math.nan)
         if self._chart is not None:
             evidence, shift = self._chart.feed(time_ns, out.residual)
@@ -250,14 +266,24 @@ class Predictor(Memory):
             self.characteristic.model_id,
         )  # fmt: skip
 
+    def _input(
+        self, u: FloatArray, opening_percent: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return what the curve is a function of, and what it is multiplied by."""
+        if opening_percent is None:
+            opening_percent = np.full(len(u), math.nan)
+        x, scale = self._form.of_integrated_input(u, opening_percent, self._exponent)
+        return x, np.ones(len(u)) if scale is None else scale
+
     def _rows(
-        self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray, kinds: ByteArray
-    ) -> _Columns:
+        self, time_ns: IntArray, u: FloatArray, scale: FloatArray, power_mw: FloatArray,
+        kinds: ByteArray,
+    ) -> _Columns:  # fmt: skip
         n = len(u)
         out = _Columns(
             np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n, dtype=np.uint8)
         )
-        _predict(time_ns, u, power_mw, kinds, self._filter, out)
+        _predict(time_ns, u, scale, power_mw, kinds, self._filter, out)
         return out
 
 

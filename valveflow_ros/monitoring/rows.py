@@ -12,7 +12,7 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.monitoring.events import Event
 from valveflow_ros.monitoring.prediction import PredictionBlock, as_measured
 from valveflow_ros.records import FloatArray, IntArray, SampleTable, Signal
-from valveflow_ros.signals.integrated_input import integrated_input
+from valveflow_ros.signals.static_form import integrated_input
 from valveflow_ros.state import State, perhaps
 
 # Rows freed of causes that are known, before the engine sees them.

@@ -6,7 +6,13 @@ import math
 
 import numpy as np
 
-from valveflow_ros.curve.characteristic import Characteristic, Choice, Piece, RegionDynamics
+from valveflow_ros.curve.characteristic import (
+    Characteristic,
+    Choice,
+    FormEvidence,
+    Piece,
+    RegionDynamics,
+)
 from valveflow_ros.records import FloatArray, Signal
 from valveflow_ros.report.figure import Figure, Spec, axis, line, rounded, token
 from valveflow_ros.report.identified import Identified
@@ -24,6 +30,7 @@ from valveflow_ros.report.words import (
     span,
     with_error,
 )
+from valveflow_ros.signals.static_form import OPENING
 
 # A power that the valve explains less of is governed by something else, or a signal is wrong.
 _LITTLE = 0.8
@@ -43,18 +50,65 @@ def explained(data: Identified) -> float:
 
 
 def doubt(data: Identified) -> str:
-    """Return a warning where the curve is none, or of the wrong form; empty otherwise."""
-    share = explained(data)
-    if not share < _LITTLE:
+    """Return a warning where the curve is none, or wrong; empty otherwise."""
+    share, misfit, form = explained(data), data.misfit, data.characteristic.form
+    if share < _LITTLE:
+        return (
+            f'Do not rely on this curve: it explains only {percent(share)} of the variance of the '
+            'power. Look whether a signal is constant, taken for another one, or in another unit.'
+        )
+    told = []
+    if misfit is not None:
+        opening, pressure, most = misfit.worst
+        told.append(
+            f'Do not rely on this curve: it is wrong by {plain(misfit.rms_mw, 2)} MW (root mean '
+            f'square) at the openings and pressures of these data, most at '
+            f'{decimals(opening, 0)} % and {decimals(pressure, 1)} MPa, where the measured power '
+            f'differs by {plain(most, 2)} MW. The power depends on opening and pressure in '
+            'another way, or on something that was not logged.'
+        )
+    if form is not None and form.contradicted:
+        told.append(
+            f'The form of this curve, {data.characteristic.static_form.words}, was given and is '
+            f'the wrong one: on stretches held out the power follows {form.other} to '
+            f'{plain(form.rmse_other_mw, 2)} MW and this form to {plain(form.rmse_mw, 2)} MW; '
+            f'{_apart(form)}.'
+        )
+    return ' '.join(told)
+
+
+def _apart(form: FormEvidence) -> str:
+    opening, pressure, most = form.worst
+    return (
+        f'the two differ by {plain(form.apart_mw, 2)} MW (root mean square), at '
+        f'{decimals(opening, 0)} % and {decimals(pressure, 1)} MPa by {plain(most, 2)} MW'
+    )
+
+
+def form_words(c: Characteristic) -> str:
+    """Say which form the power has and how that is known; nothing of the paper's, where told."""
+    form = c.form
+    if form is None or form.contradicted:
+        return ''
+    mine = c.static_form.words
+    if not form.told:
+        return (
+            f'Whether the power follows {mine}, as this curve does, or {form.other} cannot be '
+            f'told from these data: {_apart(form)}. Where the pressure leaves the range of the '
+            'data the curve may be wrong.'
+        )
+    if c.axis != OPENING:
         return ''
     return (
-        f'Do not rely on this curve: it explains only {percent(share)} of the variance of the '
-        'power. Look whether a signal is constant, taken for another one, or in another unit.'
+        f'The knees of this valve stand at fixed openings: the power follows {mine} with c = '
+        f'{decimals(c.offset_mw, 1)} MW. On stretches held out that form errs by '
+        f'{plain(form.rmse_mw, 2)} MW and {form.other} by {plain(form.rmse_other_mw, 2)} MW '
+        f'(log-likelihood {form.log_likelihood_gain:+.0f}).'
     )
 
 
 def opening_gain(data: Identified, piece: Piece) -> tuple[float, float]:
-    """Return MW per % of opening on a piece, and the pressure in MPa it holds at.
+    """Return MW per % of opening on a piece as shown, and the pressure in MPa it holds at.
 
     The pressure is the median over the special samples on the piece.
     """
@@ -64,19 +118,22 @@ def opening_gain(data: Identified, piece: Piece) -> tuple[float, float]:
     pressure = data.table.column(Signal.MAIN_STEAM_PRESSURE)[inside]
     if not len(pressure):
         return math.nan, math.nan
+    if data.at_pressure:
+        return piece.slope, data.characteristic.reference_pressure_mpa
     p = float(np.median(pressure))
     return piece.slope * p**data.characteristic.pressure_exponent, p
 
 
 def answer_words(data: Identified) -> str:
     """Return the paragraph an engineer would tell a colleague, and what endangers it."""
-    c = data.characteristic
+    c = data.shown
     ends, values = c.breakpoints, c.values()
     words = (
         f'The flow characteristic has <b>{counted(len(c.pieces), "piece")}</b> and is known for '
         f'u from {span(ends[0], ends[-1])} {input_unit(c.pressure_exponent)}, that is from '
-        f'{span(values[0], values[-1])} MW.{_bends(c)} It explains {percent(explained(data))} '
-        f'of the variance of the power in {counted(c.source.steady, "steady-state segment")} and '
+        f'{span(values[0], values[-1])} MW{data.at_pressure}.{_bends(c)} It explains '
+        f'{percent(explained(data))} of the variance of the power in '
+        f'{counted(c.source.steady, "steady-state segment")} and '
         f'{counted(c.source.slope_response, "slope-response segment")} '
         f'({counted(c.source.samples, "sample")}), and leaves a typical difference of '
         f'{plain(c.residuals.rmse_mw, 2)} MW.'
@@ -95,7 +152,9 @@ def answer_words(data: Identified) -> str:
             'as it stands. A flat end is ordinary; a falling piece elsewhere is not.'
         )
     told += [text(n) for n in (held_words(c.held), *c.notes)]
-    return paragraph(words, 'answer') + ''.join(notice(n) for n in told if n)
+    form = form_words(data.characteristic)
+    said = paragraph(words, 'answer') + (paragraph(text(form)) if form else '')
+    return said + ''.join(notice(n) for n in told if n)
 
 
 def _bends(c: Characteristic) -> str:
@@ -118,7 +177,7 @@ def _bends(c: Characteristic) -> str:
 
 def pieces_table(data: Identified) -> str:
     """Return one row a piece."""
-    c = data.characteristic
+    c = data.shown
     rows = []
     for k, piece in enumerate(c.pieces):
         gain, pressure = opening_gain(data, piece)
@@ -131,7 +190,7 @@ def pieces_table(data: Identified) -> str:
             count(piece.samples), *_rests(c, k),
         ])  # fmt: skip
     head = [
-        'piece', f'u ({input_unit(c.pressure_exponent)})', 'power (MW)',
+        'piece', f'u ({input_unit(c.pressure_exponent)})', f'power{data.at_pressure} (MW)',
         'slope ± standard error (MW per unit of u)', 'intercept ± standard error (MW)',
         'MW per 1 % of opening', 'samples', *(['rests on'] if c.support else []),
     ]  # fmt: skip

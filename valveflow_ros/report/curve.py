@@ -65,18 +65,20 @@ def band(piece: Piece, u_samples: FloatArray, u: FloatArray) -> FloatArray:
 
 def curve_figure(data: Identified) -> Figure:
     """Return the picture of the characteristic."""
-    c = data.characteristic
+    c = data.shown
     u = data.u[data.special]
-    traces = [_heat(u, data.power[data.special]), *_bands(data, u)]
+    traces = [_heat(u, data.power_shown[data.special]), *_bands(data, u)]
     if c.pieces != c.partition_pieces:
         traces.append(_line(c.partition_pieces, 'before refining', 'raw', 1.2, 'dash', ''))
     if data.reference is not None:
-        traces.append(_line(data.reference.pieces, 'reference', 'chosen', 2, 'dot'))
+        there = data.reference.at_pressure(c.reference_pressure_mpa)
+        traces.append(_line(there.pieces, 'reference', 'chosen', 2, 'dot'))
     traces.append(_line(c.pieces, 'flow characteristic', 'curve', 2.6))
     if len(c.pieces) > 1:
         traces.append(_breakpoints(data))
     layout: Spec = {
-        'xaxis': axis(input_axis(c.pressure_exponent)), 'yaxis': axis('generated power (MW)'),
+        'xaxis': axis(input_axis(c.pressure_exponent)),
+        'yaxis': axis(f'generated power{data.at_pressure} (MW)'),
     }  # fmt: skip
     if (day := last_range(data)) is not None:
         layout['shapes'] = [stripe(*day, 'today')]
@@ -101,6 +103,12 @@ def _caption(data: Identified) -> str:
         '<b>The curve should run through the middle of the cloud.</b> Colour: samples in '
         'special segments, the stronger the more there are.'
     ]
+    if data.at_pressure:
+        parts.append(
+            f'The valve has its knees at fixed openings; all is shown{data.at_pressure}, at '
+            'other pressures the power goes with their ratio to the power '
+            f'{data.characteristic.pressure_scale_exponent:.3g}.'
+        )
     if len(c.pieces) > 1:
         parts.append(
             'Circles are the breakpoints; a bar through one is the range in which it lies with '
@@ -186,7 +194,7 @@ def _heat(u: FloatArray, power: FloatArray) -> Spec:
 
 def _bands(data: Identified, u_samples: FloatArray) -> list[Spec]:
     traces: list[Spec] = []
-    for piece in data.characteristic.pieces:
+    for piece in data.shown.pieces:
         u = np.linspace(piece.u_from, piece.u_to, 25)
         error = _Z95 * band(piece, u_samples, u)
         if np.all(np.isfinite(error)):

@@ -47,7 +47,8 @@ def identification_page(data: Identified) -> Page:
     missing = [presence_figure(data), coverage_figure(data)]
     sections = [
         Section('The answer', [
-            answer_words(data), curve_figure(data), pieces_table(data), breakpoints_table(c),
+            answer_words(data), curve_figure(data), pieces_table(data),
+            breakpoints_table(data.shown),
         ]),
         *([shift] if (shift := shift_section(data)) else []),
         *history_sections(data.history),

@@ -9,6 +9,7 @@ import numpy as np
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.shift import Shift
+from valveflow_ros.fit.model_form import Misfit
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
     FloatArray,
@@ -19,6 +20,7 @@ from valveflow_ros.records import (
     SpecialSegment,
 )
 from valveflow_ros.report.history import History
+from valveflow_ros.signals.static_form import OPENING
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +44,8 @@ class Identified:
     shift : Shift, optional
         The judgement against ``reference``, where there was one.
     reference : Characteristic, optional
+    misfit : Misfit, optional
+        Where the curve is wrong again and again.
     history : History, optional
         What a monitor published meanwhile, where the log is its recording.
     u : float64 (n,)
@@ -63,6 +67,7 @@ class Identified:
     notes: tuple[str, ...] = ()
     shift: Shift | None = None
     reference: Characteristic | None = None
+    misfit: Misfit | None = None
     history: History | None = None
     u: FloatArray = field(init=False)
     static_mw: FloatArray = field(init=False)
@@ -91,6 +96,28 @@ class Identified:
     def power(self) -> FloatArray:
         """Return the generated power in MW, shape (n,)."""
         return self.table.column(Signal.GENERATED_POWER)
+
+    @property
+    def shown(self) -> Characteristic:
+        """Return the curve as it is drawn: at the reference pressure where it depends on one."""
+        return self.characteristic.at_pressure()
+
+    @property
+    def power_shown(self) -> FloatArray:
+        """Return the power as it is drawn beside the curve, in MW.
+
+        What the curve gives more or less than at the reference pressure is taken off.
+        """
+        if self.characteristic.axis != OPENING:
+            return self.power
+        return np.asarray(self.power - self.static_mw + self.shown.model.static(self.u))
+
+    @property
+    def at_pressure(self) -> str:
+        """Return ' at 12.3 MPa' where the curve is shown at one pressure, else nothing."""
+        if self.characteristic.axis != OPENING:
+            return ''
+        return f' at {self.characteristic.reference_pressure_mpa:.3g} MPa'
 
     @property
     def period_ns(self) -> int:

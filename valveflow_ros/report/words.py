@@ -156,7 +156,12 @@ def exponent(value: float) -> str:
 
 
 def input_unit(value: float) -> str:
-    """Return the unit of u as HTML; m stands for an exponent that is not known."""
+    """Return the unit of u as HTML; m stands for an exponent that is not known.
+
+    With the exponent 0 u is the opening.
+    """
+    if value == 0.0:
+        return '%'
     return f'% MPa<sup>{exponent(value) if math.isfinite(value) else "m"}</sup>'
 
 
@@ -164,12 +169,16 @@ def input_unit_plain(value: float) -> str:
     """Return the unit of u as plain text: '% MPa^(9/8)'; of an exponent not known, '% MPa^m'."""
     if not math.isfinite(value):
         return '% MPa^m'
+    if value == 0.0:
+        return '%'
     power = exponent(value)
     return f'% MPa^({power})' if '/' in power else f'% MPa^{power}'
 
 
 def input_axis(value: float) -> dict[str, str]:
     """Return the title of an axis of u, and a short one for narrow pictures, as HTML."""
+    if value == 0.0:
+        return {'text': 'u = V, valve opening (%)', 'short': 'u = V (%)'}
     long = f'integrated input u = V p<sup>{exponent(value)}</sup> ({input_unit(value)})'
     return {'text': long, 'short': f'u ({input_unit(value)})'}
 

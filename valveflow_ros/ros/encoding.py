@@ -100,6 +100,7 @@ def curve_message(
     message = FlowCharacteristic(
         header=header(0 if curve is None else curve.source.window_end_ns, tag),
         status=int(status), cause=cause, pressure_exponent=nan, rmse_mw=nan,
+        pressure_scale_exponent=nan, offset_mw=nan, reference_pressure_mpa=nan,
         temperature_mean_degc=nan, temperature_spread_degc=nan, reference_model_id=reference_id,
     )  # fmt: skip
     if curve is None:
@@ -131,6 +132,10 @@ def curve_message(
     likely = choice.confidence
     message.confidence = [likely.get(j, 0.0) for j in range(1, max(likely, default=0) + 1)]
     message.pressure_exponent = curve.pressure_exponent
+    message.axis = curve.axis
+    message.pressure_scale_exponent = curve.pressure_scale_exponent
+    message.offset_mw = curve.offset_mw
+    message.reference_pressure_mpa = curve.reference_pressure_mpa
     message.samples = source.samples
     message.steady_segments = source.steady
     message.slope_segments = source.slope_response

@@ -39,6 +39,7 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.ros.encoding import VERDICTS, diagnosis_message, encode
 from valveflow_ros.ros.process import one_line, with_place
 from valveflow_ros.segments.window import WindowContents
+from valveflow_ros.signals.static_form import StaticForm
 from valveflow_ros.state import from_bytes, to_bytes
 
 FIT_JOB = 'valveflow_ros.fit.fit:fit'
@@ -92,6 +93,8 @@ def task_to_bytes(task: Task) -> bytes:
     else:
         state |= {'input_noise': task.input_noise, 'power_noise_mw': task.power_noise_mw}
         state |= held_json(task.held)
+        if task.form is not None:
+            state['form'] = [task.form.axis, task.form.exponent]
     return to_bytes(state)
 
 
@@ -104,7 +107,8 @@ def task_from_bytes(data: bytes) -> Task:
         return DiagnosisTask(state['request_ns'], window, settings, curve, state['window_end_ns'])
     held = held_from(state)
     noise = state['input_noise'], state['power_noise_mw']
-    return FitTask(state['request_ns'], window, settings, *noise, held)
+    form = StaticForm(*state['form']) if 'form' in state else None
+    return FitTask(state['request_ns'], window, settings, *noise, held, form)
 
 
 def result_to_bytes(result: object) -> bytes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SegmentKind, SpecialSegment
 from valveflow_ros.segments.segmenter import FoundSegment
+from valveflow_ros.signals.static_form import PAPER_EXPONENT, pressure_of
 from valveflow_ros.state import State, perhaps
 
 # Special segments as plain values, for a saved state.
@@ -118,6 +119,8 @@ class RollingWindow:
     ----------
     window_s, period_s : float
         Length of the window and step of the rows; together they bound the memory.
+    exponent : float
+        m of the u = V p^m of the rows.
 
     Notes
     -----
@@ -129,7 +132,8 @@ class RollingWindow:
     window without gaps, and is inside again when the leap is taken back.
     """
 
-    def __init__(self, window_s: float, period_s: float) -> None:
+    def __init__(self, window_s: float, period_s: float, exponent: float = PAPER_EXPONENT) -> None:
+        self._exponent = exponent
         self._window_ns = round(window_s * NS_PER_S)
         self._period_ns = round(period_s * NS_PER_S)
         self._doubt = max(1, math.ceil(_DOUBT_S / period_s))
@@ -145,7 +149,10 @@ class RollingWindow:
     @classmethod
     def of(cls, settings: Settings) -> RollingWindow:
         """Return an empty window of the length in the settings."""
-        return cls(86400.0 * settings.real('window_days'), settings.real('sample_period'))
+        return cls(
+            86400.0 * settings.real('window_days'), settings.real('sample_period'),
+            settings.real('pressure_exponent'),
+        )  # fmt: skip
 
     def __len__(self) -> int:
         """Return the number of rows held, without those set aside."""
@@ -207,10 +214,28 @@ class RollingWindow:
         aside = self._aside
         if aside is not None and _has(aside.number, found.end_row - 1):
             # It was open when the clock went back.
-            aside.segments.append(found)
+            aside.segments.append(self._with_ends(found, aside.number, aside.data))
         elif _has(self._number[: self._end], found.end_row - 1):
-            self._segments.append(found)
+            number, data = self._number[: self._end], self._data[:, : self._end]
+            self._segments.append(self._with_ends(found, number, data))
             self._forget()
+
+    def _with_ends(self, found: FoundSegment, number: IntArray, data: FloatArray) -> FoundSegment:
+        """Return a segment with opening and pressure at the ends of a line through its rows."""
+        first, end = np.searchsorted(number, (found.first_row, found.end_row))
+        u, opening = data[0, first:end], data[3, first:end]
+        pressure = pressure_of(u, opening, self._exponent)
+        known = np.isfinite(pressure)
+        if known.sum() < 2:
+            return found
+        place = np.linspace(0.0, 1.0, len(u))[known]
+        v, p = (np.polyfit(place, x[known], 1) for x in (opening, pressure))
+        return replace(found, segment=replace(
+            found.segment,
+            opening_start_percent=float(v[1]), opening_end_percent=float(v[0] + v[1]),
+            pressure_start_mpa=float(p[1]), pressure_end_mpa=float(p[0] + p[1]),
+            exponent=self._exponent,
+        ))  # fmt: skip
 
     def go_back(self, time_ns: int) -> None:
         """Set aside the rows from a time on, to which the clock went back."""
@@ -248,10 +273,11 @@ class RollingWindow:
         """Return the numbers of the rows inside the window, counted from the first ever."""
         return self._number[self._first() : self._end].copy()
 
-    def tail(self, rows: int) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Return copies of time, ``u`` and power of the last ``rows`` rows, or of all held."""
+    def tail(self, rows: int) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+        """Return copies of time, ``u``, power and opening of the last ``rows`` rows held."""
         part = slice(max(0, self._end - rows), self._end)
-        return self._time_ns[part].copy(), self._data[0, part].copy(), self._data[1, part].copy()
+        u, power, opening = (self._data[k, part].copy() for k in (0, 1, 3))
+        return self._time_ns[part].copy(), u, power, opening
 
     def contents(self) -> WindowContents:
         """Return a copy of the rows inside the window and their segments."""

@@ -11,6 +11,7 @@ import numpy as np
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import (
+    U_UNIT,
     Cause,
     Kind,
     SentenceValues,
@@ -54,14 +55,15 @@ def curve_shape_starts(screening: Screening) -> Sequence[Start]:
         ]
         found.append(max(tried, key=lambda s: s.gain))
     best = sorted(found, key=lambda s: -s.gain)[:_KEPT]
-    return [replace(s, base=_levels_under(screening.model.base, s.values)) for s in best]
+    scale = float(np.median(screening.grids.scale))
+    return [replace(s, base=_levels_under(screening.model.base, s.values, scale)) for s in best]
 
 
-def _levels_under(base: RegionalModel, values: Values) -> RegionalModel:
+def _levels_under(base: RegionalModel, values: Values, scale: float) -> RegionalModel:
     """Return the base with its levels lifted by the bump: regions then change at the same u."""
     if not len(base.levels) or np.any(base.right <= base.left):
         return base
-    x = np.append(base.left, base.right[-1])
+    x = scale * np.append(base.left, base.right[-1]) + base.offset
     lift = np.empty(len(base.levels))
     kernels.bump(np.interp(base.levels, x, base.knots), values[1], values[2], lift)
     levels = base.levels + values[0] * lift
@@ -81,8 +83,8 @@ CURVE_SHAPE = Cause(
     'curve_shape', 'curve', Stage.FLOW,
     (
         Unknown('h_mw', 'MW', 0.1, -500.0, 500.0),
-        Unknown('u0', '% MPa^m', 10.0, 0.0, 1e5, Kind.ROUGH),
-        Unknown('width_u', '% MPa^m', 10.0, 5.0, 1e5, Kind.ROUGH),
+        Unknown('u0', U_UNIT, 10.0, 0.0, 1e5, Kind.ROUGH),
+        Unknown('width_u', U_UNIT, 10.0, 5.0, 1e5, Kind.ROUGH),
     ),
     apply_curve_shape, curve_shape_starts, curve_shape_sentence,
     ('saturation', 'exponent', 'choked'),
@@ -136,8 +138,8 @@ CURVE_STEP = Cause(
     'curve_step', 'step', Stage.FLOW,
     (
         Unknown('s_mw', 'MW', 0.1, -500.0, 500.0),
-        Unknown('u_from', '% MPa^m', 10.0, 0.0, 1e5, Kind.ROUGH),
-        Unknown('u_to', '% MPa^m', 10.0, 0.0, 1e5, Kind.ROUGH),
+        Unknown('u_from', U_UNIT, 10.0, 0.0, 1e5, Kind.ROUGH),
+        Unknown('u_to', U_UNIT, 10.0, 0.0, 1e5, Kind.ROUGH),
         ONSET,
     ),
     apply_curve_step, curve_step_starts, curve_step_sentence, ('gain_step', 'input_step'),

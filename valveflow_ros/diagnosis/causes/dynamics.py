@@ -38,7 +38,8 @@ def apply_region_lag(model: RegionalModel, values: Values) -> RegionalModel:
 def region_lag_starts(screening: Screening) -> Sequence[Start]:
     """Try other time constants above some loads, the model's own levels among them."""
     grids, base = screening.grids, screening.model.base
-    x = base.static(grids.u[grids.usable > 0][::10])
+    used = grids.usable > 0
+    x = base.static(grids.u[used][::10], grids.scale[used][::10])
     levels = [*np.quantile(x, _TRIED_SHARES).tolist(), *(base.levels + 0.01).tolist()]
     grid: list[Values] = []
     for level in levels:

@@ -25,7 +25,8 @@ def apply_exponent(
         u_true = u (p / mean p)^dm
 
     Under sliding pressure the curve takes up most of it: only the pressure's departure
-    from its line over the load tells.
+    from its line over the load tells. Where the knees stand at fixed openings it is the flow
+    itself that is multiplied.
     """
     log = np.log(np.maximum(grids.pressure, 1e-6))
     return np.asarray(np.exp(values[0] * (log - grids.reference.log_pressure)))
@@ -69,9 +70,9 @@ def _psi(ratio: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(1.0 - share * share))
 
 
-def _flow(u: FloatArray, model: RegionalModel) -> FloatArray:
+def _flow(u: FloatArray, scale: FloatArray, model: RegionalModel) -> FloatArray:
     x = np.empty(len(u))
-    kernels.flow(u, model.knots, model.left, model.right, x)
+    kernels.flow(u, scale, model.offset, model.knots, model.left, model.right, x)
     return np.maximum(x, 0.0)
 
 
@@ -87,7 +88,7 @@ def apply_choked(u: FloatArray, values: Values, grids: Grids, model: RegionalMod
 
     IEC 60534 says the same of control valves with an expansion factor.
     """
-    x = _flow(u, model)
+    x = _flow(u, grids.scale, model)
     p = np.maximum(grids.pressure, 1e-6)
     line = np.maximum(grids.reference.pressure_level + grids.reference.pressure_slope * x, 0.1 * p)
     kappa = values[0]
@@ -98,7 +99,7 @@ def choked_starts(screening: Screening) -> Sequence[Start]:
     """Try sizes that reach different pressure ratios at high load."""
     grids = screening.grids
     here = grids.usable > 0
-    x = _flow(grids.u[here], screening.model.base)
+    x = _flow(grids.u[here], grids.scale[here], screening.model.base)
     top = float(np.quantile(x / np.maximum(grids.pressure[here], 1e-6), 0.98))
     if not top > 0.0:
         return []

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valveflow_ros.numerics import jit
 from valveflow_ros.records import FloatArray
-from valveflow_ros.signals.integrated_input import integrated_input
 
 INTEGRATED_INPUT = 'integrated_input'
 OPENING = 'opening'
@@ -88,7 +88,41 @@ class StaticForm:
 
 
 def pressure_of(u: FloatArray, opening_percent: FloatArray, exponent: float) -> FloatArray:
-    """Return the pressure that stands in u = V p^``exponent``, MPa; NaN where V is not positive."""
-    with np.errstate(divide='ignore', invalid='ignore'):
-        density = np.where((opening_percent > 0.0) & (u > 0.0), u / opening_percent, np.nan)
-    return np.asarray(density ** (1.0 / exponent))
+    """Return the pressure in u = V p^``exponent``, MPa; NaN where V is not positive."""
+    pressure = np.empty(len(u))
+    _pressure_of(
+        np.ascontiguousarray(u, dtype=np.float64),
+        np.ascontiguousarray(opening_percent, dtype=np.float64), 1.0 / exponent, pressure,
+    )  # fmt: skip
+    return pressure
+
+
+@jit
+def _pressure_of(u: FloatArray, opening: FloatArray, power: float, out: FloatArray) -> None:
+    """Write the pressure row by row; a loop, so that blocks of any size round alike."""
+    for t in range(u.size):
+        known = opening[t] > 0.0 and u[t] > 0.0
+        out[t] = (u[t] / opening[t]) ** power if known else np.nan
+
+
+def integrated_input(
+    opening_percent: FloatArray, pressure_mpa: FloatArray, exponent: float = 1.125
+) -> FloatArray:
+    """Return u = V p^m, eq. (1) of the paper with m = 9/8, in % MPa^m.
+
+    NaN where an input is NaN or the pressure is not positive.
+    """
+    opening = np.ascontiguousarray(opening_percent, dtype=np.float64)
+    pressure = np.ascontiguousarray(pressure_mpa, dtype=np.float64)
+    u = np.empty(len(opening))
+    _integrated_input(opening, pressure, exponent, u)
+    return u
+
+
+@jit
+def _integrated_input(
+    opening: FloatArray, pressure: FloatArray, exponent: float, out: FloatArray
+) -> None:
+    """Write u row by row; a loop, so that blocks of any size round alike."""
+    for t in range(opening.size):
+        out[t] = opening[t] * pressure[t] ** exponent if pressure[t] > 0.0 else np.nan
