@@ -14,6 +14,7 @@ import argparse
 import json
 import time
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -67,7 +68,7 @@ def run(case: Case, days: float) -> tuple[Diagnosis, SimulatedLog, Record, dict[
         other = watched(simulate(days, case.seed + OTHER_SEED, case.unit), days)[0]
         model = fit(replace(other, form=StaticForm())).model
     else:
-        model = outline(replace(task, form=StaticForm()))
+        model, _ = outline(replace(task, form=StaticForm()))
     middle = time.process_time()
     record = Record(
         log.table, settings.real('sample_period'), StaticForm(),

@@ -20,7 +20,7 @@ from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
 from valveflow_ros.diagnosis.grids import make_grids
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import NS_PER_S, Quality, SampleTable, Signal
-from valveflow_ros.signals.static_form import integrated_input
+from valveflow_ros.signals.static_form import StaticForm, integrated_input
 from valveflow_ros.state import from_bytes, to_bytes
 
 pytestmark = needs_jit

@@ -361,7 +361,7 @@ def test_four_days_of_the_simulated_plant_give_its_curve_and_dynamics():
     u = np.linspace(c.breakpoints[0], c.breakpoints[-1], 200)
     assert np.abs(c(u) - truth(u)).max() < 2.5
     # The outline is what the fit has before its last step: near, and with the same regions.
-    rough = outline(request.task)
+    rough, _ = outline(request.task)
     assert rough.regions == len(c.dynamics)
     assert np.abs(rough.static(u) - c(u)).max() < 2.0
 

@@ -118,7 +118,8 @@ _EACH = 5.0  # log-likelihood that each number more of curve and regions must br
 def rebuilt(task: Task, model: Extended) -> tuple[Task, Extended]:
     """Return the model on a curve and regions of its own if they do better, else as it is."""
     try:
-        base = simplified(search_plain(_seen_through(task, model), _rich(model.base), _MOST))
+        found, _ = search_plain(_seen_through(task, model), _rich(model.base), _MOST)
+        base = simplified(found)
     except (TooFewSamplesError, np.linalg.LinAlgError):
         return task, model
     if base.pieces == model.base.pieces and base.regions == model.base.regions:
@@ -229,6 +230,12 @@ def search(task: Task, start: Extended, progress: Progress, rough: Grids | None 
         if why := cause.hindered(task.grids):
             found.reasons[name] = f'cannot be judged: {why}'
             barred.add(name)
+    if task.grids.form.scaled and not task.fixed_dynamics:
+        # The form was found with it, in the same record.
+        found.reasons['exponent'] = (
+            'cannot be judged: the exponent of p^m F(V) + c was found from this record'
+        )
+        barred.add('exponent')
     found.tried = len(catalogue()) - len(barred)
     for turn in range(MOST_CAUSES):
         progress(0.15 + 0.15 * turn, 'causes tried' if turn == 0 else 'further causes tried')

@@ -47,7 +47,7 @@ Progress = Callable[[str], None]
 class _Formed:
     """A task whose ``contents.u`` is what the curve is a function of, and the form's other parts.
 
-    ``scale`` (n,) is p^e; without it the power is F(u).
+    ``scale`` (n,) is p^e; without it the power is F(u). ``held`` tells that the task gave e.
     """
 
     task: FitTask
@@ -55,6 +55,7 @@ class _Formed:
     offset_mw: float = 0.0
     scale: FloatArray | None = None
     evidence: FormEvidence | None = None
+    held: bool = False
 
     @property
     def contents(self) -> WindowContents:
@@ -110,10 +111,13 @@ def form_contradicted(task: FitTask, given: StaticForm) -> bool:
     return found is not None and found.contradicted
 
 
-def outline(task: FitTask, progress: Progress = lambda _: None) -> RegionalModel:
+def outline(
+    task: FitTask, progress: Progress = lambda _: None
+) -> tuple[RegionalModel, StaticForm]:
     """Find curve and dynamics without the last fit on single rows and without errors.
 
-    A start for those who fit everything themselves, in two thirds of the time of `fit`.
+    A start for those who fit everything themselves, in two thirds of the time of `fit`. The
+    form is that of the task, or the one the data ask for.
 
     Raises
     ------
@@ -123,7 +127,9 @@ def outline(task: FitTask, progress: Progress = lambda _: None) -> RegionalModel
     begun = _begin(task, progress)
     progress('curve and dynamics together')
     try:
-        return search(_samples(begun.formed), *_refinement(begun))
+        formed = begun.formed
+        model, power = search(_samples(formed), *_refinement(begun), formed.held)
+        return model, replace(formed.form, exponent=power * formed.form.exponent)
     except np.linalg.LinAlgError as error:
         raise DataError(f'Curve and dynamics could not be found together: {error}.') from None
 
@@ -191,7 +197,9 @@ def _formed(task: FitTask) -> _Formed:
     formed = replace(
         task, contents=replace(contents, u=u), input_noise=task.input_noise * abs(ratio)
     )
-    return _Formed(formed, found.form, found.offset_mw, scale, found.evidence)
+    return _Formed(
+        formed, found.form, found.offset_mw, scale, found.evidence, task.form is not None
+    )
 
 
 def _pressure(task: FitTask, rows: IntArray) -> float:
@@ -333,7 +341,7 @@ def _refined(begun: _Begun, progress: Progress) -> Characteristic:
     progress('curve and dynamics together')
     samples = _samples(begun.formed)
     try:
-        result = refine(samples, *_refinement(begun))
+        result = refine(samples, *_refinement(begun), begun.formed.held)
     except (np.linalg.LinAlgError, TooFewSamplesError) as error:
         return _only_straight(begun, str(error))
     return from_refined(begun.formed.task, begun.static, result, samples, begun.u_special)

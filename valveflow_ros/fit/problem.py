@@ -59,6 +59,16 @@ class Samples:
         """Return the number of scored means."""
         return len(self.u) // self.group
 
+    @property
+    def scale_or_ones(self) -> FloatArray:
+        """Return p^e, 1 for a form without."""
+        return np.ones(len(self.u)) if self.scale is None else self.scale
+
+    def with_scale_power(self, power: float) -> Samples:
+        """Return the rows with p^e raised to a power."""
+        scale = None if self.scale is None or power == 1.0 else self.scale**power
+        return self if scale is None else replace(self, scale=scale)
+
     def finer(self) -> Samples:
         """Return the same rows with hardly any averaging, for the last word on all parameters."""
         return replace(self, group=max(1, min(self.group, round(_FINE_S / self.step_s))))
@@ -99,8 +109,7 @@ class Problem:
         self.settle = round(samples.settle_s / samples.step_s)
         self.u = np.ascontiguousarray(samples.u[:cut])
         self.usable = np.ascontiguousarray(samples.usable[:cut])
-        scale = np.ones(cut) if samples.scale is None else samples.scale[:cut]
-        self.scale = np.ascontiguousarray(scale)
+        self.scale = np.ascontiguousarray(samples.scale_or_ones[:cut])
         power = np.where(self.usable > 0, samples.power_mw[:cut], 0.0)
         self.power = power.reshape(m, samples.group).mean(axis=1)
         self._threads = cores()

@@ -11,6 +11,7 @@ not smooth in it; everything else moves by Levenberg-Marquardt.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -227,6 +228,7 @@ def find_regions(problem: Problem, model: RegionalModel) -> tuple[RegionalModel,
 _LEAST_ROWS, _LEAST_S = 600, 3600.0
 # What an autoregressive model must remember: white noise on top of slow noise has a long tail.
 _MEMORY_S = 40.0
+_POWER_STEP, _POWER_ROUNDS = 0.01, 4  # of the exponent
 _NARROWEST = 0.01  # of the range of u: narrower pieces are not given to the search
 
 
@@ -255,6 +257,8 @@ class Refined:
         sd of the residual of single rows.
     confidence : dict
         Probability of each number of pieces; empty when it was given.
+    scale_power : float
+        To which power p^e was raised.
     """
 
     model: RegionalModel
@@ -268,9 +272,13 @@ class Refined:
     weight: ByteArray
     row_sd_mw: float
     confidence: dict[int, float] = field(default_factory=dict)
+    scale_power: float = 1.0
 
 
-def refine(samples: Samples, start: RegionalModel, most_pieces: int | None = None) -> Refined:
+def refine(
+    samples: Samples, start: RegionalModel, most_pieces: int | None = None,
+    exponent_held: bool = True,
+) -> Refined:  # fmt: skip
     """Fit curve and dynamics together, from ``start``'s curve.
 
     Parameters
@@ -284,6 +292,8 @@ def refine(samples: Samples, start: RegionalModel, most_pieces: int | None = Non
         but for pieces narrower than a hundredth of the range, which are joined with others.
         ``start`` should then have rather too many pieces than too few: the AR model takes the
         misfit of a curve that is too simple for noise.
+    exponent_held : bool
+        Otherwise p^e is raised to the power that fits best, `Refined.scale_power`.
 
     Raises
     ------
@@ -294,7 +304,9 @@ def refine(samples: Samples, start: RegionalModel, most_pieces: int | None = Non
     -------
     Refined
     """
-    problem, (model, likely) = Problem(samples), _outlined(samples, start, most_pieces)
+    model, likely, power = _outlined(samples, start, most_pieces, exponent_held)
+    samples = samples.with_scale_power(power)
+    problem = Problem(samples)
     searched = model.pieces
     fine = Problem(samples.finer())
     order = int(np.clip(round(_MEMORY_S / (fine.samples.step_s * fine.samples.group)), ORDER, 20))
@@ -314,23 +326,28 @@ def refine(samples: Samples, start: RegionalModel, most_pieces: int | None = Non
         model, cost = move(fine, model, ar, free, 4)
     model = corrected(samples, fine, model, ar, free)
     found = _conclude(problem, fine, model, free, ar)
-    return replace(found, confidence=shifted(likely, model.pieces - searched))
+    return replace(found, confidence=shifted(likely, model.pieces - searched), scale_power=power)
 
 
-def search(samples: Samples, start: RegionalModel, most_pieces: int | None) -> RegionalModel:
+def search(
+    samples: Samples, start: RegionalModel, most_pieces: int | None, exponent_held: bool = True
+) -> tuple[RegionalModel, float]:
     """Find regions and pieces on means of ten seconds: `refine` without its last fit.
+
+    Returns the model, and the power of p^e that fits best.
 
     Raises
     ------
     TooFewSamplesError
         As for `refine`.
     """
-    return _outlined(samples, start, most_pieces)[0]
+    model, _, power = _outlined(samples, start, most_pieces, exponent_held)
+    return model, power
 
 
 def _outlined(
-    samples: Samples, start: RegionalModel, most_pieces: int | None
-) -> tuple[RegionalModel, dict[int, float]]:
+    samples: Samples, start: RegionalModel, most_pieces: int | None, exponent_held: bool
+) -> tuple[RegionalModel, dict[int, float], float]:
     """Search on coarse rows, if there are enough of them."""
     _, weight = Problem(samples).answer(
         replace(start, levels=np.empty(0), time_constants=np.ones(1), delays=np.zeros(1))
@@ -340,7 +357,39 @@ def _outlined(
         raise TooFewSamplesError(
             'Rows that follow each other for longer than the transient', rows, least
         )
-    return _search(Problem(samples.coarser()), _join(start), most_pieces)
+    coarse = samples.coarser()
+    model, likely = _search(Problem(coarse), _join(start), most_pieces)
+    if exponent_held or samples.scale is None:
+        return model, likely, 1.0
+    return _with_exponent(coarse, model, likely)
+
+
+def _with_exponent(
+    coarse: Samples, model: RegionalModel, likely: dict[int, float]
+) -> tuple[RegionalModel, dict[int, float], float]:
+    """Return a model with the power of p^e that fits best, all else fitted along with it."""
+    free = free_parameters(model)
+    residual, weight = Problem(coarse).answer(model)
+    ar = fit_ar(residual, weight)
+
+    def fitted(power: float) -> tuple[float, RegionalModel]:
+        problem = Problem(coarse.with_scale_power(power))
+        # What F is multiplied by at the median pressure stays as it is.
+        middle = float(np.median(coarse.scale_or_ones[coarse.usable > 0])) ** (1.0 - power)
+        begin = replace(model, left=middle * model.left, right=middle * model.right)
+        moved, cost = move(problem, begin, ar, free, 3)
+        return cost, moved
+
+    power, step = 1.0, _POWER_STEP
+    for _ in range(_POWER_ROUNDS):
+        places = (power - step, power, power + step)
+        low, here, high = (fitted(p)[0] for p in places)
+        bend = low - 2.0 * here + high
+        by = 0.5 * step * (low - high) / bend if bend > 0.0 else math.copysign(step, low - high)
+        power += float(np.clip(by, -2.0 * step, 2.0 * step))
+        if abs(by) < step:
+            break
+    return fitted(power)[1], likely, power
 
 
 def least_rows(step_s: float) -> int:

@@ -128,6 +128,7 @@ def from_refined(
         breakpoint_intervals=intervals,
         dynamics=dynamics,
         offset_mw=m.offset,
+        pressure_scale_exponent=result.scale_power * static.pressure_scale_exponent,
         residuals=residual_statistics(
             task,
             result.residual_mw,

@@ -102,13 +102,11 @@ class _Rows:
         """
         if self.observed is None or not self.observed.contradicts(given):
             return None
-        form = self.observed.form()
-        if form.axis == given.axis:
-            return None
         try:
-            return form, self.observed.outline(form)
+            model, form = self.observed.outline()
         except DataError:
             return None
+        return None if form.axis == given.axis else (form, model)
 
 
 def load_diagnosable(path: str | Path) -> Model:
@@ -218,13 +216,18 @@ def _rows(
         form = StaticForm(exponent=settings.real('pressure_exponent'))
         return _Rows(table, np.empty((0, 2), dtype=np.int64), None, form, why)
     spans = np.array([(s.start_ns, s.end_ns) for s in observed.segments], dtype=np.int64)
-    form = observed.form()
     rows = _Rows(
-        observed.table, spans.reshape(-1, 2), None, form, places=observed.rows, observed=observed
+        observed.table,
+        spans.reshape(-1, 2),
+        None,
+        observed.paper_form,
+        places=observed.rows,
+        observed=observed,
     )
     if not wanted:
         return rows
     try:
-        return replace(rows, model=observed.outline(form, progress))
+        model, form = observed.outline(progress)
+        return replace(rows, model=model, form=form)
     except DataError as error:
         return replace(rows, why=f'{error} All rows are used instead.')

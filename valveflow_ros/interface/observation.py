@@ -73,25 +73,26 @@ class Observed:
         """Return the curve; raises `DataError` with the reason if the data carry none."""
         return fit(self.task, lambda what: progress(0.6, what))
 
-    def form(self) -> StaticForm:
-        """Return the form to begin a diagnosis with.
-
-        Where the data do not ask for knees at fixed openings it is the paper's with the exponent
-        of the settings: another one is a cause, and is to be named.
-        """
-        asked = form_of_data(self.task)
-        paper = StaticForm(exponent=self.task.settings.real('pressure_exponent'))
-        return asked if asked.scaled else paper
+    @property
+    def paper_form(self) -> StaticForm:
+        """Return the paper's form with the exponent of the settings."""
+        return StaticForm(exponent=self.task.settings.real('pressure_exponent'))
 
     def contradicts(self, given: StaticForm) -> bool:
         """Return whether the data tell that the static power has another form."""
         return form_contradicted(self.task, given)
 
     def outline(
-        self, form: StaticForm, progress: Callable[[float, str], None] = SILENT
-    ) -> RegionalModel:
-        """Return curve and dynamics to begin a diagnosis with; raises `DataError` as `fit`."""
-        return outline(replace(self.task, form=form), lambda what: progress(0.6, what))
+        self, progress: Callable[[float, str], None] = SILENT
+    ) -> tuple[RegionalModel, StaticForm]:
+        """Return curve and dynamics to begin a diagnosis with; raises `DataError` as `fit`.
+
+        Where the data do not ask for knees at fixed openings the form is the paper's with the
+        exponent of the settings: another one is a cause, and is to be named.
+        """
+        scaled = form_of_data(self.task).scaled
+        task = self.task if scaled else replace(self.task, form=self.paper_form)
+        return outline(task, lambda what: progress(0.6, what))
 
 
 def settings_of(
