@@ -1,0 +1,644 @@
+"""Simulate a unit of `valveflow_ros.plant.thermal_unit` and record it as a historian does.
+
+Schedule and AGC give a set point, primary response adds to it, a governor turns it into an
+opening, steam flows, turbine and boiler answer, instruments and a historian write it down.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from valveflow_ros.errors import InputError
+from valveflow_ros.numerics import jit, kernel
+from valveflow_ros.plant.effect import DAY_S, HistorianRows, LoopInputs, clock_at_ns
+from valveflow_ros.plant.historian import Historian
+from valveflow_ros.plant.loop import lag_coefficients
+from valveflow_ros.plant.plant import Wander
+from valveflow_ros.plant.simulator import DEFAULT_START_NS
+from valveflow_ros.plant.spec import EffectSpec, install
+from valveflow_ros.plant.thermal_effects import ThermalHooks, thermal_effect
+from valveflow_ros.plant.thermal_unit import TABLE_STEP_PERCENT, SequencedValves, ThermalUnit
+from valveflow_ros.records import (
+    NS_PER_S,
+    SIGNALS,
+    FloatArray,
+    IntArray,
+    Readings,
+    SampleTable,
+    Signal,
+    table_to_readings,
+)
+
+LONGEST_DAYS = 60.0
+_WARM_UP_S = 7200
+# Rows behind the end, for a clock that stamps the power early; always simulated, so that
+# switching it on changes no random number.
+_MARGIN_S = 600
+# Share of the range of load by hour of day: a morning and an evening peak.
+_HOURS = (0.0, 4.0, 7.0, 10.0, 13.0, 17.0, 20.0, 23.0, 24.0)
+_SHARES = (0.35, 0.15, 0.45, 0.9, 0.6, 0.75, 1.0, 0.55, 0.35)
+_LOWEST_OPENING, _SERVO_PERCENT_PER_S = 3.0, 10.0
+# The condenser: cooling water warms by so much at full flow, steam condenses so much above it.
+_WATER_RISE_K, _TERMINAL_K, _CONDENSER_S = 9.5, 4.0, 60.0
+_PRIMARY_LIMIT = 0.06
+_NOMINAL_HZ = 50.0
+
+
+class TrueRows(NamedTuple):
+    """What really happened, every second; float64 (n,) each.
+
+    %, % (of the servo, before anything behind the position sensor), %, MPa, MPa in the drum,
+    share of full flow, share of full firing, MW without the meter's noise, kPa.
+    """
+
+    command: FloatArray
+    stem: FloatArray
+    plug: FloatArray
+    pressure: FloatArray
+    drum: FloatArray
+    flow: FloatArray
+    heat: FloatArray
+    power: FloatArray
+    condenser: FloatArray
+
+    def part(self, start: int, end: int) -> TrueRows:
+        """Return rows ``[start, end)``."""
+        return TrueRows(*(column[start:end] for column in self))
+
+
+@dataclass(frozen=True, slots=True)
+class ThermalLog:
+    """What the historian kept of a thermal unit, and the truth behind it.
+
+    Attributes
+    ----------
+    table : SampleTable
+        The five signals. Where values have times of their own, NaN means no new value.
+    extra : dict of float64 (n,)
+        Further columns on the same rows: ``condenser_pressure_kpa``, ``grid_frequency_hz``,
+        and ``valve_1_position_percent`` and so on of valves in sequence.
+    unit : ThermalUnit
+        Without its effects.
+    historian : Historian
+        How it was recorded.
+    truth : TrueRows
+        Every second from the first sample on, whatever was recorded.
+    demand_mw, temperature_degc, water_degc : float64 (n,)
+        Set point after the rate limit, true steam and cooling water temperature; as ``truth``.
+    active : tuple of EffectSpec
+        What was switched on.
+    """
+
+    table: SampleTable
+    extra: dict[str, FloatArray]
+    unit: ThermalUnit
+    historian: Historian
+    truth: TrueRows
+    demand_mw: FloatArray
+    temperature_degc: FloatArray
+    water_degc: FloatArray
+    active: tuple[EffectSpec, ...] = ()
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.table)
+
+    @property
+    def readings(self) -> Readings:
+        """The values one by one, without the empty cells of values with their own times."""
+        readings = table_to_readings(self.table)
+        if not self.historian.own_times:
+            return readings
+        there = np.isfinite(readings.value)
+        return Readings(
+            readings.time_ns[there], readings.signal[there],
+            readings.value[there], readings.quality[there],
+        )  # fmt: skip
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what is true of the plant.
+
+        ``form``, ``pressure_exponent``, ``pressure_scale_exponent`` and ``offset_mw`` describe
+        the static power as a characteristic does. ``curve`` is the static power at rated
+        pressure; its ``knees`` are in % for the form 'opening', in % MPa^m for
+        'integrated_input', and for 'sequence' where a valve begins to open.
+        """
+        unit = self.unit
+        opening = np.arange(0.0, 100.1, 2.5)
+        at_opening = unit.on_opening
+        area = unit.area
+        density = unit.pressure_rated_mpa**unit.exponent
+        if isinstance(area, SequencedValves):
+            knees = [valve.from_percent for valve in area.valves]
+        else:
+            knees = [k if at_opening else k * density for k in area.knees_percent]
+        return {
+            'sample_period_s': 1.0,
+            'form': unit.form,
+            'pressure_exponent': unit.exponent,
+            'pressure_scale_exponent': unit.exponent if at_opening else 0.0,
+            'offset_mw': -unit.no_load_mw,
+            'curve': {
+                'pressure_mpa': unit.pressure_rated_mpa,
+                'opening_percent': opening.tolist(),
+                'power_mw': unit.static_power(
+                    opening, np.full(opening.size, unit.pressure_rated_mpa)
+                ).tolist(),
+                'knees': knees,
+            },
+            'dynamics': {
+                'actuator_s': unit.actuator_s,
+                'high_pressure_s': unit.high_pressure_s,
+                'reheater_s': unit.reheater_s,
+                'high_pressure_share': unit.high_pressure_share,
+            },
+            'unit': unit.to_json(),
+            'recording': self.historian.recording,
+            'effects': [{'name': e.name, 'parameters': e.parameters} for e in self.active],
+        }
+
+
+def simulate_thermal(
+    days: float,
+    seed: int,
+    unit: ThermalUnit | None = None,
+    historian: Historian | None = None,
+    start_ns: int = DEFAULT_START_NS,
+    effects: Sequence[str | EffectSpec] = (),
+) -> ThermalLog:
+    """Simulate ``days`` of operation of a thermal unit.
+
+    Parameters
+    ----------
+    days : float
+        Length, more than 0 and at most 60.
+    seed : int
+        Every random number follows from it, whatever effects are on and however it is recorded.
+    unit : ThermalUnit, optional
+        By default one of the kind 'choked'.
+    historian : Historian, optional
+        By default every sample is kept.
+    start_ns : int
+        Time of the first sample; it decides the time of day, taken as UTC.
+    effects : sequence of str or EffectSpec
+        What to switch on, of `thermal_catalogue`; their order makes no difference.
+
+    Raises
+    ------
+    InputError
+        An argument is out of range, or effects that cannot act in this run or not together.
+
+    Notes
+    -----
+    A day takes about 50 MB. Lags are discretised exactly for an input that is held (controllers)
+    or straight (steam) between two samples. The pressure of one second acts on the flow of the
+    next, which is short against the boiler's storage.
+    """
+    unit, historian = unit or ThermalUnit(), historian or Historian()
+    if not 0.0 < days <= LONGEST_DAYS:
+        raise InputError(
+            f'A simulation of this unit must last more than 0 and at most {LONGEST_DAYS:g} days, '
+            f'not {days}.'
+        )
+    if seed < 0:
+        raise InputError(f'The seed must be 0 or more, not {seed}.')
+    rows = max(1, round(days * DAY_S))
+    if start_ns < _WARM_UP_S * NS_PER_S or start_ns + rows * NS_PER_S >= 2**63:
+        raise InputError('A simulation must lie between the years 1970 and 2262.')
+    hooks = ThermalHooks.for_run(float(rows))
+    active = tuple(thermal_effect(effect, unit.kind) for effect in effects)
+    install(active, hooks)
+    rng = np.random.default_rng([seed, 330])
+    outside = _Outside.draw(unit, hooks, rng, rows, clock_at_ns(start_ns))
+    law = _law(unit, hooks)
+    out = np.empty((len(TrueRows._fields), outside.series.demand.size))
+    _run(outside.series, law, out)
+    truth = TrueRows(*out)
+    signals = _instruments(unit, hooks, outside, truth, rng, rows)
+    time_ns, columns = historian.record(start_ns, signals, rng)
+    mine = {info.column: info.signal for info in SIGNALS}
+    table = SampleTable.from_columns(
+        time_ns, {mine[name]: column for name, column in columns.items() if name in mine}
+    )
+    extra = {name: column for name, column in columns.items() if name not in mine}
+    kept = slice(_WARM_UP_S, _WARM_UP_S + rows)
+    return ThermalLog(
+        table, extra, unit, historian, truth.part(kept.start, kept.stop),
+        outside.series.demand[kept], outside.temperature[kept], outside.water[kept], active,
+    )  # fmt: skip
+
+
+# What acts on the unit from outside.
+
+
+class _Series(NamedTuple):
+    """What drives the loop; float64 (n,) each.
+
+    MW, MW, MPa, share of full firing, factor on the power, MW, factor on and error of the
+    position, factor on the area, degC, MW, MW, MPa.
+    """
+
+    demand: FloatArray
+    primary: FloatArray
+    pressure_set: FloatArray
+    fire: FloatArray
+    gain: FloatArray
+    offset: FloatArray
+    position_factor: FloatArray
+    position_zero: FloatArray
+    area_factor: FloatArray
+    water: FloatArray
+    swing: FloatArray
+    power_noise: FloatArray
+    pressure_noise: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Outside:
+    series: _Series
+    temperature: FloatArray
+    water: FloatArray
+    frequency: FloatArray
+
+    @classmethod
+    def draw(
+        cls,
+        unit: ThermalUnit,
+        hooks: ThermalHooks,
+        rng: np.random.Generator,
+        rows: int,
+        clock_s: float,
+    ) -> _Outside:
+        """Draw everything, from the start of the warm-up to the margin behind the end."""
+        n = _WARM_UP_S + rows + _MARGIN_S
+        time_s = np.arange(n, dtype=np.float64) - _WARM_UP_S
+        clock = np.mod(clock_s + time_s, DAY_S)
+        demand = _set_point(unit, rng, time_s, clock_s)
+        frequency = _frequency(rng, n)
+        excess = frequency - _NOMINAL_HZ
+        excess -= np.clip(excess, -unit.dead_band_hz, unit.dead_band_hz)
+        limit = _PRIMARY_LIMIT * unit.rated_mw
+        primary = np.clip(-excess / _NOMINAL_HZ / unit.droop * unit.rated_mw, -limit, limit)
+        sliding = _lagged(unit.pressure_set_mpa(demand), 150.0)
+        wander = unit.pressure_wander_mpa * Wander(rng, 10_800.0, 1.0).advance(n)
+        pressure_set = np.minimum(sliding + wander, 1.03 * unit.pressure_rated_mpa)
+        temperature = _temperature(unit, rng, demand)
+        water = unit.water_degc + unit.water_weather_k * Wander(rng, 1.5 * DAY_S, 1.0).advance(n)
+        water += unit.water_daily_k * np.cos(2.0 * np.pi * (clock / 3600.0 - 16.0) / 24.0)
+        forcing = LoopInputs(
+            time_s, clock, pressure_set, temperature, np.ones(n), np.ones(n), np.zeros(n)
+        )
+        for change in hooks.forcing:
+            change(forcing)
+        gain = forcing.gain * (
+            1.0 + unit.temperature_per_k * (temperature - unit.temperature_degc)
+        )
+        area = np.ones(n)
+        for factor in hooks.area:
+            area *= factor(time_s)
+        zero = np.zeros(n)
+        for error in hooks.position_zero:
+            zero += error(time_s)
+        noise = unit.noise
+        series = _Series(
+            demand, primary, pressure_set, 0.012 * Wander(rng, 900.0, 1.0).advance(n), gain,
+            forcing.offset_mw, forcing.input_gain, zero, area, water,
+            unit.swing_mw * Wander(rng, 15.0, 1.0).advance(n),
+            noise['generated_power_mw'] * rng.standard_normal(n),
+            noise['main_steam_pressure_mpa'] * rng.standard_normal(n),
+        )  # fmt: skip
+        return cls(series, temperature, water, frequency)
+
+
+def _set_point(
+    unit: ThermalUnit, rng: np.random.Generator, time_s: FloatArray, clock_s: float
+) -> FloatArray:
+    """Return schedule and AGC after the rate limit, MW (n,)."""
+    low, span = unit.load_low_mw, unit.load_high_mw - unit.load_low_mw
+    per_s = unit.ramp_mw_per_min / 60.0
+    hour = np.mod(clock_s + time_s[0], DAY_S) / 3600.0
+    level = low + span * float(np.interp(hour, _HOURS, _SHARES))
+    knots_s, knots_mw, agc_on = [float(time_s[0])], [level], [1.0]
+    while knots_s[-1] < time_s[-1]:
+        begin = knots_s[-1] + rng.uniform(900.0, 1800.0) + rng.exponential(2700.0)
+        hour = np.mod(clock_s + begin, DAY_S) / 3600.0
+        share = float(np.interp(hour, _HOURS, _SHARES)) + 0.15 * rng.standard_normal()
+        target = low + span * min(max(share, 0.0), 1.0)
+        rate = per_s * rng.uniform(0.5, 1.0)
+        knots_s += [begin, begin + max(1.0, abs(target - level) / rate)]
+        knots_mw += [level, target]
+        agc_on += [agc_on[-1], float(rng.random() < 0.7)]
+        level = target
+    schedule = np.interp(time_s, knots_s, knots_mw)
+    # AGC asks for another amount every 20 to 120 s; some holds are without it.
+    count = int(np.ptp(time_s) / 20.0) + 2
+    moments = time_s[0] + np.cumsum(rng.uniform(20.0, 120.0, count))
+    amounts = unit.agc_mw * Wander(rng, 6.0, 1.0).advance(count)
+    asked = np.append(0.0, amounts)[np.searchsorted(moments, time_s, side='right')]
+    on = np.array(agc_on)[np.searchsorted(knots_s, time_s, side='right') - 1]
+    target_mw = np.clip(schedule + on * asked, low, unit.load_high_mw)
+    return np.asarray(_rate_limited(target_mw, per_s))
+
+
+def _frequency(rng: np.random.Generator, n: int) -> FloatArray:
+    """Return the grid's frequency in Hz: unrest, and now and then a lost generator or load."""
+    deviation = 0.012 * Wander(rng, 300.0, 1.0).advance(n)
+    deviation += 0.006 * Wander(rng, 15.0, 1.0).advance(n)
+    now = rng.exponential(DAY_S / 4.0)
+    while now < n:
+        size = rng.uniform(0.04, 0.1) * (1.0 if rng.random() < 0.25 else -1.0)
+        after = np.arange(min(3600, n - int(now)), dtype=np.float64)
+        deviation[int(now) : int(now) + after.size] += (
+            size * (1.0 - np.exp(-after / 5.0)) * np.exp(-after / 240.0)
+        )
+        now += rng.exponential(DAY_S / 4.0)
+    return np.asarray(_NOMINAL_HZ + deviation)
+
+
+def _temperature(unit: ThermalUnit, rng: np.random.Generator, demand: FloatArray) -> FloatArray:
+    """Return the steam temperature in degC: colder at low load and after a rise of load."""
+    short = (unit.load_high_mw - demand) / (unit.load_high_mw - unit.load_low_mw)
+    per_min = 60.0 * np.diff(demand, prepend=demand[0])
+    return np.asarray(
+        unit.temperature_degc
+        + unit.temperature_wander_k * Wander(rng, 1800.0, 1.0).advance(demand.size)
+        - unit.temperature_load_k * _lagged(short, 900.0)
+        - 0.3 * _lagged(per_min, 200.0)
+    )
+
+
+@kernel
+def _rate_limited(target: FloatArray, per_row: float) -> FloatArray:
+    """Follow a target by at most ``per_row`` a row."""
+    out = np.empty_like(target)
+    now = target[0]
+    for t in range(target.size):
+        now += min(max(target[t] - now, -per_row), per_row)
+        out[t] = now
+    return out
+
+
+def _lagged(signal: FloatArray, time_s: float) -> FloatArray:
+    """Return a first-order lag, at rest at the first value."""
+    return np.asarray(_lag_rows(signal, *lag_coefficients(time_s, 1.0)))
+
+
+@kernel
+def _lag_rows(signal: FloatArray, a: float, b: float, c: float) -> FloatArray:
+    out = np.empty_like(signal)
+    out[0] = signal[0]
+    for t in range(1, signal.size):
+        out[t] = a * out[t - 1] + b * signal[t - 1] + c * signal[t]
+    return out
+
+
+# The loop of governor, valve, turbine and boiler.
+
+
+class _Law(NamedTuple):
+    """What stays the same during a run; lags are (a, b, c) of `lag_coefficients`.
+
+    ``bank_*`` are (largest step, slip-off, slip-to, top, half slack), of what stands before and
+    behind the position sensor.
+    """
+
+    area: FloatArray
+    opening_of: FloatArray  # the governor's inverse of the area, on a grid of `inverse_step`
+    inverse_step: float
+    on_opening: bool
+    exponent: float
+    rated_pressure: float
+    pressure_factor: float
+    full_mw: float  # rated_mw + no_load_mw
+    no_load_mw: float
+    share: float
+    servo: float
+    high_pressure: tuple[float, float, float]
+    reheater: tuple[float, float, float]
+    mill: float
+    fuel: tuple[float, float, float]
+    storage_s: float
+    drop: float
+    integral_s: float
+    vacuum_per_kpa: float
+    water_reference: float
+    bank_before: tuple[float, float, float, float, float]
+    bank_behind: tuple[float, float, float, float, float]
+
+
+def _law(unit: ThermalUnit, hooks: ThermalHooks) -> _Law:
+    """Collect what stays the same during a run."""
+    area = unit.area_table()
+    known = np.arange(area.size) * TABLE_STEP_PERCENT
+    # A governor knows its valve by a table of few points only.
+    points = np.linspace(0.0, 104.0, 14)
+    at_points = np.interp(points, known, area)
+    rising = np.append(True, np.diff(at_points) > 1e-6)
+    grid = np.linspace(0.0, float(at_points[-1]), 1024)
+    banks = []
+    for bank in (hooks.before_sensor, hooks.after_sensor):
+        off = (bank.band_percent + bank.jump_percent) / 2.0
+        to = (bank.band_percent - bank.jump_percent) / 2.0
+        step = bank.rate_percent_per_s
+        banks.append((step, off, to, bank.top_percent, bank.slack_percent / 2.0))
+    banks[0] = (min(banks[0][0], _SERVO_PERCENT_PER_S), *banks[0][1:])
+    return _Law(
+        area, np.interp(grid, at_points[rising], points[rising]), float(grid[1]),
+        unit.on_opening, unit.exponent, unit.pressure_rated_mpa, hooks.pressure_factor,
+        unit.rated_mw + unit.no_load_mw, unit.no_load_mw, unit.high_pressure_share,
+        math.exp(-1.0 / unit.actuator_s), lag_coefficients(unit.high_pressure_s, 1.0),
+        lag_coefficients(unit.reheater_s, 1.0), math.exp(-1.0 / unit.mill_s),
+        lag_coefficients(unit.fuel_s, 1.0), unit.storage_s, unit.drop, unit.integral_s,
+        unit.vacuum_per_kpa, unit.water_degc, *banks,
+    )  # fmt: skip
+
+
+@jit
+def _at(table: FloatArray, step: float, x: float) -> float:
+    """Interpolate a table over multiples of ``step``; level beyond its ends."""
+    place = min(max(x / step, 0.0), table.size - 1.000001)
+    k = int(place)
+    return float(table[k] + (table[k + 1] - table[k]) * (place - k))
+
+
+@jit
+def _saturation_kpa(degc: float) -> float:
+    """Return the saturation pressure of water (Magnus)."""
+    return float(0.61094 * np.exp(17.625 * degc / (degc + 243.04)))
+
+
+@jit
+def _through(wanted: float, memory: FloatArray, bank: tuple[float, ...]) -> float:
+    """Move through servo speed, friction, stop and slack; ``memory`` is (6,).
+
+    Friction has two states: the stem is at rest until the pull exceeds (S + J) / 2, slips by J,
+    then follows (S - J) / 2 behind until the pull stops or turns.
+    """
+    servo, before, position, direction = memory[0], memory[1], memory[2], memory[3]
+    servo += min(max(wanted - servo, -bank[0]), bank[0])
+    if (servo - before) * direction <= 0.0:
+        direction = 0.0
+    pull = servo - position
+    if direction == 0.0 and abs(pull) > bank[1]:
+        direction = 1.0 if pull > 0.0 else -1.0
+    if direction != 0.0:
+        position = servo - direction * bank[2]
+    stopped = min(position, bank[3])
+    loose = min(max(memory[4], stopped - bank[4]), stopped + bank[4])
+    memory[0], memory[1], memory[2], memory[3], memory[4] = (
+        servo, servo, position, direction, loose,
+    )  # fmt: skip
+    return float(loose)
+
+
+@jit
+def _governor_opening(flow: float, density: float, law: _Law) -> float:
+    """Return the opening that the governor's table gives for a flow."""
+    if law.on_opening:
+        opening = _at(law.opening_of, law.inverse_step, flow / density)
+    else:
+        opening = _at(law.opening_of, law.inverse_step, flow) / density
+    return min(max(opening, _LOWEST_OPENING), 100.0)
+
+
+@jit
+def _flow(plug: float, pressure: float, law: _Law) -> float:
+    """Return the steam flow as a share of the full one."""
+    density = (pressure / law.rated_pressure) ** law.exponent
+    if law.on_opening:
+        return density * _at(law.area, TABLE_STEP_PERCENT, plug)
+    return _at(law.area, TABLE_STEP_PERCENT, plug * density)
+
+
+@kernel
+def _run(series: _Series, law: _Law, out: FloatArray) -> None:
+    """Fill ``out`` (9, n) as `TrueRows`, beginning at rest."""
+    rated, full = law.rated_pressure, law.full_mw
+    demand = series.demand[0]
+    flow = heat = mill = firing = direct = reheated = warmed = (demand + law.no_load_mw) / full
+    reference, trim, boiler_trim = demand, 0.0, 0.0
+    lost = law.drop * rated * flow * flow
+    drum = series.pressure_set[0] + lost
+    seen = series.pressure_set[0] * law.pressure_factor
+    command = _governor_opening(flow, (seen / rated) ** law.exponent, law)
+    servo = command
+    before = np.full(5, command)
+    behind = np.full(5, (command - series.position_zero[0]) * series.position_factor[0])
+    before[3] = behind[3] = 0.0
+    ka, kb, kc = law.high_pressure
+    ra, rb, rc = law.reheater
+    fa, fb, fc = law.fuel
+    loss_decay, seen_decay = np.exp(-1.0 / 4.0), np.exp(-1.0 / 3.0)
+    warm_decay = np.exp(-1.0 / _CONDENSER_S)
+    for t in range(series.demand.size):
+        # Boiler: mills, furnace, storage, and the loss of pressure on the way to the valve.
+        mill_old, heat_old = mill, heat
+        mill = law.mill * mill + (1.0 - law.mill) * firing
+        heat = fa * heat + fb * mill_old + fc * mill
+        drum += rated / law.storage_s * (0.5 * (heat_old + heat) + series.fire[t] - flow)
+        lost = loss_decay * lost + (1.0 - loss_decay) * law.drop * rated * flow * flow
+        pressure = max(drum - lost, 0.05 * rated)
+        # Valve. The servo's loop is closed on what the position sensor reads.
+        servo = law.servo * servo + (1.0 - law.servo) * command
+        stem = _through(servo, before, law.bank_before)
+        position = (stem - series.position_zero[t]) * series.position_factor[t]
+        plug = min(max(_through(position, behind, law.bank_behind), 0.0), 105.0)
+        # Turbine.
+        flow_old, direct_old = flow, direct
+        flow = _flow(plug, pressure, law) * series.area_factor[t]
+        direct = ka * direct + kb * flow_old + kc * flow
+        reheated = ra * reheated + rb * direct_old + rc * direct
+        steam = law.share * direct + (1.0 - law.share) * reheated
+        warmed = warm_decay * warmed + (1.0 - warm_decay) * flow
+        above = _WATER_RISE_K * warmed + _TERMINAL_K
+        condenser = _saturation_kpa(series.water[t] + above)
+        worse = condenser - _saturation_kpa(law.water_reference + above)
+        gain = series.gain[t] * (1.0 + law.vacuum_per_kpa * worse)
+        power = (full * steam - law.no_load_mw) * gain + series.offset[t] + series.swing[t]
+        # Governor: what is asked for, fed forward, and an integral of what is missing beside
+        # an answer of the usual shape.
+        demand_old, demand = demand, series.demand[t] + series.primary[t]
+        reference = ra * reference + rb * demand_old + rc * demand
+        expected = law.share * demand + (1.0 - law.share) * reference
+        missing = expected - power - series.power_noise[t]
+        wide = (command >= 100.0 and missing > 0.0) or (
+            command <= _LOWEST_OPENING and missing < 0.0
+        )
+        if not wide:
+            trim = min(max(trim + missing / law.integral_s, -0.2 * full), 0.2 * full)
+        read = pressure * law.pressure_factor + series.pressure_noise[t]
+        seen = seen_decay * seen + (1.0 - seen_decay) * read
+        wanted = (demand + trim + 0.1 * missing + law.no_load_mw) / full
+        density = (max(seen, 0.05 * rated) / rated) ** law.exponent
+        command = _governor_opening(max(wanted, 0.0), density, law)
+        # Fire: the load fed forward with what a moving set point stores, and pressure control.
+        short = (series.pressure_set[t] - seen) / rated
+        rise = (series.pressure_set[t] - series.pressure_set[max(t - 1, 0)]) / rated
+        asked = (series.demand[t] + law.no_load_mw) / full + law.storage_s * rise
+        wish = asked + 1.6 * short + boiler_trim
+        firing = min(max(wish, 0.2), 1.15)
+        if firing == wish:
+            boiler_trim = min(max(boiler_trim + 1.6 * short / 700.0, -0.3), 0.3)
+        out[0, t] = command
+        out[1, t] = stem
+        out[2, t] = plug
+        out[3, t] = pressure
+        out[4, t] = drum
+        out[5, t] = flow
+        out[6, t] = heat
+        out[7, t] = power
+        out[8, t] = condenser
+
+
+# Instruments.
+
+
+def _instruments(
+    unit: ThermalUnit,
+    hooks: ThermalHooks,
+    outside: _Outside,
+    truth: TrueRows,
+    rng: np.random.Generator,
+    rows: int,
+) -> dict[str, FloatArray]:
+    """Return what the instruments show every second, by column, float64 (rows,)."""
+    kept = slice(_WARM_UP_S, _WARM_UP_S + rows)
+    n, noise = truth.power.size, unit.noise
+    series = outside.series
+    power = truth.power + series.power_noise
+    opening = truth.stem + noise['valve_opening_percent'] * rng.standard_normal(n)
+    temperature_noise = noise['main_steam_temperature_degc'] * rng.standard_normal(n)
+    shown = {
+        'valve_opening_percent': opening,
+        'main_steam_pressure_mpa': truth.pressure * hooks.pressure_factor + series.pressure_noise,
+        'main_steam_temperature_degc': outside.temperature + temperature_noise,
+        'generated_power_mw': _shifted(power, hooks.lead_s),
+        'valve_command_percent': truth.command,
+        'condenser_pressure_kpa': truth.condenser
+        + noise['condenser_pressure_kpa'] * rng.standard_normal(n),
+        'grid_frequency_hz': outside.frequency,
+    }
+    if isinstance(unit.area, SequencedValves):
+        for number, valve in enumerate(unit.area.valves, 1):
+            shown[f'valve_{number}_position_percent'] = valve.lift_percent(opening)
+    columns = {}
+    for name, column in shown.items():
+        step = unit.resolution.get(name, 0.1)
+        columns[name] = np.round(np.round(column[kept] / step) * step, 6)
+    time_s = np.arange(rows, dtype=np.float64)
+    changed: dict[Signal, FloatArray] = {info.signal: columns[info.column] for info in SIGNALS}
+    for change in hooks.writing:
+        change(HistorianRows(time_s, changed))
+    columns.update({info.column: changed[info.signal] for info in SIGNALS})
+    return columns
+
+
+def _shifted(column: FloatArray, lead_s: float) -> FloatArray:
+    """Return the values that stand ``lead_s`` later, linear between samples."""
+    place: IntArray = np.arange(column.size)
+    return np.interp(place + lead_s, place, column) if lead_s else column
