@@ -61,14 +61,14 @@ class ThermalHooks(Hooks):
 
 
 def _thermal(hooks: Hooks) -> ThermalHooks:
-    """Return the hooks of a thermal unit; the verbs and functions offer these effects to no other."""
+    """Return the hooks as those of a thermal unit."""
     if not isinstance(hooks, ThermalHooks):
         raise InputError('This effect acts on a thermal unit only; choose one with unit=...')
     return hooks
 
 
 def _install_area_step(values: Values, hooks: Hooks) -> None:
-    """Seats wear, a part breaks, or the valve is overhauled: ``area (1 + g)`` from t0 on."""
+    """Multiply the area by 1 + g from t0 on: worn seats, a broken part, an overhaul."""
     _thermal(hooks).area.append(lambda time_s: 1.0 + values['g'] * step(time_s, values))
 
 
@@ -82,7 +82,7 @@ AREA_STEP = Effect(
 
 
 def _install_opening_offset(values: Values, hooks: Hooks) -> None:
-    """The position sensor's zero is wrong or drifts: ``reading = position + b + d t / 10 d``."""
+    """Let the position sensor read b + d t / 10 d too high; the servo follows the reading."""
 
     def change(time_s: FloatArray) -> FloatArray:
         return values['b_percent'] + values['drift_percent'] * ramp(time_s)
@@ -102,7 +102,7 @@ OPENING_OFFSET = Effect(
 
 
 def _install_pressure_scale(values: Values, hooks: Hooks) -> None:
-    """The pressure transmitter's scale is wrong: ``reading = p (1 + g)``, for the control too."""
+    """Let the pressure sensor read p (1 + g), for record and control alike."""
     hooks.claim('pressure_scale')
     _thermal(hooks).pressure_factor = 1.0 + values['g']
 

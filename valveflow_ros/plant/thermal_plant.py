@@ -306,7 +306,7 @@ class _Outside:
             zero += error(time_s)
         noise = unit.noise
         series = _Series(
-            demand, primary, pressure_set, 0.012 * Wander(rng, 900.0, 1.0).advance(n), gain,
+            demand, primary, pressure_set, 0.007 * Wander(rng, 900.0, 1.0).advance(n), gain,
             forcing.offset_mw, forcing.input_gain, zero, area, water,
             unit.swing_mw * Wander(rng, 15.0, 1.0).advance(n),
             noise['generated_power_mw'] * rng.standard_normal(n),
@@ -511,8 +511,8 @@ def _flow(plug: float, pressure: float, law: _Law) -> float:
     """Return the steam flow as a share of the full one."""
     density = (pressure / law.rated_pressure) ** law.exponent
     if law.on_opening:
-        return density * _at(law.area, TABLE_STEP_PERCENT, plug)
-    return _at(law.area, TABLE_STEP_PERCENT, plug * density)
+        return float(density * _at(law.area, TABLE_STEP_PERCENT, plug))
+    return float(_at(law.area, TABLE_STEP_PERCENT, plug * density))
 
 
 @kernel

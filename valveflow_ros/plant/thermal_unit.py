@@ -121,6 +121,24 @@ class SequencedValves:
         return np.asarray(sum(valve.area(opening_percent) for valve in self.valves))
 
 
+# Instruments: standard deviation, and smallest step, in the unit of the column.
+NOISE: dict[str, float] = {
+    'valve_opening_percent': 0.02,
+    'main_steam_pressure_mpa': 0.006,
+    'main_steam_temperature_degc': 0.1,
+    'generated_power_mw': 0.12,
+    'condenser_pressure_kpa': 0.01,
+}
+RESOLUTION: dict[str, float] = {
+    'valve_opening_percent': 0.01,
+    'main_steam_pressure_mpa': 0.002,
+    'main_steam_temperature_degc': 0.1,
+    'generated_power_mw': 0.02,
+    'valve_command_percent': 0.01,
+    'condenser_pressure_kpa': 0.01,
+    'grid_frequency_hz': 0.001,
+}
+
 # The kinds: what the flow follows, and whether the pressure slides with load.
 
 KINDS = {
@@ -313,24 +331,6 @@ class ThermalUnit:
         return dataclasses.asdict(self)
 
 
-NOISE = {
-    'valve_opening_percent': 0.02,
-    'main_steam_pressure_mpa': 0.006,
-    'main_steam_temperature_degc': 0.1,
-    'generated_power_mw': 0.12,
-    'condenser_pressure_kpa': 0.01,
-}
-RESOLUTION = {
-    'valve_opening_percent': 0.01,
-    'main_steam_pressure_mpa': 0.002,
-    'main_steam_temperature_degc': 0.1,
-    'generated_power_mw': 0.02,
-    'valve_command_percent': 0.01,
-    'condenser_pressure_kpa': 0.01,
-    'grid_frequency_hz': 0.001,
-}
-
-
 def random_unit(kind: str, number: int) -> ThermalUnit:
     """Draw a unit of a kind; the same number gives the same unit.
 
@@ -352,14 +352,17 @@ def random_unit(kind: str, number: int) -> ThermalUnit:
     rated, c = rng.uniform(320.0, 335.0), rng.uniform(8.0, 22.0)
     exponent, top = rng.uniform(1.0, 1.13), rng.uniform(16.2, 17.4)
     low, full = rng.uniform(132.0, 155.0), rng.uniform(84.0, 90.0)
-    slide_from, slide_to = rng.uniform(0.50, 0.54) * rated, rng.uniform(0.86, 0.94) * rated
+    slide_from, slide_to = (
+        max(low, rng.uniform(0.42, 0.54) * rated),
+        rng.uniform(0.86, 0.94) * rated,
+    )
     lowest = top
     if sliding:
         # At the lower end of the slide this share of the full area is open.
         open_share = rng.uniform(0.74, 0.9) if form == 'sequence' else rng.uniform(0.8, 0.94)
         flow = (slide_from + c) / (rated + c)
         lowest = max(7.0, top * (flow / open_share) ** (1.0 / exponent))
-    unit = ThermalUnit(
+    return ThermalUnit(
         kind=kind, area=area, exponent=exponent, rated_mw=rated, no_load_mw=c,
         full_opening_percent=full, load_low_mw=low,
         load_high_mw=rng.uniform(0.96, 0.98) * rated,
@@ -379,7 +382,6 @@ def random_unit(kind: str, number: int) -> ThermalUnit:
         water_degc=rng.uniform(16.0, 24.0), water_weather_k=rng.uniform(1.5, 2.5),
         water_daily_k=rng.uniform(0.6, 1.5), swing_mw=rng.uniform(0.15, 0.4),
     )  # fmt: skip
-    return unit
 
 
 def _smooth(rng: np.random.Generator, sliding: bool) -> SmoothArea:
