@@ -47,7 +47,7 @@ class Historian:
         A value is kept at the last scan before this time since the last one kept is over.
     resample_s : float
         Of a compressed record: 0 gives each value at its own time; otherwise whole seconds
-        between rows that hold the last value kept.
+        between rows that hold the last value kept, from where each signal has one.
     dropouts_per_day, dropout_minutes : float
         How often a signal is missing, and for how long on average.
     """
@@ -191,7 +191,10 @@ class Historian:
                 for name, column in signals.items()
             }
             return seconds, columns
-        seconds = np.arange(0, _length(signals), round(self.resample_s), dtype=np.int64)
+        step = round(self.resample_s)
+        # One that is missing throughout is not waited for.
+        begin = max((int(np.argmax(k)) for k in kept.values() if k.any()), default=0)
+        seconds = np.arange(-(-begin // step) * step, _length(signals), step, dtype=np.int64)
         columns = {}
         for name, column in signals.items():
             places = np.flatnonzero(kept[name])

@@ -49,7 +49,8 @@ class TrueRows(NamedTuple):
     """What really happened, every second; float64 (n,) each.
 
     %, % (of the servo, before anything behind the position sensor), %, MPa, MPa in the drum,
-    share of full flow, share of full firing, MW without the meter's noise, kPa.
+    share of full flow, heat that the boiler took up in the last second as a share of that of
+    full flow, MW without the meter's noise, kPa.
     """
 
     command: FloatArray
@@ -207,7 +208,8 @@ def run(series: Series, law: Law, out: FloatArray) -> None:
         mill_old, heat_old = mill, heat
         mill = law.mill * mill + (1.0 - law.mill) * firing
         heat = fa * heat + fb * mill_old + fc * mill
-        drum += rated / law.storage_s * (0.5 * (heat_old + heat) + series.fire[t] - flow)
+        taken = 0.5 * (heat_old + heat) + series.fire[t]
+        drum += rated / law.storage_s * (taken - flow)
         lost = loss_decay * lost + (1.0 - loss_decay) * law.drop * rated * flow * flow
         pressure = max(drum - lost, 0.05 * rated)
         # Valve. The servo's loop is closed on what the position sensor reads.
@@ -257,6 +259,6 @@ def run(series: Series, law: Law, out: FloatArray) -> None:
         out[3, t] = pressure
         out[4, t] = drum
         out[5, t] = flow
-        out[6, t] = heat
+        out[6, t] = taken
         out[7, t] = power
         out[8, t] = condenser
