@@ -201,8 +201,8 @@ def simulate(
         return _thermal(days, seed, effects, unit, recording, progress)
     if recording != Historian():
         raise InputError(
-            "The paper's unit is recorded once a second; choose another unit for another "
-            f'recording, such as integrated_input, which has its form: {", ".join(KINDS)}.'
+            "The paper's unit is recorded once a second only. Choose another unit for the "
+            f"recording '{recording.recording}'; integrated_input has the paper's form."
         )
     specs = [e if isinstance(e, EffectSpec) else EffectSpec.parse(e) for e in effects]
     parts: list[SimulatedLog] = []

@@ -257,7 +257,7 @@ class _Outside:
             zero += error(time_s)
         noise = unit.noise
         series = Series(
-            demand, primary, pressure_set, 0.007 * Wander(rng, 900.0, 1.0).advance(n), gain,
+            demand, primary, pressure_set, unit.fire * Wander(rng, 900.0, 1.0).advance(n), gain,
             forcing.offset_mw, forcing.input_gain, zero, area, water,
             unit.swing_mw * Wander(rng, 15.0, 1.0).advance(n),
             noise['generated_power_mw'] * rng.standard_normal(n),

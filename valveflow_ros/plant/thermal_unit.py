@@ -194,6 +194,8 @@ class ThermalUnit:
         Cooling water: mean (the reference), weather over days, amplitude of the day.
     swing_mw : float
         Standard deviation of the power's own unrest, with a time of 15 s.
+    fire : float
+        Standard deviation of the heat's unrest, with a time of 900 s, of that of full flow.
     noise, resolution : dict
         Standard deviation and smallest step of the instruments, by column.
     """
@@ -233,6 +235,7 @@ class ThermalUnit:
     water_weather_k: float = 2.0
     water_daily_k: float = 1.0
     swing_mw: float = 0.25
+    fire: float = 0.007
     noise: dict[str, float] = field(default_factory=lambda: dict(NOISE))
     resolution: dict[str, float] = field(default_factory=lambda: dict(RESOLUTION))
 
