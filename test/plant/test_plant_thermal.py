@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+from streams import needs_jit
 
 from valveflow_ros.errors import InputError
 from valveflow_ros.plant.effects import catalogue
@@ -117,6 +118,7 @@ def test_a_hundred_units_of_a_kind_are_plausible_and_different(kind: str) -> Non
             assert 3 <= len(unit.area.valves) <= 4
 
 
+@needs_jit
 @pytest.mark.parametrize('number', [0, 11, 42])
 @pytest.mark.parametrize('kind', KINDS)
 def test_a_day_of_a_unit_stays_in_range_and_its_governor_does_not_swing(
@@ -145,6 +147,7 @@ def test_a_day_of_a_unit_stays_in_range_and_its_governor_does_not_swing(
     assert np.std(true.pressure[calm]) > 0.03
 
 
+@needs_jit
 def test_steady_rows_lie_on_the_static_power_to_within_noise() -> None:
     unit = dataclasses.replace(random_unit('sequence', 2), vacuum_per_kpa=0.0)
     log = simulate_thermal(0.5, 8, unit)
@@ -162,6 +165,7 @@ def test_steam_is_neither_made_nor_lost(healthy: ThermalLog) -> None:
     np.testing.assert_allclose(rise, true.heat[1:] - true.flow[:-1], atol=1e-12)
 
 
+@needs_jit
 def test_the_condenser_moves_the_power_by_its_share_and_not_at_all_when_switched_off() -> None:
     unit = dataclasses.replace(QUIET, vacuum_per_kpa=-0.01)
     worse, none = quiet_log(unit=unit, days=1.0), quiet_log(days=1.0)

@@ -6,6 +6,7 @@ opening, steam flows, turbine and boiler answer, instruments and a historian wri
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -133,7 +134,7 @@ class ThermalLog:
                 'high_pressure_share': unit.high_pressure_share,
             },
             'unit': unit.to_json(),
-            'recording': self.historian.recording,
+            'recording': dataclasses.asdict(self.historian),
             'effects': [{'name': e.name, 'parameters': e.parameters} for e in self.active],
         }
 

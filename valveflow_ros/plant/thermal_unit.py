@@ -331,7 +331,13 @@ class ThermalUnit:
 
     def to_json(self) -> dict[str, Any]:
         """Return all that is fixed about the unit."""
-        return dataclasses.asdict(self)
+
+        def plain(value: Any) -> Any:
+            if isinstance(value, dict):
+                return {key: plain(inner) for key, inner in value.items()}
+            return [plain(v) for v in value] if isinstance(value, tuple) else value
+
+        return {key: plain(value) for key, value in dataclasses.asdict(self).items()}
 
 
 def random_unit(kind: str, number: int) -> ThermalUnit:
