@@ -365,6 +365,7 @@ REFUSED = [
             ({'slide_from_mw': 310.0}, 'slide_from_mw'),
             ({'pressure_low_mpa': 17.0}, 'pressures must be'),
             ({'full_opening_percent': 101.0}, 'full_opening_percent'),
+            ({'reserve_hours': 1.1}, 'reserve_hours'),
             ({'high_pressure_share': 1.1}, 'high_pressure_share'),
             ({'droop': 0.0}, 'droop'),
             ({'vacuum_per_kpa': -1.0}, 'vacuum_per_kpa'),

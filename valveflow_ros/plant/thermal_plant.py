@@ -238,6 +238,7 @@ class _Outside:
         primary = np.clip(-excess / _NOMINAL_HZ / unit.droop * unit.rated_mw, -limit, limit)
         sliding = _lagged(unit.pressure_set_mpa(demand), 150.0)
         wander = unit.pressure_wander_mpa * Wander(rng, 10_800.0, 1.0).advance(n)
+        sliding += _reserve(unit, rng, n) * (unit.pressure_rated_mpa - sliding)
         pressure_set = np.minimum(sliding + wander, 1.03 * unit.pressure_rated_mpa)
         temperature = _temperature(unit, rng, demand)
         water = unit.water_degc + unit.water_weather_k * Wander(rng, 1.5 * DAY_S, 1.0).advance(n)
@@ -295,6 +296,19 @@ def _set_point(
     on = np.array(agc_on)[np.searchsorted(knots_s, time_s, side='right') - 1]
     target_mw = np.clip(schedule + on * asked, low, unit.load_high_mw)
     return np.asarray(_rate_limited(target_mw, per_s))
+
+
+def _reserve(unit: ThermalUnit, rng: np.random.Generator, n: int) -> FloatArray:
+    """Return how far the pressure stands above the sliding one, 0 to 1 on the way to the rated."""
+    wanted = np.zeros(n)
+    begin = 0
+    while begin < n:
+        end = begin + int(3600.0 * (2.0 + rng.exponential(5.0)))
+        asked, way = rng.random(), rng.uniform(0.3, 1.0)
+        wanted[begin:end] = way if asked < unit.reserve_hours else 0.0
+        begin = end
+    # An operator takes three quarters of an hour for all of the way.
+    return np.asarray(_rate_limited(wanted, 1.0 / 2700.0))
 
 
 def _frequency(rng: np.random.Generator, n: int) -> FloatArray:

@@ -174,6 +174,9 @@ class ThermalUnit:
         Set point at and above ``slide_to_mw``, and at and below ``slide_from_mw``.
     pressure_wander_mpa : float
         Standard deviation of the set point's slow wander, on top of what the fire does.
+    reserve_hours : float
+        Share of the time at which a sliding unit is asked for a reserve: some of the way from the
+        sliding pressure up to the rated one, for hours, so that the valve throttles.
     storage_s, fuel_s, mill_s : float
         Seconds of full flow that empty the boiler of its pressure; lags of the fire.
     drop : float
@@ -213,6 +216,7 @@ class ThermalUnit:
     slide_from_mw: float = 165.0
     slide_to_mw: float = 300.0
     pressure_wander_mpa: float = 0.25
+    reserve_hours: float = 0.4
     storage_s: float = 220.0
     fuel_s: float = 80.0
     mill_s: float = 25.0
@@ -262,6 +266,7 @@ class ThermalUnit:
                 'pressures must be 1 to 35 MPa and the lowest not above the rated one',
             ),
             (10.0 <= self.full_opening_percent <= 100.0, 'full_opening_percent: 10 to 100 %'),
+            (0.0 <= self.reserve_hours <= 1.0, 'reserve_hours must be 0 to 1'),
             (0.0 <= self.high_pressure_share <= 1.0, 'high_pressure_share must be 0 to 1'),
             (
                 self.ramp_mw_per_min > 0.0 and self.droop > 0.0,
@@ -378,6 +383,7 @@ def random_unit(kind: str, number: int) -> ThermalUnit:
         pressure_rated_mpa=top, pressure_low_mpa=lowest,
         slide_from_mw=slide_from, slide_to_mw=slide_to,
         pressure_wander_mpa=rng.uniform(0.18, 0.32) if sliding else rng.uniform(0.06, 0.15),
+        reserve_hours=rng.uniform(0.2, 0.6),
         # Half of the units have a drum; once-through boilers store less and answer faster.
         storage_s=rng.uniform(180.0, 300.0) if rng.random() < 0.5 else rng.uniform(110.0, 150.0),
         fuel_s=rng.uniform(60.0, 110.0), mill_s=rng.uniform(15.0, 35.0),
