@@ -33,7 +33,7 @@ another unit of the kind; vacuum_per_kpa and temperature_per_k are further optio
 Further options: band_percent, scan_low_s, scan_high_s, longest_s, dropouts_per_day,
 dropout_minutes.
 
-examples:
+example:
   valveflow simulate -o plant.mcap --days 10 --seed 1 --effect gain_drift
   valveflow simulate -o plant.csv --days 2 --unit choked --recording minute --truth truth.json
 

@@ -239,7 +239,7 @@ class _Outside:
         sliding = _lagged(unit.pressure_set_mpa(demand), 150.0)
         wander = unit.pressure_wander_mpa * Wander(rng, 10_800.0, 1.0).advance(n)
         sliding += _reserve(unit, rng, n) * (unit.pressure_rated_mpa - sliding)
-        pressure_set = np.minimum(sliding + wander, 1.03 * unit.pressure_rated_mpa)
+        pressure_set = np.minimum(sliding + wander, 1.02 * unit.pressure_rated_mpa)
         temperature = _temperature(unit, rng, demand)
         water = unit.water_degc + unit.water_weather_k * Wander(rng, 1.5 * DAY_S, 1.0).advance(n)
         water += unit.water_daily_k * np.cos(2.0 * np.pi * (clock / 3600.0 - 16.0) / 24.0)

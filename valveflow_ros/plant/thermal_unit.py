@@ -364,7 +364,7 @@ def random_unit(kind: str, number: int) -> ThermalUnit:
     form, sliding = KINDS[kind]
     area = _sequence(rng) if form == 'sequence' else _smooth(rng, sliding)
     rated, c = rng.uniform(320.0, 335.0), rng.uniform(8.0, 22.0)
-    exponent, top = rng.uniform(1.0, 1.13), rng.uniform(16.2, 17.4)
+    exponent, top = rng.uniform(1.0, 1.13), rng.uniform(16.2, 17.2)
     low, full = rng.uniform(132.0, 155.0), rng.uniform(84.0, 90.0)
     slide_from, slide_to = (
         max(low, rng.uniform(0.42, 0.54) * rated),
