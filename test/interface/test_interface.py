@@ -381,6 +381,9 @@ class TestOtherUnits:
         half = plant.static_power(opening, 0.5 * curve['pressure_mpa'])
         scale, c = 0.5 ** truth['pressure_exponent'], truth['offset_mw']
         np.testing.assert_allclose(half - c, scale * (power - c))
+        other = vf.simulate(0.01, 3, unit='integrated_input').to_json()
+        assert (other['form'], other['offset_mw']) == ('integrated_input', 0.0)
+        assert other['pressure_scale_exponent'] == 0.0 < other['no_load_mw']
         paper = vf.simulate(0.01, 3)
         assert paper.static_power(100.0, 1050.0 ** (8.0 / 9.0) / 100.0 ** (8.0 / 9.0)) == (
             pytest.approx(152.0)

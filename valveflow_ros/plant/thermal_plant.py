@@ -118,7 +118,9 @@ class ThermalLog:
             'form': unit.form,
             'pressure_exponent': unit.exponent,
             'pressure_scale_exponent': unit.exponent if at_opening else 0.0,
-            'offset_mw': -unit.no_load_mw,
+            # The paper's F holds the no-load power itself.
+            'offset_mw': -unit.no_load_mw if at_opening else 0.0,
+            'no_load_mw': unit.no_load_mw,
             'curve': {
                 'pressure_mpa': unit.pressure_rated_mpa,
                 'opening_percent': opening.tolist(),
