@@ -80,3 +80,22 @@ def test_a_log_that_is_there_is_not_replaced_by_accident(run, tmp_path):
     bag.mkdir()
     (bag / 'mine.txt').write_text('keep')
     assert 'not empty' in run('simulate', '-o', bag, *SHORT).refused()
+
+
+def test_another_unit_and_recording_are_simulated_and_told(run, tmp_path):
+    words = ['simulate', '-o', tmp_path / 'a.csv', *SHORT, '--unit', 'choked', '--recording']
+    ran = run(*words, 'minute', '--truth', tmp_path / 't.json', '--effect', 'area_step:t0_days=0')
+    assert ran.status == 0, ran.err
+    assert 'choked: flow p^m f(V)' in ran.out
+    assert 'recorded minute' in ran.out
+    truth = json.loads((tmp_path / 't.json').read_text())
+    assert truth['form'] == 'opening'
+    assert truth['effects'][0]['name'] == 'area_step'
+    assert len(read_table(tmp_path / 'a.csv').time_ns) == 28
+    assert 'no recording' in run(*words, 'hourly', '--overwrite').refused(2)
+
+
+def test_the_effects_of_another_unit_are_listed(run):
+    data = run('simulate', '--effects', '--unit', 'choked', '--json').json
+    assert 'pressure_scale' in data['effects']
+    assert 'exponent' not in data['effects']

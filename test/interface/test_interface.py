@@ -336,6 +336,74 @@ def test_a_simulation_is_written_with_its_truth(tmp_path):
         vf.simulate(1.0, effects=['gain_drif'])
 
 
+class TestOtherUnits:
+    @pytest.mark.parametrize('name', ['a.csv', 'a.parquet', 'a.mcap'])
+    @pytest.mark.parametrize('kept', ['1s', 'minute', 'compressed:resample_s=5'])
+    def test_what_is_written_is_what_was_kept(self, tmp_path, name, kept):
+        plant = vf.simulate(0.05, 3, unit='sequence', recording=kept)
+        plant.write(tmp_path / name, truth=tmp_path / 't.json')
+        assert json.loads((tmp_path / 't.json').read_text()) == plant.to_json()
+        back = vf.open_log(tmp_path / name).to_dataframe()
+        pd.testing.assert_frame_equal(back, plant.log.to_dataframe())
+
+    def test_values_with_their_own_times_are_written_and_no_empty_cell_is(self, tmp_path):
+        plant = vf.simulate(0.05, 3, unit='choked', recording='compressed')
+        frame = plant.to_dataframe()
+        plant.write(tmp_path / 'a.mcap')
+        readings = vf.open_log(tmp_path / 'a.mcap').readings
+        assert np.isfinite(readings.value).all()
+        for info in SIGNALS:
+            mine = readings.signal == info.signal
+            kept = frame[info.column].dropna()
+            np.testing.assert_array_equal(np.sort(readings.value[mine]), np.sort(kept))
+        plant.write(tmp_path / 'a.csv')
+        table = pd.read_csv(tmp_path / 'a.csv')
+        assert table['main_steam_pressure_mpa'].isna().mean() > 0.3
+
+    def test_tables_hold_further_columns(self, tmp_path):
+        plant = vf.simulate(0.01, 3, unit='sequence')
+        plant.write(tmp_path / 'a.csv')
+        table = pd.read_csv(tmp_path / 'a.csv')
+        valves = [f'valve_{n}_position_percent' for n in range(1, 4)]
+        for column in ('condenser_pressure_kpa', 'grid_frequency_hz', *valves):
+            np.testing.assert_array_equal(table[column], plant.to_dataframe()[column])
+
+    def test_the_truth_tells_form_and_static_power(self):
+        plant = vf.simulate(0.01, 3, ['backlash'], unit='choked:number=4', recording='minute')
+        truth = plant.to_json()
+        assert (truth['form'], truth['recording']['recording']) == ('opening', 'minute')
+        assert truth['pressure_scale_exponent'] == truth['pressure_exponent']
+        assert truth['effects'] == [{'name': 'backlash', 'parameters': {'w_percent': 0.6}}]
+        curve = truth['curve']
+        opening = np.array(curve['opening_percent'])
+        power = plant.static_power(opening, curve['pressure_mpa'])
+        np.testing.assert_allclose(power, curve['power_mw'])
+        half = plant.static_power(opening, 0.5 * curve['pressure_mpa'])
+        scale, c = 0.5 ** truth['pressure_exponent'], truth['offset_mw']
+        np.testing.assert_allclose(half - c, scale * (power - c))
+        other = vf.simulate(0.01, 3, unit='integrated_input').to_json()
+        assert (other['form'], other['offset_mw']) == ('integrated_input', 0.0)
+        assert other['pressure_scale_exponent'] == 0.0 < other['no_load_mw']
+        paper = vf.simulate(0.01, 3)
+        assert paper.static_power(100.0, 1050.0 ** (8.0 / 9.0) / 100.0 ** (8.0 / 9.0)) == (
+            pytest.approx(152.0)
+        )
+
+    @pytest.mark.parametrize(
+        ('given', 'words'),
+        [
+            ({'unit': 'chocked'}, "There is no unit 'chocked': use one of paper, choked, "),
+            ({'recording': 'minute'}, "The paper's unit is recorded once a second only"),
+            ({'recording': 'hourly'}, "no recording 'hourly'"),
+            ({'unit': 'choked', 'effects': ['exponent']}, 'no meaning on the unit'),
+            ({'effects': ['area_step']}, "'area_step' is unknown"),
+        ],
+    )
+    def test_what_does_not_go_together_is_refused(self, given, words):
+        with pytest.raises(InputError, match=words):
+            vf.simulate(0.01, 1, **given)
+
+
 def recording(path, parameters):
     table = vf.simulate(0.01, 1).data.table
     values = table.values.copy()

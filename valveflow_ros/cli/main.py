@@ -29,7 +29,11 @@ _ONCE_S = 2.0
 
 # In the order in which a newcomer needs them: verb, module, what it does.
 VERBS: tuple[tuple[str, str, str], ...] = (
-    ('simulate', 'simulate', "the paper's plant, with any effect switched on"),
+    (
+        'simulate',
+        'simulate',
+        "the paper's plant or another, with any effect switched on",
+    ),
     ('import', 'import_table', 'a historian table becomes a log'),
     ('info', 'info', 'what is in a log, and is it any good'),
     ('identify', 'identify', 'find the flow characteristic'),

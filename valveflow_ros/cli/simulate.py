@@ -1,4 +1,4 @@
-"""``valveflow simulate``: the paper's plant, with effects."""
+"""``valveflow simulate``: the paper's plant or another one, with effects."""
 
 from __future__ import annotations
 
@@ -13,16 +13,32 @@ from valveflow_ros.report.terminal.text import number, whole
 
 if TYPE_CHECKING:
     from valveflow_ros.interface.simulate import Simulation
+    from valveflow_ros.plant.simulator import SimulatedLog
+    from valveflow_ros.plant.thermal_plant import ThermalLog
 
 _DESCRIPTION = """\
 Simulate the unit of the paper's study: a 300 MW unit under load control, with sliding
 pressure, primary-frequency pulses and noise, written down once a second. Effects make it
 misbehave in a known way, to see whether that is found.
 
+--unit takes another one, of about 330 MW, with boiler, governor, AGC, reheater and condenser:
+  choked            one group of valves, flow p^m f(V), sliding pressure
+  sequence          three or four valves that open one after the other, sliding pressure
+  integrated_input  the paper's form g(V p^m), sliding pressure
+and choked_fixed, sequence_fixed, integrated_input_fixed at fixed pressure. "choked:number=7" is
+another unit of the kind; vacuum_per_kpa and temperature_per_k are further options.
+
+--recording says how such a unit is recorded: 1s (every sample), minute (means), compressed
+(exception compression, values at their own times; compressed:resample_s=60 holds the last value).
+Further options: band_percent, scan_low_s, scan_high_s, longest_s, dropouts_per_day,
+dropout_minutes.
+
 example:
   valveflow simulate -o plant.mcap --days 10 --seed 1 --effect gain_drift
+  valveflow simulate -o plant.csv --days 2 --unit choked --recording minute --truth truth.json
 
-"valveflow simulate --effects" lists the effects and their parameters."""
+"valveflow simulate --effects" lists the effects and their parameters; with --unit those of
+that unit."""
 
 
 def arguments(parser: ArgumentParser) -> None:
@@ -42,6 +58,14 @@ def arguments(parser: ArgumentParser) -> None:
         help='the same seed gives the same log (default 1)',
     )  # fmt: skip
     parser.add_argument(
+        '--unit', metavar='UNIT[:KEY=VALUE,...]', default='paper',
+        help='the unit (default: paper)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--recording', metavar='HOW[:KEY=VALUE,...]', default='1s',
+        help="how a unit other than the paper's is recorded (default: 1s)",
+    )  # fmt: skip
+    parser.add_argument(
         '--effect', action='append', default=[], metavar='NAME[:KEY=VALUE,...]',
         help='switch an effect on; may be given several times',
     )  # fmt: skip
@@ -56,7 +80,7 @@ def arguments(parser: ArgumentParser) -> None:
 def run(options: Namespace, console: Console) -> VerbResult:
     """Simulate and write."""
     if options.effects:
-        return _catalogue()
+        return _catalogue(options.unit)
     if options.output is None:
         raise UsageError('Where to? Name the log with -o LOG.')
     check_log(options.output, overwrite=options.overwrite)
@@ -64,7 +88,10 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
     console(0.0, 'simulating')
     try:
-        found = simulate(options.days, options.seed, options.effect, progress=console)
+        found = simulate(
+            options.days, options.seed, options.effect,
+            unit=options.unit, recording=options.recording, progress=console,
+        )  # fmt: skip
     except InputError as error:
         raise UsageError(str(error)) from None
     console(0.6, 'writing')
@@ -73,11 +100,12 @@ def run(options: Namespace, console: Console) -> VerbResult:
     return VerbResult(_text(found, log, options.truth), data)
 
 
-def _catalogue() -> VerbResult:
+def _catalogue(unit: str) -> VerbResult:
     from valveflow_ros.plant.effects import catalogue
     from valveflow_ros.plant.spec import describe
+    from valveflow_ros.plant.thermal_effects import thermal_catalogue
 
-    effects = catalogue().values()
+    effects = (catalogue() if unit == 'paper' else thermal_catalogue()).values()
     data = {
         'effects': {
             e.name: {
@@ -94,14 +122,26 @@ def _catalogue() -> VerbResult:
 
 
 def _text(found: Simulation, written: Path, truth: Path | None) -> str:
-    from valveflow_ros.report.words import count, counted, duration, plain
+    from valveflow_ros.plant.thermal_plant import ThermalLog
+    from valveflow_ros.report.words import count, duration
 
     log = found.data
-    curve = log.unit.curve
     days = f'{found.days:g} day{"" if found.days == 1.0 else "s"}'
+    begin = f'Simulated {days} with seed {found.seed}: {count(len(log))} rows'
+    if isinstance(log, ThermalLog):
+        lines = [f'{begin}.', *_thermal_lines(log)]
+    else:
+        lines = [f'{begin}, one every {duration(log.unit.sample_period_s)}.', *_paper_lines(log)]
+    lines += [f'  effect   {effect}' for effect in log.active] or ['  effects  none']
+    lines.append(f'Wrote {written}' + (f' and {truth}' if truth else '') + '.')
+    return '\n'.join(lines)
+
+
+def _paper_lines(log: SimulatedLog) -> list[str]:
+    from valveflow_ros.report.words import counted, plain
+
+    curve = log.unit.curve
     lines = [
-        f'Simulated {days} with seed {found.seed}: {count(len(log))} '
-        f'rows, one every {duration(log.unit.sample_period_s)}.',
         f'  curve    {counted(len(curve.slopes), "piece")}, slopes '
         + ', '.join(plain(float(k)) for k in curve.slopes)
         + ', knots '
@@ -111,6 +151,22 @@ def _text(found: Simulation, written: Path, truth: Path | None) -> str:
         to = f'up to {plain(region.power_to_mw)} MW' if region.power_to_mw < 1e9 else 'above'
         head = '  dynamics' if k == 0 else '          '
         lines.append(f'{head} T {region.time_constant_s:g} s, tau {region.delay_s:g} s {to}')
-    lines += [f'  effect   {effect}' for effect in log.active] or ['  effects  none']
-    lines.append(f'Wrote {written}' + (f' and {truth}' if truth else '') + '.')
-    return '\n'.join(lines)
+    return lines
+
+
+def _thermal_lines(log: ThermalLog) -> list[str]:
+    from valveflow_ros.report.words import plain
+
+    unit = log.unit
+    flow = 'p^m f(V)' if unit.on_opening else 'g(V p^m)'
+    low, high = unit.pressure_low_mpa, unit.pressure_rated_mpa
+    pressure = f'{plain(low)} to {plain(high)}' if low < high else plain(high)
+    return [
+        f'  unit     {unit.kind}: flow {flow}, m = {plain(unit.exponent)}, '
+        f'no-load flow worth {plain(unit.no_load_mw)} MW',
+        f'  boiler   {pressure} MPa, full flow empties it in {plain(unit.storage_s)} s',
+        f'  dynamics valve {plain(unit.actuator_s)} s, {plain(unit.high_pressure_share)} of the '
+        f'power after {plain(unit.high_pressure_s)} s, the rest behind a reheater of '
+        f'{plain(unit.reheater_s)} s',
+        f'  recorded {log.historian.recording}',
+    ]

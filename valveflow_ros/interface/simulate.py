@@ -1,4 +1,4 @@
-"""``simulate``: the unit of the paper's study, with any effect switched on."""
+"""``simulate``: the unit of the paper's study or one built from physics, with effects."""
 
 from __future__ import annotations
 
@@ -8,12 +8,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from valveflow_ros.errors import InputError
 from valveflow_ros.interface import SILENT, Progress
-from valveflow_ros.interface.files import check_log, check_writable, whole_file, write_log
+from valveflow_ros.interface.files import (
+    TABLES,
+    check_log,
+    check_writable,
+    is_empty,
+    whole_file,
+    write_log,
+)
 from valveflow_ros.interface.logs import Log, open_log
+from valveflow_ros.plant.historian import Historian
 from valveflow_ros.plant.simulator import SimulatedLog, simulate_parts
 from valveflow_ros.plant.spec import EffectSpec
-from valveflow_ros.records import SIGNALS
+from valveflow_ros.plant.thermal_plant import ThermalLog, simulate_thermal
+from valveflow_ros.plant.thermal_unit import KINDS, ThermalUnit, unit_of
+from valveflow_ros.records import SIGNALS, FloatArray
+
+PAPER = 'paper'
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,13 +37,13 @@ class Simulation:
 
     Attributes
     ----------
-    data : SimulatedLog
+    data : SimulatedLog or ThermalLog
         What the instruments wrote, and true input, power and plug as arrays.
     days : float
     seed : int
     """
 
-    data: SimulatedLog
+    data: SimulatedLog | ThermalLog
     days: float
     seed: int
 
@@ -38,18 +53,41 @@ class Simulation:
         return open_log(self.to_dataframe())
 
     def to_dataframe(self) -> Any:
-        """Return what the instruments wrote as a pandas.DataFrame, as `open_log` takes it."""
+        """Return what the instruments wrote as a pandas.DataFrame, as `open_log` takes it.
+
+        A unit other than the paper's has further columns, such as ``condenser_pressure_kpa``.
+        Where each value has a time of its own, NaN means that there is no new value.
+        """
         import pandas as pd
 
         table = self.data.table
-        columns = {info.column: table.column(info.signal) for info in SIGNALS}
+        columns = {info.column: table.column(info.signal) for info in SIGNALS} | self._extra()
         return pd.DataFrame({'time': pd.to_datetime(table.time_ns, utc=True), **columns})
+
+    def static_power(self, opening_percent: FloatArray, pressure_mpa: FloatArray) -> FloatArray:
+        """Return the true power at rest in MW, without effects.
+
+        Parameters
+        ----------
+        opening_percent, pressure_mpa : float64 (n,)
+            True opening in %, and pressure in MPa absolute; one of them may be a number.
+        """
+        unit = self.data.unit
+        if isinstance(unit, ThermalUnit):
+            return unit.static_power(opening_percent, pressure_mpa)
+        u = np.asarray(opening_percent) * np.asarray(pressure_mpa) ** unit.pressure_exponent
+        return unit.curve(u)
+
+    def _extra(self) -> dict[str, FloatArray]:
+        return self.data.extra if isinstance(self.data, ThermalLog) else {}
 
     def to_json(self) -> dict[str, Any]:
         """Return what is true of the plant, equal to the file of ``--truth``.
 
-        The last region of the dynamics has no upper end: null.
+        The last region of the dynamics of the paper's unit has no upper end: null.
         """
+        if isinstance(self.data, ThermalLog):
+            return {'days': self.days, 'seed': self.seed, **self.data.to_json()}
         unit = self.data.unit
         curve = unit.curve
         return {
@@ -83,7 +121,8 @@ class Simulation:
         Parameters
         ----------
         path : str or Path
-            ``.mcap``, ``.csv``, ``.parquet``, or a folder as ros2 bag makes it.
+            ``.mcap``, ``.csv``, ``.parquet``, or a folder as ros2 bag makes it. Only tables
+            hold columns beside the five signals.
 
         Raises
         ------
@@ -94,11 +133,27 @@ class Simulation:
         check_log(path, overwrite=overwrite)
         if truth is not None:
             check_writable(Path(truth))
-        written = write_log(self.data.table, path, overwrite)
+        written = self._write_log(path, overwrite)
         if truth is not None:
             with whole_file(Path(truth)) as draft:
                 draft.write_text(json.dumps(self.to_json(), indent=2) + '\n', encoding='utf-8')
         return written
+
+    def _write_log(self, path: Path, overwrite: bool) -> Path:
+        from valveflow_ros.logs import write_table
+        from valveflow_ros.logs.mcap.importing import write_readings
+
+        if path.suffix.lower() in TABLES:
+            with whole_file(path) as draft:
+                write_table(self.data.table, draft, self._extra())
+            return path
+        if isinstance(self.data, ThermalLog) and self.data.historian.own_times:
+            # A row of a recording would hold values that were never sent.
+            return write_readings(
+                [self.data.readings], [info.signal for info in SIGNALS], path,
+                overwrite=overwrite or is_empty(path),
+            ).path  # fmt: skip
+        return write_log(self.data.table, path, overwrite)
 
 
 def simulate(
@@ -106,18 +161,33 @@ def simulate(
     seed: int = 1,
     effects: Sequence[str | EffectSpec] = (),
     *,
+    unit: str | ThermalUnit = PAPER,
+    recording: str | Historian = '1s',
     progress: Progress = SILENT,
 ) -> Simulation:
-    """Simulate a 300 MW unit under load control, written down once a second.
+    """Simulate a unit under load control and what its historian kept.
 
     Parameters
     ----------
     days : float
-        Length, more than 0 and at most 400.
+        Length, more than 0 and at most 400 (of a unit other than the paper's: 60).
     seed : int
         The same seed gives the same log.
     effects : sequence of str or EffectSpec
         What to switch on, each ``NAME[:key=value,...]``.
+    unit : str or ThermalUnit
+        'paper': the 300 MW unit of the paper's study, its power a function of V p^m. The others
+        are reheat units of about 330 MW with a boiler, a governor, AGC and primary response:
+        'choked' has one group of valves and the flow p^m f(V), 'sequence' three or four valves
+        that open one after the other, 'integrated_input' the paper's form; at sliding pressure,
+        and with '_fixed' behind the name at fixed pressure. ``NAME:number=7`` is another unit
+        of the kind, ``vacuum_per_kpa`` and ``temperature_per_k`` are how far its power follows
+        condenser pressure and steam temperature.
+    recording : str or Historian
+        Of a unit other than the paper's: '1s' every sample, 'minute' means of a minute,
+        'compressed' exception compression with values at their own times. Options follow as in
+        ``compressed:resample_s=60,dropouts_per_day=2``: ``band_percent``, ``scan_low_s``,
+        ``scan_high_s``, ``longest_s``, ``resample_s``, ``dropouts_per_day``, ``dropout_minutes``.
     progress : Progress
 
     Raises
@@ -125,6 +195,15 @@ def simulate(
     InputError
         An argument is out of range, or effects that cannot act in this run or not together.
     """
+    if not isinstance(recording, Historian):
+        recording = Historian.parse(recording)
+    if unit != PAPER:
+        return _thermal(days, seed, effects, unit, recording, progress)
+    if recording != Historian():
+        raise InputError(
+            "The paper's unit is recorded once a second only. Choose another unit for the "
+            f"recording '{recording.recording}'; integrated_input has the paper's form."
+        )
     specs = [e if isinstance(e, EffectSpec) else EffectSpec.parse(e) for e in effects]
     parts: list[SimulatedLog] = []
     # Day by day, which gives the same as all at once and can be watched.
@@ -132,3 +211,22 @@ def simulate(
         parts.append(part)
         progress(min(0.6, 0.6 * len(parts) / days), 'simulating')
     return Simulation(SimulatedLog.joined(parts), days, seed)
+
+
+def _thermal(
+    days: float,
+    seed: int,
+    effects: Sequence[str | EffectSpec],
+    unit: str | ThermalUnit,
+    recording: Historian,
+    progress: Progress,
+) -> Simulation:
+    """Simulate a unit that is not the paper's."""
+    if not isinstance(unit, ThermalUnit):
+        if unit.partition(':')[0].strip() not in KINDS:
+            known = ', '.join((PAPER, *KINDS))
+            raise InputError(f"There is no unit '{unit}': use one of {known}.")
+        unit = unit_of(unit)
+    data = simulate_thermal(days, seed, unit, recording, effects=effects)
+    progress(0.6, 'simulating')
+    return Simulation(data, days, seed)

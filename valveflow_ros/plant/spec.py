@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from valveflow_ros.errors import InputError, ParameterError
@@ -38,8 +38,10 @@ class EffectSpec:
         return f'{self.name}:{pairs}'
 
     @classmethod
-    def parse(cls, text: str) -> EffectSpec:
+    def parse(cls, text: str, known: Mapping[str, Effect] | None = None) -> EffectSpec:
         """Read ``NAME`` or ``NAME:key=value,...``; what is not given keeps its default.
+
+        ``known`` are the effects by name, by default those of the catalogue.
 
         Raises
         ------
@@ -48,7 +50,7 @@ class EffectSpec:
             out of range, or a parameter given twice; the sentence lists what is known.
         """
         name, colon, rest = text.strip().partition(':')
-        effect = _lookup(name.strip())
+        effect = _lookup(name.strip(), known or catalogue())
         given: dict[str, Value] = {}
         for part in rest.split(',') if colon and rest.strip() else []:
             key, equals, word = (piece.strip() for piece in part.partition('='))
@@ -71,7 +73,7 @@ class EffectSpec:
             As `parse`.
         """
         if isinstance(effect, str):
-            effect = _lookup(effect)
+            effect = _lookup(effect, catalogue())
         for key in given:
             _parameter(effect, key)
         pairs = []
@@ -117,8 +119,7 @@ def describe(effect: Effect) -> str:
     return '\n'.join(lines)
 
 
-def _lookup(name: str) -> Effect:
-    known = catalogue()
+def _lookup(name: str, known: Mapping[str, Effect]) -> Effect:
     if name in known:
         return known[name]
     close = difflib.get_close_matches(name, known, n=1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -198,7 +198,9 @@ def _ordered(raw: RawTable, notes: list[str]) -> RawTable:
     )
 
 
-def write_table(table: SampleTable, path: str | Path) -> None:
+def write_table(
+    table: SampleTable, path: str | Path, extra: Mapping[str, FloatArray] | None = None
+) -> None:
     """Write a table with the contract's columns.
 
     Times are ISO 8601 in UTC with as many digits as they need, numbers have
@@ -212,6 +214,8 @@ def write_table(table: SampleTable, path: str | Path) -> None:
         The samples.
     path : str or Path
         ``.csv`` or ``.parquet``; replaced if it exists.
+    extra : mapping of str to float64 (n,), optional
+        Further columns by name, behind the signals.
 
     Raises
     ------
@@ -230,14 +234,18 @@ def write_table(table: SampleTable, path: str | Path) -> None:
     with os_errors(path, 'cannot be written'):
         make_folder(place.parent)
         try:
-            (_write_csv if kind == '.csv' else _write_parquet)(table, draft)
+            write = _write_csv if kind == '.csv' else _write_parquet
+            write(table.time_ns, list(_columns(table, extra or {})), draft)
             draft.replace(place)
         except OSError:
             draft.unlink(missing_ok=True)
             raise
 
 
-def _columns(table: SampleTable) -> Iterator[tuple[str, FloatArray, ByteArray | None]]:
+_Column = tuple[str, FloatArray, ByteArray | None]
+
+
+def _columns(table: SampleTable, extra: Mapping[str, FloatArray]) -> Iterator[_Column]:
     """Yield name, values and, where some are doubtful, qualities of the columns to be written."""
     for info in SIGNALS:
         values = table.column(info.signal)
@@ -245,10 +253,12 @@ def _columns(table: SampleTable) -> Iterator[tuple[str, FloatArray, ByteArray | 
             quality = table.quality[:, info.signal]
             doubtful = bool((quality == int(Quality.UNCERTAIN)).any())
             yield info.column, values, quality if doubtful else None
+    for name, values in extra.items():
+        yield name, values, None
 
 
-def _write_csv(table: SampleTable, path: Path) -> None:
-    times, columns, names = _iso(table.time_ns), list(_columns(table)), [TIME]
+def _write_csv(time_ns: IntArray, columns: Sequence[_Column], path: Path) -> None:
+    times, names = _iso(time_ns), [TIME]
     for name, _, quality in columns:
         names += [name] if quality is None else [name, name + QUALITY_SUFFIX]
     # Among whole numbers a reader takes ``-0`` for 0.
@@ -273,17 +283,17 @@ def _numbers(values: FloatArray, signed: bool) -> list[str]:
     return ['' if cell == 'nan' else cell for cell in cells] if np.isnan(values).any() else cells
 
 
-def _write_parquet(table: SampleTable, path: Path) -> None:
+def _write_parquet(time_ns: IntArray, columns: Sequence[_Column], path: Path) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
-    columns = {TIME: pa.array(table.time_ns, pa.timestamp('ns', 'UTC'))}
-    for name, values, quality in _columns(table):
-        columns[name] = pa.array(values, mask=np.isnan(values))
+    arrays = {TIME: pa.array(time_ns, pa.timestamp('ns', 'UTC'))}
+    for name, values, quality in columns:
+        arrays[name] = pa.array(values, mask=np.isnan(values))
         if quality is not None:
-            columns[name + QUALITY_SUFFIX] = pa.array(quality)
+            arrays[name + QUALITY_SUFFIX] = pa.array(quality)
     with path.open('wb') as stream:
-        parquet.write_table(pa.table(columns), stream)
+        parquet.write_table(pa.table(arrays), stream)
 
 
 def _iso(time_ns: IntArray) -> list[str]:

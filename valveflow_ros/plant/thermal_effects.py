@@ -1,0 +1,146 @@
+"""What can be wrong with a unit of `valveflow_ros.plant.thermal_unit` or with its record.
+
+Effects that mean the same as on the paper's unit are taken from its catalogue. Those that
+change the paper's curve or its regions have no meaning here. Three more speak of places that the
+paper's unit does not have: the steam area, the position sensor's zero, the pressure sensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from valveflow_ros.errors import InputError
+from valveflow_ros.parameters import Parameter
+from valveflow_ros.plant.effect import (
+    ONSET,
+    Effect,
+    Hooks,
+    Values,
+    at_onset,
+    ramp,
+    step,
+)
+from valveflow_ros.plant.effects import catalogue
+from valveflow_ros.plant.spec import EffectSpec
+from valveflow_ros.plant.unit import UnitDescription
+from valveflow_ros.records import FloatArray
+
+_SHARED = (
+    'backlash', 'clock', 'diurnal', 'flatline', 'gain_drift', 'gain_step', 'input_drift',
+    'input_step', 'intervals', 'output_offset_drift', 'quantisation', 'rate_limit', 'saturation',
+    'spikes', 'stiction', 'temperature',
+)  # fmt: skip
+
+Change = Callable[[FloatArray], FloatArray]
+
+
+@dataclass(slots=True)
+class ThermalHooks(Hooks):
+    """The places of `Hooks`, and three more.
+
+    Attributes
+    ----------
+    area : list of callables
+        Each returns a factor on the steam area, from seconds since the first row.
+    position_zero : list of callables
+        Each returns what the position sensor reads too high, %.
+    pressure_factor : float
+        What the pressure sensor reads, relative to the true pressure.
+    """
+
+    area: list[Change] = field(default_factory=list)
+    position_zero: list[Change] = field(default_factory=list)
+    pressure_factor: float = 1.0
+
+    @classmethod
+    def for_run(cls, length_s: float) -> ThermalHooks:
+        """Return hooks with nothing on them; record effects ask them for the sample period."""
+        paper = UnitDescription()
+        return cls(paper, length_s, paper.regions)
+
+
+def _thermal(hooks: Hooks) -> ThermalHooks:
+    """Return the hooks as those of a thermal unit."""
+    if not isinstance(hooks, ThermalHooks):
+        raise InputError('This effect acts on a thermal unit only; choose one with unit=...')
+    return hooks
+
+
+def _install_area_step(values: Values, hooks: Hooks) -> None:
+    """Multiply the area by 1 + g from t0 on: worn seats, a broken part, an overhaul."""
+    _thermal(hooks).area.append(lambda time_s: 1.0 + values['g'] * step(time_s, values))
+
+
+AREA_STEP = Effect(
+    'area_step',
+    'The steam area belonging to an opening changes at one moment.',
+    (Parameter('g', 0.01, '', 'Relative change.', -0.3, 0.3), ONSET),
+    _install_area_step,
+    starts_days=at_onset,
+)
+
+
+def _install_opening_offset(values: Values, hooks: Hooks) -> None:
+    """Let the position sensor read b + d t / 10 d too high; the servo follows the reading."""
+
+    def change(time_s: FloatArray) -> FloatArray:
+        return values['b_percent'] + values['drift_percent'] * ramp(time_s)
+
+    _thermal(hooks).position_zero.append(change)
+
+
+OPENING_OFFSET = Effect(
+    'opening_offset',
+    'The position sensor reads too high by a fixed or drifting amount.',
+    (
+        Parameter('b_percent', 0.5, '%', 'What it reads too high at first.', -10.0, 10.0),
+        Parameter('drift_percent', 0.0, '%/(10 d)', 'Change in ten days.', -10.0, 10.0),
+    ),
+    _install_opening_offset,
+)
+
+
+def _install_pressure_scale(values: Values, hooks: Hooks) -> None:
+    """Let the pressure sensor read p (1 + g), for record and control alike."""
+    hooks.claim('pressure_scale')
+    _thermal(hooks).pressure_factor = 1.0 + values['g']
+
+
+PRESSURE_SCALE = Effect(
+    'pressure_scale',
+    'The pressure sensor reads too high by a share.',
+    (Parameter('g', 0.01, '', 'Relative error.', -0.2, 0.2),),
+    _install_pressure_scale,
+)
+
+_OWN = (AREA_STEP, OPENING_OFFSET, PRESSURE_SCALE)
+
+
+def thermal_catalogue() -> dict[str, Effect]:
+    """Return all effects of a thermal unit by name, in alphabetical order."""
+    shared = {name: catalogue()[name] for name in _SHARED}
+    own = {effect.name: effect for effect in _OWN}
+    return dict(sorted((shared | own).items()))
+
+
+def thermal_effect(given: str | EffectSpec, kind: str) -> EffectSpec:
+    """Return an effect from its text, checked to have a meaning on a thermal unit.
+
+    Raises
+    ------
+    InputError
+        As `EffectSpec.parse`, or an effect of the paper's curve or regions alone.
+    """
+    known = thermal_catalogue()
+    name = given.partition(':')[0].strip() if isinstance(given, str) else given.name
+    if name not in known and name in catalogue():
+        raise InputError(
+            f"Effect '{name}' changes the paper's curve or dynamics and has no meaning on the "
+            f"unit '{kind}': use one of {', '.join(known)}."
+        )
+    if isinstance(given, EffectSpec):
+        if name not in known:
+            raise InputError(f"Effect '{name}' is unknown: use one of {', '.join(known)}.")
+        return given
+    return EffectSpec.parse(given, known)
