@@ -47,7 +47,7 @@ Progress = Callable[[str], None]
 class _Formed:
     """A task whose ``contents.u`` is what the curve is a function of, and the form's other parts.
 
-    ``scale`` (n,) is p^e; without it the power is F(u). ``held`` tells that the task gave e.
+    ``scale`` (n,) is p^e; without it the power is F(u). ``held``: e stays as it is.
     """
 
     task: FitTask
@@ -198,7 +198,8 @@ def _formed(task: FitTask) -> _Formed:
         task, contents=replace(contents, u=u), input_noise=task.input_noise * abs(ratio)
     )
     return _Formed(
-        formed, found.form, found.offset_mw, scale, found.evidence, task.form is not None
+        formed, found.form, found.offset_mw, scale, found.evidence,
+        task.form is not None or not found.evidence.told,
     )
 
 

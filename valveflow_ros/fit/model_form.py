@@ -32,6 +32,9 @@ _FREEDOM = 4.0
 # One form is told from the other by so much log-likelihood, so many standard errors of it over
 # stretches, and where the two differ by such a share of the power's range.
 _LEAST_GAIN, _LEAST_Z, _LEAST_APART = 12.0, 2.5, 0.003
+# Where they are not told apart the likelier one is taken, the paper's in doubt.
+_LIKELIER_Z = 1.5
+_CHOKED_EXPONENT = 1.0
 _WORST = 0.05
 _LEAST_IN_CELL = 5
 _MISFIT = 0.01  # of the power's range
@@ -134,8 +137,13 @@ def find_form(
         )
     elif axis == OPENING:
         held = scaled.form
-    gain, _, told = _told(means, scaled, paper)
-    takes_scaled = told if held is None else held.scaled
+    gain, sure, told = _told(means, scaled, paper)
+    if held is None and not told:
+        # Too little moves the pressure to tell its exponent: that of ideal choked flow will do.
+        scaled = _fitted(means, StaticForm(OPENING, _CHOKED_EXPONENT))
+        gain, sure, told = _told(means, scaled, paper)
+    likelier = gain > _LEAST_GAIN and sure > _LIKELIER_Z
+    takes_scaled = likelier if held is None else held.scaled
     chosen, other = (scaled, paper) if takes_scaled else (paper, scaled)
     if not takes_scaled:
         gain, _, told = _told(means, paper, scaled)

@@ -228,7 +228,7 @@ def find_regions(problem: Problem, model: RegionalModel) -> tuple[RegionalModel,
 _LEAST_ROWS, _LEAST_S = 600, 3600.0
 # What an autoregressive model must remember: white noise on top of slow noise has a long tail.
 _MEMORY_S = 40.0
-_POWER_STEP, _POWER_ROUNDS = 0.01, 4  # of the exponent
+_POWER_STEP, _POWER_MOST, _POWER_ROUNDS = 0.01, 0.1, 4  # of the exponent
 _NARROWEST = 0.01  # of the range of u: narrower pieces are not given to the search
 
 
@@ -387,6 +387,7 @@ def _with_exponent(
         bend = low - 2.0 * here + high
         by = 0.5 * step * (low - high) / bend if bend > 0.0 else math.copysign(step, low - high)
         power += float(np.clip(by, -2.0 * step, 2.0 * step))
+        power = float(np.clip(power, 1.0 - _POWER_MOST, 1.0 + _POWER_MOST))
         if abs(by) < step:
             break
     return fitted(power)[1], likely, power
