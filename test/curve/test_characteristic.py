@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import examples
 
-from valveflow_ros.curve.characteristic import Choice, FittedData
+from valveflow_ros.curve.characteristic import Choice, FittedData, FormEvidence
 from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.errors import DataError
 
@@ -166,7 +166,7 @@ def test_numbers_that_json_does_not_have_become_absent(value):
 
 def test_the_contracts_keys_are_there():
     raw = to_json(curve([0.0, 1.0, 2.0], [1.0, 2.0], dynamics=DYNAMICS).with_id())
-    assert (raw['format'], raw['version'], raw['optimal']) == ('valveflow/characteristic', 1, True)
+    assert (raw['format'], raw['version'], raw['optimal']) == ('valveflow/characteristic', 2, True)
     assert {'u_from', 'u_to', 'slope', 'intercept', 'slope_stderr', 'intercept_stderr',
             'samples'} <= set(raw['pieces'][0])  # fmt: skip
     assert len(raw['breakpoint_intervals']) == 1
@@ -174,6 +174,8 @@ def test_the_contracts_keys_are_there():
     assert set(raw['selection']['cost']) == {'1', '2'}
     assert set(raw['segments']) == {'steady', 'slope_response', 'samples'}
     assert set(raw['dynamics'][0]) >= {'power_from', 'power_to', 'time_constant_s', 'delay_s'}
+    assert raw['axis'] == 'integrated_input'
+    assert (raw['pressure_scale_exponent'], raw['offset_mw']) == (0.0, 0.0)
 
 
 GOOD = to_json(curve([0.0, 10.0, 20.0], [1.0, 2.0], dynamics=DYNAMICS).with_id())
@@ -268,7 +270,7 @@ def test_any_value_absent_or_nonsense_is_read_or_refused_with_a_sentence(value):
         (('notes',), 'abc'),
         (('window', 'start_ns'), INF),
         (('window', 'start_ns'), 1e300),
-        (('version',), 2),
+        (('version',), 3),
         (('version',), True),
         (('format',), 'valveflow/diagnosis'),
     ],
@@ -283,3 +285,85 @@ def test_what_no_plant_has_is_refused_and_the_place_named(path, value):
 def test_what_is_no_characteristic_at_all_is_refused(raw):
     with pytest.raises(DataError):
         from_json(raw)
+
+
+# --- knees at fixed openings ----------------------------------------------------------------
+
+
+def choked(exponent=1.05, offset=-9.0, **more):
+    """Return a curve of p^e F(V) + c."""
+    return curve(
+        [20.0, 45.0, 70.0, 100.0], [0.4, 0.25, 0.1], start=5.0, dynamics=DYNAMICS,
+        axis='opening', pressure_exponent=0.0, pressure_scale_exponent=exponent, offset_mw=offset,
+        reference_pressure_mpa=13.0, **more,
+    )  # fmt: skip
+
+
+@examples(60)
+@given(st.floats(0.9, 1.3), st.floats(-40.0, 40.0), st.floats(10.0, 110.0), st.floats(5.0, 20.0))
+def test_the_power_is_the_curves_at_the_opening_times_the_pressure(exponent, offset, v, p):
+    c = choked(exponent, offset)
+    expected = p**exponent * naive_value(c, v) + offset
+    assert float(c.power(v, p)) == pytest.approx(expected, nan_ok=True)
+    there = c.at_pressure(p)
+    assert float(there(np.array(v))) == pytest.approx(expected, nan_ok=True)
+    assert float(there.power(v, 1.7)) == pytest.approx(expected, nan_ok=True)
+    if math.isfinite(expected):
+        assert float(c.opening(expected, p)) == pytest.approx(v, abs=1e-6)
+        assert math.isnan(c.opening(expected + 5000.0, p))
+
+
+def test_what_is_shown_is_at_the_reference_pressure():
+    c = choked()
+    assert c.values() == pytest.approx(c.power(c.breakpoints, 13.0))
+    assert c(c.breakpoints) == pytest.approx(c.values())
+    assert c.inverse(c.values()[1:3]) == pytest.approx(c.breakpoints[1:3])
+    assert curve([0.0, 9.0], [2.0]).at_pressure(5.0) == curve([0.0, 9.0], [2.0])
+    assert choked(1.05).with_id().model_id != choked(1.06).with_id().model_id
+
+
+@pytest.mark.parametrize('form', [None, FormEvidence(
+    'opening', True, 321.0, 0.4, 7.5, 'F(V p^1.2)', 6.0, (80.0, 9.0, 21.0), False)])  # fmt: skip
+def test_the_form_survives_json(form):
+    c = choked(form=form).with_id()
+    raw = json.loads(json.dumps(to_json(c), allow_nan=False))
+    assert (raw['axis'], raw['pressure_scale_exponent'], raw['offset_mw']) == ('opening', 1.05, -9)
+    back = from_json(raw)
+    assert back == c
+    if form is not None:
+        assert {'chosen', 'log_likelihood_gain', 'rmse_other_mw'} <= set(raw['form'])
+    # A file of another program has what the contract names and no more.
+    bare = {k: v for k, v in raw.items() if k not in ('reference_pressure_mpa', 'model_id')}
+    bare['pressure_exponent'] = 1.125
+    bare['form'] = {'chosen': 'opening', 'log_likelihood_gain': 3.0, 'rmse_other_mw': 2.0}
+    theirs = from_json(bare)
+    assert theirs.power(50.0, 11.0) == pytest.approx(c.power(50.0, 11.0))
+    assert np.isfinite(theirs.values()).all()
+
+
+def test_a_file_of_version_1_is_a_curve_of_the_integrated_input():
+    raw = {
+        k: v
+        for k, v in GOOD.items()
+        if k not in ('axis', 'pressure_scale_exponent', 'offset_mw', 'reference_pressure_mpa')
+    }
+    back = from_json({**raw, 'version': 1})
+    assert back.axis == 'integrated_input'
+    assert back(np.array([5.0])) == from_json(GOOD)(np.array([5.0]))
+
+
+@pytest.mark.parametrize(
+    ('change', 'what'),
+    [
+        ({'axis': 'pressure'}, 'axis'),
+        ({'axis': 'opening'}, 'pressure_scale_exponent'),
+        ({'offset_mw': 3.0}, 'offset_mw'),
+        ({'pressure_scale_exponent': 1.0}, 'pressure_scale_exponent'),
+        ({'pressure_exponent': 0.0}, 'pressure_exponent'),
+        ({'form': {'chosen': 'both', 'log_likelihood_gain': 0.0, 'rmse_other_mw': 0.0}}, 'chosen'),
+        ({'form': 3}, 'form'),
+    ],
+)
+def test_exponents_that_do_not_belong_to_the_axis_are_refused(change, what):
+    with pytest.raises(DataError, match=what):
+        from_json({**GOOD, **change})

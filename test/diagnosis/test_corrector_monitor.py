@@ -43,7 +43,9 @@ def model_of(rows: SampleTable, held: dict[str, tuple[float, ...]]) -> ExtendedM
     grids = make_grids(*record(rows).about, np.zeros(rows.values.shape, dtype=bool))
     active = tuple(Active(catalogue()[n], v) for n, v in held.items())
     return ExtendedModel(
-        Extended(rough_model(), active), StaticForm(exponent=EXPONENT), grids.start_ns,
+        Extended(rough_model(), active),
+        StaticForm(exponent=EXPONENT),
+        grids.start_ns,
         grids.reference,
     )
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from curves import gaps, inputs, models
@@ -40,16 +42,29 @@ def plant(rng, group=2):
     return Samples(u, power, usable, step_s=1.0, settle_s=20.0, group=group), model
 
 
-def samples_of(u, power, usable, settle_s=20.0, group=5, step_s=1.0):
+def samples_of(u, power, usable, settle_s=20.0, group=5, step_s=1.0, scale=None):
     return Samples(
         u=np.where(usable > 0, u, 0.0), power_mw=np.where(usable > 0, power, 0.0), usable=usable,
-        step_s=step_s, settle_s=settle_s, group=group,
+        step_s=step_s, settle_s=settle_s, group=group, scale=scale,
     )  # fmt: skip
 
 
-def naive_means(model, u, usable, step_s, settle, group):
+def choked(model, seed, n=300):
+    """Return the model as one of p^e F(V) + c that gives about the same power, and p^e."""
+    rng = np.random.default_rng(seed)
+    scale = np.clip(12.0 + np.cumsum(rng.normal(0.0, 0.1, n)), 8.0, 17.0)
+    return replace(
+        model, left=(model.left + 9.0) / 12.0, right=(model.right + 9.0) / 12.0, offset_mw=-9.0
+    ), scale  # fmt: skip
+
+
+def naive_means(model, u, usable, step_s, settle, group, scale=None):
     """Return the mean answers and which of them count, by loops."""
-    x = [naive_curve(v, model.knots, model.left, model.right) for v in u]
+    scale = [1.0] * len(u) if scale is None else scale
+    x = [
+        s * naive_curve(v, model.knots, model.left, model.right) + (model.offset_mw or 0.0)
+        for v, s in zip(u, scale, strict=True)
+    ]
     answer = naive_respond(x, usable, model.levels, model.time_constants, model.delays, step_s)
     age, settled = 0, []
     for good in usable:
@@ -64,13 +79,14 @@ def naive_means(model, u, usable, step_s, settle, group):
 
 
 @examples(40)
-@given(models(), st.integers(0, 2**32 - 1), st.sampled_from([1, 3, 7]))
-def test_means_of_the_response_are_the_slow_ones(model, seed, group):
+@given(models(), st.integers(0, 2**32 - 1), st.sampled_from([1, 3, 7]), st.booleans())
+def test_means_of_the_response_are_the_slow_ones(model, seed, group, scaled):
     u, usable = inputs(model, seed), gaps(seed, 300)
     power = np.random.default_rng(seed).normal(200.0, 5.0, 300)
-    problem = Problem(samples_of(u, power, usable, group=group))
+    model, scale = choked(model, seed) if scaled else (model, None)
+    problem = Problem(samples_of(u, power, usable, group=group, scale=scale))
     residual, weight = problem.answer(model)
-    means, counts = naive_means(model, u, usable, 1.0, 20, group)
+    means, counts = naive_means(model, u, usable, 1.0, 20, group, scale)
     assert weight.tolist() == [int(c) for c in counts]
     for k, counted in enumerate(counts):
         measured = power[k * group : (k + 1) * group].mean()
@@ -118,23 +134,28 @@ def test_the_tangents_of_one_region_are_the_differences(model, seed, group):
 
 
 @examples(10)
-@given(seeds)
-def test_tangents_are_differences_of_the_answer(seed):
+@given(seeds, st.booleans())
+def test_tangents_are_differences_of_the_answer(seed, scaled):
     samples, model = plant(np.random.default_rng(seed))
+    if scaled:
+        model, scale = choked(model, seed, N)
+        samples = replace(samples, scale=scale)
     problem = Problem(samples)
     residual, jacobian, weight = problem.tangents(model)
     again, same = problem.answer(model)
     assert weight.tolist() == same.tolist()
     assert residual == pytest.approx(again, abs=1e-9)
     values, step = model.pack(), 1e-5
-    regions = np.searchsorted(model.levels, model.static(samples.u))
+    scale = samples.scale_or_ones
+    regions = np.searchsorted(model.levels, model.static(samples.u, scale))
+    assert jacobian.shape[1] == len(values) == model.size
     for p in range(len(values)):
         ends = []
         for sign in (0.5, -0.5):
             moved = values.copy()
             moved[p] += sign * step
             ends.append(model.unpack(moved))
-        if any((np.searchsorted(model.levels, e.static(samples.u)) != regions).any()
+        if any((np.searchsorted(model.levels, e.static(samples.u, scale)) != regions).any()
                for e in ends):  # fmt: skip
             continue
         slope = (problem.answer(ends[1])[0] - problem.answer(ends[0])[0]) / step

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import subprocess
 import sys
@@ -51,6 +52,50 @@ def test_costs_are_the_least(seed, shortest):
     found = partition(u, y, 4, shortest)
     truth = naive.best_costs(naive.piece_costs(u, y, np.ones(len(u))), 4, shortest)
     assert found.cost == pytest.approx([float(row[-1]) for row in truth], rel=1e-10)
+
+
+@EXAMPLES
+@given(SEEDS, st.integers(2, 4))
+def test_weighted_costs_are_the_least(seed, shortest):
+    r = np.random.default_rng(seed)
+    u = np.sort(r.choice(np.arange(400), int(r.integers(20, 60)), replace=False) / 7.0)
+    y = r.normal(size=len(u)) + np.abs(u - 20.0)
+    weight = 10.0 ** r.uniform(-2.0, 2.0, len(u))
+    found = partition(u, y, 4, shortest, weight=weight)
+    truth = naive.best_costs(naive.piece_costs(u, y, weight), 4, shortest)
+    assert found.certified
+    assert found.cost == pytest.approx([float(row[-1]) for row in truth], rel=1e-9)
+    for j in range(1, 5):
+        pieces = found.pieces(j)
+        assert sum(p.sse for p in pieces) == pytest.approx(found.cost[j - 1], abs=found.floor)
+
+
+@EXAMPLES
+@given(SEEDS)
+def test_whole_weights_are_repeated_samples_and_a_common_factor_scales_the_cost(seed):
+    r = np.random.default_rng(seed)
+    u = np.sort(r.uniform(0.0, 10.0, 40))
+    y = np.abs(u - 4.0) + 0.1 * r.normal(size=40)
+    times = r.integers(1, 5, 40)
+    order = r.permutation(40)
+    found = partition(u[order], y[order], 4, weight=times[order])
+    repeated = partition(np.repeat(u, times), np.repeat(y, times), 4)
+    assert found.cost == pytest.approx(repeated.cost, rel=1e-9)
+    for one, other in zip(found.pieces(3), repeated.pieces(3), strict=True):
+        assert one.slope == pytest.approx(other.slope)
+        assert (one.u_from, one.u_to) == (other.u_from, other.u_to)
+    assert partition(u, y, 4, weight=7.5 * times).cost == pytest.approx(7.5 * found.cost)
+
+
+@pytest.mark.parametrize(
+    ('weight', 'what'),
+    [([1.0, 2.0], 'as long as u'), ([1.0, 0.0, 1.0], r'weight\[1\] is 0'),
+     ([1.0, 1.0, math.nan], r'weight\[2\] is nan'), ([1e9, 1.0, 1.0], 'between'),
+     (['a', 'b', 'c'], 'real numbers')],
+)  # fmt: skip
+def test_what_is_no_weight_is_refused(weight, what):
+    with pytest.raises(DataError, match=what):
+        partition([0.0, 1.0, 2.0], [0.0, 1.0, 2.0], 1, weight=weight)
 
 
 @pytest.mark.parametrize('kind', KINDS)

@@ -198,7 +198,11 @@ def _formed(task: FitTask) -> _Formed:
         task, contents=replace(contents, u=u), input_noise=task.input_noise * abs(ratio)
     )
     return _Formed(
-        formed, found.form, found.offset_mw, scale, found.evidence,
+        formed,
+        found.form,
+        found.offset_mw,
+        scale,
+        found.evidence,
         task.form is not None or not found.evidence.told,
     )
 

@@ -36,7 +36,7 @@ _LEAST_GAIN, _LEAST_Z, _LEAST_APART = 12.0, 2.5, 0.003
 _LIKELIER_Z = 1.5
 _CHOKED_EXPONENT = 1.0
 _WORST = 0.05
-_LEAST_IN_CELL = 5
+_LEAST_IN_CELL, _EIGHTHS = 5, 8
 _MISFIT = 0.01  # of the power's range
 _PROFILE_MEANS, _PROFILE_PIECES = 1500, 6
 
@@ -199,7 +199,7 @@ def find_misfit(
 
     Notes
     -----
-    Cells of opening and pressure get a mean from even and one from odd stretches of time. What
+    Cells of opening and pressure get a mean from even and one from odd eighths of the time. What
     both have in common is the curve's; the product of independent noise has the mean 0.
     """
     means = _means_of(opening, pressure, residual, spans, period_s)
@@ -209,7 +209,7 @@ def find_misfit(
     square = float((ramp.rate**2).sum())
     rest = means.power - ramp.rate * (float((ramp.rate * means.power).sum()) / max(square, 1e-12))
     cell = _place(means.opening, 6) * 5 + _place(means.pressure, 5)
-    odd = np.arange(len(rest)) * _STRETCHES // len(rest) % 2 > 0
+    odd = np.arange(len(rest)) * _EIGHTHS // len(rest) % 2 > 0
     halves = []
     for half in (odd, ~odd):
         count = np.bincount(cell[half], minlength=30)
