@@ -33,6 +33,7 @@ _TIME_WORDS = re.compile(
 )
 _DATE_WORDS = re.compile(r'^(?:date|datum|day|tag)$')
 _CLOCK_WORDS = re.compile(r'^(?:time|zeit|uhrzeit|clock|time of day)$')
+_STAMP = re.compile(r'\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[T ]\s*\d{1,2}:\d{2}.*')
 _LOCAL = {
     **dict.fromkeys(('CET', 'MEZ', 'CEST', 'MESZ'), 'Europe/Berlin'),
     'EET': 'Europe/Helsinki', 'WET': 'Europe/Lisbon', 'BST': 'Europe/London',
@@ -222,6 +223,12 @@ def time_columns(heading: Heading) -> tuple[int | None, int | None]:
         return clock, date
     found = next((k for k, name in enumerate(names) if _is_time(name)), None)
     return (found, None) if found is not None else (None, date)
+
+
+def stamps_in(cells: list[str]) -> bool:
+    """Tell whether most cells of a column are dates with a time of day."""
+    stamps = sum(bool(_STAMP.fullmatch(cell.strip())) for cell in cells)
+    return bool(cells) and 2 * stamps > len(cells)
 
 
 def _is_time(name: str) -> bool:
