@@ -39,8 +39,8 @@ def arguments(parser: ArgumentParser) -> None:
         help='folder for loop.json, made if absent',
     )  # fmt: skip
     for option, about in (
-        ('command', "the controller's output in % (by default a column named OP, MV, ...)"),
-        ('position', 'the measured position in %; with it the sizes are told'),
+        ('command', "the controller's output in %% (by default a column named OP, MV, ...)"),
+        ('position', 'the measured position in %%; with it the sizes are told'),
         ('process', 'the process value: flow, level, pressure (by default PV)'),
         ('set-point', 'the set point (by default SP or SV); it may be absent'),
         ('time', 'date and time, or Unix seconds'),

@@ -327,6 +327,7 @@ def judge_rows(
     step_s: float,
     subs: int = _SUBS,
     dependent: float = _DEPENDENT,
+    offset: float | None = None,
 ) -> ActuatorFault | None:
     """Return the fault between command and position sensor, None if there is none.
 
@@ -340,9 +341,12 @@ def judge_rows(
         Parts of the record whose scores are independent.
     dependent : float
         Rows that count as one.
+    offset : float, optional
+        By how much the position reads more than the command; found from the rows by default.
     """
     both = np.isfinite(command[1:]) & np.isfinite(position[1:]) & np.isfinite(position[:-1])
-    offset = _offset(command[1:][both], position[1:][both])
+    if offset is None:
+        offset = _offset(command[1:][both], position[1:][both])
     pairs = _Pairs(command[1:][both] + offset, position[:-1][both], position[1:][both], step_s)
     sub = np.arange(len(position)) // max(1, len(position) // subs)
     sub = np.minimum(sub, subs - 1)[1:][both]

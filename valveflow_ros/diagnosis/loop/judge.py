@@ -41,6 +41,7 @@ _MOST_FLAT = 0.5
 _TURN = 0.2  # share of the command's usual span that counts as a way back
 _REGULAR = 1.0
 _MOST_LEFT = 4.0
+_LEAST_SLOPE = 0.3  # of the position over the command
 # Rows of a position that count as one: those of ten seconds, for a servo's rest is not white.
 _DEPENDENT_S, _LEAST_DEPENDENT, _MOST_DEPENDENT = 10.0, 2.0, 10.0
 
@@ -184,12 +185,12 @@ def judge_position(command: FloatArray, position: FloatArray, step_s: float) -> 
     why = _hindered(c[both], v[both], 'position')
     if why:
         return LoopJudgement(NOT_JUDGED, why, rows=rows)
-    if np.ptp(v[both]) < 1.5 < 0.02 * np.ptp(c[both]) + 1.45:  # a fraction of full opening
-        v = 100.0 * v
+    if v[both].min() > -0.05 and v[both].max() < 1.1 and np.ptp(c[both]) > 2.0:
+        v = 100.0 * v  # a fraction of full opening
     slope = float(np.polyfit(c[both], v[both], 1)[0])
     if slope < 0.0:
         c = -c
-    if not 0.5 < abs(slope) < 2.0 and np.ptp(c[both]) > 2.0 * np.ptp(v[both]):
+    if abs(slope) < _LEAST_SLOPE:
         return LoopJudgement(
             NOT_JUDGED,
             f'The position hardly follows the command: it moves over {np.ptp(v[both]):.3g} while '
@@ -198,7 +199,9 @@ def judge_position(command: FloatArray, position: FloatArray, step_s: float) -> 
             rows=rows,
         )
     dependent = min(max(_DEPENDENT_S / step_s, _LEAST_DEPENDENT), _MOST_DEPENDENT)
-    fault = actuator.judge_rows(c, v, step_s, dependent=dependent)
+    # The ends of what the position is away from the command are alike for every fault.
+    offset = 0.5 * float(np.quantile((v - c)[both], (0.01, 0.99)).sum())
+    fault = actuator.judge_rows(c, v, step_s, dependent=dependent, offset=offset)
     if fault is None and (left := _beyond_servo(c, v)) > _MOST_LEFT:
         return LoopJudgement(
             NOT_JUDGED,
@@ -214,8 +217,9 @@ def _beyond_servo(c: FloatArray, v: FloatArray) -> float:
     rows = np.flatnonzero(np.isfinite(v[1:]) & np.isfinite(v[:-1]) & np.isfinite(c[1:]))
     table = np.column_stack([v[rows], c[rows + 1], np.ones(len(rows))])
     rest = v[rows + 1] - table @ np.linalg.lstsq(table, v[rows + 1], rcond=None)[0]
-    noise = float(np.median(np.abs(v[rows + 1] - v[rows]))) / (0.6745 * np.sqrt(2.0))
-    return float(rest.std()) / max(noise, 0.01)
+    noise = float(np.median(np.abs(v[rows + 1] - v[rows]))) / 0.954
+    left: float = float(np.std(rest)) / max(noise, 0.01)
+    return left
 
 
 def _of_fault(fault: actuator.ActuatorFault | None, rows: int) -> LoopJudgement:
