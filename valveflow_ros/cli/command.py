@@ -235,7 +235,7 @@ def add_table(parser: ArgumentParser, gathered: str) -> None:
          'to how much a workbook or a Parquet file may unpack (default: 64 MB, or 200 times its '
          'size if that is more, up to 1074 MB and 2147 MB)'),
         ('period', 'TIME', 'time from one row to the next, such as 60s or 1min, where no column '
-         'holds times; the first row is then at 1970-01-01'),
+         'holds times; the first row is then at 2000-01-01'),
     ):  # fmt: skip
         about.add_argument(
             f'--{option}', dest=gathered, action='append', metavar=metavar, help=told,

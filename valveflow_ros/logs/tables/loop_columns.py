@@ -24,9 +24,9 @@ from valveflow_ros.logs.tables.refusal import (
     Remedy,
     TableOptions,
 )
-from valveflow_ros.logs.tables.times import NEVER, TimeReader
+from valveflow_ros.logs.tables.times import NEVER, RowClock, TimeReader
 from valveflow_ros.logs.tables.words import folded, split_unit
-from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
+from valveflow_ros.records import FloatArray, IntArray
 
 COMMAND, POSITION, PROCESS, SET_POINT = ROLES = ('command', 'position', 'process', 'set_point')
 _SHORT = {
@@ -100,7 +100,7 @@ def read_loop_columns(
     wanted = [k for k in (*chosen.values(), time, date) if k is not None]
     frame = pd.concat(list(file.blocks(wanted)), ignore_index=True)
     if time is None:
-        time_ns = np.arange(len(frame), dtype=np.int64) * round(options.period_s * NS_PER_S)
+        time_ns = RowClock(options).at(0, len(frame))
     else:
         time_ns = _times(file, frame, time, date, options)
     values = {r: to_numbers(frame[k], file.marks or Marks()).values for r, k in chosen.items()}

@@ -27,6 +27,8 @@ from valveflow_ros.logs.tables.words import (
 from valveflow_ros.records import SIGNALS, Signal
 
 TIME, DATE = 'time', 'date'
+# What a column is called that was the unnamed index of a DataFrame.
+NAMES_OF_AN_INDEX = ('', 'Unnamed: 0', '__index_level_0__')
 _TIME_WORDS = re.compile(
     r'time ?stamp|zeit ?stempel|date ?time|datum ?(?:und ?)?(?:uhr)?zeit|^(?:\w+ )?time$|'
     r'^(?:local |utc |lokale |abtast)?(?:time|zeit)\b|^uhrzeit$|^ts$|^t$|^sample time$|^clock$'
@@ -41,6 +43,7 @@ _LOCAL = {
     **dict.fromkeys(('CST', 'CDT'), 'America/Chicago'),
     **dict.fromkeys(('PST', 'PDT'), 'America/Los_Angeles'),
 }  # fmt: skip
+_PERIOD = '60s'
 _GROUNDS = {EXACT: '', CLEAR: 'by its name', LIKELY: 'by its name', TAG: 'by its tag'}
 
 
@@ -158,9 +161,10 @@ class Matcher:
             unit = '' if topics == [TIME] else '[:unit]'
             options = ' '.join(f'--column {name}={THEIRS}{unit}' for name in topics)
             constant = ', or give --constant NAME=VALUE for what hardly changes'
+            apart = f', or say with --period {_PERIOD} how far apart the rows are' if times else ''
             parts.append(
                 f'there is no {self.what} {told}; the {self.what}s are: {self._have()}. Name '
-                f'yours with {options}{constant if missing else ""}'
+                f'yours with {options}{constant if missing else ""}{apart}'
             )
         return RefusedError(
             self.path, '; '.join(parts), [*remedies, *(choosing(t, THEIRS) for t in topics)]
