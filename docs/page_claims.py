@@ -165,5 +165,5 @@ def acts() -> str:
 def measured() -> str:
     """Return what the studies found, with the command of each."""
     rows = [*_paper(), *_partition(), *_coverage(), *_rivals(), *_alarm(),
-            *_diagnosis(), *_speed()]  # fmt: skip
+            *_diagnosis(), *_loops(), *_speed()]  # fmt: skip
     return table(('question', 'answer', 'measured by'), rows)

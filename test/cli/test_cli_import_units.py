@@ -102,11 +102,14 @@ def test_a_period_that_is_none_is_refused(run, tmp_path, frame, said):
 @pytest.mark.parametrize(
     ('pressure', 'words'),
     [
-        (-1.0 * ROWS, 'name the right column'), (0.0 * ROWS, 'name the right column'),
+        (-1.0 * ROWS, 'name the right column'),
+        (0.0 * ROWS, 'name the right column'),
         (1e5 + ROWS, 'name the right column'),
-        (1.6e7 + ROWS, 'main_steam_pressure_mpa:Pa'), (1e9 + ROWS, 'name the right column'), (160.0 + ROWS, 'main_steam_pressure_mpa:bar'),
+        (1.6e7 + ROWS, 'main_steam_pressure_mpa:Pa'),
+        (1e9 + ROWS, 'name the right column'),
+        (160.0 + ROWS, 'main_steam_pressure_mpa:bar'),
     ],
-)  # fmt: skip
+)
 def test_a_log_without_a_possible_pressure_is_refused(run, tmp_path, frame, pressure, words):
     path = tmp_path / 'a.csv'
     frame.assign(main_steam_pressure_mpa=pressure).to_csv(path, index_label='time')

@@ -342,9 +342,12 @@ def judge_rows(
     dependent : float
         Rows that count as one.
     offset : float, optional
-        By how much the position reads more than the command; found from the rows by default.
+        By how much the position reads more than the command, found from the rows by default. It
+        is given for a short record, in which the valve may hardly rest: the noise of a reading is
+        then bounded by what the fit leaves.
     """
     both = np.isfinite(command[1:]) & np.isfinite(position[1:]) & np.isfinite(position[:-1])
+    rests = offset is None
     if offset is None:
         offset = _offset(command[1:][both], position[1:][both])
     pairs = _Pairs(command[1:][both] + offset, position[:-1][both], position[1:][both], step_s)
@@ -369,7 +372,7 @@ def judge_rows(
     if not rms[1] < rms[0]:
         return None
     chance = min(1.0, len(fits) * sign_flip(scores))
-    noise = float(np.sqrt(best.cost))
+    noise = np.inf if rests else float(np.sqrt(best.cost))
     sharp = sized(best.plan.name, command + offset, position, step_s, best.values, noise)
     parameters = (
         dict(zip(best.plan.keys, sharp, strict=True))
