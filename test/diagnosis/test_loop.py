@@ -207,6 +207,14 @@ def test_a_position_as_a_fraction_is_the_same_valve():
     assert part.sizes['w_percent']['value'] == pytest.approx(whole.sizes['w_percent']['value'])
 
 
+def test_a_valve_at_its_stop_is_not_called_loose():
+    command, _, _ = driven(3, 0.0, 0.0)
+    noise = 0.03 * np.random.default_rng(1).normal(size=700)
+    found = judge_position(command, np.minimum(command, 51.0) + noise, STEP_S)
+    assert found.verdict == NOT_JUDGED
+    assert 'does not open beyond 51' in found.reason
+
+
 def test_a_position_that_stands_is_no_sound_valve():
     command, _, _ = driven(3, 0.0, 0.0)
     dead = judge_position(command, np.full(700, 31.0), STEP_S)

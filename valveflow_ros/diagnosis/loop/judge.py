@@ -199,9 +199,14 @@ def judge_position(command: FloatArray, position: FloatArray, step_s: float) -> 
             rows=rows,
         )
     dependent = min(max(_DEPENDENT_S / step_s, _LEAST_DEPENDENT), _MOST_DEPENDENT)
-    # The ends of what the position is away from the command are alike for every fault.
-    offset = 0.5 * float(np.quantile((v - c)[both], (0.01, 0.99)).sum())
-    fault = actuator.judge_rows(c, v, step_s, dependent=dependent, offset=offset)
+    # In a short record the middle between the ends of their difference is the offset; at a
+    # stop it is not, and the median is.
+    middle = 0.5 * float(np.quantile((v - c)[both], (0.01, 0.99)).sum())
+    tried = [
+        actuator.judge_rows(c, v, step_s, dependent=dependent, offset=offset)
+        for offset in (middle, None)
+    ]
+    fault = min((f for f in tried if f is not None), key=lambda f: f.rms_after, default=None)
     if fault is None and (left := _beyond_servo(c, v)) > _MOST_LEFT:
         return LoopJudgement(
             NOT_JUDGED,
@@ -225,7 +230,10 @@ def _beyond_servo(c: FloatArray, v: FloatArray) -> float:
 def _of_fault(fault: actuator.ActuatorFault | None, rows: int) -> LoopJudgement:
     if fault is None:
         return LoopJudgement(
-            HEALTHY, 'The position follows the command without stick band or slack.', rows=rows
+            HEALTHY,
+            'The position follows the command without stick band or slack; a loose linkage behind '
+            'the position sensor would not show.',
+            rows=rows,
         )
     units = {'r_percent_per_s': '%/s'}
     sizes: dict[str, dict[str, float | str]] = {
