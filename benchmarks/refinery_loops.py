@@ -1,7 +1,10 @@
 """Simulated flow, pressure and level loops under PI control, with and without a sticking valve.
 
-They are for fixing and trying thresholds of `refinery_judge`; nothing in them
-was taken from the measured loops but their length and step.
+They are for fixing and trying thresholds of `valveflow_ros.diagnosis.loop`; nothing in them was
+taken from the measured loops but their length and step. The valve is direct or reverse acting. It
+sticks as He's two-parameter model says, which the method itself fits, or as Kano's (M. Kano,
+H. Maruta, H. Kugemoto, K. Shimizu, "Practical model and detection algorithm for valve stiction",
+IFAC DYCOPS 2004), which it does not know.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from valveflow_ros.records import FloatArray
 
 ROWS, STEP_S = 751, 10.0
 _SETTLE_S = 3000
+HE, KANO = 'he', 'kano'
 NULLS = ('quiet', 'setpoint', 'sine', 'random', 'tight', 'all')
 KINDS = ('flow', 'pressure', 'level')
 
@@ -52,6 +56,23 @@ class Loop:
 
 
 @jit
+def _kano(wanted: float, before: float, stick: FloatArray, memory: FloatArray) -> float:
+    """Move a valve of Kano's model; memory: the last command, that of the rest, way, resting."""
+    band, jump = stick[0] + stick[1], stick[0] - stick[1]
+    last, place, way, resting = memory
+    step = wanted - last
+    if resting == 0.0 and step * way <= 0.0:
+        place, resting = last, 1.0
+    gone = way * (wanted - place)
+    if resting == 1.0 and -gone > band:
+        way, resting = -way, 0.0
+    elif resting == 1.0 and gone > jump:
+        resting = 0.0
+    memory[:] = (wanted, place, way, resting)
+    return before if resting == 1.0 else wanted - way * stick[1]
+
+
+@jit
 def _run(
     process: FloatArray, pi: FloatArray, stick: FloatArray, sp: FloatArray,
     load: FloatArray, noise: FloatArray, pv: FloatArray, op: FloatArray,
@@ -60,13 +81,15 @@ def _run(
 
     ``process``: gain, time constant, integrating rate (0: self-regulating), delay, filter,
     largest change of the measured value a second. ``pi``: gain, reset time, execution period.
-    ``stick``: slip-off and slip-to distance. ``load`` is added to the plug's opening.
+    ``stick``: slip-off and slip-to distance, and 1 for Kano's model. ``load`` is added to the
+    plug's opening.
     """
     gain, lag, integrating, delay, smooth, slew = process
     line = np.zeros(int(delay) + 1)
     plug, flow, level, seen, out = 0.0, 0.0, 0.0, 0.0, 0.0
     integral = 0.0
     period = int(pi[2])
+    memory = np.array([0.0, 0.0, 1.0, 1.0])
     for t in range(sp.size):
         if t % period == 0:
             error = sp[t] - seen
@@ -75,7 +98,10 @@ def _run(
             if out > 50.0 or out < -50.0:
                 integral += (50.0 if out > 0 else -50.0) - out
                 out = 50.0 if out > 0 else -50.0
-        plug = stick_slip(out, plug, stick[0], stick[1])
+        if stick[2] == 1.0:
+            plug = _kano(out, plug, stick, memory)
+        else:
+            plug = stick_slip(out, plug, stick[0], stick[1])
         line[t % line.size] = plug + load[t]
         late = line[(t + 1) % line.size]
         flow += (gain * late - flow) / max(lag, 1.0)
@@ -158,10 +184,11 @@ def _excitation(
     return load, sp, noise
 
 
-def simulate_loop(seed: int, sticky: bool) -> Loop:
+def simulate_loop(seed: int, sticky: bool, model: str = HE) -> Loop:
     """Draw a loop and run it.
 
-    Every seed gives one loop for each ``sticky``; its kind and its excitation are drawn.
+    Every seed gives one loop for each ``sticky``; its kind and its excitation are drawn. Odd ones
+    are reverse acting.
     """
     rng = np.random.default_rng([seed, int(sticky)])
     kind = str(rng.choice(KINDS, p=[0.5, 0.2, 0.3]))
@@ -177,7 +204,7 @@ def simulate_loop(seed: int, sticky: bool) -> Loop:
     if rng.random() < 0.15:
         p[5] = rng.uniform(0.05, 0.5) * scale
     pv, op = np.zeros(n), np.zeros(n)
-    stick = np.array([0.5 * (band + jump), 0.5 * (band - jump)])
+    stick = np.array([0.5 * (band + jump), 0.5 * (band - jump), float(model == KANO)])
     _run(p, pi, stick, sp, load, noise, pv, op)
     rows = _SETTLE_S + (np.arange(ROWS) * STEP_S).astype(np.int64)
     centre, offset = rng.uniform(30, 70), rng.uniform(0, 200)
@@ -185,4 +212,7 @@ def simulate_loop(seed: int, sticky: bool) -> Loop:
     if rng.random() < 0.5:  # a historian rounds
         grain = 10.0 ** np.floor(np.log10(max(float(np.std(response)), 1e-9) / 8.0))
         response = np.round(response / grain) * grain
-    return Loop(op[rows] + centre, response, sp[rows] + offset, kind, case, band, jump)
+    command = op[rows] + centre
+    if seed % 2:  # a valve that opens when the output falls
+        command = 100.0 - command
+    return Loop(command, response, sp[rows] + offset, kind, case, band, jump)

@@ -110,6 +110,31 @@ def _diagnosis() -> list[tuple[str, str, str]]:
     return rows
 
 
+def _loops() -> list[tuple[str, str, str]]:
+    told = result('refinery_valves')
+    simulated, horch = (told['simulated']['all'][k] for k in ('verdict', 'horch'))
+
+    def words(s: dict[str, Any]) -> str:
+        return f'{100 * s["found"]:.0f} % found, {100 * s["falsely_named"]:.0f} % false'
+
+    rows = [_row(
+        f'`valveflow loop` from command and process value, {simulated["sticky"]} sticking and '
+        f'{simulated["sound"]} sound simulated loops',
+        f"{words(simulated)} ({words(horch)} by Horch's test)", 'refinery_valves',
+    )]  # fmt: skip
+    if isinstance(told['measured'], dict):
+        ours, horch = (told['measured']['per_valve'][k] for k in ('verdict', 'horch'))
+        counts = [f'{s["found"] * s["sticky"]:.0f} of {s["sticky"]} found, '
+                  f'{s["falsely_named"] * s["sound"]:.0f} of {s["sound"]} false'
+                  for s in (ours, horch)]  # fmt: skip
+        rows.append(
+            _row('the same on valves of a refinery, known while the method was made',
+                 f"{counts[0]}, {ours['open']} not judged ({counts[1]} by Horch's test)",
+                 'refinery_valves')
+        )  # fmt: skip
+    return rows
+
+
 def _speed() -> list[tuple[str, str, str]]:
     name = 'ten_days'
     steps = {step['step']: step for step in result(name)['steps']}
@@ -140,5 +165,5 @@ def acts() -> str:
 def measured() -> str:
     """Return what the studies found, with the command of each."""
     rows = [*_paper(), *_partition(), *_coverage(), *_rivals(), *_alarm(),
-            *_diagnosis(), *_speed()]  # fmt: skip
+            *_diagnosis(), *_loops(), *_speed()]  # fmt: skip
     return table(('question', 'answer', 'measured by'), rows)

@@ -1,8 +1,8 @@
 """Online identification and monitoring of main steam valve flow characteristics.
 
 The Python interface, ``import valveflow_ros as vf``: `open_log`, `identify`, `diagnose`,
-`compare`, `validate`, `monitor`, `simulate`, `load_characteristic`. Its parts are loaded when
-they are first used.
+`compare`, `validate`, `monitor`, `judge_loop`, `simulate`, `load_characteristic`. Its parts are
+loaded when they are first used.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from valveflow_ros.interface.diagnose import diagnose
     from valveflow_ros.interface.identify import identify
     from valveflow_ros.interface.logs import open_log
+    from valveflow_ros.interface.loop import judge_loop
     from valveflow_ros.interface.models import load_characteristic
     from valveflow_ros.interface.monitor import monitor
     from valveflow_ros.interface.simulate import simulate
@@ -23,6 +24,7 @@ __all__ = [
     'compare',
     'diagnose',
     'identify',
+    'judge_loop',
     'load_characteristic',
     'monitor',
     'open_log',
@@ -33,6 +35,7 @@ _MODULES = {
     'compare': 'compare',
     'diagnose': 'diagnose',
     'identify': 'identify',
+    'judge_loop': 'loop',
     'load_characteristic': 'models',
     'monitor': 'monitor',
     'open_log': 'logs',

@@ -87,10 +87,10 @@ NOTICED = {
     **{
         f'{signal} in another unit': (
             HEADER, rows(), mapped(signal, theirs),
-            ['Warning: ', f'add --column {signal}={theirs}:{unit}\n'],
+            ['Warning: ', f'add --column {signal}={theirs}:{unit}'],
         )
         for signal, theirs, unit in (
-            ('valve_opening', 'CV', 'fraction'), ('main_steam_pressure', 'PS', 'bar'),
+            ('valve_opening', 'CV', 'fraction'),
             ('main_steam_temperature', 'TS', 'K'), ('generated_power', 'MW', 'kW'),
         )
     },

@@ -143,8 +143,8 @@ def test_the_other_verbs_name_all_options_in_one_line(run, table, tmp_path):
 
 @pytest.mark.parametrize(
     ('spelt', 'unit'),
-    [('barg', 'barg'), ('BARG', 'barg'), ('bar(g)', 'barg'), ('barü', 'barg'), ('MPag', 'MPag'),
-     ('kpag', 'kPag'), ('psi(g)', 'psig')],
+    [('barg', 'barg'), ('BARG', 'barg'), ('bar(g)', 'barg'), ('barü', 'barg'), ('kpag', 'kPag'),
+     ('psi(g)', 'psig')],
 )  # fmt: skip
 def test_a_gauge_pressure_can_be_said(run, table, tmp_path, spelt, unit):
     table.write_text(table.read_text().replace('Steam press', 'P1'))

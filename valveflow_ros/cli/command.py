@@ -216,6 +216,12 @@ def add_mapping(parser: ArgumentParser) -> None:
         '--constant', action='append', default=[], metavar='NAME=VALUE[:UNIT]',
         help='a signal that was not logged and hardly changes',
     )  # fmt: skip
+    add_table(parser, 'column')
+
+
+def add_table(parser: ArgumentParser, gathered: str) -> None:
+    """Add the options that say how a table is written, to be gathered under this name."""
+    parser.set_defaults(**{gathered: []})
     about = parser.add_argument_group('how a table is written, where it does not show it itself')
     for option, metavar, told in (
         ('time-zone', 'ZONE',
@@ -228,9 +234,11 @@ def add_mapping(parser: ArgumentParser) -> None:
         ('max-unpacked', 'MB',
          'to how much a workbook or a Parquet file may unpack (default: 64 MB, or 200 times its '
          'size if that is more, up to 1074 MB and 2147 MB)'),
+        ('period', 'TIME', 'time from one row to the next, such as 60s or 1min, where no column '
+         'holds times; the first row is then at 2000-01-01'),
     ):  # fmt: skip
         about.add_argument(
-            f'--{option}', dest='column', action='append', metavar=metavar, help=told,
+            f'--{option}', dest=gathered, action='append', metavar=metavar, help=told,
             type=_table_option(option),
         )  # fmt: skip
 

@@ -39,6 +39,7 @@ VERBS: tuple[tuple[str, str, str], ...] = (
     ('identify', 'identify', 'find the flow characteristic'),
     ('diagnose', 'diagnose', 'what the simulation gets wrong, and why'),
     ('validate', 'validate', 'hold a characteristic against other days'),
+    ('loop', 'loop', 'judge one control valve: sticks, slack, sound, or cannot be told'),
     ('compare', 'compare', 'the proposed method beside two of the literature'),
     ('compensate', 'compensate', 'the inverse curve as a table for the turbine controller'),
     ('export', 'export', 'a log becomes a table'),

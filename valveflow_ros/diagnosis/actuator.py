@@ -38,8 +38,9 @@ _CHI95 = 3.84
 
 
 def sized(
-    name: str, c: FloatArray, v: FloatArray, step_s: float, values: tuple[float, ...]
-) -> Sizes | None:
+    name: str, c: FloatArray, v: FloatArray, step_s: float, values: tuple[float, ...],
+    most_noise: float = np.inf,
+) -> Sizes | None:  # fmt: skip
     """Return sizes with 95 % intervals, None where too few rows tell them.
 
     Parameters
@@ -53,13 +54,16 @@ def sized(
     values : tuple of float
         The parameters as fitted: of stiction S and J, of backlash the width, of the rate limit
         the rate.
+    most_noise : float
+        Standard deviation that the noise of a reading does not exceed: where the valve hardly
+        ever rests, the readings alone do not tell it.
     """
     ways: dict[str, Callable[..., Sizes | None]] = {
         'stiction': _stiction_size, 'backlash': _backlash_size, 'rate_limit': _rate_size,
     }  # fmt: skip
     if name not in ways or len(v) < 10:
         return None
-    return ways[name](c, v, _noise(v), step_s, values)
+    return ways[name](c, v, min(_noise(v), most_noise), step_s, values)
 
 
 def _noise(v: FloatArray) -> float:
@@ -186,6 +190,7 @@ _LEAST_ROWS, _MOST_ROWS = 1000, 150_000
 _LEAST_GAIN = 30.0
 _PENALTY = 10.0
 _LEAST_SHARE = 0.05
+_SUBS = 80  # parts of a record that brings none
 _DEPENDENT = 10.0  # rows that count as one: what is left is not white
 _TOP_PERCENT, _MOSTLY_AT_TOP = 0.3, 0.3
 _SHARES = (0.1, 0.05, 0.02, 0.008, 0.003, 0.001)
@@ -313,17 +318,45 @@ def judge(grids: Grids) -> ActuatorFault | None:
     """Return the fault between command and position sensor, None if there is none."""
     if hindered(grids):
         return None
-    both = np.isfinite(grids.command[1:]) & np.isfinite(grids.v[1:]) & np.isfinite(grids.v[:-1])
-    offset = _offset(grids.command[1:][both], grids.v[1:][both])
-    pairs = _Pairs(
-        grids.command[1:][both] + offset, grids.v[:-1][both], grids.v[1:][both], grids.fine_s
-    )
-    sub = np.arange(len(grids.v)) // max(1, len(grids.v) // grids.subs)
-    sub = np.minimum(sub, grids.subs - 1)[1:][both]
+    return judge_rows(grids.command, grids.v, grids.fine_s, grids.subs)
+
+
+def judge_rows(
+    command: FloatArray,
+    position: FloatArray,
+    step_s: float,
+    subs: int = _SUBS,
+    dependent: float = _DEPENDENT,
+    offset: float | None = None,
+) -> ActuatorFault | None:
+    """Return the fault between command and position sensor, None if there is none.
+
+    Parameters
+    ----------
+    command, position : float64 (n,)
+        In %, one row after the other; NaN where missing.
+    step_s : float
+        Time between rows.
+    subs : int
+        Parts of the record whose scores are independent.
+    dependent : float
+        Rows that count as one.
+    offset : float, optional
+        By how much the position reads more than the command, found from the rows by default. It
+        is given for a short record, in which the valve may hardly rest: the noise of a reading is
+        then bounded by what the fit leaves.
+    """
+    both = np.isfinite(command[1:]) & np.isfinite(position[1:]) & np.isfinite(position[:-1])
+    rests = offset is None
+    if offset is None:
+        offset = _offset(command[1:][both], position[1:][both])
+    pairs = _Pairs(command[1:][both] + offset, position[:-1][both], position[1:][both], step_s)
+    sub = np.arange(len(position)) // max(1, len(position) // subs)
+    sub = np.minimum(sub, subs - 1)[1:][both]
     sealed = sub // SUBS_IN_BLOCK % FOLDS == SEALED_FOLD
     fitted = pairs.part(~sealed).part(slice(_MOST_ROWS))
     plain, *fits = [_fitted(fitted, plan) for plan in _plans(fitted.c)]
-    effective = len(fitted.v) / _DEPENDENT
+    effective = len(fitted.v) / dependent
 
     def score(fit: _Fit) -> float:
         return float(0.5 * effective * np.log(max(fit.cost, 1e-12)) + _PENALTY * len(fit.values))
@@ -339,7 +372,8 @@ def judge(grids: Grids) -> ActuatorFault | None:
     if not rms[1] < rms[0]:
         return None
     chance = min(1.0, len(fits) * sign_flip(scores))
-    sharp = sized(best.plan.name, grids.command + offset, grids.v, grids.fine_s, best.values)
+    noise = np.inf if rests else float(np.sqrt(best.cost))
+    sharp = sized(best.plan.name, command + offset, position, step_s, best.values, noise)
     parameters = (
         dict(zip(best.plan.keys, sharp, strict=True))
         if sharp

@@ -40,6 +40,7 @@ _FORMATS = {
     'comparison': 'compare',
     'validation': 'validate',
     'monitor': 'monitor',
+    'loop': 'loop',
 }
 _TABLES = {
     'compare': re.compile(

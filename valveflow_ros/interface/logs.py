@@ -19,6 +19,7 @@ from valveflow_ros.interface.plausibility import (
     check_constants,
     doubt,
     refuse_guesses,
+    refuse_impossible,
     with_constants,
 )
 from valveflow_ros.logs import LogContents
@@ -124,6 +125,7 @@ def open_log(
     decimal: str = '',
     sheet: str = '',
     max_unpacked: str = '',
+    period: str = '',
     progress: Progress = SILENT,
 ) -> Log:
     """Open a log, convert it, and report what looks wrong.
@@ -145,6 +147,8 @@ def open_log(
         How a table is written, where it does not show that itself.
     max_unpacked : str
         Megabytes to which a workbook or a Parquet file may unpack.
+    period : str
+        Time from one row to the next of a table without times: ``60s``, ``1min``.
     progress : Progress
 
     Raises
@@ -154,7 +158,7 @@ def open_log(
     """
     if mapping is None:
         table = {'time_zone': time_zone, 'date_order': date_order, 'decimal': decimal,
-                 'sheet': sheet, 'max_unpacked': max_unpacked}  # fmt: skip
+                 'sheet': sheet, 'max_unpacked': max_unpacked, 'period': period}  # fmt: skip
         mapping = read_mapping(
             [f'{name}={theirs}' for name, theirs in (columns or {}).items()],
             [f'{name}={value}' for name, value in (constants or {}).items()],
@@ -216,6 +220,8 @@ def _understood(name: str, contents: LogContents, mapping: LogMapping, progress:
         if (found := doubt(s, raw.value[raw.signal == s], units[s], settings)) is not None
     ]
     refuse_guesses(contents.path, doubts, contents.grounds, contents.signals)
+    if not contents.topics:  # a table
+        refuse_impossible(contents.path, doubts, contents.signals)
     for found in doubts:
         progress.warn(found.advice(contents.signals[found.signal]))
     for signal in constants.keys() & contents.signals.keys():

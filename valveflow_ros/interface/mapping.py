@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -27,7 +27,7 @@ Answer = TypeVar('Answer')
 _TIMES = ('time', 'date')
 _BY_NAME = {name: info for info in SIGNALS for name in (info.topic, info.column)}
 _TABLE = {'time-zone': 'time_zone', 'date-order': 'date_order', 'decimal': 'decimal',
-          'sheet': 'sheet', 'max-unpacked': 'max_unpacked'}  # fmt: skip
+          'sheet': 'sheet', 'max-unpacked': 'max_unpacked', 'period': 'period'}  # fmt: skip
 # Stands in for a signal that nobody has named yet, to find what else a table leaves open.
 _STAND_IN = {
     'valve_opening': 50.0,
@@ -132,14 +132,15 @@ def read_mapping(columns: Sequence[str], constants: Sequence[str], **table: str)
     constants : sequence of str
         Each ``NAME=VALUE[:UNIT]``.
     **table : str
-        Of a table: ``time_zone``, ``date_order``, ``decimal``, ``sheet``, ``max_unpacked``.
+        Of a table: ``time_zone``, ``date_order``, ``decimal``, ``sheet``, ``max_unpacked``,
+        ``period``.
 
     Raises
     ------
     UsageError
         Something is not of the right form, given twice, or contradictory.
     """
-    found = LogMapping(table=_table_options(table))
+    found = LogMapping(table=table_options(table))
     for text in columns:
         column = _column(text)
         if column.name in found.columns:
@@ -155,7 +156,8 @@ def read_mapping(columns: Sequence[str], constants: Sequence[str], **table: str)
     return found
 
 
-def _table_options(said: dict[str, str]) -> TableOptions:
+def table_options(said: Mapping[str, str]) -> TableOptions:
+    """Return the options of a table by name; raises `UsageError`."""
     options = AS_SEEN
     try:
         for name, value in said.items():

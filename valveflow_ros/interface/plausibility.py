@@ -36,22 +36,26 @@ class Doubt:
     impossible : float
         Share of its values that the engine will reject.
     looks_like : str
-        The unit that would suit, empty if none does.
+        The unit that would suit, empty if none does; the first where several do.
     sentence : str
         What to tell a person, without the option that would help.
+    also : tuple of str
+        Further units that would suit.
     """
 
     signal: Signal
     impossible: float
     looks_like: str
     sentence: str
+    also: tuple[str, ...] = ()
 
     def advice(self, theirs: str) -> str:
         """Return the sentence with the exact option that helps; ``theirs`` is the column."""
         if not self.looks_like:
             return self.sentence
-        chosen = option(SIGNALS[self.signal].topic, theirs, self.looks_like)
-        return f'{self.sentence} If so, add {chosen}'
+        topic = SIGNALS[self.signal].topic
+        chosen = [option(topic, theirs, unit) for unit in (self.looks_like, *self.also)]
+        return f'{self.sentence} If so, add {" or ".join(chosen)}'
 
 
 def limits(signal: Signal, settings: Settings) -> tuple[float, float]:
@@ -77,7 +81,8 @@ def doubt(signal: Signal, written: FloatArray, unit: str, settings: Settings) ->
     taken = unit_of(signal, unit)
     values = written * taken.scale + taken.offset
     impossible = float(((values < low) | (values > high)).mean())
-    looks_like = _better_unit(signal, written, unit, (low, high))
+    fitting = _better_units(signal, written, unit, (low, high))
+    looks_like = fitting[0] if fitting else ''
     if impossible < _MANY and not looks_like:
         return None
     info = SIGNALS[signal]
@@ -91,14 +96,14 @@ def doubt(signal: Signal, written: FloatArray, unit: str, settings: Settings) ->
     else:
         sentence = f'{info.topic}: {runs} and are taken as {unit}, which is unusual.'
     if looks_like:
-        sentence += f' They look like {looks_like}.'
-    return Doubt(signal, impossible, looks_like, sentence)
+        sentence += f' They look like {" or ".join(fitting)}.'
+    return Doubt(signal, impossible, looks_like, sentence, fitting[1:])
 
 
-def _better_unit(
+def _better_units(
     signal: Signal, written: FloatArray, unit: str, allowed: tuple[float, float]
-) -> str:
-    """Return the unit in which the values would be usual when in their own they are not."""
+) -> tuple[str, ...]:
+    """Return the units in which the values would be usual when in their own they are not."""
     middle = float(np.median(written))
     low, high = _USUAL[signal]
 
@@ -110,9 +115,32 @@ def _better_unit(
 
     own = unit_of(signal, unit)
     if usual(unit):
-        return ''
-    others = (name for name, other in UNITS[signal].items() if other != own and usual(name))
-    return next(others, '')
+        return ()
+    # Of two names of one unit the first.
+    others = {other: name for name, other in reversed(UNITS[signal].items()) if other != own}
+    return tuple(name for name in reversed(others.values()) if usual(name))
+
+
+def refuse_impossible(path: object, doubts: Iterable[Doubt], names: dict[Signal, str]) -> None:
+    """Refuse a table in which every main steam pressure is impossible.
+
+    Raises
+    ------
+    RefusedError
+        With the options that would help.
+    """
+    for found in doubts:
+        if found.signal != Signal.MAIN_STEAM_PRESSURE or found.impossible < 1.0:
+            continue
+        topic, theirs = SIGNALS[found.signal].topic, names[found.signal]
+        said, remedy = found.advice(theirs), choosing(topic, theirs, found.looks_like)
+        if not found.looks_like:
+            said = (
+                f'{said.removesuffix(".")}; name the right column with --column '
+                f'{topic}={THEIRS}[:unit], or give --constant {topic}=VALUE'
+            )
+            remedy = choosing(topic, THEIRS)
+        raise RefusedError(path, f"'{theirs}' is taken for {said}", [remedy], last=True)
 
 
 def refuse_guesses(

@@ -24,6 +24,7 @@ from valveflow_ros.interface.plausibility import (
     check_constants,
     doubt,
     refuse_guesses,
+    refuse_impossible,
     with_constants,
 )
 from valveflow_ros.logs.reader import TABLE_SUFFIXES
@@ -432,5 +433,6 @@ class TableImport:
             for sentence in reader.understood():
                 self._progress.say(sentence)
             raise merge_refusals(reader.path, refused)
+        refuse_impossible(reader.path, doubts, names)
         for found in doubts:
             self._progress.warn(found.advice(names[found.signal]))

@@ -27,12 +27,15 @@ from valveflow_ros.logs.tables.words import (
 from valveflow_ros.records import SIGNALS, Signal
 
 TIME, DATE = 'time', 'date'
+# What a column is called that was the unnamed index of a DataFrame.
+NAMES_OF_AN_INDEX = ('', 'Unnamed: 0', '__index_level_0__')
 _TIME_WORDS = re.compile(
     r'time ?stamp|zeit ?stempel|date ?time|datum ?(?:und ?)?(?:uhr)?zeit|^(?:\w+ )?time$|'
     r'^(?:local |utc |lokale |abtast)?(?:time|zeit)\b|^uhrzeit$|^ts$|^t$|^sample time$|^clock$'
 )
 _DATE_WORDS = re.compile(r'^(?:date|datum|day|tag)$')
 _CLOCK_WORDS = re.compile(r'^(?:time|zeit|uhrzeit|clock|time of day)$')
+_STAMP = re.compile(r'\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[T ]\s*\d{1,2}:\d{2}.*')
 _LOCAL = {
     **dict.fromkeys(('CET', 'MEZ', 'CEST', 'MESZ'), 'Europe/Berlin'),
     'EET': 'Europe/Helsinki', 'WET': 'Europe/Lisbon', 'BST': 'Europe/London',
@@ -40,6 +43,7 @@ _LOCAL = {
     **dict.fromkeys(('CST', 'CDT'), 'America/Chicago'),
     **dict.fromkeys(('PST', 'PDT'), 'America/Los_Angeles'),
 }  # fmt: skip
+_PERIOD = '60s'
 _GROUNDS = {EXACT: '', CLEAR: 'by its name', LIKELY: 'by its name', TAG: 'by its tag'}
 
 
@@ -157,9 +161,10 @@ class Matcher:
             unit = '' if topics == [TIME] else '[:unit]'
             options = ' '.join(f'--column {name}={THEIRS}{unit}' for name in topics)
             constant = ', or give --constant NAME=VALUE for what hardly changes'
+            apart = f', or say with --period {_PERIOD} how far apart the rows are' if times else ''
             parts.append(
                 f'there is no {self.what} {told}; the {self.what}s are: {self._have()}. Name '
-                f'yours with {options}{constant if missing else ""}'
+                f'yours with {options}{constant if missing else ""}{apart}'
             )
         return RefusedError(
             self.path, '; '.join(parts), [*remedies, *(choosing(t, THEIRS) for t in topics)]
@@ -222,6 +227,12 @@ def time_columns(heading: Heading) -> tuple[int | None, int | None]:
         return clock, date
     found = next((k for k, name in enumerate(names) if _is_time(name)), None)
     return (found, None) if found is not None else (None, date)
+
+
+def stamps_in(cells: list[str]) -> bool:
+    """Tell whether most cells of a column are dates with a time of day."""
+    stamps = sum(bool(_STAMP.fullmatch(cell.strip())) for cell in cells)
+    return bool(cells) and 2 * stamps > len(cells)
 
 
 def _is_time(name: str) -> bool:

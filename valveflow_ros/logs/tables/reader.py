@@ -25,16 +25,18 @@ from valveflow_ros.logs.tables.cells import (
 from valveflow_ros.logs.tables.file import Heading, TableFile, look_at
 from valveflow_ros.logs.tables.match import (
     DATE,
+    NAMES_OF_AN_INDEX,
     TIME,
     Chosen,
     Matcher,
     local_zone_in,
+    stamps_in,
     time_columns,
     zone_in,
 )
 from valveflow_ros.logs.tables.refusal import AS_SEEN, RefusedError, Remedy, TableOptions
 from valveflow_ros.logs.tables.text import decimal_mark
-from valveflow_ros.logs.tables.times import NEVER, TimeReader
+from valveflow_ros.logs.tables.times import NEVER, RowClock, TimeReader
 from valveflow_ros.logs.tables.words import folded, split_unit
 from valveflow_ros.records import (
     SIGNALS,
@@ -154,13 +156,13 @@ class TableReader:
         else:
             heading = self._file.heading
             matcher = Matcher(path, heading, taken=quality_columns(heading.names) | taken)
-        found = matcher.match(by_signal, signals_of(absent), no_time=time is None)
-        assert time is not None, 'the matcher has refused it'
+        counted = bool(options.period) and self.long is None
+        found = matcher.match(by_signal, signals_of(absent), no_time=time is None and not counted)
         self._time = time
         self._chosen: dict[str, Chosen] = {SIGNALS[s].column: found[s] for s in sorted(found)}
         self._quality = {} if self.long is not None else self._quality_places()
         self._marks = self._decided_marks()
-        self._clock = self._time_reader()
+        self._clock = RowClock(options) if time is None else self._time_reader(time)
         used = {c.place for c in self._chosen.values()} | set(self._quality.values())
         used |= taken if self.long is None else set()
         named = enumerate(matcher.names)
@@ -195,7 +197,9 @@ class TableReader:
     def time_words(self) -> str:
         """Return which column the times are from and how they are written."""
         names = [self._file.names[k] for k in (self._date, self._time) if k is not None]
-        told = ' and '.join(f"'{name}'" for name in names)
+        if not names:
+            return self._clock.words
+        told = ' and '.join(f"'{name}'" if name else 'the column without a name' for name in names)
         return f'{told}, {self._clock.words}'
 
     @property
@@ -205,7 +209,7 @@ class TableReader:
 
     def blocks(self) -> Iterator[RawBlock]:
         """Yield the rows whose time is known, block by block; raises like `read_table`."""
-        places = [self._time] + ([] if self._date is None else [self._date])
+        places = [k for k in (self._time, self._date) if k is not None]
         long, coded = self.long, False
         if long is not None:
             places += [k for k in (long.tag, long.value, long.quality) if k >= 0]
@@ -284,6 +288,8 @@ class TableReader:
 
     def _time_places(self, named: Mapping[str, str]) -> tuple[int | None, int | None]:
         time, date = time_columns(self._file.heading)
+        if time is None and date is None:
+            time = self._index_of_times()
         matcher = Matcher(self.path, self._file.heading)
         places = {TIME: time, DATE: date}
         for key, theirs in named.items():
@@ -300,6 +306,11 @@ class TableReader:
         clock = sum(c.count(':') >= 1 and not any(m in c for m in '-/T') and len(c) <= 15
                     and c.find('.') not in range(5) for c in cells)  # fmt: skip
         return time, (date if date != time and 2 * clock > len(cells) else None)
+
+    def _index_of_times(self) -> int | None:
+        """Return the column without a name that holds times: pandas writes an index so."""
+        places = (k for k, name in enumerate(self._file.names) if name in NAMES_OF_AN_INDEX)
+        return next((k for k in places if stamps_in(self._cells(k))), None)
 
     def _cells(self, place: int) -> list[str]:
         """Return what stands in a column in the rows that were looked at."""
@@ -345,13 +356,13 @@ class TableReader:
                 )
         return Marks()
 
-    def _time_reader(self) -> TimeReader:
-        name = self._file.names[self._time]
-        samples = self._cells(self._time)
+    def _time_reader(self, time: int) -> TimeReader:
+        name = self._file.names[time]
+        samples = self._cells(time)
         if self._date is not None:
             samples = [
                 f'{date[:11].strip()} {time}'
-                for date, time in self._file.samples(self._date, self._time)
+                for date, time in self._file.samples(self._date, time)
             ]
         clock = TimeReader(samples, str(self.path), name, self._options, zone_in(name))
         abbreviated, place = local_zone_in(name)
@@ -366,6 +377,8 @@ class TableReader:
         return clock
 
     def _read_times(self, frame: pd.DataFrame) -> IntArray:
+        if isinstance(self._clock, RowClock):
+            return self._clock.at(self.rows, len(frame))
         column = frame[self._time]
         if self._date is not None:
             days = frame[self._date].astype('string').str.strip().str.slice(0, 11)

@@ -86,6 +86,9 @@ def quoted(word: str) -> str:
 _UNPACKED_FREELY = 64_000_000
 _UNPACKED_TIMES = 200
 DATE_ORDERS = ('dmy', 'mdy', 'ymd')
+_SECONDS = {'ms': 1e-3, 's': 1.0, 'sec': 1.0, 'min': 60.0, 'm': 60.0, 'h': 3600.0}
+_PERIOD = re.compile(r'(\d+(?:\.\d+)?) ?(ms|s|sec|min|m|h)?')
+_LONGEST_PERIOD_S = 86_400.0
 DECIMALS = ('point', 'comma')
 
 
@@ -107,6 +110,8 @@ class TableOptions:
     max_unpacked : str
         Megabytes to which a workbook or the needed columns of a Parquet file may unpack. Empty:
         64, or 200 times the file if that is more, up to a fixed bound.
+    period : str
+        Time from one row to the next of a table without times: ``60s``, ``1min``, ``60``.
     """
 
     time_zone: str = ''
@@ -114,6 +119,7 @@ class TableOptions:
     decimal: str = ''
     sheet: str = ''
     max_unpacked: str = ''
+    period: str = ''
 
     def __post_init__(self) -> None:
         if self.date_order not in ('', *DATE_ORDERS):
@@ -122,6 +128,17 @@ class TableOptions:
             raise InputError(f"--decimal must be point or comma, not '{self.decimal}'.")
         if self.max_unpacked:
             self.unpacked_bytes(0, 0)
+        if self.period and not 0.0 < self.period_s <= _LONGEST_PERIOD_S:
+            raise InputError(
+                '--period must be a time from one row to the next, such as 60s, 1min or 500ms, '
+                f"not '{self.period}'."
+            )
+
+    @property
+    def period_s(self) -> float:
+        """Return the period in s, NaN if none was given or it is no time."""
+        found = _PERIOD.fullmatch(self.period.strip().lower())
+        return float(found[1]) * _SECONDS[found[2] or 's'] if found else math.nan
 
     def unpacked_bytes(self, packed: int, bound: int) -> float:
         """Return to how many bytes a file of ``packed`` bytes may unpack; ``bound`` at most.

@@ -132,6 +132,40 @@ _HOUR_NS = 3600 * NS_PER_S
 _FEW = 8
 
 
+FIRST_ROW_NS = 946_684_800 * NS_PER_S
+
+
+class RowClock:
+    """Gives the rows of a table without times the period a person told, from the year 2000 on."""
+
+    zone = ''
+
+    def __init__(self, options: TableOptions) -> None:
+        self._period = f'{options.period_s:g} s'
+        self._step_ns = round(options.period_s * NS_PER_S)
+
+    def at(self, first: int, count: int) -> IntArray:
+        """Return the times of ``count`` rows from row ``first`` on."""
+        return FIRST_ROW_NS + np.arange(first, first + count, dtype=np.int64) * self._step_ns
+
+    def finish(self) -> list[str]:
+        """Return what is to be said of the times."""
+        return [
+            f'The table has no times; its rows were taken to be {self._period} apart, from '
+            '2000-01-01 on.'
+        ]
+
+    @property
+    def words(self) -> str:
+        """Return where the times are from."""
+        return f'counted, {self._period} a row'
+
+    @property
+    def told_zone(self) -> str:
+        """Return the zone."""
+        return 'UTC'
+
+
 class TimeReader:
     """Reads the column of time block by block, all blocks by the same rule.
 

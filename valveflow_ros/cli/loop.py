@@ -1,0 +1,80 @@
+"""``valveflow loop``: one control loop, judged from its command and what follows it."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+
+from valveflow_ros.cli.command import (
+    Console,
+    VerbResult,
+    add_table,
+    columns,
+    lines,
+)
+from valveflow_ros.errors import UsageError
+from valveflow_ros.interface.files import check_folder
+
+_DESCRIPTION = """\
+Judge the valve of one control loop from the controller's output and the measured position, or
+from the controller's output and the process value alone: it sticks, it has slack, the loop
+oscillates for another reason, it is sound, or the record cannot tell. 200 rows are the least.
+DIR gets loop.json.
+
+example:
+  valveflow loop FIC101.csv -o result
+and with columns whose names say nothing:
+  valveflow loop trend.csv -o result --command A17 --process A18"""
+
+
+def arguments(parser: ArgumentParser) -> None:
+    """Add description, example and options."""
+    parser.description = _DESCRIPTION
+    parser.usage = 'valveflow loop TABLE -o DIR [options]'
+    parser.add_argument(
+        'table', metavar='TABLE', type=Path, help='a .csv or other text, .xlsx or .parquet table'
+    )
+    parser.add_argument(
+        '-o', '--output', metavar='DIR', type=Path, required=True,
+        help='folder for loop.json, made if absent',
+    )  # fmt: skip
+    for option, about in (
+        ('command', "the controller's output in %% (by default a column named OP, MV, ...)"),
+        ('position', 'the measured position in %%; with it the sizes are told'),
+        ('process', 'the process value: flow, level, pressure (by default PV)'),
+        ('set-point', 'the set point (by default SP or SV); it may be absent'),
+        ('time', 'date and time, or Unix seconds'),
+    ):
+        parser.add_argument(f'--{option}', metavar='COLUMN', default='', help=about)
+    add_table(parser, 'said')
+
+
+def run(options: Namespace, console: Console) -> VerbResult:
+    """Read, judge, write."""
+    from valveflow_ros.interface.loop import judge_loop
+    from valveflow_ros.interface.mapping import table_options
+
+    if options.position and options.process:
+        raise UsageError('Give --position or --process, not both.')
+    check_folder(options.output)
+    said = {o.option.replace('-', '_'): o.value for o in options.said}
+    found = judge_loop(
+        options.table, command=options.command, position=options.position,
+        process=options.process, set_point=options.set_point, time=options.time,
+        options=table_options(said), progress=console,
+    )  # fmt: skip
+    path = found.write(options.output)
+    content = found.to_json()
+    sizes = [
+        [key, f'{s["value"]:.3g}', f'{s["low"]:.3g} to {s["high"]:.3g}', str(s['unit'])]
+        for key, s in found.judgement.sizes.items()
+    ]
+    taken = ', '.join(f'{role} {theirs}' for role, theirs in found.names.items())
+    text = lines(
+        f'{options.table.name}: {content["verdict"].replace("_", " ")}.',
+        content['reason'],
+        columns(sizes, ['size', 'value', '95 %', '']) if sizes else '',
+        f'Columns: {taken}; {content["rows"]} rows.',
+        f'Wrote {path}.',
+    )
+    return VerbResult(text, {**content, 'files': {path.name: str(path)}})

@@ -1,0 +1,1 @@
+"""One control loop judged from its command and what follows it."""

@@ -1,0 +1,226 @@
+"""``loop``: the valve of one control loop judged from its command and what follows it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from valveflow_ros.diagnosis.loop.judge import LoopJudgement, judge_position, judge_response
+from valveflow_ros.errors import InputError
+from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface.files import write_texts
+from valveflow_ros.logs.tables.loop_columns import (
+    COMMAND,
+    POSITION,
+    PROCESS,
+    ROLES,
+    SET_POINT,
+    LoopColumns,
+    ordered,
+    read_loop_columns,
+    roles_of,
+)
+from valveflow_ros.logs.tables.refusal import TableOptions
+from valveflow_ros.logs.tables.times import NEVER
+from valveflow_ros.records import FloatArray
+
+FILE = 'loop.json'
+# Rows on a grid of the usual step; beyond so many the table has one long gap.
+_MOST_GRID = 4
+
+
+@dataclass(frozen=True, slots=True)
+class LoopResult:
+    """What a record says of the valve of its loop.
+
+    Attributes
+    ----------
+    judgement : LoopJudgement
+        Verdict, reason, sizes, and what each test says.
+    names : dict of str to str
+        The columns by role: command, position or process, set_point.
+    time_s : float64 (n,)
+        Since the first row, equally far apart.
+    columns : dict of str to float64 (n,)
+        By role; NaN where a row is missing.
+    """
+
+    judgement: LoopJudgement
+    names: dict[str, str]
+    time_s: FloatArray
+    columns: dict[str, FloatArray]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of ``loop.json``."""
+        found = self.judgement
+        return {
+            'format': 'valveflow/loop',
+            'version': 1,
+            'verdict': found.verdict,
+            'reason': found.reason,
+            'sizes': found.sizes,
+            'columns': self.names,
+            'rows': found.rows,
+            'step_s': float(self.time_s[1] - self.time_s[0]) if len(self.time_s) > 1 else None,
+            'period_s': _known(found.period_s),
+            'evidence': {'gain': _known(found.gain), 'travel': _known(found.travel)},
+            'tests': {
+                name: {'answer': one.answer, 'index': _known(one.index)}
+                for name, one in found.detections.items()
+            },
+        }
+
+    def write(self, folder: str | Path) -> Path:
+        """Write ``loop.json`` into a folder, made if absent; return where it is.
+
+        Raises
+        ------
+        RecordingError
+            It cannot be written.
+        """
+        text = json.dumps(self.to_json(), indent=1, allow_nan=False) + '\n'
+        return write_texts(Path(folder), {FILE: text})[FILE]
+
+    def plot(self) -> Any:
+        """Return command and what follows it as a plotly figure.
+
+        Raises
+        ------
+        InputError
+            plotly is not installed.
+        """
+        from valveflow_ros.report.page import plotly_script
+
+        plotly_script()  # a sentence where plotly is missing
+        import plotly.graph_objects as go
+
+        figure = go.Figure(layout={'title': self.judgement.reason, 'template': 'plotly_white'})
+        for role, values in self.columns.items():
+            axis = 'y2' if role in (PROCESS, SET_POINT) else 'y'
+            figure.add_scatter(x=self.time_s, y=values, name=self.names[role], yaxis=axis)
+        figure.update_layout(yaxis2={'overlaying': 'y', 'side': 'right'}, xaxis_title='s')
+        return figure
+
+
+def judge_loop(
+    table: Any,
+    *,
+    command: str = '',
+    position: str = '',
+    process: str = '',
+    set_point: str = '',
+    time: str = '',
+    options: TableOptions | None = None,
+    progress: Progress = SILENT,
+) -> LoopResult:
+    """Judge the valve of one control loop: sticks, has slack, is sound, or cannot be judged.
+
+    Parameters
+    ----------
+    table : str, Path or pandas.DataFrame
+        A ``.csv`` or other text, ``.xlsx`` or ``.parquet`` table, or a DataFrame with a column
+        ``time`` or times in its index.
+    command : str
+        Column of the controller's output in %.
+    position : str
+        Column of the measured position in %; with it sizes are told.
+    process : str
+        Column of the process variable, in any unit; needed without a position.
+    set_point, time : str
+        Columns. What is not named is found by its name: MV or OP, PV, SP or SV.
+    options : TableOptions, optional
+        How a table is written, where it does not show that itself.
+    progress : Progress
+
+    Raises
+    ------
+    RecordingError, InputError, DataError
+        The table cannot be read, or a column is missing.
+    """
+    if position and process:
+        raise InputError('Give the position or the process value, not both.')
+    named = {COMMAND: command, POSITION: position, PROCESS: process, SET_POINT: set_point}
+    progress(0.05, 'reading')
+    if hasattr(table, 'columns'):
+        read = _from_dataframe(table, named, time)
+    else:
+        read = read_loop_columns(Path(table), {**named, 'time': time}, options or TableOptions())
+    step_s, values = _gridded(read)
+    progress(0.3, 'judging')
+    if POSITION in values:
+        found = judge_position(values[COMMAND], values[POSITION], step_s)
+        used: tuple[str, ...] = (COMMAND, POSITION)
+    else:
+        found = judge_response(values[COMMAND], values[PROCESS], step_s, values.get(SET_POINT))
+        used = (COMMAND, PROCESS, SET_POINT)
+    seconds = step_s * np.arange(len(values[COMMAND]), dtype=np.float64)
+    return LoopResult(
+        found,
+        {role: read.names[role] for role in used if role in values},
+        seconds,
+        {role: values[role] for role in used if role in values},
+    )
+
+
+def _known(value: float) -> float | None:
+    return round(float(value), 4) if np.isfinite(value) else None
+
+
+def _gridded(read: LoopColumns) -> tuple[float, dict[str, FloatArray]]:
+    """Return the usual step in s and the columns on rows of that step, NaN where none was."""
+    times = read.time_ns
+    if len(times) < 2:
+        return 1.0, read.columns
+    step = float(np.median(np.diff(times)))
+    rows = np.rint((times - times[0]) / step).astype(np.int64)
+    if rows[-1] > _MOST_GRID * len(rows):
+        # Long pauses become short ones: a stretch ends at either.
+        rows = np.concatenate(([0], np.cumsum(np.minimum(np.diff(rows), 10))))
+    rows, first = np.unique(rows, return_index=True)
+    out = {}
+    for role, values in read.columns.items():
+        out[role] = np.full(int(rows[-1]) + 1, np.nan)
+        out[role][rows] = values[first]
+    return step / 1e9, out
+
+
+def _from_dataframe(frame: Any, named: dict[str, str], time: str) -> LoopColumns:
+    import pandas as pd
+
+    names = [str(c) for c in frame.columns]
+    for theirs in (*named.values(), time):
+        if theirs and theirs not in names:
+            raise InputError(f"The DataFrame has no column '{theirs}'.")
+    guessed = roles_of(names, [''] * len(names))
+    chosen = {role: theirs for role, theirs in named.items() if theirs}
+    for role in ROLES:
+        behind = role in (POSITION, PROCESS) and {POSITION, PROCESS} & set(chosen)
+        free = [names[k] for k in guessed.get(role, []) if names[k] not in chosen.values()]
+        if role not in chosen and not behind and len(free) == 1:
+            chosen[role] = free[0]
+    if COMMAND not in chosen or not {POSITION, PROCESS} & set(chosen):
+        raise InputError(
+            'The DataFrame has no columns that are clearly the command and what follows it; name '
+            'them with command= and process= or position=.'
+        )
+    clock = time or ('time' if 'time' in names else '')
+    column = frame[clock] if clock else frame.index
+    if not clock and not isinstance(frame.index, pd.DatetimeIndex):
+        raise InputError("The DataFrame has no column 'time', and its index holds no times.")
+    series = pd.Series(column).reset_index(drop=True)
+    if pd.api.types.is_numeric_dtype(series):
+        there = series.notna().to_numpy()
+        seconds = np.where(there, series.to_numpy(np.float64), 0.0)
+        time_ns = np.where(there, np.rint(seconds * 1e9), NEVER).astype(np.int64)
+    else:
+        stamps = pd.to_datetime(series, utc=True, errors='coerce')
+        time_ns = stamps.astype('datetime64[ns, UTC]').astype(np.int64).to_numpy()
+    values = {
+        role: pd.to_numeric(frame[theirs], errors='coerce').to_numpy(np.float64)
+        for role, theirs in chosen.items()
+    }
+    return ordered(time_ns, values, chosen)
