@@ -46,7 +46,7 @@ def test_the_curve_is_the_plants(run, logs, results, curves):
     # Ten hours under 3 MW of noise: the curve is near, its pieces need not be all there.
     assert np.sqrt(np.mean((found(u) - truth(u)) ** 2)) < 4.0
     assert content['format'] == 'valveflow/characteristic'
-    assert content['version'] == 1
+    assert content['version'] == 2
     assert content['optimal'] is True
 
 

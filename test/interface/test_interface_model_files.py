@@ -199,8 +199,8 @@ def curve_can_be(raw: dict[str, Any]) -> bool:
     window, temperature = raw.get('window', {}), raw.get('temperature', {})
     segments = raw['segments']
     return (
-        raw['format'] == 'valveflow/characteristic' and raw['version'] == 1
-        and text(raw.get('model_id', '')) and number(raw['pressure_exponent'], 0.5, 2)
+        raw['format'] == 'valveflow/characteristic' and raw['version'] in (1, 2)
+        and text(raw.get('model_id', '')) and form_can_be(raw)
         and len(pieces) > 0 and all(map(piece_can_be, pieces)) and all(map(support_can_be, pieces))
         and all(p.get('identifiable', True) in (True, False) for p in pieces)
         and all(a['u_to'] == b['u_from'] for a, b in itertools.pairwise(pieces))
@@ -230,6 +230,23 @@ def curve_can_be(raw: dict[str, Any]) -> bool:
         )
         and isinstance(raw.get('optimal', True), bool)
     )  # fmt: skip
+
+
+def form_can_be(raw: dict[str, Any]) -> bool:
+    axis, told = raw.get('axis', 'integrated_input'), raw.get('form')
+    e, c = raw.get('pressure_scale_exponent', 0.0), raw.get('offset_mw', 0.0)
+    return (
+        (axis == 'integrated_input' and number(raw['pressure_exponent'], 0.5, 2) and e == c == 0)
+        or (axis == 'opening' and number(raw['pressure_exponent'], 0, 2)
+            and number(e, 0.5, 2) and number(c, *POWER))
+    ) and unknown_or(raw.get('reference_pressure_mpa'), 1e-4, 1e3) and (told is None or (
+        told['chosen'] in ('integrated_input', 'opening')
+        and number(told['log_likelihood_gain'], -1e16, 1e16)
+        and all(number(told[f'rmse_{k}'], 0, 1e13) for k in ('mw', 'other_mw'))
+        and number(told['apart_mw'], 0, 1e13) and text(told['other'])
+        and all(number(x, -1e13, 1e13) for x in told['worst'].values())
+        and all(isinstance(told[k], bool) for k in ('told', 'contradicted'))
+    ))  # fmt: skip
 
 
 def model_can_be(raw: dict[str, Any]) -> bool:

@@ -122,10 +122,8 @@ def model_to_json(given: ExtendedModel) -> dict[str, Any]:
     return {
         'format': MODEL_FORMAT,
         'version': MODEL_VERSION,
-        'axis': given.form.axis,
         'pressure_exponent': given.pressure_exponent,
-        'pressure_scale_exponent': given.form.scale_exponent,
-        'offset_mw': m.offset,
+        **_form_json(given),
         'start_ns': given.start_ns,
         'reference': dataclasses.asdict(given.reference),
         'curve': {'knots': m.knots.tolist(), 'left': m.left.tolist(), 'right': m.right.tolist()},
@@ -139,6 +137,17 @@ def model_to_json(given: ExtendedModel) -> dict[str, Any]:
         ],
         **({} if earlier is None else {'on_top_of': model_to_json(earlier)}),
     }  # fmt: skip
+
+
+def _form_json(given: ExtendedModel) -> dict[str, Any]:
+    """Return the form under its keys; a model of the paper's has none of them."""
+    if not given.form.scaled:
+        return {}
+    return {
+        'axis': given.form.axis,
+        'pressure_scale_exponent': given.form.scale_exponent,
+        'offset_mw': given.model.base.offset,
+    }
 
 
 def is_model(raw: object) -> bool:

@@ -58,6 +58,11 @@ class _Formed:
     held: bool = False
 
     @property
+    def free_exponent(self) -> float | None:
+        """Return e where it is to be found along with the curve."""
+        return None if self.held or not self.form.scaled else self.form.exponent
+
+    @property
     def contents(self) -> WindowContents:
         """Return the rows."""
         return self.task.contents
@@ -128,7 +133,7 @@ def outline(
     progress('curve and dynamics together')
     try:
         formed = begun.formed
-        model, power = search(_samples(formed), *_refinement(begun), formed.held)
+        model, power = search(_samples(formed), *_refinement(begun), formed.free_exponent)
         return model, replace(formed.form, exponent=power * formed.form.exponent)
     except np.linalg.LinAlgError as error:
         raise DataError(f'Curve and dynamics could not be found together: {error}.') from None
@@ -346,7 +351,7 @@ def _refined(begun: _Begun, progress: Progress) -> Characteristic:
     progress('curve and dynamics together')
     samples = _samples(begun.formed)
     try:
-        result = refine(samples, *_refinement(begun), begun.formed.held)
+        result = refine(samples, *_refinement(begun), begun.formed.free_exponent)
     except (np.linalg.LinAlgError, TooFewSamplesError) as error:
         return _only_straight(begun, str(error))
     return from_refined(begun.formed.task, begun.static, result, samples, begun.u_special)

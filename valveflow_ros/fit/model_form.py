@@ -17,15 +17,14 @@ from valveflow_ros.curve.characteristic import FormEvidence
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.partition.partition import partition
 from valveflow_ros.records import BoolArray, FloatArray, IntArray
-from valveflow_ros.signals.static_form import INTEGRATED_INPUT, OPENING, StaticForm
+from valveflow_ros.signals.static_form import EXPONENTS, INTEGRATED_INPUT, OPENING, StaticForm
 
 _MEAN_S = 60.0
 _KNOTS = 10
 _FOLDS, _STRETCHES = 5, 40
 _LEAST_MEANS = 200
 _MOST_MEANS = 6000
-_LOWEST_EXPONENT, _HIGHEST_EXPONENT = 0.8, 1.4
-_EXPONENT_STEP = 0.1
+_EXPONENT_STEP = 0.05
 # Held-out errors count as Student's t with so many degrees of freedom: a stretch beyond what the
 # others visit would otherwise outweigh all of them.
 _FREEDOM = 4.0
@@ -272,9 +271,9 @@ def _best(means: _Means, axis: str) -> _Fit:
     def cost(exponent: float) -> float:
         return float(_surprise(_fitted(means, StaticForm(axis, exponent)).error).sum())
 
-    grid = np.arange(_LOWEST_EXPONENT, _HIGHEST_EXPONENT + 1e-9, _EXPONENT_STEP)
-    least = float(min(grid, key=cost))
-    bounds = max(_LOWEST_EXPONENT, least - 0.1), min(_HIGHEST_EXPONENT, least + 0.1)
+    low, high = EXPONENTS
+    least = float(min(np.arange(low, high + 1e-9, _EXPONENT_STEP), key=cost))
+    bounds = max(low, least - _EXPONENT_STEP), min(high, least + _EXPONENT_STEP)
     found = minimize_scalar(cost, bounds=bounds, method='bounded', options={'xatol': 1e-3})
     return _fitted(means, StaticForm(axis, round(float(found.x), 4)))
 

@@ -36,6 +36,7 @@ from valveflow_ros.fit.problem import (
 from valveflow_ros.fit.uncertainty import covariance_of
 from valveflow_ros.fit.whitening import ORDER, fit_ar, whitened
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
+from valveflow_ros.signals.static_form import EXPONENTS
 
 # Errors of the measured input, which make a plant look slower than it is, and their correction.
 #
@@ -228,7 +229,7 @@ def find_regions(problem: Problem, model: RegionalModel) -> tuple[RegionalModel,
 _LEAST_ROWS, _LEAST_S = 600, 3600.0
 # What an autoregressive model must remember: white noise on top of slow noise has a long tail.
 _MEMORY_S = 40.0
-_POWER_STEP, _POWER_MOST, _POWER_ROUNDS = 0.01, 0.1, 4  # of the exponent
+_POWER_STEP, _POWER_ROUNDS = 0.01, 4
 _NARROWEST = 0.01  # of the range of u: narrower pieces are not given to the search
 
 
@@ -277,7 +278,7 @@ class Refined:
 
 def refine(
     samples: Samples, start: RegionalModel, most_pieces: int | None = None,
-    exponent_held: bool = True,
+    exponent: float | None = None,
 ) -> Refined:  # fmt: skip
     """Fit curve and dynamics together, from ``start``'s curve.
 
@@ -292,8 +293,9 @@ def refine(
         but for pieces narrower than a hundredth of the range, which are joined with others.
         ``start`` should then have rather too many pieces than too few: the AR model takes the
         misfit of a curve that is too simple for noise.
-    exponent_held : bool
-        Otherwise p^e is raised to the power that fits best, `Refined.scale_power`.
+    exponent : float, optional
+        e of p^e where it is free: p^e is raised to the power that fits best,
+        `Refined.scale_power`.
 
     Raises
     ------
@@ -304,7 +306,7 @@ def refine(
     -------
     Refined
     """
-    model, likely, power = _outlined(samples, start, most_pieces, exponent_held)
+    model, likely, power = _outlined(samples, start, most_pieces, exponent)
     samples = samples.with_scale_power(power)
     problem = Problem(samples)
     searched = model.pieces
@@ -330,7 +332,10 @@ def refine(
 
 
 def search(
-    samples: Samples, start: RegionalModel, most_pieces: int | None, exponent_held: bool = True
+    samples: Samples,
+    start: RegionalModel,
+    most_pieces: int | None,
+    exponent: float | None = None,
 ) -> tuple[RegionalModel, float]:
     """Find regions and pieces on means of ten seconds: `refine` without its last fit.
 
@@ -341,12 +346,12 @@ def search(
     TooFewSamplesError
         As for `refine`.
     """
-    model, _, power = _outlined(samples, start, most_pieces, exponent_held)
+    model, _, power = _outlined(samples, start, most_pieces, exponent)
     return model, power
 
 
 def _outlined(
-    samples: Samples, start: RegionalModel, most_pieces: int | None, exponent_held: bool
+    samples: Samples, start: RegionalModel, most_pieces: int | None, exponent: float | None
 ) -> tuple[RegionalModel, dict[int, float], float]:
     """Search on coarse rows, if there are enough of them."""
     _, weight = Problem(samples).answer(
@@ -359,13 +364,13 @@ def _outlined(
         )
     coarse = samples.coarser()
     model, likely = _search(Problem(coarse), _join(start), most_pieces)
-    if exponent_held or samples.scale is None:
+    if exponent is None or samples.scale is None:
         return model, likely, 1.0
-    return _with_exponent(coarse, model, likely)
+    return _with_exponent(coarse, model, likely, exponent)
 
 
 def _with_exponent(
-    coarse: Samples, model: RegionalModel, likely: dict[int, float]
+    coarse: Samples, model: RegionalModel, likely: dict[int, float], exponent: float
 ) -> tuple[RegionalModel, dict[int, float], float]:
     """Return a model with the power of p^e that fits best, all else fitted along with it."""
     free = free_parameters(model)
@@ -387,7 +392,7 @@ def _with_exponent(
         bend = low - 2.0 * here + high
         by = 0.5 * step * (low - high) / bend if bend > 0.0 else math.copysign(step, low - high)
         power += float(np.clip(by, -2.0 * step, 2.0 * step))
-        power = float(np.clip(power, 1.0 - _POWER_MOST, 1.0 + _POWER_MOST))
+        power = float(np.clip(power, EXPONENTS[0] / exponent, EXPONENTS[1] / exponent))
         if abs(by) < step:
             break
     return fitted(power)[1], likely, power
