@@ -19,8 +19,8 @@ INTEGRATED_INPUT = 'integrated_input'
 OPENING = 'opening'
 AXES = (INTEGRATED_INPUT, OPENING)
 PAPER_EXPONENT = 1.125
-# Exponents that data may ask for: 1 is ideal choked flow, 9/8 the paper's. One form with an exponent
-# beyond them imitates the other.
+# Exponents that data may ask for: 1 is ideal choked flow, 9/8 the paper's. With an exponent beyond
+# them one form imitates the other.
 EXPONENTS = 0.9, 1.25
 
 
