@@ -14,7 +14,7 @@ FLAT_LEAST_S = 30.0
 _FLAT_FACTOR = 3.0
 _LARGEST_SHARE = 0.5
 _SPIKE_WINDOW, _SPIKE_SD, _LONGEST_SPIKE = 11, 6.0, 1
-_SPIKE_SHARE, _LEAST_SPIKES = 0.01, 4
+_SPIKE_SHARE, _LEAST_SPIKES, _LEAST_HEIGHT = 0.01, 4, 0.01
 _NOISE_ROWS = 3600
 _BACK_SHARE = 0.6
 _LEAP_ROWS, _LEAP_SD = 200, 4.2
@@ -116,7 +116,13 @@ def _spikes(x: FloatArray) -> tuple[BoolArray, float]:
     bad &= good
     if not _LEAST_SPIKES <= bad.sum() <= _SPIKE_SHARE * len(x):
         return np.zeros(len(x), dtype=bool), 0.0
-    return bad, float(np.median(size[bad]))
+    height = float(np.median(size[bad]))
+    # The livelier a governor the more of its moves come back in a row; a converter that slips
+    # shows values far from where the signal is.
+    low, high = np.quantile(x[good], (0.01, 0.99))
+    if not height > _LEAST_HEIGHT * (high - low):
+        return np.zeros(len(x), dtype=bool), 0.0
+    return bad, height
 
 
 def _coarse(x: FloatArray) -> tuple[int, float]:

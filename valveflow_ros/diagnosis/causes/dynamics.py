@@ -73,7 +73,7 @@ REGION_LAG = Cause(
 )  # fmt: skip
 
 
-_SLOW, _SWALLOWED, _SHORTEST, _STEPS = (0.3, 60.0), 0.7, 0.3, 5
+_SLOW, _SWALLOWED, _SHORTEST, _QUICK, _STEPS = (0.3, 60.0), 0.7, 0.3, 0.05, 5
 _REHEATER_TRIED = tuple((alpha, t) for alpha in (0.2, 0.4, 0.7) for t in (8.0, 20.0, 60.0, 200.0))
 
 
@@ -97,18 +97,32 @@ def reheater_starts(screening: Screening) -> Sequence[Start]:
 
     The plain model took much of the lag for its own; its tangents do not lead out of that.
     """
-    task, base = screening.task, screening.model.base
+    base = screening.model.base
     alpha, time_s = _SLOW
     less = _SWALLOWED * (1.0 - alpha) * time_s
     quicker = np.maximum(base.time_constants - less, _SHORTEST * base.time_constants)
-    model = replace(screening.model, base=replace(base, time_constants=quicker))
-    model, cost = improve(task, model.with_cause(Active(REHEATER, _SLOW)), _STEPS)
-    gain = (task.cost(screening.model) - cost) / (2.0 * screening.variance)
-    fitted = Start(model.active[-1].values, gain, base=model.base)
+    # Or all that is late is the reheater's, as in a unit whose valve and chest are quick.
+    whole = float(np.median(base.time_constants + base.delays)) / (1.0 - alpha)
+    quick = np.full(base.regions, max(_QUICK * whole, screening.grids.step_s))
+    fitted = [
+        _fitted(screening, _SLOW, replace(base, time_constants=quicker)),
+        _fitted(
+            screening, (alpha, whole),
+            replace(base, time_constants=quick, delays=np.zeros(base.regions)),
+        ),
+    ]  # fmt: skip
     return [
         *screening.best(REHEATER, list(_REHEATER_TRIED), keep=1),
-        *([fitted] if gain > 0.0 else []),
+        *(start for start in fitted if start.gain > 0.0),
     ]
+
+
+def _fitted(screening: Screening, values: Values, base: RegionalModel) -> Start:
+    """Return a reheater fitted with the whole model, from these values on that base."""
+    task, model = screening.task, replace(screening.model, base=base)
+    model, cost = improve(task, model.with_cause(Active(REHEATER, values)), _STEPS)
+    gain = (task.cost(screening.model) - cost) / (2.0 * screening.variance)
+    return Start(model.active[-1].values, gain, base=model.base)
 
 
 def reheater_sentence(values: dict[str, float]) -> str:
