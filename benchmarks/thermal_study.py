@@ -3,7 +3,8 @@
 Run: ``python -m benchmarks.thermal_study --recording minute --seeds 100 --first 101``. Each seed
 is a unit of each kind of ``plant/thermal_unit.py``, drawn and run for some days. The error of a
 curve is the root mean square of its static power less the unit's, over what was visited.
-``--names`` runs a diagnosis of each healthy unit instead and counts what it names. The limits in
+``--names`` runs a diagnosis of each healthy unit instead and counts what it names; ``--effect``
+hides an effect in each, as ``valveflow simulate --effect`` does. The limits in
 ``fit/model_form.py`` were fixed on seeds 1 to 6; the results kept are of other seeds.
 """
 
@@ -55,9 +56,13 @@ def curve_row(seed: int, kind: str, days: float, recording: str) -> dict[str, An
     }  # fmt: skip
 
 
-def name_row(seed: int, kind: str, days: float, recording: str) -> dict[str, Any]:
-    """Diagnose a healthy unit; return what was named."""
-    simulation = vf.simulate(days, seed, unit=f'{kind}:number={seed}', recording=recording)
+def name_row(
+    seed: int, kind: str, days: float, recording: str, effects: list[str]
+) -> dict[str, Any]:
+    """Diagnose a unit; return what was named."""
+    simulation = vf.simulate(
+        days, seed, effects, unit=f'{kind}:number={seed}', recording=recording
+    )
     row = {'kind': kind, 'seed': seed}
     log, begin = simulation.log, time.process_time()
     try:
@@ -66,6 +71,11 @@ def name_row(seed: int, kind: str, days: float, recording: str) -> dict[str, Any
         return {**row, 'refused': str(error)}
     return {
         **row, 'verdict': found.verdict, 'names': [c.name for c in found.causes],
+        'sizes': {
+            c.name: {k: [e.value, e.low, e.high] for k, e in c.parameters.items()}
+            for c in found.causes
+        },
+        'drift': found.disturbance and found.disturbance.rms_mw,
         'rmse_mw': [round(r, 3) for r in (found.rmse_simulation, found.rmse_extended)],
         'cpu_s': round(time.process_time() - begin, 1),
     }  # fmt: skip
@@ -103,8 +113,12 @@ def main() -> None:
     parser.add_argument('--recording', default='1s')
     parser.add_argument('--kinds', default=','.join(KINDS))
     parser.add_argument('--names', action='store_true')
+    parser.add_argument('--effect', action='append', default=[])
     given = parser.parse_args()
-    work, summary = (name_row, of_names) if given.names else (curve_row, of_curves)
+    names = given.names or bool(given.effect)
+    work, summary = (
+        (partial(name_row, effects=given.effect), of_names) if names else (curve_row, of_curves)
+    )
     kinds = given.kinds.split(',')
     rows = {
         kind: study.rows_of(
@@ -113,7 +127,7 @@ def main() -> None:
         )
         for kind in kinds
     }
-    what = 'names' if given.names else 'curves'
+    what = '_'.join(['names', *(e.partition(':')[0] for e in given.effect)]) if names else 'curves'
     recording = given.recording.replace(':', '_').replace('=', '_')
     study.keep(
         study.name_of(f'thermal_{what}_{recording}', given.first, given.seeds),

@@ -9,6 +9,9 @@ from functools import partial
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from curves import curve
+
+from valveflow_ros.curve.characteristic_json import to_json
 
 # From 150 MW on.
 KNOTS = [1060.0, 1250.0, 1600.0, 1900.0, 2280.0]
@@ -149,3 +152,25 @@ def test_what_is_no_curve_is_refused(run, model, tmp_path):
     # The folder of a result stands for the curve in it.
     ran = run('compensate', '--model', model().parent, '-o', table, '--overwrite')
     assert ran.status == 0
+
+
+def test_knees_at_fixed_openings_are_a_table_for_one_pressure(run, tmp_path):
+    file = tmp_path / 'characteristic.json'
+    c = curve(
+        [20.0, 45.0, 70.0, 100.0], [0.4, 0.25, 0.1], start=5.0, axis='opening',
+        pressure_exponent=0.0, pressure_scale_exponent=1.05, offset_mw=-9.0,
+        reference_pressure_mpa=13.0,
+    )  # fmt: skip
+    file.write_text(json.dumps(to_json(c)))
+    refused = run(
+        'compensate', '--model', file, '-o', tmp_path / 'both.csv',
+        '--pressure', '10', '--pressure', '16',
+    ).refused(status=2)  # fmt: skip
+    assert 'one table for each --pressure' in refused
+    for pressure, given in ((13.0, []), (10.0, ['--pressure', '10'])):
+        path = tmp_path / f'{pressure:g}.csv'
+        assert run('compensate', '--model', file, '-o', path, *given).status == 0
+        head, *rows = path.read_text().splitlines()
+        at = head.split(',').index(f'opening_percent_at_{pressure:g}_mpa')
+        table = np.array([[float(x) if x else np.nan for x in r.split(',')] for r in rows])
+        assert c.power(table[:, at], pressure) == pytest.approx(table[:, 0], abs=0.02)

@@ -218,6 +218,7 @@ import time
 from valveflow_ros.ros.node.engine import example_task
 from valveflow_ros.parameters import Settings
 from valveflow_ros.ros.worker import FitWorker
+from valveflow_ros.signals.static_form import OPENING, StaticForm
 made = FitWorker(120.0, 'hurt_jobs:hangs')
 made.start()
 made.submit(example_task(Settings()))
@@ -254,6 +255,13 @@ def test_damaged_bytes_are_refused(cut: bytes) -> None:
     half = to_bytes({'text': 'a diagnosis of no window'})
     with pytest.raises(DataError):
         result_from_bytes(half)
+
+
+def test_a_fit_is_sent_with_the_form_that_it_must_have() -> None:
+    for form in (None, StaticForm(OPENING, 1.05)):
+        task = task_from_bytes(task_to_bytes(replace(TASK, form=form)))
+        assert isinstance(task, FitTask)
+        assert task.form == form
 
 
 def test_tasks_and_results_arrive_as_they_were_sent() -> None:

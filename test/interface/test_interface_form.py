@@ -1,0 +1,89 @@
+"""The form of the static power through the verbs: found, given, wrong, and put to use."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import valveflow_ros as vf
+from valveflow_ros.errors import DataError
+from valveflow_ros.interface.models import load_model
+from valveflow_ros.signals.static_form import INTEGRATED_INPUT, OPENING
+
+UNIT = 'choked:number=2,vacuum_per_kpa=0'
+
+
+@cache
+def plant(seed: int = 3, unit: str = UNIT):
+    """Return six days as a historian of means keeps them."""
+    return vf.simulate(6.0, seed, unit=unit, recording='minute')
+
+
+@cache
+def identified(axis: str = 'auto', unit: str = UNIT):
+    return vf.identify(plant(unit=unit).log, parameters={'axis': axis})
+
+
+def error_mw(simulation, curve) -> float:
+    truth = simulation.data.truth
+    opening, pressure = truth.plug[::60], truth.pressure[::60]
+    error = curve.power(opening, pressure) - simulation.static_power(opening, pressure)
+    return float(np.sqrt(np.nanmean(error**2)))
+
+
+def test_the_curve_is_right_over_opening_and_pressure_and_far_off_in_the_other_form():
+    found, held = identified(), identified(INTEGRATED_INPUT)
+    assert found.characteristic.axis == OPENING
+    assert error_mw(plant(), found.characteristic) < 1.0
+    assert error_mw(plant(), held.characteristic) > 3.0 * error_mw(plant(), found.characteristic)
+    assert 'fixed openings' in found.page().to_html()
+    assert 'is the wrong one' in held.page().to_html()
+    assert 'is the wrong one' not in found.page().to_html()
+
+
+def test_a_unit_of_the_paper_s_form_keeps_it():
+    unit = 'integrated_input:number=2,vacuum_per_kpa=0'
+    found = identified(unit=unit)
+    assert found.characteristic.axis == INTEGRATED_INPUT
+    assert found.characteristic.static_form.exponent == pytest.approx(1.06, abs=0.03)
+    assert error_mw(plant(unit=unit), found.characteristic) < 1.0
+
+
+def test_a_model_of_the_wrong_form_is_the_first_finding():
+    given = identified(INTEGRATED_INPUT).characteristic
+    found = vf.diagnose(plant(4).log, model=given).diagnosis
+    assert found.verdict == 'named'
+    form = found.causes[0]
+    assert form.name == 'form'
+    assert 'fixed openings' in form.sentence
+    assert form.gain.rmse_after < 0.5 * form.gain.rmse_before
+    assert form.gain.p_value < 0.01
+    right = vf.diagnose(plant(4).log, model=identified().characteristic).diagnosis
+    assert 'form' not in [c.name for c in right.causes]
+
+
+def test_a_healthy_choked_unit_has_no_cause_and_its_model_is_kept_with_its_form(tmp_path):
+    found = vf.diagnose(plant(5).log)
+    assert not {'form', 'choked', 'exponent'} & {c.name for c in found.diagnosis.causes}
+    found.write(tmp_path / 'd')
+    model = load_model(tmp_path / 'd' / 'extended_model.json')
+    assert model.form.axis == OPENING
+    curve = model.characteristic()
+    assert error_mw(plant(5), curve) < 1.0
+
+
+def test_other_days_are_validated_and_curves_of_both_forms_held_against_each_other():
+    ours, paper = identified().characteristic, identified(INTEGRATED_INPUT).characteristic
+    found = vf.validate(plant(6).log, ours, against=paper)
+    gain = found.data.result.gain
+    assert gain is not None
+    assert gain.mean > 0.0
+    assert gain.zero_is_rejected()
+
+
+def test_too_little_data_for_an_axis_that_is_asked_for_is_refused():
+    short = vf.simulate(0.3, 1)
+    with pytest.raises(DataError, match=r'exponent of p\^m F\(V\) \+ c'):
+        vf.identify(short.log, parameters={'axis': OPENING})
