@@ -1,4 +1,4 @@
-"""A monitor beside a choked valve: curve, prediction, reference and restart with knees at openings."""
+"""A monitor beside a choked valve: curve, prediction, reference and restart over openings."""
 
 from __future__ import annotations
 

@@ -36,6 +36,7 @@ from valveflow_ros.ros.worker import (
     task_to_bytes,
 )
 from valveflow_ros.segments.window import NO_ROWS
+from valveflow_ros.signals.static_form import OPENING, StaticForm
 from valveflow_ros.state import to_bytes
 
 pytestmark = pytest.mark.usefixtures('jobs_on_path')
@@ -218,7 +219,6 @@ import time
 from valveflow_ros.ros.node.engine import example_task
 from valveflow_ros.parameters import Settings
 from valveflow_ros.ros.worker import FitWorker
-from valveflow_ros.signals.static_form import OPENING, StaticForm
 made = FitWorker(120.0, 'hurt_jobs:hangs')
 made.start()
 made.submit(example_task(Settings()))
