@@ -2,7 +2,8 @@
 
 Run: ``python -m benchmarks.thermal_study --recording minute --seeds 100 --first 101``. Each seed
 is a unit of each kind of ``plant/thermal_unit.py``, drawn and run for some days. The error of a
-curve is the root mean square of its static power less the unit's, over what was visited.
+curve is the root mean square of its static power less the unit's at the mean weather of these
+days, over the openings and pressures visited.
 ``--names`` runs a diagnosis of each healthy unit instead and counts what it names; ``--effect``
 hides an effect in each, as ``valveflow simulate --effect`` does. The limits in
 ``fit/model_form.py`` were fixed on seeds 1 to 6; the results kept are of other seeds.
@@ -42,7 +43,10 @@ def curve_row(seed: int, kind: str, days: float, recording: str) -> dict[str, An
     except DataError as error:
         return {**row, 'refused': str(error)}
     curve = found.characteristic
-    error = curve.power(opening, pressure) - simulation.static_power(opening, pressure)
+    static, made = simulation.static_power(opening, pressure), truth.power[::_EVERY]
+    # A curve of some days is one at their weather, which makes more or less of the same steam.
+    weather = float(made.sum() / static.sum())
+    error = curve.power(opening, pressure) - weather * static
     known = np.isfinite(error)
     form = curve.form
     return {
@@ -50,7 +54,7 @@ def curve_row(seed: int, kind: str, days: float, recording: str) -> dict[str, An
         'told': form is not None and form.told,
         'exponent': round(curve.static_form.exponent, 4), 'pieces': len(curve.pieces),
         'error_mw': round(float(np.sqrt(np.mean(error[known] ** 2))), 3),
-        'outside': round(1.0 - float(known.mean()), 4),
+        'weather': round(weather - 1.0, 4), 'outside': round(1.0 - float(known.mean()), 4),
         'misfit_told': found.data.misfit is not None,
         'cpu_s': round(time.process_time() - begin, 1),
     }  # fmt: skip
