@@ -22,11 +22,18 @@ from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.errors import DataError
 from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState, ShiftAlarm
-from valveflow_ros.monitoring.events import CurveAdopted, JournalEntry, JournalKind, ReferenceSet
+from valveflow_ros.monitoring.events import (
+    CurveAdopted,
+    FitRequested,
+    JournalEntry,
+    JournalKind,
+    ReferenceSet,
+)
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import CLOCK_BACK, JournalReplayer, feed_rows
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S
+from valveflow_ros.signals.static_form import StaticForm
 
 # The residual alarm is out of the way: it would stop refits before the curve can move.
 SETTINGS = Settings({**QUICK_MONITOR, 'alarm_limit': 1000.0, 'shift_confidence': 0.99})
@@ -85,10 +92,14 @@ def test_one_that_is_given_stands_in_the_journal_whole():
     again = from_json(json.loads(entry.text))
     assert to_json(again) == to_json(curve)
     assert entry.rows == 0
-    other = replace(curve, pressure_exponent=1.0)
-    with pytest.raises(DataError, match=r'pressure exponent 1, the monitor 1\.125'):
-        fresh.set_reference(other)
-    assert fresh.reference.curve.model_id == curve.model_id
+
+
+def test_fits_get_the_form_of_a_reference_with_another_exponent():
+    monitor = with_curve()
+    other = replace(monitor.characteristic, pressure_exponent=1.0)
+    monitor.set_reference(other)
+    (task,) = (e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
+    assert task.form == StaticForm(exponent=1.0)
 
 
 def test_every_later_curve_is_judged_and_none_before():

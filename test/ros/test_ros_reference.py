@@ -15,7 +15,7 @@ from valveflow_msgs.msg import Alarm
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
 from valveflow_ros.curve.shift import judge_shift
-from valveflow_ros.errors import DataError, ParameterError
+from valveflow_ros.errors import DataError
 from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.alarms import AlarmState
 from valveflow_ros.monitoring.curves import CurveStatus
@@ -158,14 +158,6 @@ def test_a_reference_is_read_from_its_file(curve: Characteristic, tmp_path: Path
     read = given_reference(Settings({'reference_file': str(path)}))
     assert read is not None
     assert to_json(read) == to_json(curve)
-
-
-def test_a_file_for_another_exponent_is_refused(curve: Characteristic, tmp_path: Path) -> None:
-    path = tmp_path / 'characteristic.json'
-    path.write_text(json.dumps(to_json(curve)), encoding='utf-8')
-    settings = Settings({'reference_file': str(path), 'pressure_exponent': 1.0})
-    with pytest.raises(ParameterError, match=r'the pressure exponent 1\.125'):
-        given_reference(settings)
 
 
 # --- the node ---------------------------------------------------------------------------------

@@ -31,8 +31,8 @@ _FREEDOM = 4.0
 # One form is told from the other by so much log-likelihood, so many standard errors of it over
 # stretches, and where the two differ by such a share of the power's range.
 _LEAST_GAIN, _LEAST_Z, _LEAST_APART = 12.0, 2.5, 0.003
-# Another exponent than the one given was searched for, and gains some log-likelihood by chance:
-# up to 15 on 42 random plants that have the one given.
+# Another exponent than the one given was searched for, which gains by chance: 15 on the one of 42
+# random plants of the given exponent on which it seemed to be told.
 _EXPONENT_GAIN = 30.0
 # Where they are not told apart the likelier one is taken, the paper's in doubt.
 _LIKELIER_Z = 1.5

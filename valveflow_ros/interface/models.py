@@ -14,7 +14,6 @@ from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.result import is_model, model_from_json
 from valveflow_ros.errors import DataError, RecordingError, UsageError
 from valveflow_ros.interface.files import reason
-from valveflow_ros.signals.static_form import OPENING
 
 Model = Characteristic | ExtendedModel
 _MOST_BYTES = 50_000_000
@@ -88,7 +87,7 @@ def with_exponent(model: Model, given: Mapping[str, Any], name: object) -> dict[
     UsageError
         Another exponent is given; ``name`` is what the sentence calls the model.
     """
-    if isinstance(model, Characteristic) and model.axis == OPENING:
+    if model.pressure_exponent == 0.0:
         return dict(given)
     wanted = given.get('pressure_exponent')
     if wanted is not None and abs(float(wanted) - model.pressure_exponent) > 1e-9:

@@ -17,7 +17,6 @@ from valveflow_ros.monitoring.rows import Rows
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, ByteArray, IntArray, SpecialSegment
 from valveflow_ros.segments.window import RollingWindow
-from valveflow_ros.signals.static_form import INTEGRATED_INPUT
 from valveflow_ros.state import Memory, State
 
 # What the running curve is worth.
@@ -143,19 +142,7 @@ class ReferenceCurve:
         self.alarm.restore(saved['alarm'])
 
     def set(self, curve: Characteristic, time_ns: int, settings: Settings) -> list[AlarmChange]:
-        """Judge against ``curve`` from the next adoption on.
-
-        Raises
-        ------
-        DataError
-            The curve's input u is not the one of this monitor.
-        """
-        exponent = settings.real('pressure_exponent')
-        if curve.axis == INTEGRATED_INPUT and curve.pressure_exponent != exponent:
-            raise DataError(
-                f'The reference has the pressure exponent {curve.pressure_exponent:g}, the '
-                f'monitor {exponent:g}: their inputs u are not the same thing.'
-            )
+        """Judge against ``curve`` from the next adoption on; fits get its form from now on."""
         self.curve = curve
         self.shift, self.problem = None, ''
         return self.alarm.reset('There is a new reference.', time_ns, curve.model_id, settings)

@@ -102,13 +102,6 @@ def _given(
         raise ParameterError(
             parameter, f"names '{path}', which cannot be used: {reason.rstrip('.')}"
         ) from None
-    exponent = settings.real('pressure_exponent')
-    if given.pressure_exponent != exponent:
-        raise ParameterError(
-            parameter,
-            f"names '{path}' with the pressure exponent {given.pressure_exponent:g}, the "
-            f'monitor has {exponent:g}',
-        )
     return given
 
 
