@@ -69,6 +69,53 @@ def _rivals() -> list[tuple[str, str, str]]:
     ]  # fmt: skip
 
 
+_KIND_WORDS = {
+    'choked': 'choked', 'sequence': 'valves in sequence', 'integrated_input': "the paper's form",
+}  # fmt: skip
+_RECORDINGS = {
+    'minute_101_200': 'means over a minute', '1s_101_110': 'every second',
+    'compressed_101_130': 'exceptions alone',
+}  # fmt: skip
+
+
+def _thermal() -> list[tuple[str, str, str]]:
+    """Return what curves and names are on units built from physics."""
+    rows = []
+    for name, recorded in _RECORDINGS.items():
+        s = result(f'thermal_curves_{name}')['summary']
+        units = next(iter(s.values()))['units']
+        errors = ', '.join(
+            f'{words} {s[kind]["error_mw"]["median"]:.2f}, {s[kind]["error_mw"]["p90"]:.2f}, '
+            f'{s[kind]["error_mw"]["largest"]:.2f} MW'
+            for kind, words in _KIND_WORDS.items()
+        )
+        right = sum(s[kind]['right_axis'] for kind in _KIND_WORDS)
+        rows.append(_row(
+            f'{units} units of each kind built from physics, sliding pressure, eight days as '
+            f'{recorded}: error of the curve (median, nine of ten, largest), axis',
+            f'{errors}; the right axis on {right} of {units * len(_KIND_WORDS)}',
+            f'thermal_curves_{name}',
+        ))  # fmt: skip
+    for name, what in (
+        ('names_minute_201_230', 'healthy units of this kind, means over a minute'),
+        ('names_1s_201_206', 'the same, every second'),
+    ):
+        s = result(f'thermal_{name}')['summary']
+        units = sum(k['units'] for k in s.values())
+        names: dict[str, int] = {}
+        for kind in s.values():
+            for cause, count in kind['names'].items():
+                names[cause] = names.get(cause, 0) + count
+        told = ', '.join(f'{cause} {count}' for cause, count in sorted(names.items())) or 'nothing'
+        rows.append(_row(
+            f'{what}: named',
+            f'{told} on {units}; '
+            f'{sum(k["unexplained"] for k in s.values())} said to be unexplained',
+            f'thermal_{name}',
+        ))  # fmt: skip
+    return rows
+
+
 def _alarm() -> list[tuple[str, str, str]]:
     name = 'alarm_run_length_6100_6129'
     days = [row['days_per_alarm'] for row in result(name)['noise']]
@@ -164,6 +211,6 @@ def acts() -> str:
 
 def measured() -> str:
     """Return what the studies found, with the command of each."""
-    rows = [*_paper(), *_partition(), *_coverage(), *_rivals(), *_alarm(),
+    rows = [*_paper(), *_partition(), *_coverage(), *_rivals(), *_thermal(), *_alarm(),
             *_diagnosis(), *_loops(), *_speed()]  # fmt: skip
     return table(('question', 'answer', 'measured by'), rows)
