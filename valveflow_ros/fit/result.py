@@ -9,6 +9,7 @@ import numpy as np
 
 from valveflow_ros.curve.characteristic import (
     Characteristic,
+    FormEvidence,
     Piece,
     RegionDynamics,
     ResidualStatistics,
@@ -212,11 +213,33 @@ def with_support(
     return replace(c, support=support, notes=(*c.notes, *notes))
 
 
+def wrong_form(c: Characteristic) -> str:
+    """Say that the form was given and is the wrong one; nothing where it is not."""
+    form = c.form
+    if form is None or not form.contradicted:
+        return ''
+    return (
+        f'The form of this curve, {c.static_form.words}, was given and is the wrong one: on '
+        f'stretches held out the power follows {form.other} to {form.rmse_other_mw:.2g} MW and '
+        f'this form to {form.rmse_mw:.2g} MW; {forms_apart(form)}.'
+    )
+
+
+def forms_apart(form: FormEvidence) -> str:
+    """Say by how much the two forms differ, and where most."""
+    opening, pressure, most = form.worst
+    return (
+        f'the two differ by {form.apart_mw:.2g} MW (root mean square), at {opening:.0f} % and '
+        f'{pressure:.1f} MPa by {most:.2g} MW'
+    )
+
+
 def weaknesses(c: Characteristic) -> tuple[str, ...]:
-    """Return the notes that report a weakness; others only tell how a curve was made."""
+    """Return what is to be doubted of a curve: its form, and the notes that report a weakness."""
+    form = [wrong_form(c)] if wrong_form(c) else []
     without = sum(1 for found in c.support if not found.identifiable)
     unrefined = [n for n in c.notes[: len(c.notes) - without] if n.startswith(NOT_REFINED)]
-    return (*unrefined, *c.notes[len(c.notes) - without :])
+    return (*form, *unrefined, *c.notes[len(c.notes) - without :])
 
 
 def support_of(

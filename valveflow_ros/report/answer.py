@@ -9,10 +9,10 @@ import numpy as np
 from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
-    FormEvidence,
     Piece,
     RegionDynamics,
 )
+from valveflow_ros.fit.result import forms_apart, wrong_form
 from valveflow_ros.records import FloatArray, Signal
 from valveflow_ros.report.figure import Figure, Spec, axis, line, rounded, token
 from valveflow_ros.report.identified import Identified
@@ -51,7 +51,7 @@ def explained(data: Identified) -> float:
 
 def doubt(data: Identified) -> str:
     """Return a warning where the curve is none, or wrong; empty otherwise."""
-    share, misfit, form = explained(data), data.misfit, data.characteristic.form
+    share, misfit = explained(data), data.misfit
     if share < _LITTLE:
         return (
             f'Do not rely on this curve: it explains only {percent(share)} of the variance of the '
@@ -67,22 +67,9 @@ def doubt(data: Identified) -> str:
             f'differs by {plain(most, 2)} MW. The power depends on opening and pressure in '
             'another way, or on something that was not logged.'
         )
-    if form is not None and form.contradicted:
-        told.append(
-            f'The form of this curve, {data.characteristic.static_form.words}, was given and is '
-            f'the wrong one: on stretches held out the power follows {form.other} to '
-            f'{plain(form.rmse_other_mw, 2)} MW and this form to {plain(form.rmse_mw, 2)} MW; '
-            f'{_apart(form)}.'
-        )
+    if form := wrong_form(data.characteristic):
+        told.append(form)
     return ' '.join(told)
-
-
-def _apart(form: FormEvidence) -> str:
-    opening, pressure, most = form.worst
-    return (
-        f'the two differ by {plain(form.apart_mw, 2)} MW (root mean square), at '
-        f'{decimals(opening, 0)} % and {decimals(pressure, 1)} MPa by {plain(most, 2)} MW'
-    )
 
 
 def form_words(c: Characteristic) -> str:
@@ -94,7 +81,7 @@ def form_words(c: Characteristic) -> str:
     if not form.told:
         return (
             f'Whether the power follows {mine}, as this curve does, or {form.other} cannot be '
-            f'told from these data: {_apart(form)}. Where the pressure leaves the range of the '
+            f'told from these data: {forms_apart(form)}. Where the pressure leaves the range of the '
             'data the curve may be wrong.'
         )
     if c.axis != OPENING:
