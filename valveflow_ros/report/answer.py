@@ -81,8 +81,8 @@ def form_words(c: Characteristic) -> str:
     if not form.told:
         return (
             f'Whether the power follows {mine}, as this curve does, or {form.other} cannot be '
-            f'told from these data: {forms_apart(form)}. Where the pressure leaves the range of the '
-            'data the curve may be wrong.'
+            f'told from these data: {forms_apart(form)}. Where the pressure leaves the range of '
+            'these data the curve may be wrong.'
         )
     if c.axis != OPENING:
         return ''
