@@ -136,8 +136,29 @@ def test_too_few_means_tell_no_form_and_cannot_be_put_into_one() -> None:
     v, p, y, spans = unit(OPENING, 'bent', 5)
     for few in (spans[:3], spans[:0]):
         assert find_form(v, p, y, few, PERIOD_S, PAPER) is None
-        with pytest.raises(TooFewSamplesError, match='exponent'):
+        with pytest.raises(TooFewSamplesError, match='numbers of'):
             find_form(v, p, y, few, PERIOD_S, PAPER, axis=OPENING)
+        with pytest.raises(TooFewSamplesError, match='numbers of'):
+            find_form(v, p, y, few, PERIOD_S, PAPER, held=StaticForm(OPENING, 1.0))
+        given = find_form(v, p, y, few, PERIOD_S, PAPER, held=StaticForm(exponent=1.0))
+        assert given is not None
+        assert (given.form, given.evidence) == (StaticForm(exponent=1.0), None)
+
+
+def test_what_is_known_of_the_form_stays_until_data_tell_of_another() -> None:
+    known = StaticForm(OPENING, 1.07)
+    v, p, y, spans = unit(OPENING, 'bent', 2, slides=False)
+    calm = find_form(v, p, y, spans, PERIOD_S, PAPER, known=known)
+    assert calm is not None
+    assert calm.form == known, 'a calm day tells nothing of it'
+    v, p, y, spans = unit(OPENING, 'bent', 2, exponent=1.0)
+    moved = find_form(v, p, y, spans, PERIOD_S, PAPER, known=known)
+    assert moved is not None
+    assert moved.form.exponent == pytest.approx(1.0, abs=0.02)
+    v, p, y, spans = unit(INTEGRATED_INPUT, 'bent', 2)
+    other = find_form(v, p, y, spans, PERIOD_S, PAPER, known=known)
+    assert other is not None
+    assert other.form.axis == INTEGRATED_INPUT
 
 
 @pytest.mark.parametrize('seed', range(3))

@@ -85,5 +85,5 @@ def test_other_days_are_validated_and_curves_of_both_forms_held_against_each_oth
 
 def test_too_little_data_for_an_axis_that_is_asked_for_is_refused():
     short = vf.simulate(0.3, 1)
-    with pytest.raises(DataError, match=r'exponent of p\^m F\(V\) \+ c'):
+    with pytest.raises(DataError, match=r'numbers of p\^m F\(V\) \+ c'):
         vf.identify(short.log, parameters={'axis': OPENING})

@@ -259,9 +259,9 @@ def test_damaged_bytes_are_refused(cut: bytes) -> None:
 
 def test_a_fit_is_sent_with_the_form_that_it_must_have() -> None:
     for form in (None, StaticForm(OPENING, 1.05)):
-        task = task_from_bytes(task_to_bytes(replace(TASK, form=form)))
+        task = task_from_bytes(task_to_bytes(replace(TASK, form=form, known=form)))
         assert isinstance(task, FitTask)
-        assert task.form == form
+        assert (task.form, task.known) == (form, form)
 
 
 def test_tasks_and_results_arrive_as_they_were_sent() -> None:

@@ -189,6 +189,7 @@ def _formed(task: FitTask) -> _Formed:
     found = find_form(
         contents.opening_percent, pressure, contents.power_mw, contents.spans[:, :2],
         task.settings.real('sample_period'), exponent, task.settings.text('axis'), task.form,
+        task.known,
     )  # fmt: skip
     if found is None:
         return paper
@@ -208,7 +209,7 @@ def _formed(task: FitTask) -> _Formed:
         found.offset_mw,
         scale,
         found.evidence,
-        task.form is not None or not found.evidence.told,
+        task.form is not None or found.evidence is None or not found.evidence.told,
     )
 
 

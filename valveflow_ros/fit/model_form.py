@@ -33,7 +33,7 @@ _FREEDOM = 4.0
 _LEAST_GAIN, _LEAST_Z, _LEAST_APART = 12.0, 2.5, 0.003
 # Another exponent than the one given was searched for, which gains by chance: 15 on the one of 42
 # random plants of the given exponent on which it seemed to be told.
-_EXPONENT_GAIN = 30.0
+_EXPONENT_GAIN, _EXPONENT_APART = 30.0, 0.001
 # Where they are not told apart the likelier one is taken, the paper's in doubt.
 _LIKELIER_Z = 1.5
 _CHOKED_EXPONENT = 1.0
@@ -52,12 +52,13 @@ class FoundForm:
     form : StaticForm
     offset_mw : float
         c to begin a fit with; 0 for a form without.
-    evidence : FormEvidence
+    evidence : FormEvidence or None
+        None where there are too few data to compare a form that was given.
     """
 
     form: StaticForm
     offset_mw: float
-    evidence: FormEvidence
+    evidence: FormEvidence | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +97,7 @@ def find_form(
     exponent: float,
     axis: str = 'auto',
     held: StaticForm | None = None,
+    known: StaticForm | None = None,
 ) -> FoundForm | None:
     """Return the form that the data ask for; None where they are too few to compare forms.
 
@@ -113,27 +115,29 @@ def find_form(
         'auto', or the one to take: 'integrated_input' with the exponent given, or 'opening'.
     held : StaticForm, optional
         Take this one, and say how it compares with the other.
+    known : StaticForm, optional
+        What earlier data told of the same valve; it stays unless these tell of another.
 
     Raises
     ------
     DataError
-        The axis is to be the opening, and the means are too few to find its exponent.
+        The means are too few to find the exponent, or c, of a form that is to be taken.
     """
     means = _means_of(opening, pressure, power, spans, period_s)
-    if len(means) < _LEAST_MEANS:
-        if axis == OPENING and held is None:
-            raise TooFewSamplesError(
-                'Means over a minute in special segments, to find the exponent of p^m F(V) + c',
-                len(means), _LEAST_MEANS, 'A longer log would help.',
-            )  # fmt: skip
-        return None
     if axis == INTEGRATED_INPUT and held is None:
         held = StaticForm(INTEGRATED_INPUT, exponent)
-    given = _fitted(means, StaticForm(INTEGRATED_INPUT, exponent))
-    paper, scaled = _best(means, INTEGRATED_INPUT), _best(means, OPENING)
-    gain, _, told = _told(means, paper, given)
-    if not (told and gain > _EXPONENT_GAIN):
-        paper = given
+    if len(means) < _LEAST_MEANS:
+        if axis == OPENING or (held or known or StaticForm()).scaled:
+            raise TooFewSamplesError(
+                'Means over a minute in special segments, to find the numbers of p^m F(V) + c',
+                len(means), _LEAST_MEANS, 'A longer log would help.',
+            )  # fmt: skip
+        return None if held is None else FoundForm(held, 0.0, None)
+    choked = known.exponent if known is not None and known.scaled else _CHOKED_EXPONENT
+    paper = _with_exponent(means, StaticForm(INTEGRATED_INPUT, exponent))
+    scaled = _best(means, OPENING)
+    if known is not None and known.scaled:
+        scaled = _with_exponent(means, known)
     if held is not None:
         paper, scaled = (
             _fitted(means, held) if fit.form.axis == held.axis else fit for fit in (paper, scaled)
@@ -143,10 +147,13 @@ def find_form(
     gain, sure, told = _told(means, scaled, paper)
     if held is None and not told:
         # Too little moves the pressure to tell its exponent: that of ideal choked flow will do.
-        scaled = _fitted(means, StaticForm(OPENING, _CHOKED_EXPONENT))
+        scaled = _fitted(means, StaticForm(OPENING, choked))
         gain, sure, told = _told(means, scaled, paper)
-    likelier = gain > _LEAST_GAIN and sure > _LIKELIER_Z
-    takes_scaled = likelier if held is None else held.scaled
+    takes_scaled = gain > _LEAST_GAIN and sure > _LIKELIER_Z
+    if known is not None and known.scaled:
+        takes_scaled = not _told(means, paper, scaled)[2]
+    if held is not None:
+        takes_scaled = held.scaled
     chosen, other = (scaled, paper) if takes_scaled else (paper, scaled)
     if not takes_scaled:
         gain, _, told = _told(means, paper, scaled)
@@ -240,6 +247,13 @@ def _place(x: FloatArray, parts: int) -> IntArray:
     return np.asarray(np.searchsorted(edges, x, side='right'))
 
 
+def _with_exponent(means: _Means, given: StaticForm) -> _Fit:
+    """Return a form with the exponent given, or another that gains more than chance."""
+    free, fitted = _best(means, given.axis), _fitted(means, given)
+    gain, _, told = _told(means, free, fitted, _EXPONENT_APART)
+    return free if told and gain > _EXPONENT_GAIN else fitted
+
+
 def _means_of(
     opening: FloatArray, pressure: FloatArray, power: FloatArray, spans: IntArray, period_s: float
 ) -> _Means:
@@ -323,7 +337,9 @@ def _surprise(error: FloatArray, scale: float | None = None) -> FloatArray:
     return np.asarray(0.5 * (_FREEDOM + 1.0) * np.log1p((error / s) ** 2 / _FREEDOM) + math.log(s))
 
 
-def _told(means: _Means, one: _Fit, other: _Fit) -> tuple[float, float, bool]:
+def _told(
+    means: _Means, one: _Fit, other: _Fit, least_apart: float = _LEAST_APART
+) -> tuple[float, float, bool]:
     """Return the log-likelihood that ``one`` gains, its standard errors, and whether that is sure.
 
     Both errors are whitened alike, by the correlation from mean to mean of the smaller one.
@@ -345,7 +361,7 @@ def _told(means: _Means, one: _Fit, other: _Fit) -> tuple[float, float, bool]:
     gain = float(stretches.sum())
     sure = gain / spread if spread > 0.0 else 0.0
     apart = _root(one.static - other.static, 0.0)
-    enough = apart > _LEAST_APART * float(np.ptp(means.power))
+    enough = apart > least_apart * float(np.ptp(means.power))
     return gain, sure, bool(gain > _LEAST_GAIN and sure > _LEAST_Z and enough)
 
 

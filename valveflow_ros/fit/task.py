@@ -30,6 +30,8 @@ class FitTask:
         Causes that were taken out of the rows.
     form : StaticForm, optional
         The form of the curve; without it the data choose.
+    known : StaticForm, optional
+        What earlier data told of the form.
     """
 
     request_ns: int
@@ -39,6 +41,7 @@ class FitTask:
     power_noise_mw: float
     held: tuple[HeldCause, ...] = ()
     form: StaticForm | None = None
+    known: StaticForm | None = None
 
 
 # Windows that cannot carry a curve, and what would help.

@@ -28,7 +28,7 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.records import IntArray, SampleTable, SpecialSegment
 from valveflow_ros.segments.segmenter import NoiseLevel, Segmented, Segmenter
 from valveflow_ros.segments.window import RollingWindow
-from valveflow_ros.signals.static_form import OPENING
+from valveflow_ros.signals.static_form import StaticForm
 from valveflow_ros.state import Memory
 
 BY_HAND = 'asked for by hand'
@@ -305,21 +305,21 @@ class Monitor(Memory):
     def _ask(self, text: str = '') -> list[Event]:
         request_ns = self._refits.ask(self._last_ns)
         noise = self._segmenter.noise()
-        reference, settings = self.reference.curve, self.settings
-        if self._knees_at_openings():
-            settings = settings.changed({'axis': OPENING})
+        reference = self.reference.curve
         task = FitTask(
-            request_ns, self._window.contents(), settings, noise.input, noise.power_mw,
+            request_ns, self._window.contents(), self.settings, noise.input, noise.power_mw,
             self._correction.held, None if reference is None else reference.static_form,
+            self._known_form(),
         )  # fmt: skip
         entry = self._journal(JournalKind.FIT_REQUESTED, request_ns, '', text)
         return [entry, FitRequested(task)]
 
-    def _knees_at_openings(self) -> bool:
-        """Return whether the curve is known to have them there: a valve does not change that."""
+    def _known_form(self) -> StaticForm | None:
+        """Return the form that the running curve was told to have, or was given as known."""
         curve = self.characteristic
-        found = None if curve is None else curve.form
-        return found is not None and found.told and found.chosen == OPENING
+        if curve is None or curve.form is None:
+            return None
+        return curve.static_form if curve.form.told or curve.static_form.scaled else None
 
     def _model_id(self) -> str:
         return '' if self.characteristic is None else self.characteristic.model_id

@@ -93,8 +93,9 @@ def task_to_bytes(task: Task) -> bytes:
     else:
         state |= {'input_noise': task.input_noise, 'power_noise_mw': task.power_noise_mw}
         state |= held_json(task.held)
-        if task.form is not None:
-            state['form'] = [task.form.axis, task.form.exponent]
+        for name, form in (('form', task.form), ('known', task.known)):
+            if form is not None:
+                state[name] = [form.axis, form.exponent]
     return to_bytes(state)
 
 
@@ -107,8 +108,8 @@ def task_from_bytes(data: bytes) -> Task:
         return DiagnosisTask(state['request_ns'], window, settings, curve, state['window_end_ns'])
     held = held_from(state)
     noise = state['input_noise'], state['power_noise_mw']
-    form = StaticForm(*state['form']) if 'form' in state else None
-    return FitTask(state['request_ns'], window, settings, *noise, held, form)
+    forms = {name: StaticForm(*state[name]) for name in ('form', 'known') if name in state}
+    return FitTask(state['request_ns'], window, settings, *noise, held, **forms)
 
 
 def result_to_bytes(result: object) -> bytes:
