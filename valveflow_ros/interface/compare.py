@@ -14,6 +14,7 @@ from valveflow_ros.baselines.truth import Truth
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.errors import DataError, UsageError
+from valveflow_ros.fit.result import wrong_form
 from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.files import Result
 from valveflow_ros.interface.logs import Log, as_log
@@ -162,7 +163,10 @@ def compare(
         samples_of(learn.task.contents, settings), characteristic,
         other_data(judged.task.contents, other), truth, progress,
     )  # fmt: skip
-    notes = tuple(dict.fromkeys((*notes, *more, *characteristic.notes)))
+    doubt = wrong_form(characteristic)
+    if doubt:
+        progress.warn(doubt)
+    notes = tuple(n for n in dict.fromkeys((*notes, *more, doubt, *characteristic.notes)) if n)
     return ComparisonResult(
         Compared(
             log.name, second.name, test is None, result, learn.task.contents,
