@@ -105,7 +105,7 @@ def settings_of(
     ParameterError
         Values are at odds with each other.
     """
-    settings, notes = settings_for(log.steps(), log.span_s, given)
+    settings, notes = settings_for(log.steps(), log.span_s, given, held=log.updates is not None)
     if constants:
         notes += [
             f'{SIGNALS[s].topic} was not logged and is taken as {value:g} {SIGNALS[s].unit}.'
@@ -179,7 +179,7 @@ def cut_in_two(log: Log, block_s: float) -> tuple[Log, Log]:
 
     def part(mask: Any) -> Log:
         kept = Readings(r.time_ns[mask], r.signal[mask], r.value[mask], r.quality[mask])
-        return replace(log, readings=kept)
+        return replace(log, readings=kept, updates=None)
 
     return part(r.time_ns < cut), part(r.time_ns >= cut)
 
