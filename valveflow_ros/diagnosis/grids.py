@@ -329,7 +329,8 @@ def make_grids(
     scored = measured & _settled(usable, settle_s, step).reshape(-1, group).all(axis=1)
     if int(scored.sum()) < _LEAST_MEANS:
         raise TooFewSamplesError(
-            'Means of ten seconds with all signals, far enough behind a gap',
+            ('Means of ten seconds' if step_s <= MEAN_S else 'Rows')
+            + ' with all signals, far enough behind a gap',
             int(scored.sum()), _LEAST_MEANS, 'A longer record would help.',
         )  # fmt: skip
     m = len(scored)
