@@ -11,7 +11,7 @@ from streams import needs_jit
 
 import valveflow_ros as vf
 from valveflow_ros.diagnosis import actuator, record_faults
-from valveflow_ros.diagnosis.cause import Active
+from valveflow_ros.diagnosis.cause import Active, Estimate
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.grids import Blur, Grids, blur_of
 from valveflow_ros.diagnosis.search import hidden, unseen
@@ -130,3 +130,13 @@ def test_means_of_a_minute_name_no_slack_of_another_size(effect: tuple[str, ...]
         assert said.startswith('cannot be judged at this sampling: rows 60 s apart hide a slack')
         assert not named
     assert any('may come from that' in note for note in found.notes)
+
+
+def test_a_lag_that_its_error_exceeds_is_not_told() -> None:
+    """The values stay in the parameters; the sentence does not tell them."""
+    lag = Active(catalogue()['region_lag'], (30.0, 5.0, 250.0))
+    bounds = {'time_s': (25.0, 35.0), 'delay_s': (-6.0, 16.0), 'level_mw': (240.0, 260.0)}
+    told = {name: Estimate(lag.named()[name], *ends, 's') for name, ends in bounds.items()}
+    said = lag.sentence(0, told)
+    assert 'a time constant of 30 s and a delay that is not known' in said
+    assert 'a delay of 5 s' in lag.sentence(0, None)

@@ -82,7 +82,8 @@ def _dynamics(c: Characteristic) -> Section:
     if not c.dynamics:
         none = 'Time constants and delays were not estimated for this curve.'
         return Section(title, [paragraph(none)])
-    return Section(title, [dynamics_table(c.dynamics), dynamics_figure(c.dynamics)])
+    figure = dynamics_figure(c.dynamics)
+    return Section(title, [dynamics_table(c.dynamics), *([] if figure is None else [figure])])
 
 
 def _read(data: Identified) -> str:
