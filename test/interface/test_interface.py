@@ -350,7 +350,7 @@ class TestOtherUnits:
         plant = vf.simulate(0.05, 3, unit='choked', recording='compressed')
         frame = plant.to_dataframe()
         plant.write(tmp_path / 'a.mcap')
-        readings = vf.open_log(tmp_path / 'a.mcap').readings
+        readings = vf.open_log(tmp_path / 'a.mcap').recorded
         assert np.isfinite(readings.value).all()
         for info in SIGNALS:
             mine = readings.signal == info.signal
@@ -359,6 +359,28 @@ class TestOtherUnits:
         plant.write(tmp_path / 'a.csv')
         table = pd.read_csv(tmp_path / 'a.csv')
         assert table['main_steam_pressure_mpa'].isna().mean() > 0.3
+
+    @pytest.mark.parametrize(
+        ('unit', 'seed'), [('choked:number=1', 1), ('sequence:number=9', 21),
+                           ('integrated_input:number=3', 3)],
+    )  # fmt: skip
+    def test_a_compressed_log_is_identified(self, tmp_path, unit, seed):
+        plant = vf.simulate(8, seed, unit=unit, recording='compressed')
+        plant.write(tmp_path / 'a.csv')
+        found = vf.identify(tmp_path / 'a.csv')
+        truth = plant.data.truth
+        opening, pressure = truth.plug[::60], truth.pressure[::60]
+        error = found.characteristic.power(opening, pressure) - plant.static_power(
+            opening, pressure
+        )
+        assert np.sqrt(np.nanmean(error**2)) < 1.6
+        assert np.isfinite(error).mean() > 0.95
+        said = ' '.join(found.notes)
+        assert 'The log is compressed by exception: valve_opening typically every ' in said
+        assert 'from changes of 2 MW on' in said
+        assert 'The log has a value every' not in said
+        refused = {n for c in found.data.counts.values() for r, n in c.items() if r != 'accepted'}
+        assert refused == {0}
 
     def test_tables_hold_further_columns(self, tmp_path):
         plant = vf.simulate(0.01, 3, unit='sequence')

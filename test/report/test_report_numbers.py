@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from valveflow_ros.curve.characteristic import RegionDynamics
 from valveflow_ros.report import words
+from valveflow_ros.report.answer import dynamics_figure, dynamics_table
 
 ANY = st.floats(allow_nan=True, allow_infinity=True)
 FINITE = st.floats(-1e12, 1e12)
@@ -82,3 +85,23 @@ def test_small_things():
     assert words.counted(2300, 'piece') == '2\u202f300 pieces'
     assert words.moment(0) == '1970-01-01 00:00:00 UTC'
     assert 'since 1970' in words.moment(2**62 * 100)
+
+
+@pytest.mark.parametrize('value', [0.0, 1e-3, 12.0, 400.0])
+def test_a_time_whose_error_exceeds_it_is_not_known(value):
+    assert words.time_with_error(value, 1.01 * value + 1e-9, 's') == 'not known'
+    for error in (0.99 * value, math.nan):
+        assert words.time_with_error(value, error, 's') == words.with_error(value, error, 's')
+
+
+def test_the_table_and_the_figure_of_dynamics_leave_out_what_is_not_known():
+    sure = RegionDynamics(0.0, 200.0, 12.0, 2.0, 1.0, 0.5)
+    unsure = replace(sure, power_from=200.0, power_to=300.0, time_constant_stderr_s=13.0)
+    vague = replace(sure, delay_stderr_s=2.5)
+    assert 'not known' not in dynamics_table((sure,))
+    assert dynamics_table((sure, unsure)).count('not known') == 2
+    assert dynamics_table((vague,)).count('not known') == 1
+    assert dynamics_figure((unsure,)) is None
+    figure = dynamics_figure((sure, unsure))
+    assert figure is not None
+    assert len(figure.traces) == 1

@@ -187,13 +187,13 @@ def _breakpoints(c: Characteristic) -> str:
 
 
 def _dynamics(c: Characteristic) -> str:
-    from valveflow_ros.report.words import decimals, with_error
+    from valveflow_ros.report.words import decimals, time_with_error
 
     rows = [
         [
             f'{decimals(d.power_from, 0)} to {decimals(d.power_to, 0)} MW',
-            with_error(d.time_constant_s, d.time_constant_stderr_s, 's'),
-            with_error(d.delay_s, d.delay_stderr_s, 's'),
+            time_with_error(d.time_constant_s, d.time_constant_stderr_s, 's'),
+            time_with_error(d.delay_s, d.delay_stderr_s, 's'),
         ]
         for d in c.dynamics
     ]

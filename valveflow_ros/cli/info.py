@@ -51,10 +51,16 @@ def run(options: Namespace, console: Console) -> VerbResult:
     from valveflow_ros.interface.settings import settings_for
 
     log = open_log(options.log, mapping, progress=console)
-    parts = log.readings.by_signal()
+    parts = log.recorded.by_signal()
     steps = steps_of(parts)
-    settings, _ = settings_for(steps, 0.0, {})
-    counts = _fates(log.readings, parts, settings)
+    compression = log.compression
+    # A value of a compressed log stands for long without being a gap or a jump of the clock.
+    stands_s = (
+        compression.longest_s if compression is not None and log.updates is not None else 0.0
+    )
+    jump = {'clock_jump': min(2.0 * stands_s, 3600.0)} if stands_s > 0.0 else {}
+    settings, _ = settings_for(steps, 0.0, jump)
+    counts = _fates(log.recorded, parts, settings)
     contents = log.contents
     start, end = contents.start_ns, contents.end_ns
     seconds = 0.0 if start is None or end is None else (end - start) / 1e9
@@ -62,7 +68,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
         info['topic']: info
         for s in sorted({*contents.signals, *log.constants})
         if s in parts
-        for info in [_facts(log, s, parts[s], steps.get(s, float('nan')))]
+        for info in [_facts(log, s, parts[s], steps.get(s, float('nan')), stands_s)]
     }
     data = {
         'log': contents.path,
@@ -216,7 +222,9 @@ def _in_order(readings: Readings, parts: dict[int, Readings], settings: Settings
     return True
 
 
-def _facts(log: Log, signal: Signal, part: Readings, step_s: float) -> dict[str, Any]:
+def _facts(
+    log: Log, signal: Signal, part: Readings, step_s: float, stands_s: float
+) -> dict[str, Any]:
     """Return what there is to say of one signal, in the engine's unit."""
     import numpy as np
 
@@ -224,6 +232,7 @@ def _facts(log: Log, signal: Signal, part: Readings, step_s: float) -> dict[str,
     from valveflow_ros.report.data import gaps
 
     values, times = part.value, part.time_ns
+    usual_s = max(step_s, 1.1 * stands_s / _GAP_STEPS)
     if (times[1:] < times[:-1]).any():
         times = np.sort(times)
     finite = np.isfinite(values)
@@ -240,5 +249,5 @@ def _facts(log: Log, signal: Signal, part: Readings, step_s: float) -> dict[str,
         'low': float(low),
         'median': float(middle),
         'high': float(high),
-        'gaps': gaps(times, round(step_s * 1e9), _GAP_STEPS) if np.isfinite(step_s) else [],
+        'gaps': gaps(times, round(usual_s * 1e9), _GAP_STEPS) if np.isfinite(step_s) else [],
     }

@@ -248,6 +248,8 @@ def hindered(grids: Grids) -> str:
         return 'the commanded opening was not logged'
     if both.sum() < _LEAST_ROWS or float(np.std(grids.command[both])) == 0.0:
         return 'the commanded opening hardly changes, or was rarely logged with the position'
+    if grids.blur.compressed:
+        return 'the log is compressed, and command and position are kept at different times'
     return ''
 
 

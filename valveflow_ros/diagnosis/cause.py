@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -102,6 +102,7 @@ U_UNIT = '% MPa^m'
 _OPENING_UNIT = 0.04  # % of opening move as much as one unit of V p^m does
 # So near to the end of what a plant can have the data ask for something else.
 _END = 0.95
+_Z95 = 1.959963984540054
 
 
 class Stage(enum.IntEnum):
@@ -175,11 +176,16 @@ class SentenceValues(dict[str, float]):
     ----------
     onset : str
         When it set in, as a date with its interval; empty for a cause without an onset.
+    unsure : frozenset of str
+        Names of values that their standard error exceeds.
     """
 
-    def __init__(self, values: Mapping[str, float], onset: str = '') -> None:
+    def __init__(
+        self, values: Mapping[str, float], onset: str = '', unsure: Iterable[str] = ()
+    ) -> None:
         super().__init__(values)
         self.onset = onset
+        self.unsure = frozenset(unsure)
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,4 +308,8 @@ class Active:
                 bare = Estimate(values[u.name], math.nan, math.nan, u.unit, start_ns)
                 at, between = dates(estimates[u.name] if estimates else bare)
                 onset = f'{at} on (95 % interval {between})' if between else f'{at} on'
-        return self.cause.sentence(SentenceValues(values, onset))
+        unsure = [
+            name for name, e in (estimates or {}).items()
+            if e.high - e.low > 2.0 * _Z95 * abs(e.value)
+        ]  # fmt: skip
+        return self.cause.sentence(SentenceValues(values, onset, unsure))

@@ -38,6 +38,7 @@ from valveflow_ros.diagnosis.search import Found, Progress, search, simplified
 from valveflow_ros.diagnosis.structure import Period, Structure, Wander, period, structure, wander
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import BoolArray, FloatArray, IntArray, SampleTable
+from valveflow_ros.signals.compression import Compression
 from valveflow_ros.signals.static_form import StaticForm
 
 # The sealed blocks, opened once: what each cause is worth there, and whether that stands.
@@ -142,11 +143,18 @@ def _fault_parameters(fault: Fault) -> dict[str, Estimate]:
 
 
 def notes(grids: Grids) -> tuple[str, ...]:
-    """Say what could not be judged for want of a command."""
-    why = actuator.hindered(grids)
-    if not why:
-        return ()
-    return (f'Faults between command and position sensor cannot be judged: {why}.',)
+    """Say what could not be judged for want of a command, and what the recording may feign."""
+    said = []
+    if why := actuator.hindered(grids):
+        said.append(f'Faults between command and position sensor cannot be judged: {why}.')
+    blur = grids.blur
+    if blur.words:
+        said.append(
+            f'The record hides lags and delays below {blur.time_s:.0f} s and a slack of the valve '
+            f'below {blur.opening_percent:.2g} %; a misfit that depends on ramps or on the travel '
+            'of the valve may come from that.'
+        )
+    return tuple(said)
 
 
 _LEAST_SPREAD = 0.01
@@ -175,6 +183,8 @@ class Record:
     measured : SampleTable, optional
         The rows as measured, where causes were taken out of ``table``: faults of the
         signals are looked for in these (a plug that a slack lets rest is no dead transmitter).
+    compression : Compression, optional
+        How the record was compressed, if it was.
     """
 
     table: SampleTable
@@ -183,10 +193,16 @@ class Record:
     settle_s: float
     spans_ns: IntArray
     measured: SampleTable | None = None
+    compression: Compression | None = None
 
     def faults(self) -> tuple[BoolArray, tuple[Fault, ...]]:
         """Return which values are not to be believed, shape (n, 5), and what is wrong."""
-        return faults(self.table if self.measured is None else self.measured, self.step_s)
+        table = self.table if self.measured is None else self.measured
+        return faults(table, self.step_s, self.compression is not None)
+
+    def grids(self, bad: BoolArray, rough: bool = False) -> Grids:
+        """Return the record on grids; ``bad`` (n, 5) is not believed."""
+        return make_grids(*self.about, bad, rough, self.compression)
 
     @property
     def about(self) -> tuple[SampleTable, float, StaticForm, float]:
@@ -226,7 +242,7 @@ def diagnose(
     """
     progress(0.02, 'the record itself')
     bad, wrong = record.faults()
-    grids, rough = make_grids(*record.about, bad), make_grids(*record.about, bad, rough=True)
+    grids, rough = record.grids(bad), record.grids(bad, rough=True)
     _moves(grids)
     task = Task(grids, grids.open_rows, np.zeros(ORDER), given)
     start = Extended(model if given else simplified(model))
@@ -261,7 +277,7 @@ def diagnose_form(
     """
     found = diagnose(asked, found_model, progress=progress)
     bad, _ = record.faults()
-    before, after = make_grids(*record.about, bad), make_grids(*asked.about, bad)
+    before, after = record.grids(bad), asked.grids(bad)
     plain = Task(before, before.open_rows, np.zeros(ORDER)), Extended(model)
     better = Task(after, after.open_rows, np.zeros(ORDER)), found.simulation
     gain = gain_of_form(*plain, *better)
@@ -348,11 +364,7 @@ def _conclude(
         )
         for a, gain in zip(final.active, gains, strict=True)
     )  # fmt: skip
-    raw = (
-        make_grids(*record.about, np.zeros(record.table.values.shape, dtype=bool))
-        if wrong
-        else None
-    )
+    raw = record.grids(np.zeros(record.table.values.shape, dtype=bool)) if wrong else None
     outside = actuator_cause(found) + record_causes(raw, found, wrong)
     verdict, dropped = _verdict(found, rest, bool(outside))
     near = tuple(dict.fromkeys(n for c in causes for n in c.not_told_apart))

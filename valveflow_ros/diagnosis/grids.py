@@ -9,6 +9,7 @@ import numpy as np
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.records import NS_PER_S, BoolArray, ByteArray, FloatArray, SampleTable, Signal
+from valveflow_ros.signals.compression import Compression
 from valveflow_ros.signals.static_form import StaticForm
 
 DAY_S = 86_400.0
@@ -43,6 +44,28 @@ class Reference:
 
 
 @dataclass(frozen=True, slots=True)
+class Blur:
+    """What the way of recording hides.
+
+    Attributes
+    ----------
+    time_s : float
+        Lags and delays below this cannot be judged.
+    opening_percent : float
+        Nor can a slack of the valve below this.
+    words : str
+        Why, up to what is hidden; empty if nothing is.
+    compressed : bool
+        Values were held.
+    """
+
+    time_s: float = 0.0
+    opening_percent: float = 0.0
+    words: str = ''
+    compressed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class Grids:
     """Everything measured, as arrays that the model and the statistics need.
 
@@ -69,6 +92,7 @@ class Grids:
     sub : int64 (m,)
         Which sub-block a mean lies in.
     reference : Reference
+    blur : Blur
     """
 
     start_ns: int
@@ -90,6 +114,7 @@ class Grids:
     whole: BoolArray
     sub: np.ndarray
     reference: Reference
+    blur: Blur = field(default_factory=Blur)
     cache: dict[object, FloatArray] = field(default_factory=dict)
 
     @property
@@ -200,6 +225,47 @@ def _lift(v: FloatArray) -> float:
     return 3.0 * lifted[0] - 3.0 * lifted[1] + lifted[2]
 
 
+# What the way of recording hides.
+
+_COARSE_STEP_S = 20.0
+_STEPS_HIDDEN = 1.0  # lags shorter than this many steps of a coarse table
+_MOVES_HIDDEN = 3.0  # a slack below this many usual moves of the opening within a row
+_BANDS_HIDDEN = 4.0  # or this many dead bands
+
+
+def blur_of(v: FloatArray, step_s: float, compression: Compression | None) -> Blur:
+    """Return what a record with this step, or one compressed like this, hides.
+
+    Parameters
+    ----------
+    v : float64 (n,)
+        Opening in %, row by row.
+    """
+    if compression is not None:
+        interval_s = compression.interval_s
+        opening = compression.updates.get(Signal.VALVE_OPENING)
+        band = 0.0 if opening is None else _BANDS_HIDDEN * opening.dead_band
+        return Blur(
+            max(0.5 * interval_s, step_s if step_s >= _COARSE_STEP_S else 0.0),
+            max(band, _usual_move(v)),
+            f'cannot be judged: values of this compressed log are typically {interval_s:.0f} s '
+            'apart, which hides',
+            True,
+        )  # fmt: skip
+    if step_s < _COARSE_STEP_S:
+        return Blur()
+    return Blur(
+        _STEPS_HIDDEN * step_s, _usual_move(v),
+        f'cannot be judged at this sampling: rows {step_s:g} s apart hide',
+    )  # fmt: skip
+
+
+def _usual_move(v: FloatArray) -> float:
+    moves = np.abs(np.diff(v))
+    moves = moves[np.isfinite(moves)]
+    return _MOVES_HIDDEN * float(np.quantile(moves, 0.9)) if len(moves) else 0.0
+
+
 # From a table of samples to the grids of a `Grids`.
 
 _BRIDGE_S = 30.0
@@ -212,7 +278,7 @@ SUB_S = 1800.0
 
 def make_grids(
     table: SampleTable, step_s: float, form: StaticForm, settle_s: float, bad: BoolArray,
-    rough: bool = False,
+    rough: bool = False, compression: Compression | None = None,
 ) -> Grids:  # fmt: skip
     """Put a table on the grids.
 
@@ -229,6 +295,8 @@ def make_grids(
         Values that are not believed.
     rough : bool
         With longer model rows, for looking round quickly; the scored means are the same.
+    compression : Compression, optional
+        How the record was compressed, if it was.
 
     Raises
     ------
@@ -261,7 +329,8 @@ def make_grids(
     scored = measured & _settled(usable, settle_s, step).reshape(-1, group).all(axis=1)
     if int(scored.sum()) < _LEAST_MEANS:
         raise TooFewSamplesError(
-            'Means of ten seconds with all signals, far enough behind a gap',
+            ('Means of ten seconds' if step_s <= MEAN_S else 'Rows')
+            + ' with all signals, far enough behind a gap',
             int(scored.sum()), _LEAST_MEANS, 'A longer record would help.',
         )  # fmt: skip
     m = len(scored)
@@ -281,6 +350,7 @@ def make_grids(
         power=np.where(scored, power, 0.0), scored=scored, whole=whole,
         sub=np.arange(m) // _sub_rows(m, step * group),
         reference=_reference(pressure, temperature, power, scored, step, v),
+        blur=blur_of(v, step_s, compression),
     )  # fmt: skip
 
 

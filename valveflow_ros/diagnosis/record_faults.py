@@ -8,11 +8,12 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from valveflow_ros.errors import counted
-from valveflow_ros.records import SIGNALS, BoolArray, FloatArray, SampleTable, SignalInfo
+from valveflow_ros.records import SIGNALS, BoolArray, FloatArray, SampleTable, Signal, SignalInfo
 
 FLAT_LEAST_S = 30.0
 _FLAT_FACTOR = 3.0
 _LARGEST_SHARE = 0.5
+_LARGEST = 0.999  # quantile of an opening; beyond may lie a spike
 _SPIKE_WINDOW, _SPIKE_SD, _LONGEST_SPIKE = 11, 6.0, 1
 _SPIKE_SHARE, _LEAST_SPIKES, _LEAST_HEIGHT = 0.01, 4, 0.01
 _NOISE_ROWS = 3600
@@ -68,13 +69,23 @@ def _runs(x: FloatArray) -> tuple[np.ndarray, np.ndarray]:
     return first, np.diff(np.append(first, len(x)))
 
 
-def _flat(x: FloatArray, step_s: float) -> tuple[BoolArray, float]:
-    """Return rows inside runs far longer than this signal's usual ones."""
+def _at_stop(x: FloatArray) -> BoolArray:
+    """Return where a valve stands at a stop: shut, open, or as far open as it ever is."""
+    return np.asarray((x <= 0.0) | (x >= 100.0) | (x >= np.nanquantile(x, _LARGEST)))
+
+
+def _flat(x: FloatArray, step_s: float, rests: BoolArray | None = None) -> tuple[BoolArray, float]:
+    """Return rows inside runs far longer than this signal's usual ones.
+
+    ``rests`` are rows in which it may stand still.
+    """
     first, length = _runs(x)
     bad = np.zeros(len(x), dtype=bool)
     usual = float(np.quantile(length, 0.99))
     least = max(FLAT_LEAST_S / step_s, _FLAT_FACTOR * usual, 4.0)
     long = length >= least
+    if rests is not None:
+        long &= ~rests[first]
     if length[long].sum() > _LARGEST_SHARE * len(x):
         return bad, 0.0
     for a, n in zip(first[long], length[long], strict=True):
@@ -141,8 +152,18 @@ def _coarse(x: FloatArray) -> tuple[int, float]:
     return (still, step) if moved < 2.0 * step else (0, 0.0)
 
 
-def faults(table: SampleTable, step_s: float) -> tuple[BoolArray, tuple[Fault, ...]]:
+def faults(
+    table: SampleTable, step_s: float, held: bool = False
+) -> tuple[BoolArray, tuple[Fault, ...]]:
     """Look for faults in every signal.
+
+    Parameters
+    ----------
+    table : SampleTable
+    step_s : float
+        Step of its rows.
+    held : bool
+        The log was compressed: values that stand still, and steps of the dead band, are no faults.
 
     Returns
     -------
@@ -156,10 +177,13 @@ def faults(table: SampleTable, step_s: float) -> tuple[BoolArray, tuple[Fault, .
         x = table.column(info.signal)
         if not info.required or not np.isfinite(x).any() or np.nanmax(x) == np.nanmin(x):
             continue
-        still, step = _coarse(x)
+        still, step = (0, 0.0) if held else _coarse(x)
         wild, height = _spikes(x)
         # A coarse signal stands still all the time; that is named already.
-        flat, longest = (np.zeros(len(x), dtype=bool), 0.0) if still else _flat(x, step_s)
+        flat, longest = np.zeros(len(x), dtype=bool), 0.0
+        if not still and not held:
+            rests = _at_stop(x) if info.signal == Signal.VALVE_OPENING else None
+            flat, longest = _flat(x, step_s, rests)
         if flat.any():
             found.append(Fault('flatline', info, int(flat.sum()), longest))
         if wild.any():

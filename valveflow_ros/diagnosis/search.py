@@ -243,6 +243,9 @@ def search(task: Task, start: Extended, progress: Progress, rough: Grids | None 
             break
         _drop_weak(found, barred)
         _conceal(found, barred)
+    for name in catalogue():
+        if (why := unseen(name, task.grids)) and name not in found.model.names:
+            found.reasons.setdefault(name, why)
     return found
 
 
@@ -257,7 +260,7 @@ def _conceal(found: Found, barred: set[str]) -> None:
 
 def _add(found: Found, barred: set[str]) -> bool:
     """Add the best cause if it stands up; tell whether it did."""
-    rivals = _rivals(found, barred)
+    rivals = _visible(found, _rivals(found, barred), barred)
     if not rivals:
         return False
     best = rivals[0].score
@@ -291,6 +294,48 @@ def _add(found: Found, barred: set[str]) -> bool:
             _take(found, rival, evidence.gain)
         return True
     return False
+
+
+def _visible(found: Found, rivals: list[Rival], barred: set[str]) -> list[Rival]:
+    """Return rivals that the way of recording cannot feign; put the others away."""
+    seen = []
+    for rival in rivals:
+        if why := hidden(rival.added, found.task.grids):
+            found.reasons[rival.added.name] = why
+            barred.add(rival.added.name)
+        else:
+            seen.append(rival)
+    return seen
+
+
+# Parameters with a time scale, in s, and slacks, in % of opening.
+_TIMES = {'clock': 'd_s', 'reheater': 'time_s', 'region_lag': 'time_s', 'rate_limit': ''}
+_SLACKS = {'backlash': 'w_percent', 'stiction': 's_percent'}
+
+
+def hidden(added: Active, grids: Grids) -> str:
+    """Return why a record cannot tell a cause of this size from its own recording; '' if it can.
+
+    A rate limit counts with the time that a usual fast move takes.
+    """
+    values, blur = added.named(), grids.blur
+    if added.name in _SLACKS:
+        seen = values[_SLACKS[added.name]] >= blur.opening_percent
+    elif added.name == 'rate_limit':
+        seen = blur.opening_percent >= blur.time_s * values['r_percent_per_s']
+    else:
+        seen = added.name not in _TIMES or values[_TIMES[added.name]] >= blur.time_s
+    return '' if seen else unseen(added.name, grids)
+
+
+def unseen(name: str, grids: Grids) -> str:
+    """Return what of a cause the way of recording hides; '' if nothing."""
+    blur = grids.blur
+    if not blur.words or name not in (*_TIMES, *_SLACKS):
+        return ''
+    if name in _SLACKS:
+        return f'{blur.words} a slack below {blur.opening_percent:.2g} % of opening'
+    return f'{blur.words} lags and delays below {blur.time_s:.0f} s'
 
 
 def _take(found: Found, rival: Rival, gain: float) -> None:

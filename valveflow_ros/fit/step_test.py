@@ -138,13 +138,13 @@ def broken_line(points: Points, most: int) -> BrokenLine:
             np.full(n - 2, math.nan),
             {},
         )
-    starts, cost = _partition(points, min(most, n // _LEAST_LEVELS))
+    starts, cost = partition_points(points, min(most, n // _LEAST_LEVELS))
     score = {j: c + _PRICE * (3 * j - 1) * math.log(n) for j, c in cost.items()}
     for j in sorted(score, key=lambda j: score[j]):
-        line = _joined(points, starts[j], cost)
+        line = joined(points, starts[j], cost)
         if np.all(np.diff(line.values) > 0.0):
             return line
-    return _joined(points, starts[1], cost)
+    return joined(points, starts[1], cost)
 
 
 def _line(points: Points, a: int, b: int) -> tuple[FloatArray, FloatArray, float]:
@@ -163,12 +163,14 @@ def _line(points: Points, a: int, b: int) -> tuple[FloatArray, FloatArray, float
     )
 
 
-def _partition(points: Points, most: int) -> tuple[dict[int, list[int]], dict[int, float]]:
-    """Return where the pieces begin and what they cost, for each number of pieces."""
+def partition_points(
+    points: Points, most: int, least: int = _LEAST_LEVELS
+) -> tuple[dict[int, list[int]], dict[int, float]]:
+    """Return starts and costs of pieces of at least ``least`` points, by their number."""
     n = len(points)
     error = np.full((n + 1, n + 1), math.inf)
     for a in range(n):
-        for b in range(a + _LEAST_LEVELS, n + 1):
+        for b in range(a + least, n + 1):
             error[a, b] = _line(points, a, b)[2]
     best = np.full((most + 1, n + 1), math.inf)
     came = np.zeros((most + 1, n + 1), dtype=np.int64)
@@ -189,7 +191,7 @@ def _partition(points: Points, most: int) -> tuple[dict[int, list[int]], dict[in
     return starts, {j: float(best[j, n]) for j in starts}
 
 
-def _joined(points: Points, starts: list[int], cost: dict[int, float]) -> BrokenLine:
+def joined(points: Points, starts: list[int], cost: dict[int, float]) -> BrokenLine:
     """Let neighbouring lines meet, and fit the values at the knots together."""
     ends = [*starts[1:], len(points)]
     lines = [_line(points, a, b) for a, b in zip(starts, ends, strict=True)]
@@ -387,7 +389,7 @@ def _characteristic(
     notes: tuple[str, ...],
 ) -> Characteristic:
     """Bring the line into the form of every result."""
-    pieces = _pieces(line, u[inside])
+    pieces = pieces_of_line(line, u[inside])
     if line.cost:
         why = (
             'The pieces are the exact partition of the means of the levels, weighted by their '
@@ -404,14 +406,15 @@ def _characteristic(
         pieces=pieces,
         breakpoint_intervals=intervals,
         choice=Choice(RULE, line.cost, {}, why),
-        source=_source(table, inside, len(good), settings),
+        source=tested_data(table, inside, len(good), settings),
         residuals=_residuals(table, u, good, line, settings),
         partition_pieces=pieces,
         notes=notes,
     ).with_id()
 
 
-def _pieces(line: BrokenLine, u: FloatArray) -> tuple[Piece, ...]:
+def pieces_of_line(line: BrokenLine, u: FloatArray) -> tuple[Piece, ...]:
+    """Return the pieces of a line with their errors; ``u`` are the samples behind it."""
     knots, values, covariance = line.knots, line.values, line.covariance
     counts = np.histogram(u, bins=np.concatenate([[-np.inf], knots[1:-1], [np.inf]]))[0]
     pieces = []
@@ -429,7 +432,10 @@ def _pieces(line: BrokenLine, u: FloatArray) -> tuple[Piece, ...]:
     return tuple(pieces)
 
 
-def _source(table: SampleTable, inside: IntArray, levels: int, settings: Settings) -> FittedData:
+def tested_data(
+    table: SampleTable, inside: IntArray, levels: int, settings: Settings
+) -> FittedData:
+    """Describe the rows of a test and the temperature in them."""
     temperature = table.column(Signal.MAIN_STEAM_TEMPERATURE)[inside]
     temperature = temperature[np.isfinite(temperature)]
     mean = spread = math.nan

@@ -46,6 +46,7 @@ class FitTask:
 
 # Windows that cannot carry a curve, and what would help.
 
+COARSE_STEP_S = 20.0  # from this step of the table on, a floor is told in rows of it
 _EXPLAINED_LEAST = 0.5  # share of the power's variance a curve must explain to be one
 _ONE_LEVEL_PERCENT = 2.0  # of opening: less than this is one load with its jitter
 _LEAST_SPREAD = 10.0  # noise sd that the openings must spread over
@@ -71,10 +72,16 @@ def enough_samples(task: FitTask, samples: int) -> None:
         )
     need = task.settings.whole('min_fit_samples')
     if samples < need:
-        raise TooFewSamplesError(
-            'Samples in steady-state and slope-response segments', samples, need,
-            'Longer data, or calmer operation at several loads, would help.',
-        )  # fmt: skip
+        step_s = task.settings.real('sample_period')
+        advice = 'Longer data, or calmer operation at several loads, would help.'
+        what = 'Samples in steady-state and slope-response segments'
+        if step_s >= COARSE_STEP_S:
+            what = 'Rows in steady-state and slope-response segments'
+            advice = (
+                f'The table has a row every {step_s:g} s, so that is {step_s * need / 3600.0:.2g} '
+                f'h of such operation. {advice}'
+            )
+        raise TooFewSamplesError(what, samples, need, advice)
 
 
 def input_moved(task: FitTask, u: FloatArray) -> None:

@@ -173,7 +173,9 @@ def diagnose(
         regional = model.model.base if isinstance(model, ExtendedModel) else model.model
     if regional is None:
         regional = first_model(rows.table, step, form, settle)
-    record = search.Record(rows.table, step, form, settle, rows.spans_ns)
+    record = search.Record(
+        rows.table, step, form, settle, rows.spans_ns, compression=log.compression
+    )
     if earlier is not None:
         measured = align(log.readings, settings)[0]
         record = on_top(
@@ -189,8 +191,9 @@ def diagnose(
         other = replace(record, form=form)
         found = search.diagnose_form(record, regional, other, there, part)
         record = other
+    kept = () if log.compression is None else (log.compression.sentence,)
     signatures, answers, maps = views(record, found)
-    found = replace(found, notes=(*log.contents.warnings, *notes, *found.notes))
+    found = replace(found, notes=(*log.contents.warnings, *kept, *notes, *found.notes))
     times = rows.table.time_ns
     data = Diagnosed(
         log.name, int(times[0]), int(times[-1]), found, signatures, answers, maps,

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
 from valveflow_ros.curve.shift import ShiftLimits, judge_shift, shift_json
@@ -15,6 +17,7 @@ from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
 from valveflow_ros.diagnosis.result import model_to_json
 from valveflow_ros.errors import DataError, UsageError
 from valveflow_ros.fit.model_form import find_misfit
+from valveflow_ros.fit.static_test import find_static_test
 from valveflow_ros.fit.step_levels import looks_like_step_test
 from valveflow_ros.fit.step_test import identify_step_test
 from valveflow_ros.interface import SILENT, Progress
@@ -24,7 +27,15 @@ from valveflow_ros.interface.logs import Log, as_log
 from valveflow_ros.interface.models import load_characteristic, load_extended, with_exponent
 from valveflow_ros.interface.monitor import recorded_history
 from valveflow_ros.interface.observation import check_signals, observe_log, settings_of
-from valveflow_ros.records import SampleTable, Signal, SpecialSegment
+from valveflow_ros.records import (
+    N_SIGNALS,
+    SIGNALS,
+    Quality,
+    Readings,
+    SampleTable,
+    Signal,
+    SpecialSegment,
+)
 from valveflow_ros.report.identification import identification_page
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import Page
@@ -159,7 +170,17 @@ def _identified(
         observed = observe_log(log, settings, progress, model)
         characteristic = observed.fit(progress)
     except DataError as error:
-        table, _, _ = align(log.readings, settings)
+        table, _, counts = align(log.readings, settings)
+        read = _rows_as_read(log.readings)
+        test = None if model is not None else find_static_test(read, settings)
+        if test is not None:
+            for sentence in test.characteristic.notes:
+                progress.say(sentence)
+            return Identified(
+                source=log.name, characteristic=test.characteristic, table=read,
+                segments=test.segments, counts=counts, settings=settings,
+                notes=(*log.notes, *notes),
+            )  # fmt: skip
         if looks_like_step_test(table, settings):
             raise DataError(f'{error} {STEP_TEST_ADVICE}') from None
         raise
@@ -185,6 +206,15 @@ def _identified(
         settings.real('sample_period'),
     )  # fmt: skip
     return replace(found, misfit=misfit)
+
+
+def _rows_as_read(readings: Readings) -> SampleTable:
+    """Return a row for each time at which anything was read, nothing held or shifted."""
+    times, row = np.unique(readings.time_ns, return_inverse=True)
+    values = np.full((N_SIGNALS, len(times)), np.nan)
+    good = readings.quality < Quality.BAD
+    values[readings.signal[good], row[good]] = readings.value[good]
+    return SampleTable.from_columns(times, {info.signal: values[info.signal] for info in SIGNALS})
 
 
 def _step_test(log: Log, given: Mapping[str, Any], progress: Progress) -> Identified:

@@ -37,6 +37,7 @@ from valveflow_ros.records import (
     Signal,
     table_to_readings,
 )
+from valveflow_ros.signals.compression import Compression, find_compression, held_readings
 from valveflow_ros.signals.units import UNITS, convert
 
 
@@ -58,6 +59,10 @@ class Log:
         Value of each constant signal, engine units.
     doubts : list of Doubt
         Signals whose values do not suit their unit.
+    compression : Compression, optional
+        How a historian kept the values, where it kept them by exception.
+    updates : Readings, optional
+        What was read, where ``readings`` hold each value until the next one.
     """
 
     name: str
@@ -66,6 +71,13 @@ class Log:
     units: dict[Signal, str]
     constants: dict[Signal, float]
     doubts: list[Doubt]
+    compression: Compression | None = None
+    updates: Readings | None = None
+
+    @property
+    def recorded(self) -> Readings:
+        """Return the values that stand in the log itself, none held."""
+        return self.readings if self.updates is None else self.updates
 
     @property
     def span_s(self) -> float:
@@ -75,7 +87,8 @@ class Log:
     @property
     def notes(self) -> tuple[str, ...]:
         """Return sentences about how the file was read."""
-        return (*self.contents.warnings, *(d.sentence for d in self.doubts))
+        kept = () if self.compression is None else (self.compression.sentence,)
+        return (*self.contents.warnings, *(d.sentence for d in self.doubts), *kept)
 
     def name_of(self, signal: Signal) -> str:
         """Return the topic or column a signal comes from, empty if it is not there."""
@@ -98,7 +111,7 @@ class Log:
         """
         import pandas as pd
 
-        r = self.readings
+        r = self.recorded
         times, row = np.unique(r.time_ns, return_inverse=True)
         values = np.full((len(times), N_SIGNALS), np.nan)
         quality = np.zeros((len(times), N_SIGNALS), dtype=np.uint8)
@@ -209,14 +222,14 @@ def _understood(name: str, contents: LogContents, mapping: LogMapping, progress:
     units = {s: mapping.unit_of(s, told) for s in contents.signals}
     constants = mapping.constant_signals
     check_constants(constants)
-    measured = sorted(units.keys() - constants.keys())
-    for signal in measured:
+    measured_signals = sorted(units.keys() - constants.keys())
+    for signal in measured_signals:
         if note := air_note(signal, units[signal], contents.signals[signal]):
             progress.say(note)
     raw, settings = contents.readings, Settings()
     doubts = [
         found
-        for s in measured
+        for s in measured_signals
         if (found := doubt(s, raw.value[raw.signal == s], units[s], settings)) is not None
     ]
     refuse_guesses(contents.path, doubts, contents.grounds, contents.signals)
@@ -229,8 +242,21 @@ def _understood(name: str, contents: LogContents, mapping: LogMapping, progress:
             f"{SIGNALS[signal].topic} stands in the log as '{contents.signals[signal]}' too; "
             'the constant is used instead.'
         )
-    readings = with_constants(_converted(raw, units), constants)
-    return Log(name, contents, readings, units, constants, doubts)
+    measured = _converted(raw, units)
+    compression = find_compression(measured)
+    if compression is not None:
+        progress.say(compression.sentence)
+    if compression is None or not compression.own_times:
+        readings = with_constants(measured, constants)
+        return Log(name, contents, readings, units, constants, doubts, compression)
+    held = with_constants(held_readings(measured, compression), constants)
+    there = np.isfinite(measured.value)
+    kept = Readings(
+        measured.time_ns[there], measured.signal[there], measured.value[there],
+        measured.quality[there],
+    )  # fmt: skip
+    recorded = with_constants(kept, constants)
+    return Log(name, contents, held, units, constants, doubts, compression, recorded)
 
 
 def _units_told(contents: LogContents) -> dict[Signal, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,9 +13,9 @@ from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.extended import ExtendedModel
-from valveflow_ros.errors import WORKING_BYTES, DataError, check_address_space
+from valveflow_ros.errors import WORKING_BYTES, DataError, check_address_space, counted
 from valveflow_ros.fit.fit import fit, form_contradicted, form_of_data, outline
-from valveflow_ros.fit.task import FitTask
+from valveflow_ros.fit.task import COARSE_STEP_S, FitTask
 from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.alignment import Counts, aligned_blocks, corrected
 from valveflow_ros.interface.logs import Log
@@ -105,7 +106,7 @@ def settings_of(
     ParameterError
         Values are at odds with each other.
     """
-    settings, notes = settings_for(log.steps(), log.span_s, given)
+    settings, notes = settings_for(log.steps(), log.span_s, given, held=log.updates is not None)
     if constants:
         notes += [
             f'{SIGNALS[s].topic} was not logged and is taken as {value:g} {SIGNALS[s].unit}.'
@@ -179,7 +180,7 @@ def cut_in_two(log: Log, block_s: float) -> tuple[Log, Log]:
 
     def part(mask: Any) -> Log:
         kept = Readings(r.time_ns[mask], r.signal[mask], r.value[mask], r.quality[mask])
-        return replace(log, readings=kept)
+        return replace(log, readings=kept, updates=None)
 
     return part(r.time_ns < cut), part(r.time_ns >= cut)
 
@@ -210,6 +211,14 @@ def _no_segment(table: SampleTable, settings: Settings, learnt: bool) -> str:
     span = duration(usable * settings.real('sample_period'))
     if not learnt:
         first = duration(WARM_UP * WINDOW * settings.real('block'))
+        if (step_s := settings.real('sample_period')) >= COARSE_STEP_S:
+            rows = math.ceil(WARM_UP * WINDOW * settings.real('block') / step_s)
+            return (
+                f'The log holds {counted(usable, "usable row")}, one every {duration(step_s)}; it '
+                f'takes {rows} rows ({first}) without gaps to learn the noise of the signals, and '
+                'special segments after that to find the curve. Fewer rows, 12 at least, are '
+                'enough for a static test: steady rows at one pressure and several openings.'
+            )
         return (
             f'The log holds {span} of usable data; it takes {first} without gaps to learn the '
             'noise of the signals, and special segments after that to find the curve.'

@@ -167,7 +167,11 @@ def _largest(curve: Characteristic, found: Fitted) -> None:
          [(d.time_constant_s, d.time_constant_stderr_s) for d in curve.dynamics]),
         ('delay', 'delay', [(d.delay_s, d.delay_stderr_s) for d in curve.dynamics]),
     ):  # fmt: skip
-        value, error = max(found_here)
+        known = [pair for pair in found_here if not pair[1] > pair[0]]
+        if not known:
+            found.left.append(f'{name} is left as it is: the {what} is not known from the log.')
+            continue
+        value, error = max(known)
         error = error if math.isfinite(error) else 0.0
         default = float(PARAMETERS[name].default)
         wanted = float(max(1, math.ceil(value + _SURE * error)))

@@ -163,10 +163,12 @@ def settings_for(
     given: Mapping[str, object],
     *,
     live: bool = False,
+    held: bool = False,
 ) -> tuple[Settings, list[str]]:
     """Return the complete settings for a log, and sentences about what was adapted.
 
-    The curve is fitted once, at the end, unless all is to go as in a ``live`` monitor.
+    The curve is fitted once, at the end, unless all is to go as in a ``live`` monitor. ``held``:
+    the values of a compressed log were held, which was told with the step of the rows.
 
     Raises
     ------
@@ -175,7 +177,7 @@ def settings_for(
     """
     adapted = fitting(steps, span_s, given)
     settings = Settings({**adapted, **given, **({} if live else ONE_FIT)})
-    return settings, _words(adapted, given, settings, steps, span_s)
+    return settings, _words(adapted, given, settings, steps, span_s, held)
 
 
 def _words(
@@ -184,6 +186,7 @@ def _words(
     settings: Settings,
     steps: Mapping[Signal, float],
     span_s: float,
+    held: bool,
 ) -> list[str]:
     said = []
     period = settings.real('sample_period')
@@ -199,7 +202,7 @@ def _words(
         )
         if name in adapted
     ]
-    if 'sample_period' in adapted:
+    if 'sample_period' in adapted and not held:
         said.append(f'The log has a value every {period:g} s, so the table has that step.')
     if told:
         said.append(f'Adapted to the step of the data: {", ".join(told)}.')

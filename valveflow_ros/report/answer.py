@@ -18,6 +18,7 @@ from valveflow_ros.report.figure import Figure, Spec, axis, line, rounded, token
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import notice, paragraph, table, text
 from valveflow_ros.report.words import (
+    NOT_KNOWN,
     count,
     counted,
     decimals,
@@ -25,9 +26,11 @@ from valveflow_ros.report.words import (
     held_words,
     input_unit,
     interval,
+    is_known,
     percent,
     plain,
     span,
+    time_with_error,
     with_error,
 )
 from valveflow_ros.signals.static_form import OPENING
@@ -234,13 +237,13 @@ _LOOKS = (('chosen', 'solid'), ('steady', 'dash'), ('slope', 'dot'))
 
 
 def dynamics_table(dynamics: tuple[RegionDynamics, ...]) -> str:
-    """Return time constant and delay by region of power."""
+    """Return time constant and delay by region of power; what its error exceeds is not known."""
     rows = [
         [
             f'{span(d.power_from, d.power_to)} MW',
-            with_error(d.time_constant_s, d.time_constant_stderr_s),
-            with_error(d.delay_s, d.delay_stderr_s),
-            decimals(d.delay_s + 3.0 * d.time_constant_s, 0),
+            time_with_error(d.time_constant_s, d.time_constant_stderr_s),
+            time_with_error(d.delay_s, d.delay_stderr_s),
+            decimals(d.delay_s + 3.0 * d.time_constant_s, 0) if _told(d) else NOT_KNOWN,
         ]
         for d in dynamics
     ]
@@ -248,8 +251,18 @@ def dynamics_table(dynamics: tuple[RegionDynamics, ...]) -> str:
     return table(head, rows)
 
 
-def dynamics_figure(dynamics: tuple[RegionDynamics, ...]) -> Figure:
-    """Return how the power follows a sudden step of the steam flow in each region."""
+def _told(region: RegionDynamics) -> bool:
+    return is_known(region.time_constant_s, region.time_constant_stderr_s)
+
+
+def dynamics_figure(dynamics: tuple[RegionDynamics, ...]) -> Figure | None:
+    """Return how the power follows a sudden step of the steam flow in each region.
+
+    None where no time constant is known.
+    """
+    dynamics = tuple(d for d in dynamics if _told(d))
+    if not dynamics:
+        return None
     ends = [d.delay_s + 4.0 * d.time_constant_s for d in dynamics]
     # One slow region must not press the others against the edge.
     t = np.linspace(0.0, min(max(ends), 8.0 * min(ends)), 160)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.fit.static_test import STATIC_RULE
 from valveflow_ros.fit.step_test import RULE
 from valveflow_ros.parameters import PARAMETERS, Settings
 from valveflow_ros.report.answer import (
@@ -71,7 +72,7 @@ def identification_page(data: Identified) -> Page:
 def _choice(c: Characteristic) -> Section:
     """Return why there are so many pieces; without a turning angle there is nothing to draw."""
     title, choice = 'Why this number of pieces', c.choice
-    if not choice.turning_angle and choice.rule == RULE:
+    if not choice.turning_angle and choice.rule in (RULE, STATIC_RULE):
         return Section(title, [paragraph(text(choice.note))])
     return Section(title, [choice_figure(choice, max(1, len(c.pieces))), confidence_table(choice)])
 
@@ -81,7 +82,8 @@ def _dynamics(c: Characteristic) -> Section:
     if not c.dynamics:
         none = 'Time constants and delays were not estimated for this curve.'
         return Section(title, [paragraph(none)])
-    return Section(title, [dynamics_table(c.dynamics), dynamics_figure(c.dynamics)])
+    figure = dynamics_figure(c.dynamics)
+    return Section(title, [dynamics_table(c.dynamics), *([] if figure is None else [figure])])
 
 
 def _read(data: Identified) -> str:

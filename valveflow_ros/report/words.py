@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from valveflow_ros.curve.characteristic import HeldCause
 
 UNKNOWN = 'unknown'
+NOT_KNOWN = 'not known'
 _MINUS = '−'
 
 
@@ -77,6 +78,16 @@ def with_error(value: float, error: float, unit: str = '') -> str:
         return plain(value) + tail
     places = places_for(error)
     return f'{decimals(value, places)} ± {decimals(error, places)}{tail}'
+
+
+def is_known(value: float, error: float) -> bool:
+    """Return whether a time is told: its standard error, if it has one, does not exceed it."""
+    return not error > value
+
+
+def time_with_error(value_s: float, error_s: float, unit: str = '') -> str:
+    """Write a time constant or delay; 'not known' where its standard error exceeds it."""
+    return with_error(value_s, error_s, unit) if is_known(value_s, error_s) else NOT_KNOWN
 
 
 def interval(low: float, high: float) -> str:

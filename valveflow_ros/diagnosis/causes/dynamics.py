@@ -9,7 +9,16 @@ import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel, make_taps
 from valveflow_ros.diagnosis import kernels
-from valveflow_ros.diagnosis.cause import Active, Cause, Kind, Stage, Start, Unknown, Values
+from valveflow_ros.diagnosis.cause import (
+    Active,
+    Cause,
+    Kind,
+    SentenceValues,
+    Stage,
+    Start,
+    Unknown,
+    Values,
+)
 from valveflow_ros.diagnosis.fitting import improve
 from valveflow_ros.diagnosis.grids import Grids
 from valveflow_ros.diagnosis.screening import Screening
@@ -51,11 +60,15 @@ def region_lag_starts(screening: Screening) -> Sequence[Start]:
     return screening.best(REGION_LAG, grid)
 
 
-def region_lag_sentence(values: dict[str, float]) -> str:
-    """Say it."""
+def region_lag_sentence(values: SentenceValues) -> str:
+    """Say it; a time that its error exceeds is not known."""
+    time_s, delay_s = (
+        'that is not known' if name in values.unsure else f'of {values[name]:.{digits}g} s'
+        for name, digits in (('time_s', 3), ('delay_s', 2))
+    )
     return (
-        f'Above {values["level_mw"]:.0f} MW the unit answers with a time constant of '
-        f'{values["time_s"]:.3g} s and a delay of {values["delay_s"]:.2g} s, unlike the model.'
+        f'Above {values["level_mw"]:.0f} MW the unit answers with a time constant {time_s} and a '
+        f'delay {delay_s}, unlike the model.'
     )
 
 

@@ -1,0 +1,104 @@
+"""A static flow test: steady rows far apart become a curve; rows that move do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import valveflow_ros as vf
+from valveflow_ros.errors import DataError
+
+PRESSURE = 16.7
+KNOTS = np.array([24.0, 52.0, 78.0, 100.0])
+POWER = np.array([60.0, 210.0, 288.0, 306.0])
+
+
+def flow_test(seed: int, rows: int = 47, noise_mw: float = 0.25, step_s: float = 60.0):
+    """A table of steady rows at full pressure, the opening in any order."""
+    rng = np.random.default_rng(seed)
+    opening = rng.permutation(np.linspace(KNOTS[0], KNOTS[-1], rows) + rng.normal(0.0, 0.2, rows))
+    opening = np.clip(opening, KNOTS[0], KNOTS[-1])
+    power = np.interp(opening, KNOTS, POWER) + rng.normal(0.0, noise_mw, rows)
+    return pd.DataFrame({
+        'time': 1_700_000_040.0 + step_s * np.arange(rows),
+        'valve_opening_percent': opening, 'main_steam_pressure_mpa': PRESSURE,
+        'main_steam_temperature_degc': 538.0 + rng.normal(0.0, 0.3, rows),
+        'generated_power_mw': power,
+    })  # fmt: skip
+
+
+@pytest.mark.parametrize('seed', [1, 2, 3, 4, 11, 12, 13, 14])
+@pytest.mark.parametrize(('rows', 'step_s'), [(47, 60.0), (90, 30.0)])
+def test_three_pieces_and_their_knees_are_found(seed: int, rows: int, step_s: float) -> None:
+    """Knees within 2 % of the truth; no dynamics; the table is said to be a static test."""
+    found = vf.identify(flow_test(seed, rows, step_s=step_s))
+    c = found.characteristic
+    assert len(c.pieces) == 3
+    truth = KNOTS[1:-1] * PRESSURE**c.pressure_exponent
+    np.testing.assert_allclose(c.breakpoints[1:-1], truth, rtol=0.02)
+    assert not c.dynamics
+    assert min(p.samples for p in c.pieces) >= 3
+    assert any('taken as a static test' in note for note in found.notes)
+    assert len(found.segments) == rows
+
+
+def test_the_order_of_rows_does_not_matter() -> None:
+    """Steady rows have no past."""
+    frame = flow_test(5)
+    mixed = frame.sample(frac=1.0, random_state=1)
+    mixed['time'] = frame['time'].to_numpy()
+    one, two = (vf.identify(f).characteristic for f in (frame, mixed))
+    np.testing.assert_allclose(one.breakpoints, two.breakpoints, rtol=1e-6)
+
+
+def test_twice_the_power_is_twice_the_curve() -> None:
+    """Scale of the power goes through; knees stay."""
+    frame = flow_test(6)
+    other = frame.assign(generated_power_mw=2.0 * frame['generated_power_mw'])
+    one, two = (vf.identify(f).characteristic for f in (frame, other))
+    np.testing.assert_allclose(one.breakpoints, two.breakpoints, rtol=1e-6)
+    np.testing.assert_allclose(2.0 * one.values(), two.values(), rtol=1e-6)
+
+
+def test_one_line_stays_one_piece() -> None:
+    """Noise makes no knee: in at most one of twenty tests of a straight valve."""
+    more = 0
+    for seed in range(20):
+        frame = flow_test(seed)
+        rng = np.random.default_rng(seed)
+        line = 3.0 * frame['valve_opening_percent'] + rng.normal(0.0, 0.5, len(frame))
+        more += len(vf.identify(frame.assign(generated_power_mw=line)).characteristic.pieces) > 1
+    assert more <= 2
+
+
+@pytest.mark.parametrize('seed', [1, 2, 11])
+def test_rows_that_follow_with_a_lag_are_no_static_test(seed: int) -> None:
+    """The misfit depends on the last move."""
+    frame = flow_test(seed)
+    power = frame['generated_power_mw'].to_numpy()
+    late = power + 0.03 * np.append(0.0, power[:-1] - power[1:])
+    with pytest.raises(DataError):
+        vf.identify(frame.assign(generated_power_mw=late))
+
+
+@pytest.mark.parametrize(
+    'change',
+    [
+        {'generated_power_mw': lambda f: 300.0 - f['generated_power_mw']},
+        {'valve_opening_percent': lambda f: 50.0},
+        {'main_steam_pressure_mpa': lambda f: np.linspace(8.0, 16.0, len(f))},
+        {'generated_power_mw': lambda f: np.nan},
+        {'generated_power_mw': lambda f: np.random.default_rng(1).permuted(f[f.columns[4]])},
+    ],
+)
+def test_what_is_no_static_test_is_refused(change) -> None:
+    """A falling power, one opening, sliding pressure, no power, no relation."""
+    with pytest.raises(DataError):
+        vf.identify(flow_test(1).assign(**change))
+
+
+def test_too_few_rows_are_told_in_rows() -> None:
+    """The floor is told in rows of the table as read, and in time."""
+    with pytest.raises(DataError, match=r'11 usable rows, one every 1 min; it takes 168 rows'):
+        vf.identify(flow_test(1).head(11))
