@@ -23,7 +23,7 @@ from valveflow_ros.diagnosis.evidence import (
 )
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import Task, improve, search_levels, search_lines
-from valveflow_ros.diagnosis.grids import ORDER, Grids, make_grids
+from valveflow_ros.diagnosis.grids import ORDER, CovariateRows, Grids, make_grids
 from valveflow_ros.diagnosis.record_faults import Fault, faults
 from valveflow_ros.diagnosis.result import (
     NAMED,
@@ -35,6 +35,7 @@ from valveflow_ros.diagnosis.result import (
 )
 from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.diagnosis.search import Found, Progress, search, simplified
+from valveflow_ros.diagnosis.slow import Drift, drift
 from valveflow_ros.diagnosis.structure import Period, Structure, Wander, period, structure, wander
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import BoolArray, FloatArray, IntArray, SampleTable
@@ -175,6 +176,8 @@ class Record:
     measured : SampleTable, optional
         The rows as measured, where causes were taken out of ``table``: faults of the
         signals are looked for in these (a plug that a slack lets rest is no dead transmitter).
+    covariates : tuple of CovariateRows
+        Columns beside the signals that the power may follow, on the rows of the table.
     """
 
     table: SampleTable
@@ -183,10 +186,15 @@ class Record:
     settle_s: float
     spans_ns: IntArray
     measured: SampleTable | None = None
+    covariates: tuple[CovariateRows, ...] = ()
 
     def faults(self) -> tuple[BoolArray, tuple[Fault, ...]]:
         """Return which values are not to be believed, shape (n, 5), and what is wrong."""
         return faults(self.table if self.measured is None else self.measured, self.step_s)
+
+    def grids(self, bad: BoolArray, rough: bool = False) -> Grids:
+        """Return the record on the grids of a diagnosis, without the values not believed."""
+        return make_grids(*self.about, bad, rough, self.covariates)
 
     @property
     def about(self) -> tuple[SampleTable, float, StaticForm, float]:
@@ -201,6 +209,7 @@ class _Rest:
     wander: Wander
     structure: Structure
     period: Period
+    drift: Drift
 
 
 def diagnose(
@@ -226,7 +235,7 @@ def diagnose(
     """
     progress(0.02, 'the record itself')
     bad, wrong = record.faults()
-    grids, rough = make_grids(*record.about, bad), make_grids(*record.about, bad, rough=True)
+    grids, rough = record.grids(bad), record.grids(bad, rough=True)
     _moves(grids)
     task = Task(grids, grids.open_rows, np.zeros(ORDER), given)
     start = Extended(model if given else simplified(model))
@@ -261,7 +270,7 @@ def diagnose_form(
     """
     found = diagnose(asked, found_model, progress=progress)
     bad, _ = record.faults()
-    before, after = make_grids(*record.about, bad), make_grids(*asked.about, bad)
+    before, after = record.grids(bad), asked.grids(bad)
     plain = Task(before, before.open_rows, np.zeros(ORDER)), Extended(model)
     better = Task(after, after.open_rows, np.zeros(ORDER)), found.simulation
     gain = gain_of_form(*plain, *better)
@@ -306,7 +315,7 @@ def _look_again(found: Found) -> _Rest:
     screening = Screening(found.task, found.model)
     slow = wander(screening)
     left = structure(found.task, found.model, _wandering(found.task.grids, screening, slow))
-    return _Rest(slow, left, period(found.task, found.model))
+    return _Rest(slow, left, period(found.task, found.model), drift(found.task, found.model))
 
 
 def _withdraw(found: Found, rest: _Rest) -> None:
@@ -348,11 +357,7 @@ def _conclude(
         )
         for a, gain in zip(final.active, gains, strict=True)
     )  # fmt: skip
-    raw = (
-        make_grids(*record.about, np.zeros(record.table.values.shape, dtype=bool))
-        if wrong
-        else None
-    )
+    raw = record.grids(np.zeros(record.table.values.shape, dtype=bool)) if wrong else None
     outside = actuator_cause(found) + record_causes(raw, found, wrong)
     verdict, dropped = _verdict(found, rest, bool(outside))
     near = tuple(dict.fromkeys(n for c in causes for n in c.not_told_apart))

@@ -28,9 +28,10 @@ from valveflow_ros.curve.json_schema import (
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import Active, Estimate
 from valveflow_ros.diagnosis.causes import catalogue
+from valveflow_ros.diagnosis.causes.covariate import covariate_cause
 from valveflow_ros.diagnosis.evidence import Gain, SegmentGain
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
-from valveflow_ros.diagnosis.grids import Reference
+from valveflow_ros.diagnosis.grids import COEFFICIENTS, COURSE, Covariate, Reference
 from valveflow_ros.errors import DataError
 from valveflow_ros.signals.static_form import AXES, OPENING
 
@@ -134,7 +135,11 @@ def model_to_json(given: ExtendedModel) -> dict[str, Any]:
             'delays_s': m.delays.tolist(),
         },
         'causes': [
-            {'name': a.name, 'values': a.named(), 'switches_s': list(a.extra)}
+            {
+                'name': a.name, 'values': a.named(), 'switches_s': list(a.extra),
+                **({} if a.cause.covariate is None else
+                   {'covariate': dataclasses.asdict(a.cause.covariate)}),
+            }
             for a in given.model.active
         ],
         **({} if earlier is None else {'on_top_of': model_to_json(earlier)}),
@@ -169,6 +174,12 @@ _SCHEMA = {
     'causes': ListOf({
         'name': Text(), 'values': Members(Number(-1e12, 1e12)),
         'switches_s': ListOf(_TIME, rising=True),
+        'covariate': Maybe({
+            'column': Text(), 'unit': Text(), 'spread': Number(1e-12, 1e12),
+            'power_mw': Number(1e-3, MW[1]), 'centre': ListOf(Number(-1e12, 1e12), 4, 4),
+            'surface': ListOf(Number(-1e12, 1e12), COEFFICIENTS, COEFFICIENTS),
+            'course': ListOf(Number(-1e12, 1e12), COURSE, COURSE),
+        }),
     }),
 }  # fmt: skip
 
@@ -232,6 +243,11 @@ def _causes(found: list[dict[str, Any]], path: str) -> tuple[Active, ...]:
 
 def _cause(found: dict[str, Any], path: str) -> Active:
     cause = catalogue().get(found['name'])
+    if cause is None and (about := found['covariate']):
+        given = {k: tuple(v) if isinstance(v, list) else v for k, v in about.items()}
+        if min(given['centre'][1], given['centre'][3]) <= 0.0:
+            raise fail(_WHOLE, f'{path}.covariate.centre', 'has a spread that is not positive')
+        cause = covariate_cause(Covariate(found['name'], **given))
     if cause is None:
         raise fail(_WHOLE, f'{path}.name', 'is no cause of the catalogue')
     schema = {u.name: Number(u.low, u.high) for u in cause.unknowns}

@@ -10,7 +10,7 @@ import numpy as np
 from valveflow_ros.diagnosis.diagnose import Record
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import Task
-from valveflow_ros.diagnosis.grids import ORDER, make_grids
+from valveflow_ros.diagnosis.grids import ORDER
 from valveflow_ros.diagnosis.result import Diagnosis
 from valveflow_ros.diagnosis.structure import minutes, variables
 from valveflow_ros.records import BoolArray, FloatArray
@@ -239,7 +239,7 @@ Views = tuple[tuple[Signature, ...], tuple[Answer, ...], tuple[ResidualMap, ...]
 def views(record: Record, found: Diagnosis) -> Views:
     """Return residuals by variable, around fast moves and in maps, before and after extending."""
     bad, _ = record.faults()
-    grids = make_grids(*record.about, bad)
+    grids = record.grids(bad)
     task = Task(grids, grids.whole, np.zeros(ORDER))
     return (
         signatures(task, found.simulation, found.extended),

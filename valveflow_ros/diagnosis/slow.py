@@ -1,0 +1,212 @@
+"""The slow part of what a model leaves: a drift of the power over hours and days.
+
+The residual is averaged over sub-blocks of half an hour and taken for the sum of three parts:
+what curve and pressure could still take up (hats of load, input and pressure, free coefficients), a wander of
+the plant's gain, and noise. The wander is a stationary first-order process, an Ornstein-Uhlenbeck
+process, of unknown variance and time scale:
+
+    r_i = z_i a + P_i w_i + e_i,   cov(w_i, w_j) = s^2 exp(-|t_i - t_j| / T)
+
+with P_i the mean load relative to that of the record. Variance and time scale are those of the
+largest likelihood on a grid; coefficients and the noise's variance are known in closed form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from valveflow_ros.diagnosis.extended import Extended, answer
+from valveflow_ros.diagnosis.fitting import Task
+from valveflow_ros.diagnosis.grids import Grids
+from valveflow_ros.records import BoolArray, FloatArray
+
+_TIME_SCALES_H = (0.5, 1.0, 3.0, 8.0, 24.0, 72.0, 240.0)
+_RATIOS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0, 10_000.0)
+_HATS = 9
+_HALF = 0.5  # of the usual number of means, for a sub-block to count
+_MOST_ROWS = 500  # longer records are averaged over several sub-blocks
+_LEAST_ROWS = 40
+_SLOWEST_OF_NOISE_H = 2.0
+_LEAST_DRIFT_GAIN = 16.0
+_LEAST_DRIFT_MW = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Levels:
+    """Means of half an hour of what a model leaves.
+
+    Attributes
+    ----------
+    hours : float64 (k,)
+        Middle of each, hours since the first row.
+    power : float64 (k,)
+        MW.
+    load : float64 (k,)
+        Mean load relative to that of the record.
+    free : float64 (k, p)
+        What curve and dynamics could take up.
+    noise : float64 (k,)
+        Relative variance of each mean.
+    """
+
+    hours: FloatArray
+    power: FloatArray
+    load: FloatArray
+    free: FloatArray
+    noise: FloatArray
+
+    @property
+    def enough(self) -> bool:
+        """Tell whether a wander can be told from what the curve could take up."""
+        return len(self.hours) >= _LEAST_ROWS + self.free.shape[1]
+
+
+def levels(task: Task, model: Extended, rows: BoolArray) -> tuple[Levels, FloatArray]:
+    """Return the means over sub-blocks of some rows, and a matrix (k, m) that averages so."""
+    grids = task.grids
+    sub = grids.sub // max(1, -(-grids.subs // _MOST_ROWS))
+    here = answer(grids, model)
+    count = np.bincount(sub[rows], minlength=int(sub[-1]) + 1)
+    kept = np.flatnonzero(count >= max(1.0, _HALF * float(np.median(count[count > 0]))))
+
+    def mean(x: FloatArray) -> FloatArray:
+        total = np.bincount(sub[rows], x[rows], minlength=len(count))
+        return np.asarray(total[kept] / count[kept])
+
+    usual = float(here[rows].mean())
+    inputs = (here, grids.means(grids.u), grids.means(grids.pressure))
+    free = [mean(hat) for x in inputs for hat in _hats(x, rows)]
+    time_h = (np.arange(len(here)) + 0.5) * grids.mean_s / 3600.0
+    found = Levels(
+        mean(time_h), mean(task.residual(model)), mean(here) / usual,
+        np.column_stack(free), float(count[kept].mean()) / count[kept],
+    )  # fmt: skip
+    columns = [mean(deviation(grids, name) * here / usual) for name in grids.covariates]
+    return found, np.array(columns).T.reshape(len(kept), len(columns))
+
+
+def deviation(grids: Grids, name: str) -> FloatArray:
+    """Return by how much a covariate departs from its usual value at the load, (m,), its unit."""
+    about, here = grids.covariates[name]
+    return grids.means(here - about.usual(grids.u, grids.pressure))
+
+
+def _hats(x: FloatArray, rows: BoolArray) -> Iterator[FloatArray]:
+    knots = np.linspace(*np.quantile(x[rows], (0.01, 0.99)), _HATS)
+    # The hats of each input sum to one; a pseudo-inverse has no quarrel with that.
+    return (np.interp(x, knots, row) for row in np.eye(_HATS))
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """The best wander: log-likelihood, time scale in h, variance relative to the noise's."""
+
+    likelihood: float
+    hours: float
+    ratio: float
+
+
+def _covariance(found: Levels, hours: float) -> FloatArray:
+    apart = np.abs(found.hours[:, None] - found.hours[None, :])
+    return np.asarray(np.exp(-apart / hours) * np.outer(found.load, found.load))
+
+
+def _fits(found: Levels, column: FloatArray | None = None) -> Iterator[tuple[_Fit, float]]:
+    """Yield every wander tried, and the log-likelihood that a column adds to it."""
+    k = len(found.hours)
+    flat = found.power, *(found.free.T), *(() if column is None else (column,))
+    table = np.column_stack(flat)
+    for hours in _TIME_SCALES_H:
+        wander = _covariance(found, hours)
+        for ratio in (0.0, *_RATIOS) if hours == _TIME_SCALES_H[0] else _RATIOS:
+            lower, _ = cho_factor(np.diag(found.noise) + ratio * wander, lower=True)
+            white = solve_triangular(lower, table, lower=True)
+            free = white[:, 1 : 1 + found.free.shape[1]]
+            left = white - free @ (np.linalg.pinv(free) @ white)
+            rest = left[:, 0]
+            cost = float(rest @ rest)
+            scale = -float(np.log(np.diag(lower)).sum())
+            fit = _Fit(scale - 0.5 * k * np.log(cost / k), hours, ratio)
+            more = 0.0
+            if column is not None:
+                own, toward = float(left[:, -1] @ left[:, -1]), float(left[:, -1] @ rest)
+                explained = toward * toward / own if own > 0.0 else 0.0
+                more = -0.5 * k * np.log(max(1.0 - explained / cost, 1e-300))
+            yield fit, more
+
+
+def covariate_gain(task: Task, model: Extended, name: str) -> float:
+    """Return the log-likelihood that a covariate brings beside a slow wander of the power.
+
+    With and without it the wander has the variance and the time scale that suit it best. A
+    covariate that the power follows leaves no wander, or a much smaller one; one that only looks
+    alike leaves it as large as before.
+    """
+    found, columns = levels(task, model, task.rows)
+    if not found.enough:
+        return 0.0
+    place = list(task.grids.covariates).index(name)
+    tried = list(_fits(found, columns[:, place]))
+    without = max(fit.likelihood for fit, _ in tried)
+    return max(fit.likelihood + more for fit, more in tried) - without
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """How far the power drifts over hours and days without a cause.
+
+    Attributes
+    ----------
+    gain : float
+        Log-likelihood that the wander brings over none.
+    rms_mw : float
+        Root mean square of the wander about its mean over the record, in MW.
+    time_scale_s : float
+        Time after which it has forgotten about two thirds of where it was.
+    """
+
+    gain: float
+    rms_mw: float
+    time_scale_s: float
+
+    @property
+    def there(self) -> bool:
+        """Tell whether it is more than chance, and slow."""
+        return (
+            self.gain > _LEAST_DRIFT_GAIN
+            and self.time_scale_s >= 3600.0 * _SLOWEST_OF_NOISE_H
+            and self.rms_mw > _LEAST_DRIFT_MW
+        )
+
+
+def drift(task: Task, model: Extended) -> Drift:
+    """Estimate the slow wander of the power that a model leaves.
+
+    Its size is the root mean square over the record of P_i w_i about its mean, as the data let it
+    be expected: the square of what is estimated and the variance that remains. What of it goes
+    along with the load was taken up by the curve and cannot be seen.
+    """
+    found, _ = levels(task, model, task.grids.whole)
+    if not found.enough:
+        return Drift(0.0, 0.0, 0.0)
+    tried = [fit for fit, _ in _fits(found)]
+    best = max(tried, key=lambda fit: fit.likelihood)
+    none = next(fit for fit in tried if fit.ratio == 0.0)
+    if best.ratio == 0.0:
+        return Drift(0.0, 0.0, 0.0)
+    wander = best.ratio * _covariance(found, best.hours)
+    factor = cho_factor(np.diag(found.noise) + wander, lower=True)
+    free = found.free
+    held = cho_solve(factor, free)
+    coefficients = np.linalg.pinv(free.T @ held) @ (held.T @ found.power)
+    rest = found.power - free @ coefficients
+    white = cho_solve(factor, rest)
+    noise_mw2 = float(rest @ white) / len(rest)
+    level = wander @ white
+    left = np.diag(wander - wander @ cho_solve(factor, wander)) * noise_mw2
+    rms = float(np.sqrt(np.var(level) + left.mean()))
+    return Drift(best.likelihood - none.likelihood, rms, 3600.0 * best.hours)
