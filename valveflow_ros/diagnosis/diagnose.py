@@ -211,6 +211,16 @@ class _Rest:
     period: Period
     drift: Drift
 
+    @property
+    def disturbance(self) -> Disturbance | None:
+        """Return the slow wander of the power, a drift if it is one."""
+        slow = self.drift
+        if slow.there:
+            return Disturbance(slow.rms_mw, slow.time_scale_s, slow.rms_mw)
+        if self.wander.there:
+            return Disturbance(self.wander.rms_mw, self.wander.time_scale_s)
+        return None
+
 
 def diagnose(
     record: Record, model: RegionalModel, given: bool = False, progress: Progress = _quiet
@@ -320,7 +330,7 @@ def _look_again(found: Found) -> _Rest:
 
 def _withdraw(found: Found, rest: _Rest) -> None:
     """Take back names of causes in time where the power wanders slowly all the time."""
-    if not rest.wander.there:
+    if rest.disturbance is None:
         return
     for a in found.model.active:
         if a.cause.slow:
@@ -370,8 +380,7 @@ def _conclude(
     result = Diagnosis(
         verdict=verdict, sentence='', causes=causes + outside,
         not_told_apart=near, experiments=_experiments(causes),
-        disturbance=Disturbance(rest.wander.rms_mw, rest.wander.time_scale_s)
-        if rest.wander.there else None,
+        disturbance=rest.disturbance,
         unexplained_by=unexplained, rejected=tuple(found.reasons.items()),
         rmse_simulation=before, rmse_extended=before if dropped else after,
         rmse_noise_floor=noise_floor(found.task, models[-1], explained),
@@ -417,14 +426,10 @@ def _experiments(causes: tuple[NamedCause, ...]) -> tuple[str, ...]:
 
 def _sentence(d: Diagnosis) -> str:
     """Return the verdict as one sentence an operator understands."""
+    wander = '' if d.disturbance is None else f' {d.disturbance.sentence}'
     if d.verdict == NAMED:
-        return ' '.join(c.sentence for c in d.causes)
-    wander = ''
-    if d.disturbance:
-        wander = (
-            f' The power wanders slowly by {d.disturbance.rms_mw:.2g} MW over about '
-            f'{d.disturbance.time_scale_s / 3600.0:.2g} h, which has no cause in these signals.'
-        )
+        drifts = d.disturbance is not None and d.disturbance.drift_mw is not None
+        return ' '.join(c.sentence for c in d.causes) + (wander if drifts else '')
     if d.verdict == NOTHING:
         blind = sum('cannot be judged' in reason for _, reason in d.rejected)
         but = f' {blind} causes could not be judged in this record.' if blind > 1 else ''

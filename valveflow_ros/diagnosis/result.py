@@ -53,10 +53,38 @@ class NamedCause:
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
-    """A slow wander that is no cause."""
+    """A slow wander that is no cause.
+
+    Attributes
+    ----------
+    rms_mw, time_scale_s : float
+        Its root mean square, and the time over which it changes.
+    drift_mw : float or None
+        Of a wander over many hours and days the root mean square about its mean over the
+        record; see `slow.drift`.
+    """
 
     rms_mw: float
     time_scale_s: float
+    drift_mw: float | None = None
+
+    @property
+    def sentence(self) -> str:
+        """Return it as a sentence for an operator."""
+        hours = self.time_scale_s / 3600.0
+        if self.drift_mw is not None:
+            length = 'days' if hours >= _DAYS_FROM_H else 'hours'
+            return (
+                f'The power drifts by {self.drift_mw:.2g} MW over {length}, which has no cause in '
+                'these signals.'
+            )
+        return (
+            f'The power wanders slowly by {self.rms_mw:.2g} MW over about {hours:.2g} h, which '
+            'has no cause in these signals.'
+        )
+
+
+_DAYS_FROM_H = 8.0  # a wander of so long a memory is seen to go on from day to day
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,7 +272,9 @@ def _causes(found: list[dict[str, Any]], path: str) -> tuple[Active, ...]:
 def _cause(found: dict[str, Any], path: str) -> Active:
     cause = catalogue().get(found['name'])
     if cause is None and (about := found['covariate']):
-        given = {k: tuple(v) if isinstance(v, list) else v for k, v in about.items()}
+        given: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in about.items()
+        }
         if min(given['centre'][1], given['centre'][3]) <= 0.0:
             raise fail(_WHOLE, f'{path}.covariate.centre', 'has a spread that is not positive')
         cause = covariate_cause(Covariate(found['name'], **given))
@@ -300,6 +330,7 @@ def to_json(d: Diagnosis) -> dict[str, Any]:
         'experiments': list(d.experiments),
         'disturbance': {
             'rms_mw': d.disturbance.rms_mw, 'time_scale_s': d.disturbance.time_scale_s,
+            'drift_mw': d.disturbance.drift_mw,
         }
         if d.disturbance
         else None,

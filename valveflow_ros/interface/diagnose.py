@@ -239,7 +239,7 @@ def covariate_rows(
         share = float(np.isfinite(values).mean())
         if share < _LEAST_SHARE:
             raise InputError(
-                f"--covariate {name}: '{series.column}' has a value for only {100.0 * share:.0f} % "
+                f"--covariate {name}: '{series.column}' has values for only {100.0 * share:.0f} % "
                 'of the rows; half of them are needed.'
             )
         found.append(CovariateRows(name, series.column, series.unit, values))

@@ -211,12 +211,12 @@ def read_covariate(log: Log, name: str, said: str) -> Series:
     InputError
         There is no such column, or it holds no number.
     """
-    column, colon, unit = said.rpartition(':')
-    for theirs, told in ((column, unit), (said, '')) if colon and column else ((said, ''),):
+    theirs, colon, told = said.rpartition(':')
+    contents = _column_of(log, theirs.strip()) if colon and theirs else None
+    if contents is None:  # a column's name may itself hold a colon
+        theirs, told = said, ''
         contents = _column_of(log, theirs.strip())
-        if contents is not None:
-            break
-    else:
+    if contents is None:
         raise InputError(f"--covariate {name}: {log.name} has no column or topic '{said}'.")
     mine = contents.readings.signal == _READ_AS
     good = mine & np.isfinite(contents.readings.value) & (contents.readings.quality < Quality.BAD)
