@@ -254,7 +254,7 @@ def diagnose(
     confirm(found)
     progress(0.8, 'what is left')
     rest = _look_again(found)
-    _withdraw(found, rest)
+    rest = _withdraw(found, rest)
     return _conclude(record, found, rest, wrong, progress)
 
 
@@ -328,10 +328,10 @@ def _look_again(found: Found) -> _Rest:
     return _Rest(slow, left, period(found.task, found.model), drift(found.task, found.model))
 
 
-def _withdraw(found: Found, rest: _Rest) -> None:
+def _withdraw(found: Found, rest: _Rest) -> _Rest:
     """Take back names of causes in time where the power wanders slowly all the time."""
     if rest.disturbance is None:
-        return
+        return rest
     for a in found.model.active:
         if a.cause.slow:
             found.model = found.model.without(a.name)
@@ -340,6 +340,8 @@ def _withdraw(found: Found, rest: _Rest) -> None:
                 'the power wanders slowly all the time, which would look the same'
             )
     found.model, _ = improve(found.task, found.model, 3)
+    # What these names had taken up belongs to the drift.
+    return replace(rest, drift=drift(found.task, found.model))
 
 
 def _final(found: Found) -> tuple[Task, Extended]:

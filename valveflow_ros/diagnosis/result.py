@@ -166,12 +166,18 @@ def model_to_json(given: ExtendedModel) -> dict[str, Any]:
             {
                 'name': a.name, 'values': a.named(), 'switches_s': list(a.extra),
                 **({} if a.cause.covariate is None else
-                   {'covariate': dataclasses.asdict(a.cause.covariate)}),
+                   {'covariate': _covariate_json(a.cause.covariate)}),
             }
             for a in given.model.active
         ],
         **({} if earlier is None else {'on_top_of': model_to_json(earlier)}),
     }  # fmt: skip
+
+
+def _covariate_json(about: Covariate) -> dict[str, Any]:
+    fields = dataclasses.asdict(about)
+    del fields['name']
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in fields.items()}
 
 
 def is_model(raw: object) -> bool:

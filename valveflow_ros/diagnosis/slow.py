@@ -64,7 +64,8 @@ class Levels:
     @property
     def enough(self) -> bool:
         """Tell whether a wander can be told from what the curve could take up."""
-        return len(self.hours) >= _LEAST_ROWS + self.free.shape[1]
+        rows, columns = self.free.shape
+        return bool(rows - columns >= _LEAST_ROWS)
 
 
 def levels(
