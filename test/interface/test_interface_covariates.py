@@ -8,6 +8,7 @@ import pytest
 from streams import needs_jit
 
 import valveflow_ros as vf
+from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.result import model_from_json, model_to_json, to_json
 from valveflow_ros.errors import DataError, InputError
 from valveflow_ros.interface.logs import Series, open_log, read_covariate
@@ -78,9 +79,9 @@ def test_a_damaged_covariate_is_refused_by_its_place(diagnosed, key, value):
 
 
 @needs_jit
-def test_it_cannot_be_taken_out_of_rows_and_says_so(plant, diagnosed):
+def test_it_cannot_be_taken_out_of_rows_and_says_so(diagnosed):
     with pytest.raises(DataError, match=f"'vacuum' follows the column '{COLUMN}'.*out of rows"):
-        vf.identify(plant.to_dataframe(), model=diagnosed.extended_model)
+        corrector_of(diagnosed.extended_model, 60.0)
 
 
 @needs_jit
