@@ -56,3 +56,19 @@ def test_the_page_tells_four_steps(diagnosed):
     assert 'single wild values' in page
     assert 'time (UTC)' in page
     assert 'days after' not in page
+
+
+@pytest.mark.parametrize(
+    ('said', 'sentence'),
+    [
+        (['vacuum'], "--covariate 'vacuum' is not of the form NAME=COLUMN"),
+        (['=x'], "--covariate '=x' is not of the form"),
+        (['a=x', 'a=y'], '--covariate a is given twice'),
+        (['vacuum=nowhere'], "--covariate vacuum: plant.parquet has no column or topic 'nowhere'"),
+    ],
+)
+def test_a_covariate_that_cannot_be_read_is_refused(diagnosed, capsys, said, sentence):
+    words = [word for one in said for word in ('--covariate', one)]
+    log, out = str(diagnosed / 'plant.parquet'), str(diagnosed / 'refused')
+    assert main(['diagnose', log, '-o', out, '--quiet', *words]) != 0
+    assert sentence in capsys.readouterr().err

@@ -19,6 +19,7 @@ from valveflow_ros.cli.command import (
     mapping_of,
     write_results,
 )
+from valveflow_ros.errors import UsageError
 
 if TYPE_CHECKING:
     from valveflow_ros.interface.diagnose import DiagnosisResult
@@ -33,7 +34,10 @@ example:
   valveflow diagnose plant.mcap -o result
 
 against the curve of an earlier record:
-  valveflow diagnose plant.mcap -o result --model last_year/characteristic.json"""
+  valveflow diagnose plant.mcap -o result --model last_year/characteristic.json
+
+with the condenser pressure, which the power follows too:
+  valveflow diagnose plant.csv -o result --covariate vacuum=condenser_pressure_kpa"""
 
 
 def arguments(parser: ArgumentParser) -> None:
@@ -47,6 +51,11 @@ def arguments(parser: ArgumentParser) -> None:
         help='characteristic.json or extended_model.json of an earlier log, to be held against '
         'this one; found anew without it',
     )  # fmt: skip
+    parser.add_argument(
+        '--covariate', action='append', default=[], metavar='NAME=COLUMN[:UNIT]',
+        help='a column beside the signals that the power may follow, such as '
+        'vacuum=condenser_pressure_kpa; may be given several times',
+    )  # fmt: skip
     add_parameters(parser)
     add_beside(parser)
     add_mapping(parser)
@@ -55,6 +64,7 @@ def arguments(parser: ArgumentParser) -> None:
 def run(options: Namespace, console: Console) -> VerbResult:
     """Open, diagnose, write."""
     mapping = mapping_of(options)
+    covariates = _covariates(options.covariate)
     console(0.0, 'starting')
     from valveflow_ros.diagnosis.result import to_json
     from valveflow_ros.interface.diagnose import diagnose, load_diagnosable
@@ -68,9 +78,22 @@ def run(options: Namespace, console: Console) -> VerbResult:
         given = with_exponent(model, given, options.model)
     console(0.02, 'reading')
     log = open_log(options.log, mapping, progress=console)
-    found = diagnose(log, parameters=given, model=model, progress=console)
+    found = diagnose(log, parameters=given, model=model, covariates=covariates, progress=console)
     console(0.95, 'writing the report')
     return write_results(found, options, _text(found), to_json(found.diagnosis))
+
+
+def _covariates(said: list[str]) -> dict[str, str]:
+    """Return the columns by name; raises `UsageError`."""
+    found: dict[str, str] = {}
+    for text in said:
+        name, equals, theirs = (part.strip() for part in text.partition('='))
+        if not equals or not name or not theirs:
+            raise UsageError(f"--covariate '{text}' is not of the form NAME=COLUMN[:UNIT].")
+        if name in found:
+            raise UsageError(f'--covariate {name} is given twice.')
+        found[name] = theirs
+    return found
 
 
 def _text(found: DiagnosisResult) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
-from valveflow_ros.diagnosis.grids import Grids
+from valveflow_ros.diagnosis.grids import Covariate, Grids
 from valveflow_ros.records import NS_PER_S, BoolArray
 
 # A number with its 95 % interval, and how a time is told: as dates in UTC.
@@ -252,6 +252,8 @@ class Cause:
     simpler: Callable[[Values], list[Values]] | None = None
     # Families that cannot be judged beside it, since what it leaves open looks like them.
     conceals: tuple[str, ...] = ()
+    # What it follows, if that is a column beside the signals.
+    covariate: Covariate | None = None
 
     def clipped(self, values: Values) -> Values:
         """Return values within the bounds."""

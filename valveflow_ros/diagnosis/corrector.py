@@ -226,6 +226,11 @@ def check_streams(active: tuple[Active, ...]) -> None:
     DataError
     """
     for a in active:
+        if about := a.cause.covariate:
+            raise DataError(
+                f"The cause '{a.name}' follows the column '{about.column}', which is no signal of "
+                'the monitor: it cannot be taken out of rows yet. Hold only a model without it.'
+            )
         known = {Stage.OPENING: set(_VALVES), Stage.OUTPUT: _SHOWN}.get(a.cause.stage)
         if known is not None and a.name not in known:
             raise DataError(f"The cause '{a.name}' cannot be taken out of rows as they come yet.")

@@ -23,7 +23,7 @@ from valveflow_ros.diagnosis.evidence import (
 )
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import Task, improve, search_levels, search_lines
-from valveflow_ros.diagnosis.grids import ORDER, Grids, make_grids
+from valveflow_ros.diagnosis.grids import ORDER, CovariateRows, Grids, make_grids
 from valveflow_ros.diagnosis.record_faults import Fault, faults
 from valveflow_ros.diagnosis.result import (
     NAMED,
@@ -35,6 +35,7 @@ from valveflow_ros.diagnosis.result import (
 )
 from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.diagnosis.search import Found, Progress, search, simplified
+from valveflow_ros.diagnosis.slow import Drift, drift
 from valveflow_ros.diagnosis.structure import Period, Structure, Wander, period, structure, wander
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import BoolArray, FloatArray, IntArray, SampleTable
@@ -158,6 +159,7 @@ def notes(grids: Grids) -> tuple[str, ...]:
 
 
 _LEAST_SPREAD = 0.01
+_FAR_MORE = 6.0
 _LAST_STEPS = 10  # knots go slowly beside a bump
 
 
@@ -185,6 +187,8 @@ class Record:
         signals are looked for in these (a plug that a slack lets rest is no dead transmitter).
     compression : Compression, optional
         How the record was compressed, if it was.
+    covariates : tuple of CovariateRows
+        Columns beside the signals that the power may follow, on the rows of the table.
     """
 
     table: SampleTable
@@ -194,6 +198,7 @@ class Record:
     spans_ns: IntArray
     measured: SampleTable | None = None
     compression: Compression | None = None
+    covariates: tuple[CovariateRows, ...] = ()
 
     def faults(self) -> tuple[BoolArray, tuple[Fault, ...]]:
         """Return which values are not to be believed, shape (n, 5), and what is wrong."""
@@ -201,8 +206,8 @@ class Record:
         return faults(table, self.step_s, self.compression is not None)
 
     def grids(self, bad: BoolArray, rough: bool = False) -> Grids:
-        """Return the record on grids; ``bad`` (n, 5) is not believed."""
-        return make_grids(*self.about, bad, rough, self.compression)
+        """Return the record on the grids of a diagnosis; ``bad`` (n, 5) is not believed."""
+        return make_grids(*self.about, bad, rough, self.compression, self.covariates)
 
     @property
     def about(self) -> tuple[SampleTable, float, StaticForm, float]:
@@ -217,6 +222,17 @@ class _Rest:
     wander: Wander
     structure: Structure
     period: Period
+    drift: Drift
+
+    @property
+    def disturbance(self) -> Disturbance | None:
+        """Return the slow wander of the power, a drift if it is one."""
+        slow = self.drift
+        if slow.there:
+            return Disturbance(slow.rms_mw, slow.time_scale_s, slow.rms_mw)
+        if self.wander.there:
+            return Disturbance(self.wander.rms_mw, self.wander.time_scale_s)
+        return None
 
 
 def diagnose(
@@ -251,7 +267,7 @@ def diagnose(
     confirm(found)
     progress(0.8, 'what is left')
     rest = _look_again(found)
-    _withdraw(found, rest)
+    rest = _withdraw(found, rest)
     return _conclude(record, found, rest, wrong, progress)
 
 
@@ -322,21 +338,35 @@ def _look_again(found: Found) -> _Rest:
     screening = Screening(found.task, found.model)
     slow = wander(screening)
     left = structure(found.task, found.model, _wandering(found.task.grids, screening, slow))
-    return _Rest(slow, left, period(found.task, found.model))
+    return _Rest(slow, left, period(found.task, found.model), drift(found.task, found.model))
 
 
-def _withdraw(found: Found, rest: _Rest) -> None:
-    """Take back names of causes in time where the power wanders slowly all the time."""
-    if not rest.wander.there:
-        return
+def _withdraw(found: Found, rest: _Rest) -> _Rest:
+    """Take back names of causes in time where the power wanders slowly all the time.
+
+    One that explains far more than the wander it would have to be part of stays.
+    """
+    slow = rest.disturbance
+    if slow is None:
+        return rest
     for a in found.model.active:
-        if a.cause.slow:
+        if a.cause.slow and not _explained(found, a.name) > _FAR_MORE * slow.rms_mw**2:
             found.model = found.model.without(a.name)
             found.near.pop(a.name, None)
             found.reasons[a.name] = (
                 'the power wanders slowly all the time, which would look the same'
             )
     found.model, _ = improve(found.task, found.model, 3)
+    # What these names had taken up belongs to the drift.
+    return replace(rest, drift=drift(found.task, found.model))
+
+
+def _explained(found: Found, name: str) -> float:
+    """Return by how much a cause lowers the mean square of the residual, MW^2."""
+    rows = found.task.rows
+    without, _ = improve(found.task, found.model.without(name), 3)
+    left, more = (found.task.residual(m)[rows] for m in (found.model, without))
+    return float(np.mean(more**2) - np.mean(left**2))
 
 
 def _final(found: Found) -> tuple[Task, Extended]:
@@ -377,8 +407,7 @@ def _conclude(
     result = Diagnosis(
         verdict=verdict, sentence='', causes=causes + outside,
         not_told_apart=near, experiments=_experiments(causes),
-        disturbance=Disturbance(rest.wander.rms_mw, rest.wander.time_scale_s)
-        if rest.wander.there else None,
+        disturbance=rest.disturbance,
         unexplained_by=unexplained, rejected=tuple(found.reasons.items()),
         rmse_simulation=before, rmse_extended=before if dropped else after,
         rmse_noise_floor=noise_floor(found.task, models[-1], explained),
@@ -424,14 +453,10 @@ def _experiments(causes: tuple[NamedCause, ...]) -> tuple[str, ...]:
 
 def _sentence(d: Diagnosis) -> str:
     """Return the verdict as one sentence an operator understands."""
+    wander = '' if d.disturbance is None else f' {d.disturbance.sentence}'
     if d.verdict == NAMED:
-        return ' '.join(c.sentence for c in d.causes)
-    wander = ''
-    if d.disturbance:
-        wander = (
-            f' The power wanders slowly by {d.disturbance.rms_mw:.2g} MW over about '
-            f'{d.disturbance.time_scale_s / 3600.0:.2g} h, which has no cause in these signals.'
-        )
+        drifts = d.disturbance is not None and d.disturbance.drift_mw is not None
+        return ' '.join(c.sentence for c in d.causes) + (wander if drifts else '')
     if d.verdict == NOTHING:
         blind = sum('cannot be judged' in reason for _, reason in d.rejected)
         but = f' {blind} causes could not be judged in this record.' if blind > 1 else ''

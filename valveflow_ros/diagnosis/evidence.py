@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from valveflow_ros.diagnosis.cause import Estimate, Kind, Stage, Unknown
-from valveflow_ros.diagnosis.causes import catalogue
+from valveflow_ros.diagnosis.causes import causes_for
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import (
     Task,
@@ -367,7 +367,7 @@ class Certainty:
     """The joint linearisation of a fitted model, from which all intervals come."""
 
     def __init__(self, task: Task, model: Extended) -> None:
-        model = free(model, catalogue())
+        model = free(model, causes_for(task.grids))
         self.task, self.model = task, model
         causes = cause_tangents(task, model)
         table = task.innovations(

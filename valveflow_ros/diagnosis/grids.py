@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -66,6 +66,70 @@ class Blur:
 
 
 @dataclass(frozen=True, slots=True)
+class Covariate:
+    """A column beside the signals that the power may follow.
+
+    Attributes
+    ----------
+    name : str
+        What the person calls it; also the name of the cause.
+    column, unit : str
+        Column or topic it comes from, and its unit ('' where not known).
+    spread : float
+        Standard deviation of its departure from what is usual at the load, in that unit.
+    power_mw : float
+        Mean of the power over the record.
+    centre : tuple of float
+        Mean and standard deviation of u, then of the pressure in MPa.
+    surface : tuple of float
+        Load over ``power_mw``: coefficients of the powers of scaled u and pressure up to 3.
+    course : tuple of float
+        What is usual at a load: coefficients of the powers 0 to 2 of that.
+    """
+
+    name: str
+    column: str
+    unit: str
+    spread: float
+    power_mw: float
+    centre: tuple[float, ...]
+    surface: tuple[float, ...]
+    course: tuple[float, ...]
+
+    def usual(self, u: FloatArray, pressure: FloatArray) -> FloatArray:
+        """Return the covariate that is usual at an input and a pressure in MPa, shape (n,)."""
+        return np.asarray(
+            np.polynomial.polynomial.polyval(self.load(u, pressure), np.array(self.course))
+        )
+
+    def load(self, u: FloatArray, pressure: FloatArray) -> FloatArray:
+        """Return about how much of ``power_mw`` an input and a pressure give, shape (n,)."""
+        return np.asarray(_powers(u, pressure, self.centre) @ np.array(self.surface))
+
+
+_CUBIC = tuple((i, j) for i in range(4) for j in range(4 - i))
+COEFFICIENTS, COURSE = len(_CUBIC), 3
+_FAR = 2.5  # standard deviations beyond which the surface is level
+
+
+def _powers(u: FloatArray, pressure: FloatArray, centre: tuple[float, ...]) -> FloatArray:
+    """Return the powers of the scaled input and pressure, shape (n, `COEFFICIENTS`)."""
+    a = np.clip((u - centre[0]) / centre[1], -_FAR, _FAR)
+    b = np.clip((pressure - centre[2]) / centre[3], -_FAR, _FAR)
+    return np.column_stack([a**i * b**j for i, j in _CUBIC])
+
+
+@dataclass(frozen=True, slots=True)
+class CovariateRows:
+    """The values of a covariate on the rows of a table, (rows,); NaN where there is none."""
+
+    name: str
+    column: str
+    unit: str
+    values: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
 class Grids:
     """Everything measured, as arrays that the model and the statistics need.
 
@@ -93,6 +157,8 @@ class Grids:
         Which sub-block a mean lies in.
     reference : Reference
     blur : Blur
+    covariates : dict
+        By name, a covariate and its values on the model rows, shape (n,); gaps are bridged.
     """
 
     start_ns: int
@@ -116,6 +182,7 @@ class Grids:
     reference: Reference
     blur: Blur = field(default_factory=Blur)
     cache: dict[object, FloatArray] = field(default_factory=dict)
+    covariates: dict[str, tuple[Covariate, FloatArray]] = field(default_factory=dict)
 
     @property
     def group(self) -> int:
@@ -279,6 +346,7 @@ SUB_S = 1800.0
 def make_grids(
     table: SampleTable, step_s: float, form: StaticForm, settle_s: float, bad: BoolArray,
     rough: bool = False, compression: Compression | None = None,
+    covariates: tuple[CovariateRows, ...] = (),
 ) -> Grids:  # fmt: skip
     """Put a table on the grids.
 
@@ -297,6 +365,8 @@ def make_grids(
         With longer model rows, for looking round quickly; the scored means are the same.
     compression : Compression, optional
         How the record was compressed, if it was.
+    covariates : tuple of CovariateRows
+        On the rows of the table.
 
     Raises
     ------
@@ -351,7 +421,40 @@ def make_grids(
         sub=np.arange(m) // _sub_rows(m, step * group),
         reference=_reference(pressure, temperature, power, scored, step, v),
         blur=blur_of(v, step_s, compression),
+        covariates={
+            c.name: _covariate(
+                c, coarse(_everywhere(_spread(table, step_s, c.values)[:rows])), u, pressure,
+                np.where(scored, power, np.nan),
+            )
+            for c in covariates
+        },
     )  # fmt: skip
+
+
+def _covariate(
+    rows: CovariateRows, values: FloatArray, u: FloatArray, pressure: FloatArray, power: FloatArray
+) -> tuple[Covariate, FloatArray]:
+    """Return a covariate with what is usual of it at each load, and its values.
+
+    The load is a smooth function of u and pressure, so that no noise of the power comes in. It
+    weighs the rows, as the cause multiplies by it.
+    """
+    a, b, c = (x.reshape(len(power), -1).mean(axis=1) for x in (u, pressure, values))
+    here = np.isfinite(power) & np.isfinite(a)
+    a, b, c, y = a[here], b[here], c[here], power[here]
+    centre = float(a.mean()), float(a.std()) or 1.0, float(b.mean()), float(b.std()) or 1.0
+    usual_mw = max(float(y.mean()), 1e-3)
+    powers = _powers(a, b, centre)
+    surface = np.linalg.lstsq(powers, y / usual_mw, rcond=1e-9)[0]
+    load = powers @ surface
+    course = np.linalg.lstsq(
+        np.vander(load, COURSE, increasing=True) * load[:, None], c * load, rcond=1e-9
+    )[0]
+    about = Covariate(
+        rows.name, rows.column, rows.unit, 0.0, usual_mw, centre, tuple(surface.tolist()),
+        tuple(course.tolist()),
+    )  # fmt: skip
+    return replace(about, spread=float((c - about.usual(a, b)).std())), values
 
 
 def _reference(
@@ -384,9 +487,14 @@ def _sub_rows(means: int, mean_s: float) -> int:
 
 def _on_grid(table: SampleTable, step_s: float, bad: BoolArray) -> FloatArray:
     """Return the values on an even grid, NaN where a row is missing or not believed."""
+    return _spread(table, step_s, np.where(bad, np.nan, table.values))
+
+
+def _spread(table: SampleTable, step_s: float, values: FloatArray) -> FloatArray:
+    """Return values of the rows of a table, (rows, ...), on the even grid of its times."""
     place = np.round((table.time_ns - table.time_ns[0]) / (step_s * NS_PER_S)).astype(np.int64)
-    out = np.full((int(place[-1]) + 1, table.values.shape[1]), np.nan)
-    out[place] = np.where(bad, np.nan, table.values)
+    out = np.full((int(place[-1]) + 1, *values.shape[1:]), np.nan)
+    out[place] = values
     return out
 
 

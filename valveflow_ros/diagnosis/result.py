@@ -28,9 +28,10 @@ from valveflow_ros.curve.json_schema import (
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import Active, Estimate
 from valveflow_ros.diagnosis.causes import catalogue
+from valveflow_ros.diagnosis.causes.covariate import covariate_cause
 from valveflow_ros.diagnosis.evidence import Gain, SegmentGain
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
-from valveflow_ros.diagnosis.grids import Reference
+from valveflow_ros.diagnosis.grids import COEFFICIENTS, COURSE, Covariate, Reference
 from valveflow_ros.errors import DataError
 from valveflow_ros.signals.static_form import AXES, OPENING
 
@@ -52,10 +53,38 @@ class NamedCause:
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
-    """A slow wander that is no cause."""
+    """A slow wander that is no cause.
+
+    Attributes
+    ----------
+    rms_mw, time_scale_s : float
+        Its root mean square, and the time over which it changes.
+    drift_mw : float or None
+        Of a wander over many hours and days the root mean square about its mean over the
+        record; see `slow.drift`.
+    """
 
     rms_mw: float
     time_scale_s: float
+    drift_mw: float | None = None
+
+    @property
+    def sentence(self) -> str:
+        """Return it as a sentence for an operator."""
+        hours = self.time_scale_s / 3600.0
+        if self.drift_mw is not None:
+            length = 'days' if hours >= _DAYS_FROM_H else 'hours'
+            return (
+                f'The power drifts by {self.drift_mw:.2g} MW over {length}, which has no cause in '
+                'these signals.'
+            )
+        return (
+            f'The power wanders slowly by {self.rms_mw:.2g} MW over about {hours:.2g} h, which '
+            'has no cause in these signals.'
+        )
+
+
+_DAYS_FROM_H = 8.0  # a wander of so long a memory is seen to go on from day to day
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +161,11 @@ def model_to_json(given: ExtendedModel) -> dict[str, Any]:
             'delays_s': m.delays.tolist(),
         },
         'causes': [
-            {'name': a.name, 'values': a.named(), 'switches_s': list(a.extra)}
+            {
+                'name': a.name, 'values': a.named(), 'switches_s': list(a.extra),
+                **({} if a.cause.covariate is None else
+                   {'covariate': _covariate_json(a.cause.covariate)}),
+            }
             for a in given.model.active
         ],
         **({} if earlier is None else {'on_top_of': model_to_json(earlier)}),
@@ -148,6 +181,12 @@ def _form_json(given: ExtendedModel) -> dict[str, Any]:
         'pressure_scale_exponent': given.form.scale_exponent,
         'offset_mw': given.model.base.offset,
     }
+
+
+def _covariate_json(about: Covariate) -> dict[str, Any]:
+    fields = dataclasses.asdict(about)
+    del fields['name']
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in fields.items()}
 
 
 def is_model(raw: object) -> bool:
@@ -178,6 +217,12 @@ _SCHEMA = {
     'causes': ListOf({
         'name': Text(), 'values': Members(Number(-1e12, 1e12)),
         'switches_s': ListOf(_TIME, rising=True),
+        'covariate': Maybe({
+            'column': Text(), 'unit': Text(), 'spread': Number(1e-12, 1e12),
+            'power_mw': Number(1e-3, MW[1]), 'centre': ListOf(Number(-1e12, 1e12), 4, 4),
+            'surface': ListOf(Number(-1e12, 1e12), COEFFICIENTS, COEFFICIENTS),
+            'course': ListOf(Number(-1e12, 1e12), COURSE, COURSE),
+        }),
     }),
 }  # fmt: skip
 
@@ -241,6 +286,13 @@ def _causes(found: list[dict[str, Any]], path: str) -> tuple[Active, ...]:
 
 def _cause(found: dict[str, Any], path: str) -> Active:
     cause = catalogue().get(found['name'])
+    if cause is None and (about := found['covariate']):
+        given: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in about.items()
+        }
+        if min(given['centre'][1], given['centre'][3]) <= 0.0:
+            raise fail(_WHOLE, f'{path}.covariate.centre', 'has a spread that is not positive')
+        cause = covariate_cause(Covariate(found['name'], **given))
     if cause is None:
         raise fail(_WHOLE, f'{path}.name', 'is no cause of the catalogue')
     schema = {u.name: Number(u.low, u.high) for u in cause.unknowns}
@@ -293,6 +345,7 @@ def to_json(d: Diagnosis) -> dict[str, Any]:
         'experiments': list(d.experiments),
         'disturbance': {
             'rms_mw': d.disturbance.rms_mw, 'time_scale_s': d.disturbance.time_scale_s,
+            'drift_mw': d.disturbance.drift_mw,
         }
         if d.disturbance
         else None,

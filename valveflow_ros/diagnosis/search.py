@@ -9,7 +9,7 @@ import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import Active, Start
-from valveflow_ros.diagnosis.causes import catalogue
+from valveflow_ros.diagnosis.causes import catalogue, causes_for
 from valveflow_ros.diagnosis.evidence import Evidence, colour, weigh
 from valveflow_ros.diagnosis.extended import Drive, Extended, answer, drive
 from valveflow_ros.diagnosis.fitting import (
@@ -219,6 +219,9 @@ class Found:
     rough: Grids | None = None
 
 
+_BY_CHANCE = 'the power does not follow it more closely than a slow wander would by chance'
+
+
 def search(task: Task, start: Extended, progress: Progress, rough: Grids | None = None) -> Found:
     """Fit the plain model, then add causes while one of them stands up to all tests."""
     progress(0.05, 'simulation fitted to the record')
@@ -226,7 +229,8 @@ def search(task: Task, start: Extended, progress: Progress, rough: Grids | None 
     task, plain = without_bumps(task, plain)
     found = Found(task, plain, plain, rough=rough)
     barred: set[str] = set()
-    for name, cause in catalogue().items():
+    every = causes_for(task.grids)
+    for name, cause in every.items():
         if why := cause.hindered(task.grids):
             found.reasons[name] = f'cannot be judged: {why}'
             barred.add(name)
@@ -236,7 +240,7 @@ def search(task: Task, start: Extended, progress: Progress, rough: Grids | None 
             'cannot be judged: the exponent of p^m F(V) + c was found from this record'
         )
         barred.add('exponent')
-    found.tried = len(catalogue()) - len(barred)
+    found.tried = len(every) - len(barred)
     for turn in range(MOST_CAUSES):
         progress(0.15 + 0.15 * turn, 'causes tried' if turn == 0 else 'further causes tried')
         if not _add(found, barred):
@@ -246,6 +250,9 @@ def search(task: Task, start: Extended, progress: Progress, rough: Grids | None 
     for name in catalogue():
         if (why := unseen(name, task.grids)) and name not in found.model.names:
             found.reasons.setdefault(name, why)
+    for name in task.grids.covariates:
+        if name not in found.model.names:
+            found.reasons.setdefault(name, _BY_CHANCE)
     return found
 
 
@@ -360,8 +367,9 @@ def _absorb(found: Found, rival: Rival) -> None:
 
 def _shortlist(screening: Screening, barred: set[str]) -> list[tuple[str, Start]]:
     """Return starts worth a full refit: the best, and the families of the best."""
+    every = causes_for(screening.task.grids)
     starts: dict[str, list[Start]] = {}
-    for name, cause in catalogue().items():
+    for name, cause in every.items():
         if name not in barred and name not in screening.model.names:
             starts[name] = list(cause.starts(screening))
     best = {n: max(s.gain for s in found) for n, found in starts.items() if found}
@@ -369,8 +377,8 @@ def _shortlist(screening: Screening, barred: set[str]) -> list[tuple[str, Start]
         return []
     least = max(SCREEN_LEAST, SCREEN_SHARE * max(best.values()))
     good = sorted((n for n in best if best[n] >= least), key=lambda n: -best[n])[:MOST_RIVALS]
-    families = {catalogue()[n].family for n in good}
-    good += [n for n in best if n not in good and catalogue()[n].family in families]
+    families = {every[n].family for n in good}
+    good += [n for n in best if n not in good and every[n].family in families]
     return [(n, s) for n in good for s in starts[n]]
 
 
@@ -378,10 +386,11 @@ def _rivals(found: Found, barred: set[str]) -> list[Rival]:
     """Refit every promising cause; best score first, one entry a cause."""
     screening = Screening(found.task, found.model, found.rough)
     shortlist = _shortlist(screening, barred)
+    every = causes_for(found.task.grids)
     tangents = base_tangents(found.task, found.model) if shortlist else None
     refits = []
     for name, start in shortlist:
-        added = Active(catalogue()[name], start.values, start.extra)
+        added = Active(every[name], start.values, start.extra)
         model, frozen = found.model, tangents
         if start.base is not None:
             model, frozen = replace(model, base=start.base), None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,16 +14,18 @@ import numpy as np
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import diagnose as search
+from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.from_window import first_model, on_top
+from valveflow_ros.diagnosis.grids import CovariateRows
 from valveflow_ros.diagnosis.result import Diagnosis, model_to_json, to_json
 from valveflow_ros.diagnosis.signature import views
-from valveflow_ros.errors import DataError
+from valveflow_ros.errors import DataError, InputError
 from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.alignment import align
 from valveflow_ros.interface.files import Result, signed
-from valveflow_ros.interface.logs import Log, as_log
+from valveflow_ros.interface.logs import Log, as_log, read_covariate
 from valveflow_ros.interface.models import Model, load_model, with_exponent
 from valveflow_ros.interface.monitor import recorded_history
 from valveflow_ros.interface.observation import Observed, observe_log, settings_of
@@ -131,6 +134,7 @@ def diagnose(
     *,
     parameters: Mapping[str, Any] | None = None,
     model: Model | str | Path | None = None,
+    covariates: Mapping[str, str] | None = None,
     progress: Progress = SILENT,
 ) -> DiagnosisResult:
     """Compare the simulation with the measured power and name the cause of what differs.
@@ -144,6 +148,10 @@ def diagnose(
     model : Characteristic, ExtendedModel or path, optional
         What the log is held against; found in the log itself without it. The causes of an
         extended model are taken out of the rows first, and what differs after that is found.
+    covariates : mapping of str to str, optional
+        Columns (of a recording: topics) beside the signals that the power may follow, each
+        ``COLUMN`` or ``COLUMN:unit`` by the name to give it: ``{'vacuum':
+        'condenser_pressure_kpa'}``. Each is tried like a cause of the catalogue.
     progress : Progress
 
     Raises
@@ -160,6 +168,7 @@ def diagnose(
             model = load_diagnosable(model)
         given = with_exponent(model, given, name)
     log = as_log(log, progress)
+    check_covariates(covariates or {})
     settings, notes = settings_of(log, given, progress)
     earlier = model if isinstance(model, ExtendedModel) and model.held else None
     rows = _rows(log, settings, model is None, progress, earlier)
@@ -173,9 +182,11 @@ def diagnose(
         regional = model.model.base if isinstance(model, ExtendedModel) else model.model
     if regional is None:
         regional = first_model(rows.table, step, form, settle)
+    beside = covariate_rows(log, covariates or {}, rows.table)
     record = search.Record(
-        rows.table, step, form, settle, rows.spans_ns, compression=log.compression
-    )
+        rows.table, step, form, settle, rows.spans_ns, compression=log.compression,
+        covariates=beside,
+    )  # fmt: skip
     if earlier is not None:
         measured = align(log.readings, settings)[0]
         record = on_top(
@@ -200,6 +211,47 @@ def diagnose(
         recorded_history(log.contents), form.input_exponent,
     )  # fmt: skip
     return DiagnosisResult(data, form, earlier)
+
+
+def check_covariates(said: Mapping[str, str]) -> None:
+    """Refuse names of covariates that mean something else; raises `InputError`."""
+    for name in said:
+        if not _NAME.fullmatch(name):
+            raise InputError(
+                f"--covariate '{name}': a name has letters, digits and underscores, at most 40."
+            )
+        if name in catalogue():
+            raise InputError(
+                f"--covariate '{name}' is a cause of the catalogue already; choose another name."
+            )
+
+
+def covariate_rows(
+    log: Log, said: Mapping[str, str], table: SampleTable
+) -> tuple[CovariateRows, ...]:
+    """Return covariates on the rows of a table.
+
+    Raises
+    ------
+    InputError
+        A column is missing, or has a value for less than half of the rows.
+    """
+    found = []
+    for name, theirs in said.items():
+        series = read_covariate(log, name, theirs)
+        values = series.at(table.time_ns)
+        share = float(np.isfinite(values).mean())
+        if share < _LEAST_SHARE:
+            raise InputError(
+                f"--covariate {name}: '{series.column}' has values for only {100.0 * share:.0f} % "
+                'of the rows; half of them are needed.'
+            )
+        found.append(CovariateRows(name, series.column, series.unit, values))
+    return tuple(found)
+
+
+_NAME = re.compile(r'[A-Za-z]\w{0,39}', re.ASCII)
+_LEAST_SHARE = 0.5
 
 
 def _rows(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
     N_SIGNALS,
     SIGNALS,
+    FloatArray,
     IntArray,
     Quality,
     Readings,
@@ -63,6 +64,10 @@ class Log:
         How a historian kept the values, where it kept them by exception.
     updates : Readings, optional
         What was read, where ``readings`` hold each value until the next one.
+    source : object
+        What was opened, to read further columns from.
+    mapping : LogMapping
+        How it was to be understood.
     """
 
     name: str
@@ -73,6 +78,8 @@ class Log:
     doubts: list[Doubt]
     compression: Compression | None = None
     updates: Readings | None = None
+    source: Any = None
+    mapping: LogMapping = field(default_factory=LogMapping)
 
     @property
     def recorded(self) -> Readings:
@@ -179,7 +186,9 @@ def open_log(
         )
     if hasattr(source, 'columns'):
         contents = mapping.open_with(lambda names: _from_dataframe(source, names))
-        return _understood('DataFrame', contents, mapping, progress)
+        return replace(
+            _understood('DataFrame', contents, mapping, progress), source=source, mapping=mapping
+        )
     path = Path(source)
 
     def look(said: LogMapping) -> LogContents:
@@ -193,7 +202,113 @@ def open_log(
         return look(said)
 
     contents = gather_refusals(path, look, mapping, again)
-    return _understood(path.name, contents, mapping, progress)
+    return replace(
+        _understood(path.name, contents, mapping, progress), source=path, mapping=mapping
+    )
+
+
+def read_covariate(log: Log, name: str, said: str) -> Series:
+    """Read a column beside the signals: as it stands in the log, without limits.
+
+    Parameters
+    ----------
+    log : Log
+        From `open_log`.
+    name : str
+        What the covariate is called in sentences.
+    said : str
+        ``COLUMN`` or ``COLUMN:unit``; of a recording a topic of Float64.
+
+    Raises
+    ------
+    InputError
+        There is no such column, or it holds no number.
+    """
+    theirs, colon, told = said.rpartition(':')
+    contents = _column_of(log, theirs.strip()) if colon and theirs else None
+    if contents is None:  # a column's name may itself hold a colon
+        theirs, told = said, ''
+        contents = _column_of(log, theirs.strip())
+    if contents is None:
+        raise InputError(f"--covariate {name}: {log.name} has no column or topic '{said}'.")
+    mine = contents.readings.signal == _READ_AS
+    good = mine & np.isfinite(contents.readings.value) & (contents.readings.quality < Quality.BAD)
+    if not good.any():
+        raise InputError(f"--covariate {name}: '{theirs}' of {log.name} holds no number.")
+    times, values = contents.readings.time_ns[good], contents.readings.value[good]
+    order = np.argsort(times, kind='stable')
+    return Series(theirs.strip(), told.strip() or _unit_in(theirs), times[order], values[order])
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """A column beside the signals.
+
+    Attributes
+    ----------
+    column, unit : str
+        Its name in the log; its unit, '' where not known.
+    time_ns : int64 (k,)
+        Not decreasing.
+    values : float64 (k,)
+        Finite.
+    """
+
+    column: str
+    unit: str
+    time_ns: IntArray
+    values: FloatArray
+
+    def at(self, time_ns: IntArray) -> FloatArray:
+        """Return the values at other times, on straight lines; NaN in gaps and at the ends.
+
+        A gap is longer than an hour and than five times the usual step.
+        """
+        seconds = (self.time_ns - time_ns[0]) / 1e9
+        rows = (time_ns - time_ns[0]) / 1e9
+        steps = np.diff(seconds)
+        longest = max(_GAP_S, _GAP_STEPS * float(np.median(steps)) if len(steps) else 0.0)
+        after = np.searchsorted(seconds, rows)
+        before = np.searchsorted(seconds, rows, side='right') - 1
+        last = len(seconds) - 1
+        away = np.minimum(
+            np.abs(rows - seconds[np.clip(before, 0, last)]),
+            np.abs(rows - seconds[np.clip(after, 0, last)]),
+        )
+        out: FloatArray = np.interp(rows, seconds, self.values)
+        out[away > 0.5 * longest] = np.nan
+        return out
+
+
+_GAP_S, _GAP_STEPS = 3600.0, 5.0
+# A reader gives numbers for signals only: the column is read in place of one, before units.
+_READ_AS = Signal.VALVE_COMMAND
+
+
+def _column_of(log: Log, theirs: str) -> LogContents | None:
+    """Return the log with a column in place of a signal; None where there is none."""
+    topics = [info.topic for info in SIGNALS]
+    times = {k: v for k, v in log.mapping.names().items() if k not in topics}
+    names = {**times, SIGNALS[_READ_AS].topic: theirs}
+    try:
+        if hasattr(log.source, 'columns'):
+            return _from_dataframe(log.source, names)
+        return read_file(log.source, columns=names, absent=topics, table=log.mapping.table)
+    except InputError:
+        return None
+
+
+def _unit_in(column: str) -> str:
+    """Return the unit at the end of a column's name, '' if there is none."""
+    last = column.lower().replace('[', '_').replace('(', '_').strip('])').split('_')[-1]
+    return _COVARIATE_UNITS.get(last.strip(), '')
+
+
+_COVARIATE_UNITS = {
+    unit.lower(): unit
+    for unit in ('kPa', 'Pa', 'MPa', 'hPa', 'mbar', 'bar', 'psi', 'degC', 'K', 'degF', 'MW', 'kW',
+                 'Mvar', 'percent', 't/h', 'kg/s', 'Hz', 'MJ/kg', 'kJ/kg')
+}  # fmt: skip
 
 
 def as_log(log: Any, progress: Progress) -> Log:

@@ -147,11 +147,7 @@ def _why(data: Diagnosed) -> Section:
     if d.unexplained_by:
         parts.append(notice(f'Unexplained: depends on {text(" and ".join(d.unexplained_by))}.'))
     if d.disturbance:
-        hours = plain(d.disturbance.time_scale_s / 3600.0, 2)
-        parts.append(paragraph(
-            f'The power wanders slowly by {plain(d.disturbance.rms_mw, 2)} MW over about '
-            f'{hours} h; that is a disturbance and no cause.'
-        ))  # fmt: skip
+        parts.append(paragraph(text(d.disturbance.sentence)))
     if d.rejected:
         said = 'Other causes that were tried or could not be, and why they are not named:'
         parts.append(paragraph(said) + bullets(

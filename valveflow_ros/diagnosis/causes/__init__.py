@@ -7,6 +7,8 @@ import importlib
 import pkgutil
 
 from valveflow_ros.diagnosis.cause import Cause
+from valveflow_ros.diagnosis.causes.covariate import covariate_cause
+from valveflow_ros.diagnosis.grids import Grids
 
 
 @functools.cache
@@ -19,3 +21,9 @@ def catalogue() -> dict[str, Cause]:
         made for module in modules for made in vars(module).values() if isinstance(made, Cause)
     ]
     return {cause.name: cause for cause in sorted(causes, key=lambda cause: cause.name)}
+
+
+def causes_for(grids: Grids) -> dict[str, Cause]:
+    """Return the catalogue and a cause for each covariate of a record, by name."""
+    own = {name: covariate_cause(about) for name, (about, _) in grids.covariates.items()}
+    return catalogue() | own

@@ -1,0 +1,166 @@
+"""Columns beside the signals: read, tried as causes, kept with the model; drifts without them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from streams import needs_jit
+
+import valveflow_ros as vf
+from valveflow_ros.diagnosis.corrector import corrector_of
+from valveflow_ros.diagnosis.result import model_from_json, model_to_json, to_json
+from valveflow_ros.errors import DataError, InputError
+from valveflow_ros.interface.logs import Series, open_log, read_covariate
+
+COLUMN = 'condenser_pressure_kpa'
+
+
+@pytest.fixture(scope='module')
+def plant():
+    return vf.simulate(days=5, seed=3, unit='choked:number=3', recording='minute')
+
+
+@pytest.fixture(scope='module')
+def sound():
+    unit = 'choked:number=3,vacuum_per_kpa=0'
+    return vf.simulate(days=5, seed=3, unit=unit, recording='minute')
+
+
+@pytest.fixture(scope='module')
+def diagnosed(plant, tmp_path_factory):
+    path = tmp_path_factory.mktemp('covariate') / 'plant.parquet'
+    plant.write(path)
+    return vf.diagnose(path, covariates={'vacuum': COLUMN})
+
+
+@pytest.fixture(scope='module')
+def without(plant):
+    return vf.diagnose(plant.to_dataframe()).diagnosis
+
+
+def truth(plant):
+    return plant.data.unit.vacuum_per_kpa * plant.to_dataframe()['generated_power_mw'].mean()
+
+
+@needs_jit
+def test_the_vacuum_is_named_with_its_size(plant, diagnosed, without):
+    d = diagnosed.diagnosis
+    (found,) = (c for c in d.causes if c.name == 'vacuum')
+    b = found.parameters['b']
+    assert b.unit == 'MW/kPa'
+    assert b.low <= truth(plant) <= b.high
+    assert b.high - b.low < 0.2 * abs(truth(plant))
+    assert found.gain.rmse_after < 0.6 * found.gain.rmse_before
+    assert d.rmse_extended < 0.6 * without.rmse_extended
+    assert f'for every kPa that vacuum ({COLUMN}) is higher' in found.sentence
+
+
+@needs_jit
+def test_the_model_is_kept_with_its_covariate(diagnosed):
+    model = diagnosed.extended_model
+    raw = model_to_json(model)
+    again = model_from_json(raw)
+    assert model_to_json(again) == raw
+    kept = next(a.cause.covariate for a in again.model.active if a.name == 'vacuum')
+    assert (kept.column, kept.unit) == (COLUMN, 'kPa')
+
+
+@needs_jit
+@pytest.mark.parametrize(
+    ('key', 'value'), [('spread', 0.0), ('surface', [1.0]), ('centre', [0.0, 0.0, 0.0, 1.0])]
+)
+def test_a_damaged_covariate_is_refused_by_its_place(diagnosed, key, value):
+    raw = model_to_json(diagnosed.extended_model)
+    place = next(k for k, c in enumerate(raw['causes']) if c['name'] == 'vacuum')
+    raw['causes'][place]['covariate'] |= {key: value}
+    with pytest.raises(DataError, match=rf'causes\[{place}\]\.covariate\.{key}'):
+        model_from_json(raw)
+
+
+@needs_jit
+def test_it_cannot_be_taken_out_of_rows_and_says_so(diagnosed):
+    with pytest.raises(DataError, match=f"'vacuum' follows the column '{COLUMN}'.*out of rows"):
+        corrector_of(diagnosed.extended_model, 60.0)
+
+
+@needs_jit
+def test_without_the_column_a_drift_is_told(plant, without):
+    slow = without.disturbance
+    assert slow is not None
+    assert slow.drift_mw is not None
+    frame = plant.to_dataframe()
+    line = np.polynomial.Polynomial.fit(frame['generated_power_mw'], frame[COLUMN], 3)
+    apart = frame[COLUMN] - line(frame['generated_power_mw'])
+    assert slow.drift_mw == pytest.approx(abs(truth(plant)) * apart.std(), rel=0.3)
+    assert (
+        f'The power drifts by {slow.drift_mw:.2g} MW over days, which has no' in without.sentence
+    )
+    assert to_json(without)['disturbance']['drift_mw'] == slow.drift_mw
+    assert not {'diurnal', 'gain_drift', 'output_offset_drift'} & {c.name for c in without.causes}
+
+
+@needs_jit
+def test_nothing_drifts_where_the_power_does_not_follow(sound):
+    d = vf.diagnose(sound.to_dataframe(), covariates={'vacuum': COLUMN}).diagnosis
+    assert 'vacuum' not in {c.name for c in d.causes}
+    assert 'slow wander' in dict(d.rejected)['vacuum']
+    assert d.disturbance is None or d.disturbance.drift_mw is None
+
+
+@needs_jit
+def test_an_unrelated_column_and_a_constant_are_not_named(plant):
+    frame = plant.to_dataframe()
+    frame['reversed'] = frame[COLUMN].to_numpy()[::-1]
+    frame['constant'] = 7.0
+    d = vf.diagnose(frame, covariates={'weather': 'reversed', 'number': 'constant'}).diagnosis
+    assert not {'weather', 'number'} & {c.name for c in d.causes}
+    assert dict(d.rejected)['number'].startswith('cannot be judged: constant hardly changes')
+
+
+@pytest.mark.parametrize(
+    ('said', 'unit'),
+    [(COLUMN, 'kPa'), (f'{COLUMN}:mbar', 'mbar'), ('a:b', ''), ('a:b:bar', 'bar')],
+)
+def test_a_column_is_read_as_it_stands(plant, said, unit):
+    frame = plant.to_dataframe().head(300).copy()
+    frame['a:b'] = np.arange(300) * -1e9
+    series = read_covariate(open_log(frame), 'vacuum', said)
+    assert series.unit == unit
+    np.testing.assert_array_equal(series.values, frame[series.column].to_numpy())
+
+
+@pytest.mark.parametrize('kind', ['csv', 'parquet'])
+def test_it_is_the_same_from_a_file(plant, tmp_path, kind):
+    path = tmp_path / f'plant.{kind}'
+    plant.write(path)
+    from_file = read_covariate(open_log(path), 'vacuum', COLUMN)
+    from_frame = read_covariate(open_log(plant.to_dataframe()), 'vacuum', COLUMN)
+    np.testing.assert_array_equal(from_file.time_ns, from_frame.time_ns)
+    np.testing.assert_array_equal(from_file.values, from_frame.values)
+
+
+def test_series_are_bridged_but_not_over_gaps():
+    minute = 60 * 10**9
+    times = np.array([0, 1, 2, 200, 201]) * minute
+    series = Series('x', '', times, np.array([0.0, 1.0, 2.0, 5.0, 6.0]))
+    found = series.at(np.array([0, 30 * 10**9, 100 * minute, 201 * minute, 400 * minute]))
+    np.testing.assert_allclose(found, [0.0, 0.5, np.nan, 6.0, np.nan])
+
+
+@pytest.mark.parametrize(
+    ('said', 'sentence'),
+    [
+        ({'vacuum': 'nowhere'}, "--covariate vacuum: DataFrame has no column or topic 'nowhere'"),
+        ({'diurnal': COLUMN}, "'diurnal' is a cause of the catalogue"),
+        ({'a b': COLUMN}, 'letters, digits and underscores'),
+        ({'words': 'words'}, "'words' of DataFrame holds no number"),
+        ({'few': 'few'}, 'has values for only'),
+    ],
+)
+def test_what_is_no_covariate_is_refused(plant, said, sentence):
+    frame = plant.to_dataframe().head(1500).copy()
+    frame['words'] = 'low'
+    frame['few'] = pd.Series(np.where(np.arange(1500) < 300, 1.0, np.nan))
+    with pytest.raises(InputError, match=sentence):
+        vf.diagnose(frame, covariates=said)

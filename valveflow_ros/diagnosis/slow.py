@@ -1,0 +1,237 @@
+"""The slow part of what a model leaves: a drift of the power over hours and days.
+
+The residual is averaged over sub-blocks of half an hour and taken for the sum of three parts:
+what the curve could still take up (hats of the load with free coefficients), a wander of the
+plant's gain, and noise. The wander is a stationary first-order process, an Ornstein-Uhlenbeck
+process, of unknown variance and time scale:
+
+    r_i = z_i a + P_i w_i + e_i,   cov(w_i, w_j) = s^2 exp(-|t_i - t_j| / T)
+
+with P_i the mean load relative to that of the record. Variance and time scale are those of the
+largest likelihood on a grid, for the size of the wander of the largest restricted likelihood;
+coefficients and the noise's variance are known in closed form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from valveflow_ros.diagnosis.extended import Extended, answer
+from valveflow_ros.diagnosis.fitting import Task
+from valveflow_ros.diagnosis.grids import Grids
+from valveflow_ros.records import BoolArray, FloatArray
+
+_TIME_SCALES_H = (0.5, 1.0, 3.0, 8.0, 24.0, 72.0, 240.0)
+_RATIOS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0, 10_000.0)
+_HATS = 9
+_SMALLEST = 1e-3
+_HALF = 0.5  # of the usual number of means, for a sub-block to count
+_MOST_ROWS = 500  # longer records are averaged over several sub-blocks
+_LEAST_ROWS = 40
+_SLOWEST_OF_NOISE_H = 2.0
+_LEAST_DRIFT_GAIN = 16.0
+_LEAST_DRIFT_MW = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Levels:
+    """Means of half an hour of what a model leaves.
+
+    Attributes
+    ----------
+    hours : float64 (k,)
+        Middle of each, hours since the first row.
+    power : float64 (k,)
+        MW.
+    load : float64 (k,)
+        Mean load relative to that of the record.
+    free : float64 (k, p)
+        What curve and pressure could take up, as an orthonormal basis.
+    noise : float64 (k,)
+        Relative variance of each mean.
+    """
+
+    hours: FloatArray
+    power: FloatArray
+    load: FloatArray
+    free: FloatArray
+    noise: FloatArray
+
+    @property
+    def enough(self) -> bool:
+        """Tell whether a wander can be told from what the curve could take up."""
+        rows, columns = self.free.shape
+        return bool(rows - columns >= _LEAST_ROWS)
+
+
+def levels(
+    task: Task, model: Extended, rows: BoolArray, careful: bool
+) -> tuple[Levels, FloatArray]:
+    """Return means over sub-blocks of some rows, and those of the covariates, (k, covariates).
+
+    Parameters
+    ----------
+    careful : bool
+        Functions of the input and of the pressure are free too, not of the load alone. Under
+        load control and sliding pressure they take up much of a drift: the pressure tells the
+        load that was wanted, the opening what it took.
+    """
+    grids = task.grids
+    sub = grids.sub // max(1, -(-grids.subs // _MOST_ROWS))
+    here = answer(grids, model)
+    count = np.bincount(sub[rows], minlength=int(sub[-1]) + 1)
+    kept = np.flatnonzero(count >= max(1.0, _HALF * float(np.median(count[count > 0]))))
+
+    def mean(x: np.ndarray) -> FloatArray:
+        total = np.bincount(sub[rows], x[rows], minlength=len(count))
+        return np.asarray(total[kept] / count[kept])
+
+    usual = float(np.mean(here[rows]))
+    inputs = [here]
+    if careful:
+        inputs += [grids.means(grids.u), grids.means(grids.pressure)]
+    free = [mean(hat) for x in inputs for hat in _hats(x, rows)]
+    time_h = (np.arange(len(here)) + 0.5) * grids.mean_s / 3600.0
+    found = Levels(
+        mean(time_h), mean(task.residual(model)), mean(here) / usual,
+        _basis(np.column_stack(free)), float(count[kept].mean()) / count[kept],
+    )  # fmt: skip
+    columns = [mean(deviation(grids, name) * here / usual) for name in grids.covariates]
+    return found, np.array(columns).T.reshape(len(kept), len(columns))
+
+
+def deviation(grids: Grids, name: str) -> FloatArray:
+    """Return by how much a covariate departs from its usual value at the load, (m,), its unit."""
+    about, here = grids.covariates[name]
+    return grids.means(here - about.usual(grids.u, grids.pressure))
+
+
+def _hats(x: FloatArray, rows: BoolArray) -> Iterator[FloatArray]:
+    low, high = np.quantile(x[rows], (0.01, 0.99))
+    knots = np.linspace(float(low), float(high) + 1e-9 * (1.0 + abs(float(high))), _HATS)
+    return (np.interp(x, knots, row) for row in np.eye(_HATS))
+
+
+def _basis(columns: FloatArray) -> FloatArray:
+    """Return an orthonormal basis: the hats of each input alone sum to one."""
+    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(left[:, sizes > _SMALLEST * sizes[0]])
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """A wander: its log-likelihoods, time scale in h, variance relative to the noise's."""
+
+    likelihood: float
+    restricted: float
+    hours: float
+    ratio: float
+
+
+def _covariance(found: Levels, hours: float) -> FloatArray:
+    apart = np.abs(found.hours[:, None] - found.hours[None, :])
+    return np.asarray(np.exp(-apart / hours) * np.outer(found.load, found.load))
+
+
+def _fits(found: Levels, column: FloatArray | None = None) -> Iterator[tuple[_Fit, float]]:
+    """Yield every wander tried, and the log-likelihood that a column adds to it."""
+    k, p = found.free.shape
+    flat = found.power, *(found.free.T), *(() if column is None else (column,))
+    table = np.column_stack(flat)
+    for hours in _TIME_SCALES_H:
+        wander = _covariance(found, hours)
+        for ratio in (0.0, *_RATIOS) if hours == _TIME_SCALES_H[0] else _RATIOS:
+            lower, _ = cho_factor(np.diag(found.noise) + ratio * wander, lower=True)
+            white = solve_triangular(lower, table, lower=True)
+            basis, size = np.linalg.qr(white[:, 1 : 1 + p])
+            left = white - basis @ (basis.T @ white)
+            rest = left[:, 0]
+            cost = float(rest @ rest)
+            scale = -float(np.log(np.diag(lower)).sum())
+            fit = _Fit(
+                scale - 0.5 * k * float(np.log(cost / k)),
+                scale - 0.5 * (k - p) * float(np.log(cost / (k - p)))
+                - float(np.log(np.abs(np.diag(size))).sum()),
+                hours, ratio,
+            )  # fmt: skip
+            more = 0.0
+            if column is not None:
+                own, toward = float(left[:, -1] @ left[:, -1]), float(left[:, -1] @ rest)
+                explained = toward * toward / own if own > 0.0 else 0.0
+                more = -0.5 * k * float(np.log(max(1.0 - explained / cost, 1e-300)))
+            yield fit, more
+
+
+def covariate_gain(task: Task, model: Extended, name: str) -> float:
+    """Return the log-likelihood that a covariate brings beside a slow wander of the power.
+
+    With and without it the wander has the variance and the time scale that suit it best. A
+    covariate that the power follows leaves no wander, or a much smaller one; one that only looks
+    alike leaves it as large as before.
+    """
+    found, columns = levels(task, model, task.rows, careful=True)
+    if not found.enough:
+        return 0.0
+    place = list(task.grids.covariates).index(name)
+    tried = list(_fits(found, columns[:, place]))
+    without = max(fit.likelihood for fit, _ in tried)
+    return max(fit.likelihood + more for fit, more in tried) - without
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """How far the power drifts over hours and days without a cause.
+
+    Attributes
+    ----------
+    gain : float
+        Log-likelihood that the wander brings over none.
+    rms_mw : float
+        Root mean square of the wander about its mean over the record, in MW.
+    time_scale_s : float
+        Time after which it has forgotten about two thirds of where it was.
+    """
+
+    gain: float
+    rms_mw: float
+    time_scale_s: float
+
+    @property
+    def there(self) -> bool:
+        """Tell whether it is more than chance, and slow."""
+        slow = self.time_scale_s >= 3600.0 * _SLOWEST_OF_NOISE_H
+        return slow and self.gain > _LEAST_DRIFT_GAIN and self.rms_mw > _LEAST_DRIFT_MW
+
+
+def drift(task: Task, model: Extended) -> Drift:
+    """Estimate the slow wander of the power that a model leaves.
+
+    Its size is the root mean square over the record of P_i w_i about its mean, as the data let it
+    be expected: the square of what is estimated and the variance that remains. What of the wander
+    goes along with the load by chance was taken up by the curve; it cannot be seen, but counts as
+    far as the part that can be seen makes it likely.
+    """
+    found, _ = levels(task, model, task.grids.whole, careful=False)
+    if not found.enough:
+        return Drift(0.0, 0.0, 0.0)
+    tried = [fit for fit, _ in _fits(found)]
+    best = max(tried, key=lambda fit: fit.restricted)
+    none = next(fit for fit in tried if fit.ratio == 0.0)
+    if best.ratio == 0.0:
+        return Drift(0.0, 0.0, 0.0)
+    k, p = found.free.shape
+    wander = best.ratio * _covariance(found, best.hours)
+    factor = cho_factor(np.diag(found.noise) + wander, lower=True)
+    held = cho_solve(factor, found.free)
+    # V^-1 without what the curve can take up.
+    seen = cho_solve(factor, np.eye(k)) - held @ np.linalg.solve(found.free.T @ held, held.T)
+    noise_mw2 = float(found.power @ seen @ found.power) / (k - p)
+    level = wander @ (seen @ found.power)
+    left = noise_mw2 * (wander - wander @ seen @ wander)
+    unseen = float(np.trace(left) / k - left.mean())
+    rms = float(np.sqrt(np.var(level) + unseen))
+    return Drift(best.restricted - none.restricted, rms, 3600.0 * best.hours)
