@@ -159,7 +159,7 @@ def notes(grids: Grids) -> tuple[str, ...]:
 
 
 _LEAST_SPREAD = 0.01
-_FAR_MORE = 6.0
+_FAR_MORE = 4.0
 _LAST_STEPS = 10  # knots go slowly beside a bump
 
 
