@@ -159,7 +159,8 @@ def notes(grids: Grids) -> tuple[str, ...]:
 
 
 _LEAST_SPREAD = 0.01
-_FAR_MORE = 4.0
+_FAR_MORE = 8.0
+_OWN_MISFIT = 0.004  # of the power's range
 _LAST_STEPS = 10  # knots go slowly beside a bump
 
 
@@ -223,6 +224,7 @@ class _Rest:
     structure: Structure
     period: Period
     drift: Drift
+    own_misfit: str = ''
 
     @property
     def disturbance(self) -> Disturbance | None:
@@ -338,7 +340,34 @@ def _look_again(found: Found) -> _Rest:
     screening = Screening(found.task, found.model)
     slow = wander(screening)
     left = structure(found.task, found.model, _wandering(found.task.grids, screening, slow))
-    return _Rest(slow, left, period(found.task, found.model), drift(found.task, found.model))
+    own = _own_misfit(found, left)
+    if own:
+        left = replace(left, gain=0.0, explained_mw2=0.0)
+    slowly = drift(found.task, found.model)
+    return _Rest(slow, left, period(found.task, found.model), slowly, own)
+
+
+def _own_misfit(found: Found, left: Structure) -> str:
+    """Say what the form of the model leaves, where that is too little to be something else.
+
+    A smooth area curve is no straight pieces and a turbine no single lag. That shows in records of
+    days, as little as it is, and is no fault of a unit whose model was found from the same record.
+    """
+    task = found.task
+    if (
+        task.fixed_dynamics
+        or not left.there
+        or not (task.grids.form.scaled or task.grids.blur.words)
+    ):
+        return ''
+    size = float(np.sqrt(left.explained_mw2))
+    power = task.grids.power[task.grids.scored]
+    if not size < _OWN_MISFIT * float(np.ptp(np.quantile(power, (0.005, 0.995)))):
+        return ''
+    return (
+        f'Straight pieces and the dynamics of the model leave {size:.2g} MW (root mean square) '
+        f'that depends on {" and ".join(left.variables)}.'
+    )
 
 
 def _withdraw(found: Found, rest: _Rest) -> _Rest:
@@ -414,7 +443,8 @@ def _conclude(
         segments=by_segment(found.task, models[0], models[-1], record.spans_ns),
         simulation=models[0], extended=models[0] if dropped else models[-1],
         final=final.without_causes() if dropped else final,
-        reference=grids.reference, notes=notes(grids),
+        reference=grids.reference, 
+        notes=(*notes(grids), *([rest.own_misfit] if rest.own_misfit else [])),
     )  # fmt: skip
     return replace(result, sentence=_sentence(result))
 
