@@ -97,8 +97,8 @@ def _thermal() -> list[tuple[str, str, str]]:
             f'thermal_curves_{name}',
         ))  # fmt: skip
     for name, what in (
-        ('names_minute_201_230', 'healthy units of this kind, means over a minute'),
-        ('names_1s_201_206', 'the same, every second'),
+        ('names_minute_201_215', 'healthy units of this kind, means over a minute'),
+        ('names_1s_201_203', 'the same, every second'),
     ):
         s = result(f'thermal_{name}')['summary']
         units = sum(k['units'] for k in s.values())

@@ -337,6 +337,7 @@ def test_the_form_survives_json(form):
     bare['pressure_exponent'] = 1.125
     bare['form'] = {'chosen': 'opening', 'log_likelihood_gain': 3.0, 'rmse_other_mw': 2.0}
     theirs = from_json(bare)
+    assert from_json(json.loads(json.dumps(to_json(theirs), allow_nan=False))) is not None
     assert theirs.power(50.0, 11.0) == pytest.approx(c.power(50.0, 11.0))
     assert np.isfinite(theirs.values()).all()
 

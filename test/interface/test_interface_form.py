@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 
 import numpy as np
@@ -81,6 +82,22 @@ def test_other_days_are_validated_and_curves_of_both_forms_held_against_each_oth
     assert gain is not None
     assert gain.mean > 0.0
     assert gain.zero_is_rejected()
+
+
+def test_a_curve_of_other_days_gets_the_form_of_its_reference():
+    unit = 'integrated_input:number=2,vacuum_per_kpa=0'
+    reference = identified(unit=unit).characteristic
+    later = vf.identify(plant(7, unit).log, reference=reference)
+    assert later.characteristic.static_form == reference.static_form
+    assert later.data.shift is not None
+    assert not later.data.shift.moved
+
+
+def test_loads_in_sentences_are_those_of_the_plant():
+    short = vf.identify(vf.simulate(2.0, 1, unit=UNIT, recording='minute').log)
+    loads = re.findall(r'\(([0-9]+) MW\)', ' '.join(short.characteristic.notes))
+    assert loads
+    assert all(80.0 < float(load) < 360.0 for load in loads)
 
 
 def test_too_little_data_for_an_axis_that_is_asked_for_is_refused():

@@ -139,11 +139,11 @@ def _form_json(form: FormEvidence | None) -> dict[str, Any]:
             'chosen': form.chosen,
             'told': form.told,
             'log_likelihood_gain': form.log_likelihood_gain,
-            'rmse_mw': form.rmse_mw,
+            'rmse_mw': _number(form.rmse_mw),
             'rmse_other_mw': form.rmse_other_mw,
             'other': form.other,
-            'apart_mw': form.apart_mw,
-            'worst': dict(zip(_WORST, form.worst, strict=True)),
+            'apart_mw': _number(form.apart_mw),
+            'worst': dict(zip(_WORST, map(_number, form.worst), strict=True)),
             'contradicted': form.contradicted,
         }
     }
@@ -227,10 +227,12 @@ _COST = Members(Number(0.0, 1e30, null=True), pieces=True)
 _ANGLE = Members(Number(-360.0, 360.0, null=True), pieces=True)
 _WORST = ('opening_percent', 'pressure_mpa', 'apart_mw')
 _MANY_MW = Number(0.0, 1e12)
+_PERHAPS_MW = Number(0.0, 1e12, null=True)
 _FORM = {
     'chosen': Text(AXES), 'told': Maybe(Flag()), 'log_likelihood_gain': Number(-1e15, 1e15),
-    'rmse_mw': Maybe(_MANY_MW), 'rmse_other_mw': _MANY_MW, 'other': Maybe(Text()),
-    'apart_mw': Maybe(_MANY_MW), 'worst': Maybe({name: Number(-1e12, 1e12) for name in _WORST}),
+    'rmse_mw': Maybe(_PERHAPS_MW), 'rmse_other_mw': _MANY_MW, 'other': Maybe(Text()),
+    'apart_mw': Maybe(_PERHAPS_MW),
+    'worst': Maybe({name: Number(-1e12, 1e12, null=True) for name in _WORST}),
     'contradicted': Maybe(Flag()),
 }  # fmt: skip
 _SCHEMA = {

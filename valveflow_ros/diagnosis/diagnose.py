@@ -443,7 +443,7 @@ def _conclude(
         segments=by_segment(found.task, models[0], models[-1], record.spans_ns),
         simulation=models[0], extended=models[0] if dropped else models[-1],
         final=final.without_causes() if dropped else final,
-        reference=grids.reference, 
+        reference=grids.reference,
         notes=(*notes(grids), *([rest.own_misfit] if rest.own_misfit else [])),
     )  # fmt: skip
     return replace(result, sentence=_sentence(result))

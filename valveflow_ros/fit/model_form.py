@@ -134,7 +134,8 @@ def find_form(
             )  # fmt: skip
         return None if held is None else FoundForm(held, 0.0, None)
     choked = known.exponent if known is not None and known.scaled else _CHOKED_EXPONENT
-    paper = _with_exponent(means, StaticForm(INTEGRATED_INPUT, exponent))
+    usual = known if known is not None and not known.scaled else None
+    paper = _with_exponent(means, usual or StaticForm(INTEGRATED_INPUT, exponent))
     scaled = _best(means, OPENING)
     if known is not None and known.scaled:
         scaled = _with_exponent(means, known)

@@ -207,7 +207,7 @@ def with_support(
     )
     notes = [
         _sentence(k + 1, piece, found)
-        for k, (piece, found) in enumerate(zip(c.pieces, support, strict=True))
+        for k, (piece, found) in enumerate(zip(c.at_pressure().pieces, support, strict=True))
         if not found.identifiable
     ]
     return replace(c, support=support, notes=(*c.notes, *notes))

@@ -142,7 +142,7 @@ def compare(
         A log cannot be read, carries no curve, or holds nothing to judge by.
     """
     # The other methods are the paper's: they simulate from V p^m.
-    given = {'axis': INTEGRATED_INPUT, **(parameters or {})}
+    given = {**(parameters or {}), 'axis': INTEGRATED_INPUT}
     if truth is not None and not isinstance(truth, Truth):
         truth = load_truth(truth)
     log = _not_empty(as_log(log, progress))

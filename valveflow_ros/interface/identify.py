@@ -152,8 +152,9 @@ def identify(
         reference = load_characteristic(reference)
     log = as_log(log, progress)
     found = (
-        _step_test(log, given, progress) if step_test else _identified(log, given, model, progress)
-    )
+        _step_test(log, given, progress) if step_test
+        else _identified(log, given, model, reference, progress)
+    )  # fmt: skip
     if reference is not None:
         settings = found.settings
         limits = ShiftLimits(settings.real('shift_confidence'), settings.real('shift_least'))
@@ -163,11 +164,16 @@ def identify(
 
 
 def _identified(
-    log: Log, given: Mapping[str, Any], model: ExtendedModel | None, progress: Progress
-) -> Identified:
+    log: Log, given: Mapping[str, Any], model: ExtendedModel | None,
+    reference: Characteristic | None, progress: Progress,
+) -> Identified:  # fmt: skip
     settings, notes = settings_of(log, given, progress)
     try:
         observed = observe_log(log, settings, progress, model)
+        # Curves of another form could not be held against the reference, nor causes go with them.
+        form = None if reference is None else reference.static_form
+        form = form if model is None else model.form
+        observed = replace(observed, task=replace(observed.task, form=form))
         characteristic = observed.fit(progress)
     except DataError as error:
         table, _, counts = align(log.readings, settings)

@@ -21,6 +21,9 @@ from valveflow_ros.state import State, perhaps
 _NAMES = [field.name for field in fields(SpecialSegment)]
 
 
+_WITHOUT_ENDS = len(_NAMES) - 5
+
+
 def segment_values(segment: SpecialSegment) -> list[int | float]:
     """Return a segment's fields in their order."""
     return [getattr(segment, name) for name in _NAMES]
@@ -29,7 +32,8 @@ def segment_values(segment: SpecialSegment) -> list[int | float]:
 def segment_of(values: list[Any]) -> SpecialSegment:
     """Return the segment of such values; raises `DataError` if they make none."""
     try:
-        given = dict(zip(_NAMES, values, strict=True))
+        # States of earlier versions have no openings and pressures.
+        given = dict(zip(_NAMES, values, strict=len(values) != _WITHOUT_ENDS))
         return SpecialSegment(**{**given, 'kind': SegmentKind(given['kind'])})
     except (TypeError, ValueError):
         raise DataError('The saved state has a special segment that is none.') from None
