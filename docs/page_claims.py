@@ -96,10 +96,7 @@ def _thermal() -> list[tuple[str, str, str]]:
             f'{errors}; the right axis on {right} of {units * len(_KIND_WORDS)}',
             f'thermal_curves_{name}',
         ))  # fmt: skip
-    for name, what in (
-        ('names_minute_201_215', 'healthy units of this kind, means over a minute'),
-        ('names_1s_201_203', 'the same, every second'),
-    ):
+    for name, what in (('names_1s_201_203', 'healthy units of these kinds, every second'),):
         s = result(f'thermal_{name}')['summary']
         units = sum(k['units'] for k in s.values())
         names: dict[str, int] = {}

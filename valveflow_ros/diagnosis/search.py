@@ -167,6 +167,7 @@ def _rich(base: RegionalModel) -> RegionalModel:
 
 Progress = Callable[[float, str], None]
 
+_OF_FORM = {'exponent': 'the exponent', 'curve_shape': 'the curve'}
 MOST_CAUSES = 4
 MOST_RIVALS = 7
 PENALTY = 5.0  # log-likelihood that each number chosen from the data must bring
@@ -235,11 +236,13 @@ def search(task: Task, start: Extended, progress: Progress, rough: Grids | None 
             found.reasons[name] = f'cannot be judged: {why}'
             barred.add(name)
     if task.grids.form.scaled and not task.fixed_dynamics:
-        # The form was found with it, in the same record.
-        found.reasons['exponent'] = (
-            'cannot be judged: the exponent of p^m F(V) + c was found from this record'
-        )
-        barred.add('exponent')
+        # They were found with the form, in the same record: one is its number, the other what
+        # straight pieces leave of valves in sequence.
+        for name, what in _OF_FORM.items():
+            found.reasons[name] = (
+                f'cannot be judged: {what} of p^m F(V) + c was found from this record'
+            )
+            barred.add(name)
     found.tried = len(every) - len(barred)
     for turn in range(MOST_CAUSES):
         progress(0.15 + 0.15 * turn, 'causes tried' if turn == 0 else 'further causes tried')
