@@ -79,7 +79,7 @@ _RECORDINGS = {
 
 
 def _thermal() -> list[tuple[str, str, str]]:
-    """Return what curves and names are on units built from physics."""
+    """Return how right curves are on units built from physics."""
     rows = []
     for name, recorded in _RECORDINGS.items():
         s = result(f'thermal_curves_{name}')['summary']
@@ -95,20 +95,6 @@ def _thermal() -> list[tuple[str, str, str]]:
             f'{recorded}: error of the curve (median, nine of ten, largest), axis',
             f'{errors}; the right axis on {right} of {units * len(_KIND_WORDS)}',
             f'thermal_curves_{name}',
-        ))  # fmt: skip
-    for name, what in (('names_1s_201_203', 'healthy units of these kinds, every second'),):
-        s = result(f'thermal_{name}')['summary']
-        units = sum(k['units'] for k in s.values())
-        names: dict[str, int] = {}
-        for kind in s.values():
-            for cause, count in kind['names'].items():
-                names[cause] = names.get(cause, 0) + count
-        told = ', '.join(f'{cause} {count}' for cause, count in sorted(names.items())) or 'nothing'
-        rows.append(_row(
-            f'{what}: named',
-            f'{told} on {units}; '
-            f'{sum(k["unexplained"] for k in s.values())} said to be unexplained',
-            f'thermal_{name}',
         ))  # fmt: skip
     return rows
 
