@@ -225,6 +225,9 @@ _FIT = (
     Parameter('refit_segments', 20, '',
               'Refit after this many new special segments; 0 waits for the period.',
               0, 100000, live=True),
+    Parameter('refit_share', 0.1, '',
+              'No refit before this share of the special segments in the window is new.',
+              0.0, 1.0, live=True),
     Parameter('refit_timeout', 120.0, 's', 'A refit that takes longer is ended.', 1.0, 3600.0),
     Parameter('min_fit_samples', 600, '', 'Fewest special samples a fit needs.', 10, 10_000_000),
 )  # fmt: skip
@@ -243,8 +246,9 @@ _ALARM = (
               1.0, 86400.0),
     Parameter('alarm_on_delay', 0.0, 's', 'The limit must be exceeded this long.',
               0.0, 86400.0, live=True),
-    Parameter('alarm_off_delay', 300.0, 's', 'The return must last this long.', 0.0, 86400.0,
-              live=True),
+    Parameter('alarm_off_delay', 86400.0, 's',
+              'The return must last this long, at openings where the alarm was seen.',
+              0.0, 2_592_000.0, live=True),
     Parameter('alarm_dead_band', 0.3, '', 'The return is judged at limit x (1 - dead band).',
               0.0, 0.9, live=True),
     Parameter('alarm_latch', True, '',
@@ -254,7 +258,8 @@ _ALARM = (
               60.0, 604800.0, live=True),
     Parameter('alarm_suppress_time', 3600.0, 's',
               'The residual alarm is suppressed when it could not be judged for this long; it '
-              'comes back when it could be for alarm_off_delay, or at once if it changes.',
+              'comes back when it could be for alarm_off_delay or five alarm_block, or at once if '
+              'it changes.',
               1.0, 86400.0, live=True),
     Parameter('alarm_flood', 5, '',
               'Most announcements of one alarm in ten minutes; more are counted and held back.',
@@ -265,6 +270,12 @@ _SHIFT = (
     Parameter('reference_file', '', '',
               'A characteristic.json that later curves are judged against; empty waits for '
               '~/set_reference.'),
+    Parameter('reference_after', 3.0, 'd',
+              'A curve becomes the reference by itself when nothing was wrong for this long after '
+              'it; 0 leaves that to ~/set_reference.', 0.0, 60.0, live=True),
+    Parameter('wear_budget', 3.0, 'MW/month',
+              'Slow change of the curve up to this is followed and reported as wear; beyond it '
+              'there is an alarm.', 0.0, 1e4, live=True),
     Parameter('shift_confidence', 0.999, '',
               'How sure a shift of the curve must be before it is called one.',
               0.9, 0.999999, live=True),

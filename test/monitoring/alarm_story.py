@@ -114,7 +114,8 @@ class SlowLife:
     def __init__(self, settings):
         self.alarm = NaiveAlarm(settings)  # delays, dead band, latch, acknowledgement
         self.suppress_after = round(settings['alarm_suppress_time'] * S)
-        lasting = max(settings['alarm_block'], settings['alarm_off_delay'])
+        block = settings['alarm_block']
+        lasting = max(block, min(settings['alarm_off_delay'], 5.0 * block))
         self.come_back_after = round(lasting * S)
         self.shelf_time = round(settings['alarm_shelve_time'] * S)
         self.most = settings['alarm_flood']

@@ -133,13 +133,13 @@ def test_what_was_being_computed_is_asked_for_again_although_no_segment_is_new()
     refits = Refits()
     refits.segments_seen = 5
     refits.ask(10)
-    assert not refits.due(20, False, True, settings)
+    assert not refits.due(20, False, True, settings, 5)
     saved = from_bytes(to_bytes(refits.snapshot()))
     again_there = Refits()
     again_there.restore(saved)
     again_there.ask_again()
     assert again_there.pending_ns is None
-    assert again_there.due(20, False, True, settings)
+    assert again_there.due(20, False, True, settings, 5)
     assert again_there.ask(15) > refits.pending_ns
 
 

@@ -31,6 +31,7 @@ from valveflow_ros.monitoring.events import (
     FitRequested,
     JournalEntry,
     JournalKind,
+    ReferenceSet,
     SegmentClosed,
 )
 from valveflow_ros.monitoring.monitor import Monitor
@@ -296,10 +297,11 @@ def test_requests_never_share_a_name_even_when_time_comes_again():
 # --- alarms ---------------------------------------------------------------------------------
 
 
-def test_a_fault_raises_one_alarm_which_stays_until_acknowledged_and_holds_fits_back():
+def test_a_fault_raises_one_alarm_which_stays_until_acknowledged_and_no_fit_mixes_it_in():
     monitor, _ = with_curve()
+    before = monitor.characteristic
     events = feed_rows(monitor, after(monitor, 7, 400, [('fault', 100, 200)]))
-    changes = of_type(events, AlarmChange)
+    changes = [c for c in of_type(events, AlarmChange) if c.name == 'residual']
     assert [c.state for c in changes] == [
         AlarmState.UNACKNOWLEDGED, AlarmState.RETURNED_UNACKNOWLEDGED,
     ]  # fmt: skip
@@ -307,9 +309,15 @@ def test_a_fault_raises_one_alarm_which_stays_until_acknowledged_and_holds_fits_
     raised = int(np.searchsorted(rows, changes[0].time_ns))
     assert 100 < raised < 160
     assert 300 < int(np.searchsorted(rows, changes[1].time_ns)) < 360
+    assert monitor.reference.curve is monitor.predicting
     for event in of_type(events, FitRequested):
-        assert not changes[0].time_ns <= event.task.request_ns < changes[1].time_ns
-    change, entry = monitor.operate_alarms(AlarmAction.ACKNOWLEDGE)
+        if event.task.request_ns > changes[0].time_ns:
+            assert event.task.contents.time_ns[0] >= rows[80]
+    assert of_type(events, ReferenceSet)[0].characteristic in (
+        before,
+        *(e.characteristic for e in of_type(events, CurveAdopted)),
+    )
+    change, *_, entry = monitor.operate_alarms(AlarmAction.ACKNOWLEDGE)
     assert change.state == AlarmState.NORMAL
     assert entry.kind == JournalKind.ACKNOWLEDGE
     with pytest.raises(DataError, match='no alarm'):

@@ -274,7 +274,8 @@ def test_what_waits_is_counted_once_whatever_else_happens_meanwhile():
 
 
 def test_with_its_own_delays_it_cannot_chatter():
-    alarm, told = lived({}, ([*[2.0] * 301, *[0.0] * 301], 6 * 3600))
+    delay = {'alarm_off_delay': 300.0}
+    alarm, told = lived(delay, ([*[2.0] * 301, *[0.0] * 301], 6 * 3600))
     assert alarm.occurrence == sum(c.state == UNACKNOWLEDGED for _, c in told) == 36
     assert not any('held back' in c.sentence for _, c in told)
 
@@ -282,10 +283,10 @@ def test_with_its_own_delays_it_cannot_chatter():
 @pytest.mark.parametrize('out_min', [10, 30, 59])
 @pytest.mark.parametrize('before', [0.0, 2.0])
 def test_a_valve_beyond_the_curve_some_times_a_day_is_not_told(out_min, before):
-    """By its own defaults an alarm stays what it is, standing or not; and it sees what comes."""
+    """An alarm stays what it is, standing or not; and it sees what comes."""
     beyond = (NAN, 60 * out_min)
     steps = [(before, 3600), *[beyond, (before, 1200)] * 8, beyond, (2.0 - before, 1200)]
-    _, told = lived({}, *steps)
+    _, told = lived({'alarm_off_delay': 300.0}, *steps)
     states = [UNACKNOWLEDGED, RETURNED] if before else [UNACKNOWLEDGED]
     assert [c.state for _, c in told] == states
     assert told[-1][0] > sum(count for _, count in steps[:-1])

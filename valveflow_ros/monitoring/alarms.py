@@ -22,6 +22,7 @@ from valveflow_ros.monitoring.alarm_state import (
 from valveflow_ros.numerics import jit
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
+from valveflow_ros.state import State
 
 if TYPE_CHECKING:
     from valveflow_ros.monitoring.prediction import PredictionBlock
@@ -32,9 +33,13 @@ __all__ = ['AlarmChange', 'AlarmState', 'Judged', 'Priority', 'ResidualAlarm']
 _LIMIT = 1.0
 # Places in the alarm's memory: the condition, the delay that runs, the time of the last row; how
 # long nothing could be judged and how long it could be again, and whether it is suppressed for it;
-# what happened at the last row, and the step of time before it.
-_ACTIVE, _SINCE, _COUNTING, _LAST_NS, _BLIND, _SIGHT, _DARK, _WHAT, _STEP = range(9)
-_PLACES = 9
+# what happened at the last row, and the step of time before it; when there was no evidence last.
+_ACTIVE, _SINCE, _COUNTING, _LAST_NS, _BLIND, _SIGHT, _DARK, _WHAT, _STEP, _CALM_NS = range(10)
+_PLACES = 10
+# The evidence began to gather when it was last below this share of the limit.
+_CALM = 0.25
+# The alarm comes back to sight when it could be judged for at most so many blocks.
+_BLOCKS_TO_SEE = 5.0
 # What happened, as bits.
 _TURNED, _DARKENED, _SEEING, _SET_BACK, _DUE = 1, 2, 4, 8, 16
 _NEVER = (1 << 63) - 1
@@ -97,9 +102,18 @@ def _sight(
 
 
 @jit
+def _elsewhere(v: float, u: float, limit: float, dead_band: float, span: FloatArray) -> bool:
+    """Follow from which u to which the condition was seen; tell if a calm row lies outside."""
+    if v > limit:
+        span[0], span[1] = min(span[0], u), max(span[1], u)
+    return v < limit * (1.0 - dead_band) and not span[0] <= u <= span[1]
+
+
+@jit
 def _watch(
     time_ns: IntArray,
     value: FloatArray,
+    u: FloatArray,
     limit: float,
     dead_band: float,
     on_ns: int,
@@ -109,11 +123,14 @@ def _watch(
     back_ns: int,
     due_ns: int,
     memory: IntArray,
+    span: FloatArray,
 ) -> int:
     """Run until something happens; return the row after it, or 0.
 
     NaN leaves the condition as it is: bad data neither raise nor clear. A delay
-    does not run through a gap in time, where nobody was watching.
+    does not run through a gap in time, where nobody was watching, and a return is
+    judged only where the condition was seen: what is wrong at full load is not over
+    because the unit runs at half.
     """
     for t in range(value.size):
         step_ns = time_ns[t] - memory[_LAST_NS]
@@ -124,7 +141,13 @@ def _watch(
         v = abs(value[t])
         judged = not math.isnan(v)
         turned = False
-        if judged:
+        if judged and v < _CALM * limit:
+            memory[_CALM_NS] = time_ns[t]
+        if judged and memory[_ACTIVE] == 0:
+            turned = _turns(time_ns[t], v, limit, dead_band, on_ns, off_ns, memory)
+            if turned:
+                span[:] = u[t]
+        elif judged and not _elsewhere(v, u[t], limit, dead_band, span):
             turned = _turns(time_ns[t], v, limit, dead_band, on_ns, off_ns, memory)
         else:
             # Delays stand still while there is nothing to judge.
@@ -148,8 +171,8 @@ class ResidualAlarm(Alarm):
     Where the evidence cannot be judged for long, the alarm is suppressed. By ISA-18.2 that is no
     annunciation, and it must not flutter: a valve that runs beyond the curve for some minutes,
     some times a day, suppresses nothing. The alarm comes back when the evidence could be judged
-    as long as a return of the condition has to last, less what could not, and at once if the
-    condition turns.
+    for some blocks, less what could not, and at once if the condition turns.
+    The condition is over only where it was seen: the delay of a return does not run at other u.
 
     Parameters
     ----------
@@ -160,13 +183,17 @@ class ResidualAlarm(Alarm):
     ----------
     judged : Judged
         What the next change speaks of.
+    onset_ns : int
+        When the evidence for the last occurrence began to gather; 0 before.
     """
 
     NAME = 'residual'
-    REMEMBERED = (*Alarm.REMEMBERED, '_memory', 'judged')
+    REMEMBERED = (*Alarm.REMEMBERED, '_memory', '_span', 'judged', 'onset_ns')
 
     def __init__(self, settings: Settings) -> None:
         self._memory = np.zeros(_PLACES, dtype=np.int64)
+        self._span = np.zeros(2)
+        self.onset_ns = 0
         self.judged = Judged(0, math.nan, math.nan)
         super().__init__(settings)
 
@@ -178,10 +205,30 @@ class ResidualAlarm(Alarm):
         self._off_ns = round(settings.real('alarm_off_delay') * NS_PER_S)
         self._gap_ns = round(1.5 * settings.real('sample_period') * NS_PER_S)
         self._dark_ns = round(settings.real('alarm_suppress_time') * NS_PER_S)
-        # A return lasts as long as that of the condition, and at least a block: evidence from
-        # before it is of old data.
-        back_s = max(settings.real('alarm_block'), settings.real('alarm_off_delay'))
-        self._back_ns = round(back_s * NS_PER_S)
+        # At least a block, for evidence from before it is of old data; but a return of the
+        # condition may have to last for a day, which nobody is to be blind for.
+        block_s = settings.real('alarm_block')
+        lasting_s = min(settings.real('alarm_off_delay'), _BLOCKS_TO_SEE * block_s)
+        self._back_ns = round(max(block_s, lasting_s) * NS_PER_S)
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state; one of an earlier version does not know where it was seen."""
+        memory = saved.get('memory')
+        if 'span' not in saved and isinstance(memory, np.ndarray):
+            saved = {
+                **saved, 'memory': np.append(memory, 0), 'span': np.array([-math.inf, math.inf]),
+                'onset_ns': saved.get('raised_ns'),
+            }  # fmt: skip
+        super().restore(saved)
+
+    def reset(self, time_ns: int, model_id: str) -> list[AlarmChange]:
+        """Let the condition be over, as with a new reference."""
+        if not self.active:
+            return []
+        self._memory[_ACTIVE] = self._memory[_COUNTING] = 0
+        self.judged = Judged(time_ns, 0.0, 0.0)
+        self.end(self._latch)
+        return self._tell(time_ns, model_id)
 
     def feed(
         self,
@@ -190,6 +237,7 @@ class ResidualAlarm(Alarm):
         shift_mw: FloatArray,
         model_id: str,
         beside: Sequence[Alarm] = (),
+        u: FloatArray | None = None,
     ) -> list[tuple[int, AlarmChange]]:
         """Judge rows; return changes, each with the number of rows up to it.
 
@@ -203,16 +251,20 @@ class ResidualAlarm(Alarm):
         model_id : str
         beside : sequence of Alarm
             Others, for which the time passes row by row as well.
+        u : float64 (n,), optional
+            Where on the curve the unit is.
         """
+        u = np.zeros(len(time_ns)) if u is None else u
         changes: list[tuple[int, AlarmChange]] = []
         everyone = [self, *beside]
         done = 0
         while done < len(time_ns):
             due = [alarm.due_ns for alarm in everyone]
             taken = _watch(
-                time_ns[done:], evidence[done:], _LIMIT, self._dead_band,
+                time_ns[done:], evidence[done:], u[done:], _LIMIT, self._dead_band,
                 self._on_ns, self._off_ns, self._gap_ns, self._dark_ns, self._back_ns,
                 min((d for d in due if d is not None), default=_NEVER), self._memory,
+                self._span,
             )  # fmt: skip
             if not taken:
                 break
@@ -234,6 +286,7 @@ class ResidualAlarm(Alarm):
         if what & _SEEING:
             self.suppressed = False
         if what & _TURNED and self._memory[_ACTIVE]:
+            self.onset_ns = int(self._memory[_CALM_NS])
             self.begin(now_ns)
         elif what & _TURNED:
             self.end(self._latch)
@@ -420,7 +473,7 @@ class Alarms:
         """Judge predicted rows; return what changes, in the order of the rows."""
         judged = np.where(np.isfinite(block.residual_mw), block.evidence, np.nan)
         changes = self._residual.feed(
-            block.time_ns, judged, block.shift_mw, block.model_id, [self._shift]
+            block.time_ns, judged, block.shift_mw, block.model_id, [self._shift], block.u
         )
         return [change for _, change in changes]
 

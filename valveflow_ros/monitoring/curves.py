@@ -1,21 +1,17 @@
-"""The curve that predicts, what it is worth, and why."""
+"""The curve of the last fit, the one that predicts, and when the next fit is asked for."""
 
 from __future__ import annotations
 
 import enum
-from collections.abc import Sequence
 
 import numpy as np
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import from_json, to_json
-from valveflow_ros.curve.shift import Shift, ShiftLimits, judge_shift
-from valveflow_ros.errors import DataError
-from valveflow_ros.monitoring.alarms import AlarmChange, ShiftAlarm
 from valveflow_ros.monitoring.prediction import PredictionBlock, Predictor, no_prediction
 from valveflow_ros.monitoring.rows import Rows
 from valveflow_ros.parameters import Settings
-from valveflow_ros.records import NS_PER_S, ByteArray, IntArray, SpecialSegment
+from valveflow_ros.records import NS_PER_S, ByteArray, IntArray
 from valveflow_ros.segments.window import RollingWindow
 from valveflow_ros.state import Memory, State
 
@@ -26,17 +22,22 @@ class CurveStatus(enum.IntEnum):
     """What can be said of the running curve; the same numbers stand in the message.
 
     `STALE`: there is a curve, but the last fit was refused or the clock went
-    back. `REFUSED`: there is none, and the last fit was refused.
+    back. `REFUSED`: there is none, and the last fit was refused. `PROVISIONAL`: it is made from
+    the rows since something went wrong, which is not the plant in health.
     """
 
     UNKNOWN = 0
     FRESH = 1
     STALE = 2
     REFUSED = 3
+    PROVISIONAL = 4
 
 
 class RunningCurve:
-    """Holds the running curve and its predictor.
+    """Holds the curve of the last fit, and the predictor.
+
+    Predictions come from the reference once there is one: a curve that is fitted to a fault
+    would call it health.
 
     Parameters
     ----------
@@ -44,20 +45,23 @@ class RunningCurve:
 
     Attributes
     ----------
+    characteristic : Characteristic or None
+        Of the last fit.
     status : CurveStatus
     cause : str
-        Why there is no curve, or only a stale one; empty if it is fresh.
+        Why there is no curve, or only a stale or provisional one; empty if it is fresh.
     """
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._predictor: Predictor | None = None
+        self.characteristic: Characteristic | None = None
         self.status = CurveStatus.UNKNOWN
         self.cause = 'No curve yet: not enough special segments.'
 
     @property
-    def characteristic(self) -> Characteristic | None:
-        """Return the running curve."""
+    def predicting(self) -> Characteristic | None:
+        """Return the curve that predicts."""
         return None if self._predictor is None else self._predictor.characteristic
 
     def configure(self, settings: Settings) -> None:
@@ -66,17 +70,26 @@ class RunningCurve:
         if self._predictor is not None:
             self._predictor.limit_mw = settings.real('alarm_limit')
 
-    def adopt(self, characteristic: Characteristic, window: RollingWindow) -> None:
-        """Predict from another curve; the evidence that the last one had gathered stays."""
-        before, self._predictor = self._predictor, Predictor.of(characteristic, self._settings)
-        if before is not None:
+    def adopt(self, characteristic: Characteristic, provisional: str = '') -> None:
+        """Hold the curve of a fit; ``provisional`` says what it is no curve of health for."""
+        self.characteristic, self.cause = characteristic, provisional
+        self.status = CurveStatus.PROVISIONAL if provisional else CurveStatus.FRESH
+
+    def predict_from(
+        self, curve: Characteristic, window: RollingWindow, *, afresh: bool = False
+    ) -> None:
+        """Predict from another curve.
+
+        The evidence that the last one had gathered stays, unless it is to begin afresh.
+        """
+        before, self._predictor = self._predictor, Predictor.of(curve, self._settings)
+        if before is not None and not afresh:
             self._predictor.follow(before)
         self._predictor.warm_up(*window.tail(self._predictor.warm_up_rows))
-        self.status, self.cause = CurveStatus.FRESH, ''
 
     def refuse(self, reason: str) -> None:
         """Keep the old curve as stale, if there is one."""
-        self.status = CurveStatus.REFUSED if self._predictor is None else CurveStatus.STALE
+        self.status = CurveStatus.REFUSED if self.characteristic is None else CurveStatus.STALE
         self.cause = reason
 
     def restart(self, reason: str) -> None:
@@ -97,6 +110,7 @@ class RunningCurve:
         predictor, curve = self._predictor, self.characteristic
         return {
             'curve': None if curve is None else to_json(curve),
+            'predicting': None if predictor is None else to_json(predictor.characteristic),
             'predictor': None if predictor is None else predictor.snapshot(),
             'status': int(self.status),
             'cause': self.cause,
@@ -105,77 +119,13 @@ class RunningCurve:
     def restore(self, saved: State) -> None:
         """Go on from a snapshot; raises `DataError` if it does not fit."""
         if saved['curve'] is not None:
-            self._predictor = Predictor.of(from_json(saved['curve']), self._settings)
+            self.characteristic = from_json(saved['curve'])
+        # In states of earlier versions the running curve predicts.
+        predicting = saved.get('predicting', saved['curve'])
+        if predicting is not None:
+            self._predictor = Predictor.of(from_json(predicting), self._settings)
             self._predictor.restore(saved['predictor'])
         self.status, self.cause = CurveStatus(saved['status']), saved['cause']
-
-
-# The reference of the running monitor: kept, and what later curves are judged against.
-
-
-class ReferenceCurve:
-    """Keep the reference and the alarm on a shift.
-
-    Parameters
-    ----------
-    settings : Settings
-    """
-
-    def __init__(self, settings: Settings) -> None:
-        self.curve: Characteristic | None = None
-        self.shift: Shift | None = None
-        self.problem = ''
-        self.alarm = ShiftAlarm(settings)
-
-    def snapshot(self) -> State:
-        """Return what is remembered. The last judgement is not."""
-        return {
-            'curve': None if self.curve is None else to_json(self.curve),
-            'problem': self.problem,
-            'alarm': self.alarm.snapshot(),
-        }
-
-    def restore(self, saved: State) -> None:
-        """Go on from a state; raises `DataError` if it does not fit."""
-        self.curve = None if saved['curve'] is None else from_json(saved['curve'])
-        self.problem = saved['problem']
-        self.alarm.restore(saved['alarm'])
-
-    def set(self, curve: Characteristic, time_ns: int, settings: Settings) -> list[AlarmChange]:
-        """Judge against ``curve`` from the next adoption on; fits get its form from now on."""
-        self.curve = curve
-        self.shift, self.problem = None, ''
-        return self.alarm.reset('There is a new reference.', time_ns, curve.model_id, settings)
-
-    def judge(
-        self,
-        current: Characteristic,
-        segments: Sequence[SpecialSegment],
-        time_ns: int,
-        settings: Settings,
-    ) -> tuple[Shift | None, list[AlarmChange]]:
-        """Judge a curve that was adopted; None without a reference it can be compared with.
-
-        Parameters
-        ----------
-        current : Characteristic
-        segments : sequence of SpecialSegment
-            Those of the window, in order of time.
-        time_ns : int
-        settings : Settings
-        """
-        self.shift, self.problem = None, ''
-        if self.curve is None:
-            return None, []
-        limits = ShiftLimits(settings.real('shift_confidence'), settings.real('shift_least'))
-        try:
-            self.shift = judge_shift(self.curve, current, segments, limits)
-        except DataError as error:
-            self.problem = str(error)
-            return None, self.alarm.unjudged(
-                self.problem, time_ns, current.model_id, settings
-            )  # fmt: skip
-        return self.shift, self.alarm.judge(self.shift, time_ns, settings)
 
 
 # When a fit is to be asked for, and which outcome is awaited.
@@ -219,7 +169,9 @@ class Refits(Memory):
         due = int(np.searchsorted(time_ns, self._last_ns + period_ns, side='left'))
         return (due + 1, True) if due < over else (over, False)
 
-    def due(self, last_ns: int, closed: bool, by_time: bool, settings: Settings) -> bool:
+    def due(
+        self, last_ns: int, closed: bool, by_time: bool, settings: Settings, segments: int
+    ) -> bool:
         """Tell whether the time or the segments since the last request ask for one.
 
         Parameters
@@ -230,6 +182,9 @@ class Refits(Memory):
             A segment closed at it.
         by_time : bool
             The period ended at it.
+        settings : Settings
+        segments : int
+            That a fit would have. Some must be new: half an hour more makes no other curve.
         """
         if by_time:
             self._last_ns = last_ns
@@ -237,6 +192,8 @@ class Refits(Memory):
             return False
         new = self.segments_seen - self._segments_at_request
         wanted = settings.whole('refit_segments')
+        if new < settings.real('refit_share') * segments:
+            return False
         return (by_time and new > 0) or (closed and wanted > 0 and new >= wanted)
 
     def ask(self, last_ns: int) -> int:

@@ -7,6 +7,7 @@ the cutting of the stream has a part in them.
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 from typing import Protocol
 
@@ -79,6 +80,7 @@ class DiagnosisRequests:
         self.misfit: Misfit = NOTHING
         self.sentence = ''
         self.last: Diagnosed | None = None
+        self._onset_ns: int | None = None
         # A curve makes its model anew each time it is asked, and rows come one by one.
         self._model: tuple[Characteristic, RegionalModel] | None = None
         self._hour: int | None = None
@@ -94,6 +96,15 @@ class DiagnosisRequests:
     def pending(self) -> bool:
         """Tell whether a diagnosis was asked for and its outcome is awaited."""
         return self._pending is not None
+
+    def named_onset_ns(self, reference_ns: int) -> int | None:
+        """Return when a cause set in that the last diagnosis names; None if there is none.
+
+        What was diagnosed before there was the reference is part of it.
+        """
+        if self.last is None or self.last.task.window_end_ns <= reference_ns:
+            return None
+        return self._onset_ns
 
     def watch(
         self, block: PredictionBlock, temperature_degc: FloatArray, curve: Characteristic | None
@@ -114,7 +125,7 @@ class DiagnosisRequests:
         return min(due + 1, len(time_ns))
 
     def look(
-        self, time_ns: int, window: RollingWindow, curve: Characteristic | None
+        self, time_ns: int, window: RollingWindow, curve: Characteristic | None, since_ns: int = 0
     ) -> list[Event]:
         """Look at a boundary; where it is the first of an hour, judge and ask.
 
@@ -124,6 +135,8 @@ class DiagnosisRequests:
             Of the newest row.
         window : RollingWindow
         curve : Characteristic or None
+        since_ns : int
+            Rows before are of no concern any more.
         """
         hour = time_ns // _HOUR_NS
         if hour == self._hour:
@@ -135,12 +148,15 @@ class DiagnosisRequests:
         tonight = another and self.settings.whole('diagnosis_hour') >= 0
         self._night = night
         reason = self._wanted or (NIGHTLY if tonight else '')
-        if reason and self._may_ask(time_ns) and not self._objection(window, curve):
-            events += self._ask(reason, time_ns, window, curve)
+        if (
+            reason and self._may_ask(time_ns)
+            and not self._objection(time_ns, window, curve, since_ns)
+        ):  # fmt: skip
+            events += self._ask(reason, time_ns, window, curve, since_ns)
         return events
 
     def request(
-        self, time_ns: int, window: RollingWindow, curve: Characteristic | None
+        self, time_ns: int, window: RollingWindow, curve: Characteristic | None, since_ns: int = 0
     ) -> list[Event]:
         """Ask for a diagnosis now.
 
@@ -149,17 +165,17 @@ class DiagnosisRequests:
         DataError
             One is running, there is no curve, or there is less than a day of data.
         """
-        objection = self._objection(window, curve)
+        objection = self._objection(time_ns, window, curve, since_ns)
         if objection:
             raise DataError(objection)
-        return self._ask(ASKED, time_ns, window, curve)
+        return self._ask(ASKED, time_ns, window, curve, since_ns)
 
     def adopt(self, request_ns: int, content: str) -> list[Event]:
         """Take a result; ``content`` is what `diagnosis.json` would hold."""
         task = self._settle(request_ns)
         if task is None:
             return []
-        self.last = Diagnosed(task, content, '')
+        self.last, self._onset_ns = Diagnosed(task, content, ''), _onset_ns(content)
         mark = hashlib.sha256(content.encode()).hexdigest()[:12]
         kind, model_id = JournalKind.DIAGNOSED, task.curve.model_id
         return [self.last, self._journal(kind, request_ns, model_id, mark)]
@@ -197,6 +213,7 @@ class DiagnosisRequests:
         self.misfit, self.sentence = Misfit(*saved['misfit']), saved['sentence']
         last, pending = perhaps(saved, 'last', list), perhaps(saved, 'pending', dict)
         self.last = None if last is None else Diagnosed(self._task(last[0]), last[1], last[2])
+        self._onset_ns = None if last is None or not last[1] else _onset_ns(last[1])
         self._pending = None if pending is None else self._task(pending)
         self._hour, self._night, self._night_before, self._asked_ns, self._named_ns = (
             perhaps(saved, name, int)
@@ -259,25 +276,31 @@ class DiagnosisRequests:
         # The clock may have gone back behind the last one.
         return self._asked_ns is None or not 0 <= time_ns - self._asked_ns < pause_ns
 
-    def _objection(self, window: RollingWindow, curve: Characteristic | None) -> str:
+    def _objection(
+        self, time_ns: int, window: RollingWindow, curve: Characteristic | None, since_ns: int
+    ) -> str:
         """Return why there can be no diagnosis, empty if there can."""
         if self.pending:
             return 'A diagnosis is running already.'
         if curve is None:
             return 'There is no curve to diagnose yet.'
-        if window.span_s < LEAST_S:
-            hours = window.span_s / 3600.0
+        span_s = min(window.span_s, (time_ns - since_ns) / NS_PER_S)
+        if span_s < LEAST_S:
+            hours = span_s / 3600.0
             return f'A diagnosis needs a day of data; the window holds {hours:.1f} h.'
         return ''
 
     def _ask(
-        self, reason: str, time_ns: int, window: RollingWindow, curve: Characteristic | None
-    ) -> list[Event]:
+        self, reason: str, time_ns: int, window: RollingWindow, curve: Characteristic | None,
+        since_ns: int,
+    ) -> list[Event]:  # fmt: skip
         assert curve is not None
         # After the clock went back names must not come again.
         self._named_ns = max(time_ns, self._named_ns + 1)
         self._asked_ns, self._wanted = time_ns, ''
-        task = DiagnosisTask(self._named_ns, window.contents(), self.settings, curve, time_ns)
+        task = DiagnosisTask(
+            self._named_ns, window.contents(since_ns), self.settings, curve, time_ns
+        )
         self._pending = task.without_data()
         entry = self._journal(JournalKind.DIAGNOSE, task.request_ns, curve.model_id, reason)
         return [entry, DiagnosisRequested(task)]
@@ -298,6 +321,20 @@ def _sentence(misfit: Misfit, limit: float) -> str:
         f'The model no longer fits: {misfit.hint} (statistic: {misfit.name}, '
         f'{size:g} standard errors, limit {limit:g}).'
     )
+
+
+def _onset_ns(content: str) -> int | None:
+    """Return when the first of the named causes that set in at some moment did so."""
+    try:
+        found = [
+            e['origin_ns'] + round(e['value'] * _DAY_NS)
+            for cause in json.loads(content)['causes']
+            for e in cause['parameters'].values()
+            if e.get('origin_ns') is not None and e['value'] is not None
+        ]
+    except (ValueError, TypeError, KeyError, AttributeError):
+        return None  # of another version
+    return min(found, default=None)
 
 
 def _plain(task: DiagnosisTask) -> State:

@@ -7,11 +7,12 @@ import math
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
+from valveflow_ros.curve.shift import minute
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.task import FitTask
 from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.alarms import Alarms, Judged, ResidualAlarm
-from valveflow_ros.monitoring.curves import CurveStatus, ReferenceCurve, Refits, RunningCurve
+from valveflow_ros.monitoring.curves import CurveStatus, Refits, RunningCurve
 from valveflow_ros.monitoring.diagnosis_requests import DiagnosisRequests
 from valveflow_ros.monitoring.events import (
     CurveAdopted,
@@ -23,6 +24,7 @@ from valveflow_ros.monitoring.events import (
     SegmentClosed,
 )
 from valveflow_ros.monitoring.prediction import PredictionBlock
+from valveflow_ros.monitoring.reference import ReferenceCurve
 from valveflow_ros.monitoring.rows import Correction, Corrector, Fed, Rows
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import IntArray, SampleTable, SpecialSegment
@@ -32,6 +34,9 @@ from valveflow_ros.signals.static_form import StaticForm
 from valveflow_ros.state import Memory
 
 BY_HAND = 'asked for by hand'
+BY_ITSELF = 'nothing was wrong for long enough'
+IN_TIME = 'it is from before something went wrong'
+MIXED = 'The rows of this fit are from before and since something went wrong; the next are not.'
 
 
 class Monitor(Memory):
@@ -84,8 +89,13 @@ class Monitor(Memory):
 
     @property
     def characteristic(self) -> Characteristic | None:
-        """Return the running curve."""
+        """Return the running curve: that of the last fit."""
         return self._force.characteristic
+
+    @property
+    def predicting(self) -> Characteristic | None:
+        """Return the curve that predicts: the reference, before there is one the running one."""
+        return self._force.predicting
 
     @property
     def status(self) -> CurveStatus:
@@ -152,7 +162,9 @@ class Monitor(Memory):
             taken, closed = self._take(rows.part(done, done + most), events)
             done += taken
             # Decisions never fall where a block happens to end: cutting must not matter.
-            looked = self.diagnosing.look(self._last_ns, self._window, self.characteristic)
+            looked = self.diagnosing.look(
+                self._last_ns, self._window, self.predicting, self._diagnosed_since()
+            )
             events += looked
             asked = self._ask() if self._due(closed, by_time and taken == until) else []
             events += asked
@@ -165,21 +177,36 @@ class Monitor(Memory):
 
         An outcome of a request that is no longer awaited is ignored.
         """
-        if not self._refits.settle(request_ns):
+        if request_ns != self._refits.pending_ns:
             return []
-        self._force.adopt(characteristic, self._window)
+        begun = self._follow_health()
+        if characteristic.source.window_start_ns < self.reference.regime_ns:
+            return [*begun, *self.refuse(request_ns, MIXED)]
+        self._refits.settle(request_ns)
+        self._force.adopt(characteristic, self._provisional())
+        segments = self._window.special_segments()
         shift, changes = self.reference.judge(
-            characteristic, self._window.special_segments(), self._last_ns, self.settings
+            characteristic, segments, self._last_ns, self.settings
         )
         entry = self._journal(JournalKind.FIT_ADOPTED, request_ns, characteristic.model_id, '')
-        return [CurveAdopted(characteristic, shift), entry, *changes]
+        told: list[Event] = [CurveAdopted(characteristic, shift), entry, *changes]
+        events = [*begun, *told, *self._follow_health()]
+        healthy = self.reference.renewed(characteristic, self._last_ns, self.settings)
+        if healthy is not None:
+            return [*events, *self._renew(healthy, BY_ITSELF)]
+        if self.reference.curve is None:
+            self._force.predict_from(characteristic, self._window)
+        return events
 
     def refuse(self, request_ns: int, reason: str) -> list[Event]:
         """Note that a fit gave no curve; the old one stays, as stale."""
         if not self._refits.settle(request_ns):
             return []
+        begun = self._follow_health()
+        if reason == MIXED:
+            self._refits.count_as_new()
         self._force.refuse(reason)
-        return [self._journal(JournalKind.FIT_REFUSED, request_ns, '', reason)]
+        return [*begun, self._journal(JournalKind.FIT_REFUSED, request_ns, '', reason)]
 
     def request_fit(self) -> list[Event]:
         """Ask for a fit now.
@@ -197,7 +224,9 @@ class Monitor(Memory):
 
     def request_diagnosis(self) -> list[Event]:
         """Ask for a diagnosis now; raises `DataError` where that makes no sense."""
-        return self.diagnosing.request(self._last_ns, self._window, self.characteristic)
+        return self.diagnosing.request(
+            self._last_ns, self._window, self.predicting, self._diagnosed_since()
+        )
 
     def operate_alarms(self, action: AlarmAction) -> list[Event]:
         """Acknowledge, shelve or unshelve the alarms.
@@ -209,12 +238,15 @@ class Monitor(Memory):
         """
         model_id = self._model_id()
         changes = self._alarms.operate(action, self.judged, model_id)
-        return [*changes, self._journal(JournalKind[action.name], 0, model_id, '')]
+        entry = self._journal(JournalKind[action.name], 0, model_id, '')
+        return [*changes, entry, *self._follow_health()]
 
     def set_reference(self, given: Characteristic | None = None) -> list[Event]:
-        """Let the running curve, or one that is given, be what later ones are judged against.
+        """Let the running curve, or one that is given, be the plant in health.
 
-        One that is given stands in the journal whole, since no data of this run lead to it.
+        Predictions come from it, and later curves are judged against it. Whatever was wrong is
+        accepted by that. One that is given stands in the journal whole, since no data of this
+        run lead to it.
 
         Raises
         ------
@@ -225,6 +257,8 @@ class Monitor(Memory):
         if curve is None:
             raise DataError(f'There is no curve that could become the reference. {self.cause}')
         changes = self.reference.set(curve, self._last_ns, self.settings)
+        changes += self.alarm.reset(self._last_ns, curve.model_id)
+        self._predict(afresh=True)
         text = '' if given is None else json.dumps(to_json(given))
         entry = self._journal(JournalKind.SET_REFERENCE, 0, curve.model_id, text)
         return [ReferenceSet(curve), entry, *changes]
@@ -274,7 +308,7 @@ class Monitor(Memory):
             rows.command_percent,
         )  # fmt: skip
         block = self._force.predict(rows, segmented.kinds)
-        self.diagnosing.watch(block, rows.temperature_degc, self.characteristic)
+        self.diagnosing.watch(block, rows.temperature_degc, self.predicting)
         self._rows += n
         self._last_ns = int(rows.time_ns[-1])
         self.judged = Judged(self._last_ns, float(block.evidence[-1]), float(block.shift_mw[-1]))
@@ -284,7 +318,7 @@ class Monitor(Memory):
     def _say(self, block: PredictionBlock, segmented: Segmented, events: list[Event]) -> None:
         """Append what the rows brought; a segment can only have closed at the last of them."""
         events.append(block)
-        if self.characteristic is not None:
+        if self.predicting is not None:
             events += self._alarms.feed(block)
         self._close(segmented, events)
 
@@ -296,23 +330,70 @@ class Monitor(Memory):
 
     def _due(self, closed: bool, by_time: bool) -> bool:
         """Tell whether a fit is to be asked for at this boundary."""
-        if not self._refits.due(self._last_ns, closed, by_time, self.settings):
+        if not (closed or by_time):
             return False
-        enough = self._window.special_samples >= self.settings.whole('min_fit_samples')
-        # Data under alarm would teach the curve the very fault it should show.
-        return enough and not self.alarm.active
+        segments = self._window.special_segments(self.reference.regime_ns)
+        if not self._refits.due(self._last_ns, closed, by_time, self.settings, len(segments)):
+            return False
+        return sum(s.samples for s in segments) >= self.settings.whole('min_fit_samples')
 
     def _ask(self, text: str = '') -> list[Event]:
+        before = self._follow_health()
         request_ns = self._refits.ask(self._last_ns)
         noise = self._segmenter.noise()
         reference = self.reference.curve
         task = FitTask(
-            request_ns, self._window.contents(), self.settings, noise.input, noise.power_mw,
-            self._correction.held, None if reference is None else reference.static_form,
-            self._known_form(),
+            request_ns, self._window.contents(self.reference.regime_ns), self.settings,
+            noise.input, noise.power_mw, self._correction.held,
+            None if reference is None else reference.static_form, self._known_form(),
         )  # fmt: skip
         entry = self._journal(JournalKind.FIT_REQUESTED, request_ns, '', text)
-        return [entry, FitRequested(task)]
+        return [*before, entry, FitRequested(task)]
+
+    def _follow_health(self) -> list[Event]:
+        """Follow whether something is wrong, at boundaries that a replay has too."""
+        named_ns = self.diagnosing.named_onset_ns(self.reference.set_ns)
+        own_ns = self.alarm.onset_ns if self.alarm.active else None
+        onsets = [ns for ns in (named_ns, own_ns) if ns is not None]
+        waits = self.alarm.standing or self.reference.alarm.standing
+        begins = self.reference.follow(min(onsets, default=None), waits, self._last_ns)
+        curve = self.characteristic
+        if begins and self.reference.curve is None and curve is not None:
+            return self._renew(curve, IN_TIME)
+        return []
+
+    def _renew(self, curve: Characteristic, reason: str) -> list[Event]:
+        """Let a curve be the reference by itself."""
+        segments = self._window.special_segments(self.reference.regime_ns)
+        self.reference.renew(curve, segments, self._last_ns)
+        self._predict()
+        entry = self._journal(JournalKind.SET_REFERENCE, 0, curve.model_id, reason)
+        return [ReferenceSet(curve), entry]
+
+    def _predict(self, *, afresh: bool = False) -> None:
+        """Predict from the reference, or from the running curve where that cannot be judged."""
+        reference = self.reference.curve
+        limit = self.settings.real('alarm_limit') > 0.0
+        judges = reference is not None and (limit or reference.residuals.chart is not None)
+        curve = reference if judges else self.characteristic or reference
+        if curve is not None:
+            self._force.predict_from(curve, self._window, afresh=afresh)
+
+    def _provisional(self) -> str:
+        """Say what the running curve is made from while something is wrong."""
+        since_ns = self.reference.fault_ns
+        if since_ns is None:
+            return ''
+        if not since_ns:
+            return 'Something is wrong, and since when is not known: it may mix what was and is.'
+        return (
+            f'Provisional: something is wrong since {minute(since_ns)}, and this is the plant '
+            'since then. The alarms are judged by the reference.'
+        )
+
+    def _diagnosed_since(self) -> int:
+        """Return from when on rows are diagnosed: what is wrong shows against what was right."""
+        return self.reference.regime_ns if self.reference.fault_ns is None else 0
 
     def _known_form(self) -> StaticForm | None:
         """Return the form that the running curve was told to have, or was given as known."""

@@ -172,9 +172,9 @@ class RollingWindow:
         """Return the number of special segments inside the window."""
         return len(self.special_segments())
 
-    def special_segments(self) -> tuple[SpecialSegment, ...]:
-        """Return the special segments inside the window, in order of time."""
-        return tuple(found.segment for found in self._inside())
+    def special_segments(self, since_ns: int = 0) -> tuple[SpecialSegment, ...]:
+        """Return the special segments inside the window that began since then, in order."""
+        return tuple(f.segment for f in self._inside() if f.segment.start_ns >= since_ns)
 
     @property
     def special_samples(self) -> int:
@@ -283,15 +283,17 @@ class RollingWindow:
         u, power, opening = (self._data[k, part].copy() for k in (0, 1, 3))
         return self._time_ns[part].copy(), u, power, opening
 
-    def contents(self) -> WindowContents:
-        """Return a copy of the rows inside the window and their segments."""
-        if self._end == 0:
-            return NO_ROWS
-        inside = slice(self._first(), self._end)
+    def contents(self, since_ns: int = 0) -> WindowContents:
+        """Return a copy of the rows inside the window since then, and their segments."""
+        since = int(np.searchsorted(self._time_ns[: self._end], since_ns))
+        inside = slice(max(self._first(), since), self._end)
         number = self._number[inside]
+        if not len(number):
+            return NO_ROWS
         spans = [
             (*np.searchsorted(number, (s.first_row, s.end_row)).tolist(), int(s.segment.kind))
             for s in self._inside()
+            if s.first_row >= number[0]
         ]
         command = self._data[4, inside]
         return WindowContents(

@@ -246,7 +246,7 @@ class Session:
         if self._model is not None:
             names = ', '.join(h.name for h in self._model.held) or 'nothing'
             self._log(Level.OK, f'Taken out of the rows, by model_file: {names}.')
-        kept = monitor.reference.curve
+        kept = monitor.reference.first
         if given is not None and (kept is None or kept.model_id != given.model_id):
             self.publish(monitor.set_reference(given))
 
