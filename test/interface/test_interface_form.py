@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from functools import cache
 
@@ -10,7 +11,9 @@ import pytest
 
 import valveflow_ros as vf
 from valveflow_ros.errors import DataError
+from valveflow_ros.fit.result import wrong_form
 from valveflow_ros.interface.models import load_model
+from valveflow_ros.report.validation import verdict_words
 from valveflow_ros.signals.static_form import INTEGRATED_INPUT, OPENING
 
 UNIT = 'choked:number=2,vacuum_per_kpa=0'
@@ -82,6 +85,20 @@ def test_other_days_are_validated_and_curves_of_both_forms_held_against_each_oth
     assert gain is not None
     assert gain.mean > 0.0
     assert gain.zero_is_rejected()
+
+
+def test_validation_says_how_wrong_a_curve_of_the_wrong_form_is():
+    ours, paper = identified().characteristic, identified(INTEGRATED_INPUT).characteristic
+    wrong = vf.validate(plant(6).log, paper)
+    size = wrong.validation.misfit.rms_mw
+    assert size == pytest.approx(error_mw(plant(6), paper), rel=0.3)
+    assert wrong.validation.verdict.value == 'off'
+    words = json.loads(wrong.texts()['validation.json'])['words']
+    assert words[0].startswith(f'The characteristic is off by {size:.2g} MW')
+    assert wrong_form(paper) in words
+    right = vf.validate(plant(6).log, ours)
+    assert right.validation.misfit is None or right.validation.misfit.rms_mw < 0.2 * size
+    assert not any('wrong one' in s for s in verdict_words(right.data))
 
 
 def test_a_curve_of_other_days_gets_the_form_of_its_reference():
