@@ -158,9 +158,9 @@ def _verdict(v: Validation) -> str:
     size = math.sqrt(v.judgement.mse(v.judged_by))
     return (
         f'The measured power differs from the prediction by {plain(size, 2)} MW (root mean '
-        f'square); whether the characteristic holds stays open: {mean}{real}. {which} it cannot be '
-        f'told whether the difference is within {tolerance} or beyond. A longer log, with every '
-        'load in it, would help.'
+        f'square); whether the characteristic holds stays open: {mean}{real}. {which} it cannot '
+        f'be told whether the difference is within {tolerance} or beyond. A longer log, with '
+        'every load in it, would help.'
     )
 
 
