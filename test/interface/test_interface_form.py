@@ -47,6 +47,18 @@ def test_the_curve_is_right_over_opening_and_pressure_and_far_off_in_the_other_f
     assert 'is the wrong one' not in found.page().to_html()
 
 
+def test_the_unit_of_pressure_scales_the_slopes_and_nothing_else():
+    frame = vf.simulate(2.0, 3, unit=UNIT, recording='minute').log.to_dataframe()
+    tenth = frame.assign(main_steam_pressure_mpa=0.1 * frame['main_steam_pressure_mpa'])
+    one, other = (vf.identify(f).characteristic for f in (frame, tenth))
+    e = one.pressure_scale_exponent
+    assert other.pressure_scale_exponent == pytest.approx(e, abs=1e-5)
+    assert other.offset_mw == pytest.approx(one.offset_mw, abs=0.01)
+    slopes, theirs = ([p.slope for p in c.pieces] for c in (one, other))
+    assert theirs == pytest.approx([s * 10.0**e for s in slopes], rel=1e-3)
+    np.testing.assert_allclose(other.breakpoints, one.breakpoints, rtol=1e-3)
+
+
 def test_a_unit_of_the_paper_s_form_keeps_it():
     unit = 'integrated_input:number=2,vacuum_per_kpa=0'
     found = identified(unit=unit)
