@@ -236,6 +236,19 @@ def test_shallow_knees_are_taken_out_and_steep_ones_stay():
     assert simplified(model).pieces == model.pieces
 
 
+@pytest.mark.parametrize('unit_of_curve', [1.0, 0.04, 1000.0])
+def test_a_jump_stays_in_whatever_unit_the_curve_is(unit_of_curve):
+    """p^e F(V) holds MW / MPa^e, where a jump of a MW is a small number."""
+    model = rough_model()
+    jumps = replace(
+        model, knots=np.insert(model.knots, 2, 1400.0),
+        left=np.insert(model.left, 2, 226.5), right=np.insert(model.right, 1, 225.9),
+    )  # fmt: skip
+    for curve in (model, jumps):
+        scaled = replace(curve, left=unit_of_curve * curve.left, right=unit_of_curve * curve.right)
+        assert simplified(scaled).pieces == simplified(curve).pieces == curve.pieces
+
+
 def test_the_extended_model_comes_back_from_its_file(grids):
     model = Extended(
         rough_model(),
