@@ -19,10 +19,13 @@ if TYPE_CHECKING:
     from valveflow_ros.records import FloatArray
 
 _DESCRIPTION = """\
-Write the inverse of a flow characteristic as a table: the integrated input u that gives a
+Write the inverse of a flow characteristic as a table: the input u of the curve that gives a
 demanded power, and at stated pressures the opening. Put before the valve, it makes the unit
 answer alike at every load. The knees of the curve are points of the table, so that linear
 interpolation is exact; what the table is good for, and where not, is said.
+
+u is V p^m, V being the opening in % and p the pressure in MPa. Of a curve whose knees stand at
+fixed openings, p^m F(V) + c, u is the opening, and a table is for one pressure.
 
 example:
   valveflow compensate --model result/characteristic.json -o table.csv --pressure 16.7"""
