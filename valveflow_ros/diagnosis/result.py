@@ -31,7 +31,7 @@ from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.causes.covariate import covariate_cause
 from valveflow_ros.diagnosis.evidence import Gain, SegmentGain
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
-from valveflow_ros.diagnosis.grids import COEFFICIENTS, COURSE, Covariate, Reference
+from valveflow_ros.diagnosis.grids import COEFFICIENTS, COURSE, MEAN_S, Covariate, Reference
 from valveflow_ros.errors import DataError
 from valveflow_ros.signals.static_form import AXES, OPENING, StaticForm
 
@@ -107,7 +107,7 @@ class Diagnosis:
     unexplained_by : tuple of str
     rejected : tuple of (name, reason)
     rmse_simulation, rmse_extended, rmse_noise_floor : float
-        MW, on sealed blocks.
+        MW, on sealed blocks, of means over ``mean_s``.
     segments : tuple of SegmentGain
     simulation, extended : Extended
         Without and with causes, fitted to the open blocks.
@@ -116,6 +116,7 @@ class Diagnosis:
     reference : Reference
         What its causes count from.
     notes : tuple of str
+    mean_s : float
     """
 
     verdict: str
@@ -135,6 +136,7 @@ class Diagnosis:
     final: Extended
     reference: Reference
     notes: tuple[str, ...] = ()
+    mean_s: float = MEAN_S
 
 
 # The extended model as JSON: what ``extended_model.json`` holds, and what is believed of one.
