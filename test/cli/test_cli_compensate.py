@@ -154,6 +154,26 @@ def test_what_is_no_curve_is_refused(run, model, tmp_path):
     assert ran.status == 0
 
 
+def test_a_curve_that_depends_on_the_pressure_needs_one(run, tmp_path):
+    """A file of another program states the form and no reference pressure."""
+    file, path = tmp_path / 'characteristic.json', tmp_path / 'table.csv'
+    c = curve(
+        [20.0, 45.0, 100.0], [0.4, 0.25], start=5.0, axis='opening', pressure_exponent=0.0,
+        pressure_scale_exponent=1.05, offset_mw=-9.0,
+    )  # fmt: skip
+    file.write_text(json.dumps(to_json(c)))
+    refused = run('compensate', '--model', file, '-o', path).refused(status=2)
+    assert 'give one, as in --pressure' in refused
+    assert not path.exists()
+    ran = run('compensate', '--model', file, '-o', path, '--json', '--pressure', '12')
+    assert [ran.json[k] for k in ('axis', 'pressure_scale_exponent', 'offset_mw')] == [
+        'opening', 1.05, -9.0,
+    ]  # fmt: skip
+    columns = ran.json['columns']
+    power = c.power(columns['opening_percent_at_12_mpa'], 12.0)
+    assert power == pytest.approx(columns['power_mw'], abs=0.01)
+
+
 def test_knees_at_fixed_openings_are_a_table_for_one_pressure(run, tmp_path):
     file = tmp_path / 'characteristic.json'
     c = curve(

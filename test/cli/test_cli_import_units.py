@@ -32,7 +32,8 @@ def frame():
     [
         ('main_steam_temperature_degc', 'main_steam_temperature', 812, ['K', 'degF']),
         ('main_steam_temperature_degc', 'main_steam_temperature', 1000, ['degF']),
-        ('main_steam_pressure_mpa', 'main_steam_pressure', 2400, ['kPa', 'psi']),
+        ('main_steam_pressure_mpa', 'main_steam_pressure', 2400, ['psi', 'kPa']),
+        ('main_steam_pressure_mpa', 'main_steam_pressure', 5000, ['kPa', 'psi']),
         ('main_steam_pressure_mpa', 'main_steam_pressure', 16500, ['kPa']),
         ('generated_power_mw', 'generated_power', 250_000, ['kW']),
     ],
@@ -119,6 +120,17 @@ def test_a_log_without_a_possible_pressure_is_refused(run, tmp_path, frame, pres
     with pytest.raises(InputError, match='impossible'):
         vf.open_log(path)
     assert not (tmp_path / 'x.mcap').exists()
+
+
+@pytest.mark.parametrize(('unit', 'scale', 'zero'), [('degF', 1.8, 32.0), ('K', 1.0, 273.15)])
+def test_a_temperature_in_another_unit_is_refused(run, tmp_path, frame, unit, scale, zero):
+    path = tmp_path / 'a.csv'
+    theirs = scale * frame['main_steam_temperature_degc'] + zero
+    theirs.iloc[:2] = 60.0
+    frame.assign(main_steam_temperature_degc=theirs).to_csv(path, index_label='time')
+    said = run('import', path, '-o', tmp_path / 'x.mcap').refused()
+    assert f'main_steam_temperature=main_steam_temperature_degc:{unit}' in said
+    assert run(*shlex.split(said.splitlines()[-1])[1:]).status == 0
 
 
 def test_a_log_with_some_possible_pressures_is_read_with_a_warning(run, tmp_path, frame):

@@ -12,6 +12,7 @@ from streams import needs_jit
 import valveflow_ros as vf
 from benchmarks.refinery_loops import simulate_loop
 from valveflow_ros.errors import InputError
+from valveflow_ros.logs.tables.loop_columns import roles_of
 
 pytestmark = needs_jit
 KEYS = {'format', 'version', 'verdict', 'reason', 'sizes'}
@@ -77,6 +78,25 @@ def test_three_lines_above_the_rows_are_a_heading(tmp_path, frame, table):
     assert vf.judge_loop(tmp_path / 'a.txt').to_json() == vf.judge_loop(table).to_json()
 
 
+@pytest.mark.parametrize('case', [str, str.upper, str.title])
+@pytest.mark.parametrize(
+    ('command', 'response', 'set_point'),
+    [
+        ('op', 'process', 'setpoint'), ('controller_output', 'process_value', 'set_point'),
+        ('co', 'flow', 'flow_setpoint'), ('valve_command', 'level', 'level_sp'),
+        ('output', 'processvalue', 'set_value'), ('mv', 'actual_value', 'reference'),
+        ('control signal', 'pressure', 'pressure sp'), ('cmd', 'pv', 'sv'),
+        ('controller_output', 'valve_position', 'position_setpoint'), ('op', 'travel', 'sp'),
+        ('demand', 'stem lift', 'target'),
+    ],
+)  # fmt: skip
+def test_common_names_are_recognised_in_either_case(case, command, response, set_point):
+    names = [case(name) for name in (set_point, response, command, 'time')]
+    found = roles_of(names, [''] * 4)
+    behind = found.get('position') or found.get('process')
+    assert (found['set_point'], behind, found['command']) == ([0], [1], [2])
+
+
 def test_another_clock_says_the_same(frame):
     plain = vf.judge_loop(frame).judgement
     later = frame.assign(time=frame['time'] + pd.Timedelta(days=400))
@@ -85,6 +105,11 @@ def test_another_clock_says_the_same(frame):
     assert vf.judge_loop(slower).judgement.verdict == plain.verdict
     doubled = pd.concat([frame, frame[100:200]])
     assert vf.judge_loop(doubled).judgement == plain
+
+
+def test_words_do_as_well_as_tags(frame):
+    words = frame.set_axis(['time', 'controller_output', 'flow', 'flow_setpoint'], axis=1)
+    assert vf.judge_loop(words).to_json()['sizes'] == vf.judge_loop(frame).to_json()['sizes']
 
 
 def test_a_few_rows_that_are_missing_change_nothing(frame):

@@ -39,6 +39,7 @@ def test_the_true_curve_holds_on_its_plant(run, logs, model, tmp_path):
         rows = list(csv.DictReader(file))
     assert len(rows) == content['judged']['segments']
     page = (tmp_path / 'out' / 'report.html').read_text()
+    assert re.search(r'[0-9] MW', content['words'][0].split('; ')[0])
     for sentence in content['words']:
         assert sentence in ran.out
         assert sentence.split('.')[0].replace("'", '&#x27;') in page

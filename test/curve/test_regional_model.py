@@ -23,6 +23,16 @@ def test_the_curve_is_the_slow_one_and_goes_on_beyond_its_ends(model, u):
     assert all(np.abs(line - v).min() < 1e-7 for line, v in zip(lines, expected, strict=True))
 
 
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize(('last', 'end'), [(2.0, np.inf), (1.0, np.nan), (0.5, -np.inf)])
+def test_an_infinite_input_is_answered_without_a_warning(last, end):
+    model = RegionalModel(*(
+        np.array(a) for a in ([0.0, 1.0, 2.0], [0.0, 1.0], [1.0, last], [], [], [])
+    ))  # fmt: skip
+    u = np.array([-np.inf, np.inf, np.nan])
+    np.testing.assert_array_equal(model.static(u), [-np.inf, end, np.nan])
+
+
 @examples(60)
 @given(models())
 def test_packing_and_unpacking_gives_the_same_model(model):

@@ -15,7 +15,7 @@ from streams import needs_jit
 
 from valveflow_ros.diagnosis import kernels, record_faults
 from valveflow_ros.diagnosis.cause import Active, SentenceValues, Stage
-from valveflow_ros.diagnosis.causes import catalogue
+from valveflow_ros.diagnosis.causes import catalogue, causes_for
 from valveflow_ros.diagnosis.evidence import sign_flip
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
 from valveflow_ros.diagnosis.fitting import Task, base_mask, base_tangents, cause_tangents
@@ -24,7 +24,7 @@ from valveflow_ros.diagnosis.result import model_from_json, model_to_json
 from valveflow_ros.diagnosis.search import simplified
 from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.records import SampleTable, Signal
-from valveflow_ros.signals.static_form import StaticForm
+from valveflow_ros.signals.static_form import OPENING, StaticForm
 
 pytestmark = needs_jit
 NAMES = {
@@ -90,6 +90,38 @@ def test_tangents_of_causes_predict_small_changes(grids, name):
     moved = answer(grids, Extended(model, (Active(cause, tuple(values), extra),)))
     change = moved - answer(grids, here)
     assert np.abs(change - by * tangent).max() <= 0.1 * np.abs(change).max() + 1e-9
+
+
+@pytest.mark.parametrize('name', ['curve_shape', 'curve_step'])
+def test_places_on_the_curve_are_in_the_unit_of_its_axis(grids, name):
+    """The same bump in % of opening at a constant pressure gives the same answer and bounds."""
+    per_percent = 25.0  # V p^m of one percent
+    values = TYPICAL[name]
+    opening = replace(
+        grids, u=grids.u / per_percent, form=StaticForm(OPENING), scale=np.ones(len(grids.u))
+    )
+    one, other = causes_for(grids)[name], causes_for(opening)[name]
+    places = [u.unit == '% MPa^m' for u in one.unknowns]
+    assert [u.unit for u in other.unknowns] == [
+        '%' if place else u.unit for u, place in zip(one.unknowns, places, strict=True)
+    ]
+
+    def on_opening(of):
+        return tuple(v / per_percent if p else v for v, p in zip(of, places, strict=True))
+
+    for attribute in ('low', 'high', 'step'):
+        bounds = (getattr(u, attribute) for u in one.unknowns)
+        assert [getattr(u, attribute) for u in other.unknowns] == pytest.approx(on_opening(bounds))
+    narrow = (1.5, 1425.0, 30.0) if name == 'curve_shape' else (-2.5, 1450.0, 1452.0, 0.2)
+    for size in (values, narrow):
+        assert other.clipped(on_opening(size)) == on_opening(size)
+        np.testing.assert_allclose(
+            other.act(opening.u, on_opening(size), opening), one.act(grids.u, size, grids),
+            atol=1e-9,
+        )  # fmt: skip
+        model = Extended(replace(rough_model(), offset_mw=0.0), (Active(other, on_opening(size)),))
+        kept = model_to_json(ExtendedModel(model, opening.form, 5, grids.reference))
+        assert model_from_json(kept).model.active == model.active
 
 
 def test_tangents_of_the_curve_predict_small_changes(grids):
@@ -202,6 +234,19 @@ def test_shallow_knees_are_taken_out_and_steep_ones_stay():
     )  # fmt: skip
     assert simplified(split).pieces == model.pieces
     assert simplified(model).pieces == model.pieces
+
+
+@pytest.mark.parametrize('unit_of_curve', [1.0, 0.04, 1000.0])
+def test_a_jump_stays_in_whatever_unit_the_curve_is(unit_of_curve):
+    """p^e F(V) holds MW / MPa^e, where a jump of a MW is a small number."""
+    model = rough_model()
+    jumps = replace(
+        model, knots=np.insert(model.knots, 2, 1400.0),
+        left=np.insert(model.left, 2, 226.5), right=np.insert(model.right, 1, 225.9),
+    )  # fmt: skip
+    for curve in (model, jumps):
+        scaled = replace(curve, left=unit_of_curve * curve.left, right=unit_of_curve * curve.right)
+        assert simplified(scaled).pieces == simplified(curve).pieces == curve.pieces
 
 
 def test_the_extended_model_comes_back_from_its_file(grids):

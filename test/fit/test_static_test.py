@@ -43,6 +43,16 @@ def test_three_pieces_and_their_knees_are_found(seed: int, rows: int, step_s: fl
     assert len(found.segments) == rows
 
 
+def test_a_test_at_one_pressure_says_that_it_does_not_tell_the_form() -> None:
+    """Both forms fit its rows alike, at another pressure they differ."""
+    frame = flow_test(3)
+    frame['main_steam_pressure_mpa'] += np.linspace(0.0, 0.4, len(frame))
+    found = vf.identify(frame)
+    (told,) = [n for n in found.characteristic.notes if 'F(V p^m)' in n]
+    assert told.startswith('The pressure stayed between 16.70 and 17.10 MPa')
+    assert told.replace("'", '&#x27;') in found.page().to_html()
+
+
 def test_the_order_of_rows_does_not_matter() -> None:
     """Steady rows have no past."""
     frame = flow_test(5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from functools import cache
 
@@ -10,7 +11,9 @@ import pytest
 
 import valveflow_ros as vf
 from valveflow_ros.errors import DataError
+from valveflow_ros.fit.result import wrong_form
 from valveflow_ros.interface.models import load_model
+from valveflow_ros.report.validation import verdict_words
 from valveflow_ros.signals.static_form import INTEGRATED_INPUT, OPENING
 
 UNIT = 'choked:number=2,vacuum_per_kpa=0'
@@ -42,6 +45,18 @@ def test_the_curve_is_right_over_opening_and_pressure_and_far_off_in_the_other_f
     assert 'fixed openings' in found.page().to_html()
     assert 'is the wrong one' in held.page().to_html()
     assert 'is the wrong one' not in found.page().to_html()
+
+
+def test_the_unit_of_pressure_scales_the_slopes_and_nothing_else():
+    frame = vf.simulate(2.0, 3, unit=UNIT, recording='minute').log.to_dataframe()
+    tenth = frame.assign(main_steam_pressure_mpa=0.1 * frame['main_steam_pressure_mpa'])
+    one, other = (vf.identify(f).characteristic for f in (frame, tenth))
+    e = one.pressure_scale_exponent
+    assert other.pressure_scale_exponent == pytest.approx(e, abs=1e-5)
+    assert other.offset_mw == pytest.approx(one.offset_mw, abs=0.01)
+    slopes, theirs = ([p.slope for p in c.pieces] for c in (one, other))
+    assert theirs == pytest.approx([s * 10.0**e for s in slopes], rel=1e-3)
+    np.testing.assert_allclose(other.breakpoints, one.breakpoints, rtol=1e-3)
 
 
 def test_a_unit_of_the_paper_s_form_keeps_it():
@@ -82,6 +97,20 @@ def test_other_days_are_validated_and_curves_of_both_forms_held_against_each_oth
     assert gain is not None
     assert gain.mean > 0.0
     assert gain.zero_is_rejected()
+
+
+def test_validation_says_how_wrong_a_curve_of_the_wrong_form_is():
+    ours, paper = identified().characteristic, identified(INTEGRATED_INPUT).characteristic
+    wrong = vf.validate(plant(6).log, paper)
+    size = wrong.validation.misfit.rms_mw
+    assert size == pytest.approx(error_mw(plant(6), paper), rel=0.3)
+    assert wrong.validation.verdict.value == 'off'
+    words = json.loads(wrong.texts()['validation.json'])['words']
+    assert words[0].startswith(f'The characteristic is off by {size:.2g} MW')
+    assert wrong_form(paper) in words
+    right = vf.validate(plant(6).log, ours)
+    assert right.validation.misfit is None or right.validation.misfit.rms_mw < 0.2 * size
+    assert not any('wrong one' in s for s in verdict_words(right.data))
 
 
 def test_a_curve_of_other_days_gets_the_form_of_its_reference():

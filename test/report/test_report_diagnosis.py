@@ -43,6 +43,13 @@ def test_the_one_picture_is_the_variable_that_shows_most():
     assert {'residual-u', 'fast-moves', 'map-time', 'segments', 'history', 'alarms'} < set(names)
 
 
+@pytest.mark.parametrize(('mean_s', 'told'), [(10.0, '10 s'), (60.0, '1 min')])
+def test_the_proof_says_what_its_differences_are_means_over(mean_s, told):
+    data = diagnosed()
+    page = diagnosis_page(replace(data, diagnosis=replace(data.diagnosis, mean_s=mean_s)))
+    assert f'of means over {told}:' in words_of(page.to_html())
+
+
 def test_the_steps_follow_in_their_order(page):
     titles = [s.title for s in page.sections]
     assert titles == [

@@ -6,10 +6,13 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from listener import Listener, start_monitor, start_plant
+from rclpy.serialization import deserialize_message
 from ros_helpers import Processes, wait_until
+from std_msgs.msg import Float64MultiArray
 from valveflow_msgs.msg import Alarm
 
 from valveflow_ros.curve.characteristic import Characteristic
@@ -36,6 +39,7 @@ from valveflow_ros.ros.node.health import reference_item
 from valveflow_ros.ros.node.parameter_files import given_reference
 from valveflow_ros.ros.outputs import Outputs
 from valveflow_ros.ros.verify import verify
+from valveflow_ros.signals.static_form import OPENING
 
 SETTINGS = Settings({'refit_period': 3600.0, 'refit_segments': 0, 'alarm_limit': 500.0})
 TABLE = simulate(0.3, 7).table
@@ -98,6 +102,26 @@ def test_outputs_follow_the_events(curve: Characteristic) -> None:
     assert (outputs.reference_id, outputs.shift) == ('lifted', shift)
     list(outputs.of([CurveAdopted(curve)]))
     assert outputs.shift is None
+
+
+@pytest.mark.parametrize(
+    ('form', 'units'),
+    [
+        ({}, ['% MPa^e', 'MW / (% MPa^e)']),
+        (
+            {'axis': OPENING, 'pressure_exponent': 0.0, 'pressure_scale_exponent': 1.05},
+            ['%', 'MW / (% MPa^s)'],
+        ),
+    ],
+)
+def test_plain_arrays_say_their_unit(
+    curve: Characteristic, form: dict[str, Any], units: list[str]
+) -> None:
+    adopted = CurveAdopted(replace(curve, **form))
+    said = {o.name: o.data for o in Outputs('u').of([adopted])}
+    for name, unit in zip(('breakpoints', 'slopes'), units, strict=True):
+        message = deserialize_message(said[name], Float64MultiArray)
+        assert message.layout.dim[0].label.endswith(f'[{unit}]')
 
 
 def test_a_run_with_references_is_repeated_byte_for_byte(curve: Characteristic) -> None:

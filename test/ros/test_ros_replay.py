@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 from valveflow_msgs.msg import PlantSample
 
+from valveflow_ros.errors import ParameterError
 from valveflow_ros.logs import open_log, write_samples, write_table
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import NS_PER_S, SIGNALS, SampleTable, Signal
@@ -215,6 +217,10 @@ def test_the_plant_refuses_what_makes_no_sense(
 
 
 def test_plain_values_need_a_clock_unless_in_real_time() -> None:
-    check_together(1.0, stamped=False, use_clock=False)
-    check_together(60.0, stamped=True, use_clock=False)
-    check_together(0.0, stamped=False, use_clock=True)
+    refused = []
+    for given in itertools.product((0.0, 1.0, 60.0), (False, True), (False, True)):
+        try:
+            check_together(*given)
+        except ParameterError:
+            refused.append(given)
+    assert refused == [(0.0, False, False), (60.0, False, False)]

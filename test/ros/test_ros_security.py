@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 import yaml
 from own_sockets import bound, family, readable
+from rclpy.context import Context
 from rclpy.parameter import Parameter as RosParameter
 from ros_helpers import PATIENCE_S, Processes, wait_until
 
@@ -240,15 +241,31 @@ def test_a_middleware_without_security_is_called_by_its_name(demanded: Any) -> N
         assert 'no node can be made with it' in str(refusal.value)
 
 
+@pytest.fixture
+def contexts(monkeypatch: pytest.MonkeyPatch) -> list[Context]:
+    """The contexts in which nodes are tried."""
+    made: list[Context] = []
+
+    def make() -> Context:
+        made.append(Context())
+        return made[-1]
+
+    monkeypatch.setattr(domain, 'Context', make)
+    return made
+
+
 @pytest.mark.parametrize('value', ['', 'false', 'False', '0', 'no', 'off'])
-def test_who_demands_nothing_is_let_through(demanded: Any, value: str) -> None:
+def test_who_demands_nothing_is_let_through(
+    demanded: Any, contexts: list[Context], value: str
+) -> None:
     demanded({'ROS_SECURITY_ENABLE': value, 'ROS_SECURITY_STRATEGY': 'Permissive'})
     check_security([])
     check_security([], {})
+    assert not contexts, 'no node has to be tried'
 
 
 def test_a_node_that_can_be_made_is_let_through_and_leaves_nothing_behind(
-    demanded: Any, tmp_path: Path
+    demanded: Any, contexts: list[Context], tmp_path: Path
 ) -> None:
     demanded({})
     wish = {
@@ -257,6 +274,7 @@ def test_a_node_that_can_be_made_is_let_through_and_leaves_nothing_behind(
     # The stack itself sees no wish, so that its node stands for one that got what it wished for.
     check_security(['--ros-args', '--enclave', '/a'], wish)
     check_security(None, wish)
+    assert [context.ok() for context in contexts] == [False, False]
 
 
 def test_an_unknown_middleware_is_not_trusted_to_refuse(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -20,7 +21,9 @@ from valveflow_ros.baselines.judged import (
     trial_of,
 )
 from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.fit.model_form import Misfit, find_misfit
 from valveflow_ros.records import FloatArray
+from valveflow_ros.signals.static_form import pressure_of
 
 CURVE, SIMULATED = 'curve', 'simulated'
 OTHER = 'against.'
@@ -89,6 +92,8 @@ class Validation:
     overall : PieceCheck
     pieces : tuple of PieceCheck
     verdict : Verdict
+    misfit : Misfit or None
+        What the curve gets wrong again and again at the same openings and pressures.
     gain : PairedTest or None
         Squared error of ``against`` less that of this one, MW^2.
     """
@@ -105,6 +110,12 @@ class Validation:
     pieces: tuple[PieceCheck, ...]
     verdict: Verdict
     gain: PairedTest | None
+    misfit: Misfit | None = None
+
+    @property
+    def misfit_beyond(self) -> Misfit | None:
+        """Return the misfit where it is beyond the tolerance."""
+        return self.misfit if self.misfit and self.misfit.rms_mw > self.tolerance_mw else None
 
 
 def validate(
@@ -146,10 +157,24 @@ def validate(
     if against is not None:
         theirs_by = OTHER + (SIMULATED if OTHER + SIMULATED in predictions else CURVE)
         gain = judgement.gain(by, theirs_by)
-    return Validation(
+    found = Validation(
         characteristic, against, by, tolerance_mw, trial, predictions, judgement, outside,
         checks[0], checks[1:], _verdict(checks, tolerance_mw), gain,
+        _misfit(other, trial, predictions[CURVE]),
     )  # fmt: skip
+    return replace(found, verdict=Verdict.OFF) if found.misfit_beyond else found
+
+
+def _misfit(other: OtherData, trial: Trial, predicted: FloatArray) -> Misfit | None:
+    """Return what the static curve gets wrong; nothing where the openings are not known."""
+    opening = other.opening_percent
+    if opening is None:
+        return None
+    pressure = pressure_of(other.samples.u, opening, other.exponent)
+    power = np.where(trial.good, trial.power_mw, np.nan)
+    return find_misfit(
+        opening, pressure, power - predicted, power, trial.spans[:, :2], trial.step_s
+    )
 
 
 def _predictions(
@@ -230,6 +255,7 @@ def to_json(v: Validation) -> dict[str, Any]:
         'judged_by': v.judged_by,
         'tolerance_mw': v.tolerance_mw,
         'overall': overall,
+        'misfit': None if v.misfit is None else dataclasses.asdict(v.misfit),
         'pieces': pieces,
         'totals': totals_json(v.judgement, v.predictions),
         'gain_over_against_mw2': None if v.gain is None else fields_json(v.gain),

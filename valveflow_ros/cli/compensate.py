@@ -19,10 +19,13 @@ if TYPE_CHECKING:
     from valveflow_ros.records import FloatArray
 
 _DESCRIPTION = """\
-Write the inverse of a flow characteristic as a table: the integrated input u that gives a
+Write the inverse of a flow characteristic as a table: the input u of the curve that gives a
 demanded power, and at stated pressures the opening. Put before the valve, it makes the unit
 answer alike at every load. The knees of the curve are points of the table, so that linear
 interpolation is exact; what the table is good for, and where not, is said.
+
+u is V p^m, V being the opening in % and p the pressure in MPa. Of a curve whose knees stand at
+fixed openings, p^m F(V) + c, u is the opening, and a table is for one pressure.
 
 example:
   valveflow compensate --model result/characteristic.json -o table.csv --pressure 16.7"""
@@ -78,7 +81,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
     check_output(options.output, TABLES, source=options.model, overwrite=options.overwrite)
     curve = load_characteristic(options.model)
-    pressures = sorted(set(options.pressure))
+    pressures, shown = sorted(set(options.pressure)), curve
     if curve.axis == OPENING:
         # Its knees stand at other powers at each pressure.
         if len(pressures) > 1:
@@ -86,12 +89,17 @@ def run(options: Namespace, console: Console) -> VerbResult:
                 'The knees of this curve stand at fixed openings, and at another power for each '
                 'pressure: make one table for each --pressure.'
             )
-        curve = curve.at_pressure(*pressures)
-        pressures = [curve.reference_pressure_mpa]
+        if not pressures and math.isnan(curve.reference_pressure_mpa):
+            raise UsageError(
+                'The power of this curve at an opening depends on the pressure, and its file '
+                'states no reference pressure: give one, as in --pressure 16.7.'
+            )
+        shown = curve.at_pressure(*pressures)
+        pressures = [shown.reference_pressure_mpa]
 
     def make(points: int) -> Compensation:
         return compensate(
-            curve, points, options.max_gain,
+            shown, points, options.max_gain,
             -math.inf if options.u_from is None else options.u_from,
             math.inf if options.u_to is None else options.u_to,
         )  # fmt: skip
@@ -103,7 +111,14 @@ def run(options: Namespace, console: Console) -> VerbResult:
     table = _table(made, pressures)
     _write(table, options.output)
     text = _text(made, pressures, options.tolerance, options.output)
-    return VerbResult(text, _data(made, table, pressures, options.tolerance, options.output))
+    form = {
+        'axis': curve.axis,
+        'pressure_exponent': curve.pressure_exponent,
+        'pressure_scale_exponent': curve.pressure_scale_exponent,
+        'offset_mw': curve.offset_mw,
+    }
+    data = _data(made, table, pressures, options.tolerance, options.output)
+    return VerbResult(text, {**form, **data})
 
 
 def _check(made: Compensation, tolerance_mw: float, again: Callable[[int], Compensation]) -> None:
@@ -235,7 +250,6 @@ def _data(
     return {
         'table': str(path),
         'model_id': made.curve.model_id,
-        'pressure_exponent': made.curve.pressure_exponent,
         'columns': {name: [float(v) for v in column] for name, column in table.items()},
         'power_limits_mw': [float(made.power_mw[0]), float(made.power_mw[-1])],
         'u_limits': [float(made.u[0]), float(made.u[-1])],

@@ -15,6 +15,8 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.records import FloatArray, IntArray
 from valveflow_ros.signals.static_form import INTEGRATED_INPUT, OPENING, StaticForm
 
+_COMMON_MPA = 10.0
+
 # What a chart was designed for; apart from its kernels, for whoever only reads models.
 
 
@@ -197,7 +199,7 @@ class Characteristic:
     pressure_scale_exponent, offset_mw : float
         e and c.
     reference_pressure_mpa : float
-        Median pressure of the data; what is shown of a curve with e > 0 is at this pressure.
+        Median pressure of the data, NaN where it is not known; see `shown_at_mpa`.
     form : FormEvidence or None
         How this form compares with the other; None where they were not compared.
     """
@@ -229,9 +231,18 @@ class Characteristic:
         )
 
     @property
+    def shown_at_mpa(self) -> float:
+        """Return the pressure that a curve with e > 0 is shown at.
+
+        That of reference; a common one where a file of another program does not state it.
+        """
+        p = self.reference_pressure_mpa
+        return _COMMON_MPA if self.axis == OPENING and math.isnan(p) else p
+
+    @property
     def reference_scale(self) -> float:
-        """Return p^e at the reference pressure; 1 for the paper's form."""
-        return float(self.static_form.scale(self.reference_pressure_mpa))
+        """Return p^e at the pressure the curve is shown at; 1 for the paper's form."""
+        return float(self.static_form.scale(self.shown_at_mpa))
 
     @property
     def breakpoints(self) -> FloatArray:
@@ -270,7 +281,7 @@ class Characteristic:
         """
         if self.axis != OPENING:
             return self
-        p = self.reference_pressure_mpa if pressure_mpa is None else pressure_mpa
+        p = self.shown_at_mpa if pressure_mpa is None else pressure_mpa
         scale = float(self.static_form.scale(p))
 
         def there(piece: Piece) -> Piece:
@@ -298,7 +309,7 @@ class Characteristic:
         u = np.asarray(u, dtype=np.float64)
         knots = self.breakpoints
         inside = (u >= knots[0]) & (u <= knots[-1])
-        p = self.reference_pressure_mpa if pressure_mpa is None else pressure_mpa
+        p = self.shown_at_mpa if pressure_mpa is None else pressure_mpa
         return np.where(inside, self.model.static(u, self.static_form.scale(p)), np.nan)
 
     def inverse(self, power_mw: FloatArray) -> FloatArray:

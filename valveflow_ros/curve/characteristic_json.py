@@ -35,7 +35,7 @@ from valveflow_ros.curve.json_schema import (
     fail,
 )
 from valveflow_ros.errors import DataError
-from valveflow_ros.signals.static_form import AXES, INTEGRATED_INPUT, OPENING, StaticForm
+from valveflow_ros.signals.static_form import AXES, INTEGRATED_INPUT, StaticForm
 
 # Causes held while a curve was fitted, as JSON.
 
@@ -77,7 +77,6 @@ _READABLE = (1, 2)
 
 
 _LEAST_EXPONENT = 0.5
-_COMMON_MPA = 10.0
 
 
 def _number(value: float) -> float | None:
@@ -314,6 +313,7 @@ def from_json(raw: object) -> Characteristic:
     )  # fmt: skip
     window = window or {'start_ns': 0, 'end_ns': 0}
     temperature = temperature or {'mean_degc': math.nan, 'spread_k': math.nan, 'flag': False}
+    pressure = top['reference_pressure_mpa']
     return Characteristic(
         # Where the knees stand at fixed openings u is V, whatever another program wrote.
         pressure_exponent=form.input_exponent,
@@ -341,7 +341,7 @@ def from_json(raw: object) -> Characteristic:
         axis=form.axis,
         pressure_scale_exponent=form.scale_exponent,
         offset_mw=top['offset_mw'] or 0.0,
-        reference_pressure_mpa=_reference_pressure(top),
+        reference_pressure_mpa=math.nan if pressure is None else pressure,
         form=_form(top['form']),
     )  # fmt: skip
 
@@ -368,15 +368,6 @@ def form_of(top: dict[str, Any], whole: str, inside: str = '') -> StaticForm:
         problem = f'is below {_LEAST_EXPONENT:g}'
         raise fail(whole, f'{inside}pressure_scale_exponent', problem)
     return StaticForm(axis, scale)
-
-
-def _reference_pressure(top: dict[str, Any]) -> float:
-    """Return the pressure a curve is shown at; a common one where the file does not say."""
-    pressure = top['reference_pressure_mpa']
-    scaled = top['axis'] == OPENING
-    if pressure is None or math.isnan(pressure):
-        return _COMMON_MPA if scaled else math.nan
-    return float(pressure)
 
 
 def _form(found: dict[str, Any] | None) -> FormEvidence | None:

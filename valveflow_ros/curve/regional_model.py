@@ -82,11 +82,12 @@ class RegionalModel:
         return np.asarray(scale * self.shape(u) + self.offset)
 
     def shape(self, u: FloatArray) -> FloatArray:
-        """Evaluate F; NaN in gives NaN out."""
+        """Evaluate F; NaN in gives NaN out, and so does an infinite u on a flat piece."""
         piece = np.clip(np.searchsorted(self.knots, u, side='right') - 1, 0, self.pieces - 1)
         width = np.diff(self.knots)[piece]
         w = (u - self.knots[piece]) / width
-        return np.asarray(self.left[piece] + (self.right - self.left)[piece] * w)
+        with np.errstate(invalid='ignore'):
+            return np.asarray(self.left[piece] + (self.right - self.left)[piece] * w)
 
     def taps(self, step_s: float) -> FloatArray:
         """Return the filter of each region as the kernels want it, shape (I, 7)."""

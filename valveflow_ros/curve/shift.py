@@ -267,7 +267,7 @@ def judge_shift(
     _comparable(reference, current)
     found = segment_residuals(reference, segments)
     # Curves are held against each other at one pressure, at which their power is F(u) alone.
-    pressure = reference.reference_pressure_mpa
+    pressure = reference.shown_at_mpa
     reference, current = reference.at_pressure(pressure), current.at_pressure(pressure)
     series = [
         after_known_changes(found.inside(p.u_from, p.u_to), reference.source.window_end_ns)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.grids import Covariate, Grids
 from valveflow_ros.records import NS_PER_S, BoolArray
+from valveflow_ros.signals.static_form import StaticForm
 
 # A number with its 95 % interval, and how a time is told: as dates in UTC.
 
@@ -100,6 +101,13 @@ def _step_s(width_s: float) -> int:
 Values = tuple[float, ...]
 U_UNIT = '% MPa^m'
 _OPENING_UNIT = 0.04  # % of opening move as much as one unit of V p^m does
+
+
+def axis_unit(form: StaticForm) -> float:
+    """Return how much of the axis of a form is as much as one unit of V p^m."""
+    return _OPENING_UNIT if form.scaled else 1.0
+
+
 # So near to the end of what a plant can have the data ask for something else.
 _END = 0.95
 _Z95 = 1.959963984540054
@@ -164,9 +172,14 @@ class Unknown:
     concealed: float = 0.0
     dated: bool = False
 
-    def step_on(self, grids: Grids) -> float:
-        """Return the step for differences; a place on the curve counts in the unit of its axis."""
-        return self.step * (_OPENING_UNIT if self.unit == U_UNIT and grids.form.scaled else 1.0)
+    def on(self, form: StaticForm) -> Unknown:
+        """Return it for curves of a form; a place on the curve is in the unit of their axis."""
+        if self.unit != U_UNIT or not form.scaled:
+            return self
+        one = axis_unit(form)
+        return replace(
+            self, unit='%', step=one * self.step, low=one * self.low, high=one * self.high
+        )
 
 
 class SentenceValues(dict[str, float]):
@@ -254,6 +267,10 @@ class Cause:
     conceals: tuple[str, ...] = ()
     # What it follows, if that is a column beside the signals.
     covariate: Covariate | None = None
+
+    def on(self, form: StaticForm) -> Cause:
+        """Return the cause for curves of a form; see `Unknown.on`."""
+        return replace(self, unknowns=tuple(u.on(form) for u in self.unknowns))
 
     def clipped(self, values: Values) -> Values:
         """Return values within the bounds."""

@@ -443,7 +443,7 @@ def _conclude(
         segments=by_segment(found.task, models[0], models[-1], record.spans_ns),
         simulation=models[0], extended=models[0] if dropped else models[-1],
         final=final.without_causes() if dropped else final,
-        reference=grids.reference,
+        reference=grids.reference, mean_s=grids.mean_s,
         notes=(*notes(grids), *([rest.own_misfit] if rest.own_misfit else [])),
     )  # fmt: skip
     return replace(result, sentence=_sentence(result))
@@ -490,7 +490,8 @@ def _sentence(d: Diagnosis) -> str:
     if d.verdict == NOTHING:
         blind = sum('cannot be judged' in reason for _, reason in d.rejected)
         but = f' {blind} causes could not be judged in this record.' if blind > 1 else ''
-        return f'The model explains the unit down to its noise.{but}{wander}'
+        slow = '' if d.disturbance is None else 'a slow disturbance and '
+        return f'The model explains the unit down to {slow}its noise.{but}{wander}'
     near = f'; nearest: {", ".join(d.not_told_apart)}' if d.not_told_apart else ''
     besides = ''.join(f' Found besides: {c.sentence}' for c in d.causes)
     return (

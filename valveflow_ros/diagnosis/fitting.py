@@ -286,7 +286,7 @@ def cause_tangents(task: Task, model: Extended) -> FloatArray:
     for c, k in slots:
         stage = model.active[c].cause.stage
         keep = None if stage == Stage.DYNAMICS else path
-        h = model.active[c].cause.unknowns[k].step_on(grids)
+        h = model.active[c].cause.unknowns[k].step
         up, down = _shifted(model, c, k, h), _shifted(model, c, k, -h)
         width = up.active[c].values[k] - down.active[c].values[k]
         change = answer(grids, up, None, keep) - answer(grids, down, None, keep)

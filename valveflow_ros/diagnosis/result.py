@@ -31,9 +31,9 @@ from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.causes.covariate import covariate_cause
 from valveflow_ros.diagnosis.evidence import Gain, SegmentGain
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
-from valveflow_ros.diagnosis.grids import COEFFICIENTS, COURSE, Covariate, Reference
+from valveflow_ros.diagnosis.grids import COEFFICIENTS, COURSE, MEAN_S, Covariate, Reference
 from valveflow_ros.errors import DataError
-from valveflow_ros.signals.static_form import AXES, OPENING
+from valveflow_ros.signals.static_form import AXES, OPENING, StaticForm
 
 NAMED, NOTHING, UNEXPLAINED = 'named', 'nothing', 'unexplained'
 
@@ -107,7 +107,7 @@ class Diagnosis:
     unexplained_by : tuple of str
     rejected : tuple of (name, reason)
     rmse_simulation, rmse_extended, rmse_noise_floor : float
-        MW, on sealed blocks.
+        MW, on sealed blocks, of means over ``mean_s``.
     segments : tuple of SegmentGain
     simulation, extended : Extended
         Without and with causes, fitted to the open blocks.
@@ -116,6 +116,7 @@ class Diagnosis:
     reference : Reference
         What its causes count from.
     notes : tuple of str
+    mean_s : float
     """
 
     verdict: str
@@ -135,6 +136,7 @@ class Diagnosis:
     final: Extended
     reference: Reference
     notes: tuple[str, ...] = ()
+    mean_s: float = MEAN_S
 
 
 # The extended model as JSON: what ``extended_model.json`` holds, and what is believed of one.
@@ -251,9 +253,10 @@ def model_from_json(raw: object, depth: int = 0) -> ExtendedModel:
     earlier = model_from_json(raw['on_top_of'], depth + 1) if 'on_top_of' in raw else None
     reference = top['reference']
     noise = reference.pop('opening_noise') or 0.0
+    form = form_of(top, _WHOLE, inside)
     given = ExtendedModel(
-        Extended(_base(top, inside), _causes(top['causes'], f'{inside}causes')),
-        form_of(top, _WHOLE, inside), top['start_ns'], Reference(**reference, opening_noise=noise),
+        Extended(_base(top, inside), _causes(top['causes'], f'{inside}causes', form)),
+        form, top['start_ns'], Reference(**reference, opening_noise=noise),
         earlier,
     )  # fmt: skip
     if earlier is not None and earlier.form != given.form:
@@ -277,14 +280,14 @@ def _base(top: dict[str, Any], inside: str) -> RegionalModel:
     return RegionalModel(knots, left, right, levels, times, delays, offset)
 
 
-def _causes(found: list[dict[str, Any]], path: str) -> tuple[Active, ...]:
+def _causes(found: list[dict[str, Any]], path: str, form: StaticForm) -> tuple[Active, ...]:
     names = [cause['name'] for cause in found]
     if len(set(names)) < len(names):
         raise fail(_WHOLE, path, 'names a cause twice')
-    return tuple(_cause(cause, f'{path}[{k}]') for k, cause in enumerate(found))
+    return tuple(_cause(cause, f'{path}[{k}]', form) for k, cause in enumerate(found))
 
 
-def _cause(found: dict[str, Any], path: str) -> Active:
+def _cause(found: dict[str, Any], path: str, form: StaticForm) -> Active:
     cause = catalogue().get(found['name'])
     if cause is None and (about := found['covariate']):
         given: dict[str, Any] = {
@@ -295,6 +298,7 @@ def _cause(found: dict[str, Any], path: str) -> Active:
         cause = covariate_cause(Covariate(found['name'], **given))
     if cause is None:
         raise fail(_WHOLE, f'{path}.name', 'is no cause of the catalogue')
+    cause = cause.on(form)
     schema = {u.name: Number(u.low, u.high) for u in cause.unknowns}
     values = checked(found['values'], schema, _WHOLE, f'{path}.values')
     return Active(cause, tuple(values.values()), tuple(found['switches_s']))

@@ -34,16 +34,17 @@ from valveflow_ros.records import FloatArray
 # but part of a shape, and would hide `curve_shape` inside the model.
 
 SHALLOW = 0.2  # change of slope relative to the larger one
-_JUMP_MW = 0.01
+_JUMP = 1e-4  # of the range of the curve, whose unit depends on the form
 
 
 def simplified(model: RegionalModel) -> RegionalModel:
     """Return the curve without its shallow knees, the shallowest first; jumps stay."""
+    least = _JUMP * float(np.ptp(np.concatenate([model.left, model.right])))
     while model.pieces > 1:
         slopes = model.slopes()
         larger = np.maximum(np.abs(slopes[1:]), np.abs(slopes[:-1]))
         bend = np.abs(np.diff(slopes)) / np.maximum(larger, 1e-12)
-        bend[np.abs(model.left[1:] - model.right[:-1]) > _JUMP_MW] = np.inf
+        bend[np.abs(model.left[1:] - model.right[:-1]) > least] = np.inf
         weakest = int(np.argmin(bend))
         if bend[weakest] >= SHALLOW:
             return model

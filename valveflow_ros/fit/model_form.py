@@ -24,7 +24,9 @@ _KNOTS = 10
 _FOLDS, _STRETCHES = 5, 40
 _LEAST_MEANS = 200
 _MOST_MEANS = 6000
-_EXPONENT_STEP = 0.05
+# Each grid runs between the neighbours of the best place of the one before. The likelihood is
+# ragged: a search along its slope would end elsewhere for another unit of the pressure.
+_EXPONENT_STEPS = 0.05, 0.01, 0.002
 # Held-out errors count as Student's t with so many degrees of freedom: a stretch beyond what the
 # others visit would otherwise outweigh all of them.
 _FREEDOM = 4.0
@@ -291,10 +293,11 @@ def _best(means: _Means, axis: str) -> _Fit:
         return float(_surprise(_fitted(means, StaticForm(axis, exponent)).error).sum())
 
     low, high = EXPONENTS
-    least = float(min(np.arange(low, high + 1e-9, _EXPONENT_STEP), key=cost))
-    bounds = max(low, least - _EXPONENT_STEP), min(high, least + _EXPONENT_STEP)
-    found = minimize_scalar(cost, bounds=bounds, method='bounded', options={'xatol': 1e-3})
-    return _fitted(means, StaticForm(axis, round(float(found.x), 4)))
+    best = low
+    for step in _EXPONENT_STEPS:
+        best = min(np.arange(low, high + 1e-9, step).round(4).tolist(), key=cost)
+        low, high = max(EXPONENTS[0], best - step), min(EXPONENTS[1], best + step)
+    return _fitted(means, StaticForm(axis, best))
 
 
 def _fitted(means: _Means, form: StaticForm) -> _Fit:

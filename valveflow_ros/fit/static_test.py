@@ -18,6 +18,7 @@ from valveflow_ros.errors import counted
 from valveflow_ros.fit.step_test import (
     BrokenLine,
     Points,
+    form_note,
     interval,
     joined,
     partition_points,
@@ -224,5 +225,5 @@ def _characteristic(
             input_noise=0.0, power_noise_mw=sd,
         ),
         partition_pieces=pieces,
-        notes=(note,),
+        notes=(note, form_note(pressure)),
     ).with_id()  # fmt: skip

@@ -295,7 +295,11 @@ def identify_step_test(table: SampleTable, settings: Settings) -> StepTest:
             'signals were logged, and that nothing else moved the power.'
         )
     segments = tuple(_segment(k + 1, table, u, v, settings) for k, v in enumerate(good))
-    notes = (*_notes(levels, good, spread, members), *_left_out(levels))
+    notes = (
+        *_notes(levels, good, spread, members),
+        form_note(pressure[inside]),
+        *_left_out(levels),
+    )
     curve = _characteristic(table, u, inside, good, line, settings, notes)
     return StepTest(curve, tuple(levels), segments, spread)
 
@@ -323,6 +327,15 @@ def _pressure_spread(pressure: FloatArray) -> float:
             'for a step test). Ordinary operation is identified without --step-test.'
         )
     return spread
+
+
+def form_note(pressure: FloatArray) -> str:
+    """Say that a test at one pressure does not tell the form of the static power."""
+    return (
+        f'The pressure stayed between {pressure.min():.2f} and {pressure.max():.2f} MPa: whether '
+        'the power follows F(V p^m), as this curve does, or p^m F(V) + c cannot be told from '
+        'that. At other pressures the curve may be wrong.'
+    )
 
 
 def _notes(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Container, Iterable
 from dataclasses import dataclass
 
@@ -36,7 +37,8 @@ class Doubt:
     impossible : float
         Share of its values that the engine will reject.
     looks_like : str
-        The unit that would suit, empty if none does; the first where several do.
+        The unit that would suit, empty if none does; of several the one in which the values
+        come nearest to the middle of what is usual.
     sentence : str
         What to tell a person, without the option that would help.
     also : tuple of str
@@ -107,22 +109,30 @@ def _better_units(
     middle = float(np.median(written))
     low, high = _USUAL[signal]
 
+    def middle_in(name: str) -> float:
+        return middle * unit_of(signal, name).scale + unit_of(signal, name).offset
+
     def usual(name: str) -> bool:
         other = unit_of(signal, name)
         values = written * other.scale + other.offset
         inside = (values >= allowed[0]) & (values <= allowed[1])
-        return low <= middle * other.scale + other.offset <= high and bool(inside.mean() > 0.95)
+        return low <= middle_in(name) <= high and bool(inside.mean() > 0.95)
 
     own = unit_of(signal, unit)
     if usual(unit):
         return ()
     # Of two names of one unit the first.
     others = {other: name for name, other in reversed(UNITS[signal].items()) if other != own}
-    return tuple(name for name in reversed(others.values()) if usual(name))
+    return tuple(sorted(
+        (name for name in reversed(others.values()) if usual(name)),
+        key=lambda name: abs(math.log(middle_in(name) ** 2 / (low * high))),
+    ))  # fmt: skip
 
 
 def refuse_impossible(path: object, doubts: Iterable[Doubt], names: dict[Signal, str]) -> None:
-    """Refuse a table in which every main steam pressure is impossible.
+    """Refuse a table in which every main steam pressure is impossible, or a unit surely wrong.
+
+    That is one in which most values of a signal are impossible and that another would suit.
 
     Raises
     ------
@@ -130,7 +140,8 @@ def refuse_impossible(path: object, doubts: Iterable[Doubt], names: dict[Signal,
         With the options that would help.
     """
     for found in doubts:
-        if found.signal != Signal.MAIN_STEAM_PRESSURE or found.impossible < 1.0:
+        lost = found.signal == Signal.MAIN_STEAM_PRESSURE and found.impossible >= 1.0
+        if not lost and not (found.looks_like and found.impossible > _MOST):
             continue
         topic, theirs = SIGNALS[found.signal].topic, names[found.signal]
         said, remedy = found.advice(theirs), choosing(topic, theirs, found.looks_like)

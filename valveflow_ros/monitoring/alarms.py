@@ -418,7 +418,8 @@ class ShiftAlarm(Alarm):
 
     def _content(self, state: AlarmState) -> Content:
         sentence = self._sentence or 'No piece of the curve is known to have moved.'
-        if state == AlarmState.ACKNOWLEDGED:
+        cleared = AlarmState.RETURNED_UNACKNOWLEDGED, AlarmState.NORMAL
+        if state == AlarmState.ACKNOWLEDGED or (self._before, state) == cleared:
             sentence = f'Acknowledged. {sentence}'
         elif state == AlarmState.RETURNED_UNACKNOWLEDGED:
             sentence = f'{sentence} Acknowledge to clear the alarm.'

@@ -12,6 +12,7 @@ from valveflow_ros.curve.characteristic import (
     Piece,
     RegionDynamics,
 )
+from valveflow_ros.fit.model_form import Misfit
 from valveflow_ros.fit.result import forms_apart, wrong_form
 from valveflow_ros.records import FloatArray, Signal
 from valveflow_ros.report.figure import Figure, Spec, axis, line, rounded, token
@@ -62,17 +63,23 @@ def doubt(data: Identified) -> str:
         )
     told = []
     if misfit is not None:
-        opening, pressure, most = misfit.worst
         told.append(
-            f'Do not rely on this curve: it is wrong by {plain(misfit.rms_mw, 2)} MW (root mean '
-            f'square) at the openings and pressures of these data, most at '
-            f'{decimals(opening, 0)} % and {decimals(pressure, 1)} MPa, where the measured power '
-            f'differs by {plain(most, 2)} MW. The power depends on opening and pressure in '
-            'another way, or on something that was not logged.'
+            f'Do not rely on this curve: it is wrong by {misfit_words(misfit)}. The power depends '
+            'on opening and pressure in another way, or on something that was not logged.'
         )
     if form := wrong_form(data.characteristic):
         told.append(form)
     return ' '.join(told)
+
+
+def misfit_words(misfit: Misfit) -> str:
+    """Say by how much a curve is wrong again and again, and where most."""
+    opening, pressure, most = misfit.worst
+    return (
+        f'{plain(misfit.rms_mw, 2)} MW (root mean square) at the openings and pressures of these '
+        f'data, most at {decimals(opening, 0)} % and {decimals(pressure, 1)} MPa, where the '
+        f'measured power differs by {plain(most, 2)} MW'
+    )
 
 
 def form_words(c: Characteristic) -> str:

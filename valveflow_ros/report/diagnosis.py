@@ -42,6 +42,7 @@ from valveflow_ros.report.words import (
     UNKNOWN,
     counted,
     decimals,
+    duration,
     input_unit,
     input_unit_plain,
     interval,
@@ -184,7 +185,8 @@ def _proof(data: Diagnosed) -> Section:
     parts: list[str | Figure] = [
         paragraph(
             'Every fifth block of the record was sealed: nothing was fitted to it, and it was '
-            'opened once. Root mean square difference there, means of ten seconds:'
+            'opened once. Root mean square difference there, of means over '
+            f'{duration(d.mean_s)}:'
         ),
         table(['model', 'MW'], rows),
     ]

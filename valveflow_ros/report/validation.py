@@ -10,7 +10,9 @@ import numpy as np
 
 from valveflow_ros.baselines.judged import JudgedSegment
 from valveflow_ros.baselines.validation import OTHER, PieceCheck, Validation, Verdict
+from valveflow_ros.fit.result import weaknesses
 from valveflow_ros.records import SegmentKind
+from valveflow_ros.report.answer import misfit_words
 from valveflow_ros.report.figure import (
     DAY_HOUR,
     Figure,
@@ -119,7 +121,7 @@ def verdict_words(data: Validated) -> list[str]:
     if blind := [span(c.u_from, c.u_to) for c in v.pieces if not c.segments]:
         told.append(f'No special segment lies at u from {", ".join(blind)}: nothing is said of '
                     'that.')  # fmt: skip
-    return told
+    return [*told, *weaknesses(v.characteristic)]
 
 
 def _verdict(v: Validation) -> str:
@@ -133,6 +135,11 @@ def _verdict(v: Validation) -> str:
     mean = f'over all segments {differs(v.overall)}'
     if v.verdict is Verdict.HOLDS:
         return f'The characteristic holds: {mean}, and on each piece surely within {tolerance}.'
+    if v.misfit_beyond:
+        return (
+            f'The characteristic is off by {misfit_words(v.misfit_beyond)}; {tolerance} are let '
+            f'pass. The mean {mean}.'
+        )
     if v.verdict is Verdict.OFF:
         off = [c for c in (v.overall, *v.pieces) if c.beyond(v.tolerance_mw)]
         worst = max(off, key=lambda c: abs(c.test.mean))
@@ -148,10 +155,12 @@ def _verdict(v: Validation) -> str:
     ]:
         *most, last = unsettled
         which = f'For pieces {", ".join(most)} and {last}' if most else f'For piece {last}'
+    size = math.sqrt(v.judgement.mse(v.judged_by))
     return (
-        f'Whether the characteristic holds stays open: {mean}{real}. {which} it cannot be '
-        f'told whether the difference is within {tolerance} or beyond. A longer log, with every '
-        'load in it, would help.'
+        f'The measured power differs from the prediction by {plain(size, 2)} MW (root mean '
+        f'square); whether the characteristic holds stays open: {mean}{real}. {which} it cannot '
+        f'be told whether the difference is within {tolerance} or beyond. A longer log, with '
+        'every load in it, would help.'
     )
 
 

@@ -135,7 +135,7 @@ def curve_message(
     message.axis = curve.axis
     message.pressure_scale_exponent = curve.pressure_scale_exponent
     message.offset_mw = curve.offset_mw
-    message.reference_pressure_mpa = curve.reference_pressure_mpa
+    message.reference_pressure_mpa = curve.shown_at_mpa
     message.samples = source.samples
     message.steady_segments = source.steady
     message.slope_segments = source.slope_response

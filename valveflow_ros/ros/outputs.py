@@ -30,6 +30,7 @@ from valveflow_ros.monitoring.events import JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.ros import encoding
+from valveflow_ros.signals.static_form import OPENING
 
 NO_CURVE_YET = 'No curve yet: not enough special segments.'
 
@@ -212,10 +213,12 @@ class Outputs:
         yield _output('characteristic', message, time_ns)
         knots = [] if curve is None else curve.breakpoints
         slopes = [] if curve is None else [p.slope for p in curve.pieces]
-        unit = '% MPa^e'
+        what, unit, rise = 'integrated input u', '% MPa^e', 'MW / (% MPa^e)'
+        if curve is not None and curve.axis == OPENING:
+            what, unit, rise = 'valve opening', '%', 'MW / (% MPa^s)'
         for name, values, label in (
-            ('breakpoints', knots, f'integrated input u at the ends of the pieces [{unit}]'),
-            ('slopes', slopes, f'slope of each piece [MW / ({unit})]'),
+            ('breakpoints', knots, f'{what} at the ends of the pieces [{unit}]'),
+            ('slopes', slopes, f'slope of each piece [{rise}]'),
         ):
             yield _output(name, encoding.array_message(values, label), time_ns)
 

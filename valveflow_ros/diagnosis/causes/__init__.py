@@ -24,6 +24,6 @@ def catalogue() -> dict[str, Cause]:
 
 
 def causes_for(grids: Grids) -> dict[str, Cause]:
-    """Return the catalogue and a cause for each covariate of a record, by name."""
+    """Return the catalogue for the form of a record and a cause for each covariate, by name."""
     own = {name: covariate_cause(about) for name, (about, _) in grids.covariates.items()}
-    return catalogue() | own
+    return {name: cause.on(grids.form) for name, cause in (catalogue() | own).items()}

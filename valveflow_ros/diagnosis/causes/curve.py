@@ -19,6 +19,7 @@ from valveflow_ros.diagnosis.cause import (
     Start,
     Unknown,
     Values,
+    axis_unit,
 )
 from valveflow_ros.diagnosis.causes.changes import ONSET, a_day, since
 from valveflow_ros.diagnosis.grids import Grids
@@ -39,7 +40,7 @@ def apply_curve_shape(u: FloatArray, values: Values, grids: Grids) -> FloatArray
     """
     h, centre, width = values
     out = np.empty(len(u))
-    kernels.bump(u, centre, max(width, 1.0), out)
+    kernels.bump(u, centre, width, out)
     return h * out
 
 
@@ -74,7 +75,7 @@ def curve_shape_sentence(values: dict[str, float]) -> str:
     """Say it."""
     return (
         f'The curve has a {"bump" if values["h_mw"] > 0.0 else "dent"} of '
-        f'{abs(values["h_mw"]):.2g} MW around u = {values["u0"]:.0f} that straight pieces do not '
+        f'{abs(values["h_mw"]):.2g} MW around u = {values["u0"]:.4g} that straight pieces do not '
         'follow (overlap of valves).'
     )
 
@@ -92,7 +93,7 @@ CURVE_SHAPE = Cause(
 )  # fmt: skip
 
 
-_NARROWEST = 5.0
+_NARROWEST = 5.0  # % MPa^m
 
 
 def apply_curve_step(u: FloatArray, values: Values, grids: Grids) -> FloatArray:
@@ -104,7 +105,7 @@ def apply_curve_step(u: FloatArray, values: Values, grids: Grids) -> FloatArray:
         x = F(u) + s min(max((u - u1) / (u2 - u1), 0), 1),  t >= t0
     """
     s, low, high, t0 = values
-    share = np.clip((u - low) / max(high - low, _NARROWEST), 0.0, 1.0)
+    share = np.clip((u - low) / max(high - low, _NARROWEST * axis_unit(grids.form)), 0.0, 1.0)
     return np.asarray(s * share * since(grids, t0))
 
 
@@ -129,8 +130,8 @@ def curve_step_sentence(values: SentenceValues) -> str:
     """Say it."""
     return (
         f'From {values.onset} the curve lacks part of its course: '
-        f'{values["s_mw"]:+.2g} MW above u = {values["u_to"]:.0f}, nothing below '
-        f'{values["u_from"]:.0f} (a valve that sticks, or another order of opening).'
+        f'{values["s_mw"]:+.2g} MW above u = {values["u_to"]:.4g}, nothing below '
+        f'{values["u_from"]:.4g} (a valve that sticks, or another order of opening).'
     )
 
 

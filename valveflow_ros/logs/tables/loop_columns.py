@@ -36,15 +36,16 @@ _SHORT = {
     SET_POINT: 'sp|sv|spt',
 }
 _LONG = {
-    COMMAND: r'command|demand|controller output|output|stellgroesse|stellbefehl|manipulated',
-    POSITION: r'position|travel|stem|stellung|opening|feedback|rueckmeldung|\bhub\b',
-    PROCESS: r'process (?:value|variable)|measure|istwert|\bflow\b|\blevel\b',
-    SET_POINT: r'set ?point|sollwert|target',
+    COMMAND: r'command|demand|output|control(?:ler)? signal|stellgroesse|stellbefehl|manipulated',
+    POSITION: r'position|travel|stem|stellung|opening|feedback|rueckmeldung|\bhub\b|\blift\b',
+    PROCESS: r'process ?(?:value|variable)|\bprocess$|actual value|measure|istwert|'
+    r'\bflow\b|\blevel\b',
+    SET_POINT: r'set ?point|set value|sollwert|target|reference',
 }
 _TAG = {
     COMMAND: r'(?:^| )[flptx]?c?v ?\d+$',
     POSITION: r'(?:^| )z[ti] ?\d+$',
-    PROCESS: r'(?:^| )[flpt][it] ?\d+$',
+    PROCESS: r'(?:^| )[flpt][it] ?\d+$|\bpressure\b|\btemperature\b',
     SET_POINT: r'^\b$',
 }
 
@@ -130,7 +131,9 @@ def roles_of(names: list[str], about: list[str]) -> dict[str, list[int]]:
     plain = [f'{folded(name)}\n{folded(split_unit(name)[0])}' for name in names]
     told = [folded(text) for text in about]
     found: dict[str, list[int]] = {}
-    for role in ROLES:
+    for role in reversed(ROLES):
+        # 'flow_setpoint' is no flow.
+        wanted = set(found.get(SET_POINT, ()))
         grounds = (
             (plain, rf'(?:^| )(?:{_SHORT[role]})$'),
             (plain, rf'^(?:{_SHORT[role]}) '),
@@ -140,7 +143,9 @@ def roles_of(names: list[str], about: list[str]) -> dict[str, list[int]]:
         )
         for texts, pattern in grounds:
             if places := [
-                k for k, text in enumerate(texts) if re.search(pattern, text, re.MULTILINE)
+                k
+                for k, text in enumerate(texts)
+                if k not in wanted and re.search(pattern, text, re.MULTILINE)
             ]:
                 found[role] = places
                 break
