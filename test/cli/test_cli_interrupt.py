@@ -18,7 +18,7 @@ SAID = 'valveflow: stopped; nothing was left half-written.\n'
 # Verbs that are done before anybody could press a key.
 AT_ONCE = {'completion', 'config'}
 TRIED = ('simulate', 'import', 'info', 'export', 'recover', 'identify', 'validate', 'compare',
-         'diagnose', 'loop', 'compensate', 'watch')  # fmt: skip
+         'diagnose', 'loop', 'compensate', 'watch', 'monitor')  # fmt: skip
 
 
 @pytest.fixture
@@ -60,6 +60,7 @@ def words_of(verb, logs, model, out):
         'validate': [verb, mcap, '-o', out / 'new', '--model', model],
         'compare': [verb, mcap, '-o', out / 'new'],
         'diagnose': [verb, mcap, '-o', out / 'new'],
+        'monitor': [verb, mcap, '-o', out / 'new', '--no-diagnosis'],
         'loop': [verb, csv, '-o', out / 'new', '--command', 'valve_opening_percent',
                  '--process', 'generated_power_mw'],
     }[verb]  # fmt: skip
@@ -70,7 +71,7 @@ def test_every_verb_that_takes_time_is_tried():
 
 
 @pytest.mark.parametrize(
-    'verb', ['simulate', 'import', 'info', 'export', 'recover', 'validate', 'loop']
+    'verb', ['simulate', 'import', 'info', 'export', 'recover', 'validate', 'loop', 'monitor']
 )
 def test_ctrl_c_in_every_part_of_a_verb(stopped_at, logs, identified, tmp_path, verb):
     for part in range(1, 30):

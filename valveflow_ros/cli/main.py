@@ -38,6 +38,7 @@ VERBS: tuple[tuple[str, str, str], ...] = (
     ('info', 'info', 'what is in a log, and is it any good'),
     ('identify', 'identify', 'find the flow characteristic'),
     ('diagnose', 'diagnose', 'what the simulation gets wrong, and why'),
+    ('monitor', 'monitor', 'what the monitor would have told over a log'),
     ('validate', 'validate', 'hold a characteristic against other days'),
     ('loop', 'loop', 'judge one control valve: sticks, slack, sound, or cannot be told'),
     ('compare', 'compare', 'the proposed method beside two of the literature'),

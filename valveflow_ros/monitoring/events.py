@@ -99,13 +99,15 @@ class FitRequested:
 
 @dataclass(frozen=True, slots=True)
 class CurveAdopted:
-    """A new curve predicts from the next row on.
+    """A fit gave a new curve. It predicts from the next row on if there is no reference.
 
-    ``shift`` is the judgement against the reference, None without one.
+    ``shift`` is the judgement against the reference, None without one; ``provisional`` says what
+    it is no curve of health for, empty if nothing is wrong.
     """
 
     characteristic: Characteristic
     shift: Shift | None = None
+    provisional: str = ''
 
 
 @dataclass(frozen=True, slots=True)

@@ -173,7 +173,7 @@ class Monitor(Memory):
         return Fed(done, events)
 
     def adopt(self, request_ns: int, characteristic: Characteristic) -> list[Event]:
-        """Let ``characteristic`` predict from the next row on.
+        """Hold the curve of a fit; before there is a reference it predicts from the next row on.
 
         An outcome of a request that is no longer awaited is ignored.
         """
@@ -189,7 +189,11 @@ class Monitor(Memory):
             characteristic, segments, self._last_ns, self.settings
         )
         entry = self._journal(JournalKind.FIT_ADOPTED, request_ns, characteristic.model_id, '')
-        told: list[Event] = [CurveAdopted(characteristic, shift), entry, *changes]
+        told: list[Event] = [
+            CurveAdopted(characteristic, shift, self._force.cause),
+            entry,
+            *changes,
+        ]
         events = [*begun, *told, *self._follow_health()]
         healthy = self.reference.renewed(characteristic, self._last_ns, self.settings)
         if healthy is not None:

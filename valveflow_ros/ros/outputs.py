@@ -142,7 +142,8 @@ class Outputs:
             self._alarms[event.name] = event
             yield _output('alarms', encoding.alarm_message(event, tag), event.time_ns)
         elif isinstance(event, engine.CurveAdopted):
-            self.curve, self.status, self.cause = event.characteristic, CurveStatus.FRESH, ''
+            self.curve, self.cause = event.characteristic, event.provisional
+            self.status = CurveStatus.PROVISIONAL if self.cause else CurveStatus.FRESH
             self.shift = event.shift
             yield from self._curve_messages()
         elif isinstance(event, engine.ReferenceSet):

@@ -9,7 +9,7 @@ from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.words import counted, decimals, duration, moment, signed
 
 # The words of the messages' numbers, as a person says them.
-CURVE_STATES = ('no curve yet', 'fresh', 'stale', 'refused')
+CURVE_STATES = ('no curve yet', 'fresh', 'stale', 'refused', 'provisional')
 SAMPLE_STATES = (
     'no curve to judge by',
     'plant in motion',

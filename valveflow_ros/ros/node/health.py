@@ -336,6 +336,8 @@ def fit_item(monitor: Monitor, worker: FitWorker, last_fit_s: float | None) -> I
         return Item('fit', Level.WARN if refused else Level.OK, monitor.cause, values)
     if monitor.status == CurveStatus.STALE:
         return Item('fit', Level.WARN, f'The curve is not renewed: {monitor.cause}', values)
+    if monitor.status == CurveStatus.PROVISIONAL:
+        return Item('fit', Level.WARN, monitor.cause, values)
     if curve.source.temperature_flag:
         return Item(
             'fit',
@@ -391,10 +393,18 @@ def reference_item(monitor: Monitor) -> Item:
     """Return how the curve stands to its reference."""
     reference = monitor.reference
     if reference.curve is None:
-        return Item('reference', Level.OK, 'No reference was set (~/set_reference).')
+        sentence = (
+            'There is no reference yet: a curve becomes it when nothing was wrong for '
+            'reference_after behind it, or by ~/set_reference.'
+        )
+        return Item('reference', Level.OK, sentence)
     shift = reference.shift
     values: dict[str, object] = {
         'Reference': reference.curve.model_id,
+        'Something is wrong since (s since 1970)': (
+            None if reference.fault_ns is None else reference.fault_ns // 10**9
+        ),
+        'Wear (MW a month)': None if reference.wear is None else reference.wear.mw_per_month,
         'Alarm': _words(reference.alarm),
         **_count_values(reference.alarm),
     }

@@ -1,0 +1,101 @@
+"""``valveflow monitor``: what the monitor would have told over a log."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from valveflow_ros.cli.command import (
+    Console,
+    VerbResult,
+    add_beside,
+    add_mapping,
+    add_parameters,
+    add_results,
+    checked_parameters,
+    columns,
+    lines,
+    mapping_of,
+    write_results,
+)
+
+if TYPE_CHECKING:
+    from valveflow_ros.interface.monitor import MonitorResult
+
+_DESCRIPTION = """\
+Run the monitor over a recorded log as fast as it goes: its curves, alarms and diagnoses, as the
+node would have told them. The way to choose alarm parameters before a monitor goes live.
+DIR gets report.html for people and monitor.json for programs.
+
+example:
+  valveflow monitor plant.mcap -o result
+
+and quicker, without the diagnoses:
+  valveflow monitor plant.mcap -o result --no-diagnosis -p alarm_floor:=2.0"""
+
+
+def arguments(parser: ArgumentParser) -> None:
+    """Add description, example and options."""
+    parser.description = _DESCRIPTION
+    parser.usage = 'valveflow monitor LOG -o DIR [options]'
+    parser.add_argument('log', metavar='LOG', type=Path, help='the log to read')
+    add_results(parser)
+    add_parameters(parser)
+    parser.add_argument(
+        '--model', metavar='FILE', type=Path,
+        help='an extended_model.json of diagnose: its causes are taken out of the rows first',
+    )  # fmt: skip
+    parser.add_argument(
+        '--reference', metavar='FILE', type=Path,
+        help='a characteristic.json of the plant in health',
+    )  # fmt: skip
+    parser.add_argument(
+        '--no-diagnosis', action='store_true',
+        help='leave out the diagnoses, each of which takes as long as `valveflow diagnose`',
+    )  # fmt: skip
+    add_beside(parser)
+    add_mapping(parser)
+
+
+def run(options: Namespace, console: Console) -> VerbResult:
+    """Open, monitor, write."""
+    mapping = mapping_of(options)
+    console(0.0, 'starting')
+    from valveflow_ros.interface.logs import open_log
+    from valveflow_ros.interface.monitor import monitor
+
+    given = checked_parameters(options)
+    console(0.02, 'reading')
+    log = open_log(options.log, mapping, progress=console)
+    found = monitor(
+        log, parameters=given, model=options.model, reference=options.reference,
+        diagnose=not options.no_diagnosis, progress=console,
+    )  # fmt: skip
+    console(0.95, 'writing the report')
+    return write_results(found, options, _text(found), found.to_json())
+
+
+def _text(found: MonitorResult) -> str:
+    from valveflow_ros.report.words import counted, moment
+
+    content = found.to_json()
+    alarms = [
+        [
+            alarm['name'],
+            moment(alarm['raised']),
+            '-' if alarm['cleared'] is None else moment(alarm['cleared']),
+            alarm['state'].replace('_', ' '),
+        ]
+        for alarm in content['alarms']
+    ]
+    reference = content['reference']
+    return lines(
+        f'{found.source}: {moment(found.start_ns)} to {moment(found.end_ns)}',
+        f'{counted(len(content["curves"]), "curve")}, {counted(len(alarms), "alarm")}, '
+        f'{counted(len(content["diagnoses"]), "diagnosis", "diagnoses")}.',
+        columns(alarms, ['alarm', 'raised', 'cleared', 'state at the end']) if alarms else '',
+        *(a['sentence'] for a in content['alarms'] if a['cleared'] is None),
+        'No curve became the reference.' if reference is None
+        else f'The reference is curve {reference["model_id"]}, set {moment(reference["set"])}.',
+    )  # fmt: skip
