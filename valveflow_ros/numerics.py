@@ -20,6 +20,19 @@ JIT: dict[str, Any] = {'cache': True, 'nogil': True}
 _Function = TypeVar('_Function', bound=Callable[..., Any])
 
 
+_USUAL_MW = 300.0
+
+
+def output_size(output: FloatArray) -> float:
+    """Return how large an output is beside that of a unit of 300 MW, as a power of two.
+
+    Steps of searches that are in MW are multiplied by it, so that they suit a unit of any size and
+    a flow in any unit; by a power of two, so that about 300 MW they are what they are.
+    """
+    top = float(np.quantile(np.abs(output), 0.99)) if len(output) else 0.0
+    return float(2.0 ** round(np.log2(top / _USUAL_MW))) if top > 0.0 else 1.0
+
+
 def jit(function: _Function) -> _Function:
     """Compile a loop over arrays, keeping its type for the checker."""
     return cast(_Function, _fresh(numba.njit(**JIT)(function)))

@@ -78,6 +78,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
     check_output(options.output, TABLES, source=options.model, overwrite=options.overwrite)
     curve = load_characteristic(options.model)
+    console.measured_in(curve.output_unit)
     pressures = sorted(set(options.pressure))
     if curve.axis == OPENING:
         # Its knees stand at other powers at each pressure.

@@ -165,8 +165,12 @@ class Unknown:
     dated: bool = False
 
     def step_on(self, grids: Grids) -> float:
-        """Return the step for differences; a place on the curve counts in the unit of its axis."""
-        return self.step * (_OPENING_UNIT if self.unit == U_UNIT and grids.form.scaled else 1.0)
+        """Return the step for differences, in proportion to axis and output."""
+        if self.unit == U_UNIT:
+            return self.step * (_OPENING_UNIT if grids.form.scaled else 1.0)
+        if self.unit.endswith('/MW'):
+            return self.step / grids.size
+        return self.step * (grids.size if self.unit.startswith('MW') else 1.0)
 
 
 class SentenceValues(dict[str, float]):

@@ -370,9 +370,10 @@ def search_levels(
     task: Task, model: Extended, cost: float, steps: tuple[float, ...] = _LEVEL_STEPS_MW
 ) -> tuple[Extended, float]:
     """Move each level between regions along a line while the cost falls."""
+    size = task.grids.size
 
     def moved(model: Extended, level: int, by: float) -> Extended | None:
-        base = with_level_moved(model.base, level, by)
+        base = with_level_moved(model.base, level, by * size, size)
         return None if base is None else replace(model, base=base)
 
     for k in range(0 if task.fixed_dynamics else len(model.base.levels)):
@@ -381,7 +382,7 @@ def search_levels(
     return model, cost
 
 
-def _directions(cause: Cause) -> list[Values]:
+def _directions(cause: Cause, grids: Grids) -> list[Values]:
     """Return steps along which parameters of kind ``LINE`` are searched: each, and in pairs."""
     lines = [k for k, u in enumerate(cause.unknowns) if u.kind is Kind.LINE]
     out = []
@@ -390,7 +391,7 @@ def _directions(cause: Cause) -> list[Values]:
     for k, other in itertools.combinations(lines, 2):
         out += [{k: 1.0, other: 1.0}, {k: 1.0, other: -1.0}]
     return [
-        tuple(d.get(k, 0.0) * u.step for k, u in enumerate(cause.unknowns)) for d in out
+        tuple(d.get(k, 0.0) * u.step_on(grids) for k, u in enumerate(cause.unknowns)) for d in out
     ]  # fmt: skip
 
 
@@ -404,7 +405,7 @@ def _along(model: Extended, c: int, direction: Values, by: float) -> Extended:
 def search_lines(task: Task, model: Extended, cost: float) -> tuple[Extended, float]:
     """Move every parameter of kind ``LINE`` along a line while the cost falls."""
     for c, a in enumerate(model.active):
-        directions = _directions(a.cause)
+        directions = _directions(a.cause, task.grids)
         for share in _LINE_SHARES if directions else ():
             for direction, sign in itertools.product(directions, (1.0, -1.0)):
                 model, cost = descend(

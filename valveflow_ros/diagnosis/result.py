@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from valveflow_ros.curve.characteristic_json import form_of
+from valveflow_ros.curve.characteristic_json import OUTPUT_UNIT, form_of
 from valveflow_ros.curve.json_schema import (
     DEGC,
     MOST_PIECES,
@@ -151,6 +151,7 @@ def model_to_json(given: ExtendedModel) -> dict[str, Any]:
     return {
         'format': MODEL_FORMAT,
         'version': MODEL_VERSION,
+        **({} if given.output_unit == 'MW' else {'output_unit': given.output_unit}),
         'pressure_exponent': given.pressure_exponent,
         **_form_json(given),
         'start_ns': given.start_ns,
@@ -196,6 +197,7 @@ def is_model(raw: object) -> bool:
 
 _TIME = Number(-4e7, 4e7)  # seconds from the model's start, 400 days and more
 _SCHEMA = {
+    'output_unit': OUTPUT_UNIT,
     'axis': Maybe(Text(AXES)),
     'pressure_exponent': Number(0.0, 2.0),
     'pressure_scale_exponent': Maybe(Number(0.0, 2.0)),
@@ -254,7 +256,7 @@ def model_from_json(raw: object, depth: int = 0) -> ExtendedModel:
     given = ExtendedModel(
         Extended(_base(top, inside), _causes(top['causes'], f'{inside}causes')),
         form_of(top, _WHOLE, inside), top['start_ns'], Reference(**reference, opening_noise=noise),
-        earlier,
+        earlier, top['output_unit'] or 'MW',
     )  # fmt: skip
     if earlier is not None and earlier.form != given.form:
         raise fail(_WHOLE, f'{inside}on_top_of', 'is a model over another input u')

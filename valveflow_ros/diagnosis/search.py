@@ -26,6 +26,7 @@ from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.fit.refine import search as search_plain
+from valveflow_ros.numerics import output_size
 from valveflow_ros.records import FloatArray
 
 # The plain simulation: few distinct pieces.
@@ -39,11 +40,12 @@ _JUMP_MW = 0.01
 
 def simplified(model: RegionalModel) -> RegionalModel:
     """Return the curve without its shallow knees, the shallowest first; jumps stay."""
+    jump_mw = _JUMP_MW * output_size(np.append(model.left, model.right))
     while model.pieces > 1:
         slopes = model.slopes()
         larger = np.maximum(np.abs(slopes[1:]), np.abs(slopes[:-1]))
         bend = np.abs(np.diff(slopes)) / np.maximum(larger, 1e-12)
-        bend[np.abs(model.left[1:] - model.right[:-1]) > _JUMP_MW] = np.inf
+        bend[np.abs(model.left[1:] - model.right[:-1]) > jump_mw] = np.inf
         weakest = int(np.argmin(bend))
         if bend[weakest] >= SHALLOW:
             return model

@@ -225,4 +225,4 @@ def _characteristic(
         ),
         partition_pieces=pieces,
         notes=(note,),
-    ).with_id()  # fmt: skip
+    ).measured_in(settings.output_unit)  # fmt: skip

@@ -69,6 +69,7 @@ class Diagnosed:
     maps: tuple[ResidualMap, ...] = ()
     history: History | None = None
     exponent: float = math.nan
+    output_unit: str = 'MW'
 
 
 def diagnosis_page(data: Diagnosed) -> Page:
