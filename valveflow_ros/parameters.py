@@ -155,7 +155,7 @@ _PLAUSIBLE = (
               -273.15, 700.0),
     Parameter('main_steam_temperature_high', 750.0, 'degC', 'Higher values are rejected.',
               50.0, 1000.0),
-    Parameter('generated_power_low', -100.0, 'MW', 'Lower values are rejected.', -1e6, 1e6),
+    Parameter('generated_power_low', -100.0, 'MW', 'Lower values are rejected.', -1e7, 1e7),
     Parameter('generated_power_high', 2500.0, 'MW', 'Higher values are rejected.', 1e-6, 1e7),
 )  # fmt: skip
 

@@ -46,7 +46,7 @@ def arguments(parser: ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--pressure', metavar='MPA', action='append', default=[],
-        type=number('a pressure in MPa', 0.05, 40, '--pressure 16.7'),
+        type=number('a pressure in MPa', 1e-6, 100, '--pressure 16.7'),
         help='add a column with the opening at this main steam pressure; may be repeated',
     )  # fmt: skip
     parser.add_argument(

@@ -148,11 +148,12 @@ class Log:
             top = float(np.quantile(sizes, _FULL)) if len(sizes) else 0.0
             found['generated_power_unit'] = unit
             if top > 0.0:
-                found |= {'generated_power_low': -_MOST * top, 'generated_power_high': _MOST * top}
-                found |= {
-                    name: float(PARAMETERS[name].default) * top / _USUAL_MW
-                    for name in ('alarm_floor', 'shift_least')
-                }
+                sized = {'generated_power_low': -_MOST * top, 'generated_power_high': _MOST * top}
+                for name in ('alarm_floor', 'shift_least'):
+                    sized[name] = float(PARAMETERS[name].default) * top / _USUAL_MW
+                for name, value in sized.items():
+                    low, high = PARAMETERS[name].low, PARAMETERS[name].high
+                    found[name] = min(max(value, low or 0.0), high or value)
             own = ', '.join(
                 f'{n} {found[n]:.3g}' for n in ('alarm_floor', 'shift_least')
                 if n in found and n not in given
