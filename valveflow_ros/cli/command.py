@@ -206,9 +206,11 @@ MAPPING_HELP = """\
 names and units (the usual unit first):
   valve_opening             %, fraction
   main_steam_pressure       MPa, kPa, Pa, bar, psi; absolute. MPag, kPag, barg, psig are gauge:
-                            0.101325 MPa of air is added
+                            0.101325 MPa of air is added; kPad, bard, mbard, psid are the
+                            difference over the valve
   main_steam_temperature    degC, K, degF
-  generated_power           MW, kW, W
+  generated_power           MW, kW, W; or a flow, which keeps its unit: t/h, kg/h, kg/s, m3/h,
+                            Nm3/h, l/s, l/min, klb/h, lb/h, gpm, scfm
   valve_command             %, fraction; optional
   time, date                date and time of the usual kinds, or Unix seconds
 Columns of a table that are named after what they hold need no --column."""
