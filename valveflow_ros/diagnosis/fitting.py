@@ -232,13 +232,13 @@ def base_mask(task: Task, model: Extended) -> BoolArray:
     return free
 
 
-def _base_steps(model: RegionalModel) -> FloatArray:
-    """Return steps for differences in the packed parameters."""
+def _base_steps(model: RegionalModel, size: float) -> FloatArray:
+    """Return steps for differences in the packed parameters, at an output of this size."""
     j, i = model.pieces, model.regions
     span = float(model.knots[-1] - model.knots[0])
     return np.concatenate(
-        [np.ones(j + 1), np.full(j - 1, 1e-3 * span), np.ones(j - 1), np.full(i, 0.02),
-         np.full(i, 0.2), np.ones(model.size - (3 * j - 1 + 2 * i))]
+        [np.full(j + 1, size), np.full(j - 1, 1e-3 * span), np.full(j - 1, size),
+         np.full(i, 0.02), np.full(i, 0.2), np.full(model.size - (3 * j - 1 + 2 * i), size)]
     )  # fmt: skip
 
 
@@ -248,7 +248,7 @@ def base_tangents(task: Task, model: Extended) -> FloatArray:
     driven = drive(grids, model)
     path = region_path(model, flow_of(model, driven))
     here = answer(grids, model, driven, path)
-    packed, steps = model.base.pack(), _base_steps(model.base)
+    packed, steps = model.base.pack(), _base_steps(model.base, grids.size)
     columns = []
     for p in np.flatnonzero(base_mask(task, model)):
         moved = packed.copy()
@@ -301,7 +301,7 @@ def level_tangents(task: Task, model: Extended) -> FloatArray:
     columns = []
     for k in range(len(model.base.levels)):
         up, down = model.base.levels.copy(), model.base.levels.copy()
-        up[k], down[k] = up[k] + 1.0, down[k] - 1.0
+        up[k], down[k] = up[k] + task.grids.size, down[k] - task.grids.size
         high = answer(task.grids, replace(model, base=model.base.with_levels(up)))
         low = answer(task.grids, replace(model, base=model.base.with_levels(down)))
         columns.append(0.5 * (high - low))

@@ -34,6 +34,7 @@ from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
 from valveflow_ros.diagnosis.grids import COEFFICIENTS, COURSE, Covariate, Reference
 from valveflow_ros.errors import DataError
 from valveflow_ros.signals.static_form import AXES, OPENING
+from valveflow_ros.signals.units import in_unit
 
 NAMED, NOTHING, UNEXPLAINED = 'named', 'nothing', 'unexplained'
 
@@ -135,6 +136,25 @@ class Diagnosis:
     final: Extended
     reference: Reference
     notes: tuple[str, ...] = ()
+
+    def measured_in(self, unit: str) -> Diagnosis:
+        """Return the same numbers as those of an output in ``unit``, and sentences that say so."""
+        causes = tuple(
+            dataclasses.replace(
+                c, sentence=in_unit(c.sentence, unit), experiment=in_unit(c.experiment, unit),
+                parameters={
+                    key: dataclasses.replace(e, unit=in_unit(e.unit, unit))
+                    for key, e in c.parameters.items()
+                },
+            )
+            for c in self.causes
+        )  # fmt: skip
+        return dataclasses.replace(
+            self, causes=causes, sentence=in_unit(self.sentence, unit),
+            experiments=tuple(in_unit(one, unit) for one in self.experiments),
+            rejected=tuple((name, in_unit(why, unit)) for name, why in self.rejected),
+            notes=tuple(in_unit(note, unit) for note in self.notes),
+        )  # fmt: skip
 
 
 # The extended model as JSON: what ``extended_model.json`` holds, and what is believed of one.

@@ -73,6 +73,7 @@ class ComparisonResult(Result):
         data = self.data
         content = {
             **comparison.to_json(data.result),
+            'output_unit': self.output_unit,
             'learnt_from': data.source,
             'judged_on': data.other,
             'held_out': data.held_out,
@@ -112,6 +113,7 @@ class ValidationResult(Result):
         data = self.data
         content = {
             **validation.to_json(data.result),
+            'output_unit': self.output_unit,
             'log': data.source,
             'model': data.model,
             'against': data.other or None,

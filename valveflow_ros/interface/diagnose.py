@@ -81,7 +81,7 @@ class DiagnosisResult(Result):
     def texts(self) -> dict[str, str]:
         """Return ``diagnosis.json`` and ``extended_model.json``."""
         contents = {
-            'diagnosis.json': to_json(self.diagnosis),
+            'diagnosis.json': {**to_json(self.diagnosis), 'output_unit': self.output_unit},
             'extended_model.json': signed(model_to_json(self.extended_model), self.verb),
         }
         return {
@@ -214,6 +214,7 @@ def diagnose(
     kept = () if log.compression is None else (log.compression.sentence,)
     signatures, answers, maps = views(record, found)
     found = replace(found, notes=(*log.contents.warnings, *kept, *notes, *found.notes))
+    found = found.measured_in(settings.output_unit)
     times = rows.table.time_ns
     data = Diagnosed(
         log.name, int(times[0]), int(times[-1]), found, signatures, answers, maps,
