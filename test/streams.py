@@ -241,3 +241,29 @@ def simulated(days, seed, effects=()):
 @functools.lru_cache(maxsize=3)
 def _simulated(days, seed, effects):
     return simulate(days, seed, effects=[EffectSpec.parse(e) for e in effects])
+
+
+def flow_valve(kpa, top, warm):
+    """A valve of which the flow is F(V dp^0.5), as a table; knots in u and values of F."""
+    rng = np.random.default_rng(1)
+    n = 30_000
+    changes = np.sort(rng.choice(n, 60, replace=False))
+    opening = np.interp(
+        np.arange(n), [0, *np.repeat(changes, 2) + np.tile([0, 250], 60), n + 500],
+        np.repeat(rng.uniform(15.0, 85.0, 61), 2),
+    )  # fmt: skip
+    difference = kpa * 2.0 ** np.sin(np.arange(n) / 1100.0)
+    u = opening * np.sqrt(difference / 1e3)
+    most = 85.0 * np.sqrt(kpa / 500.0)
+    knots, values = most * np.array([0.0, 0.35, 0.6, 1.1]), top * np.array([0.0, 0.2, 0.62, 1.0])
+    static, lag = np.interp(u, knots, values), np.exp(-1.0 / 12.0)
+    answer = np.empty(n)
+    answer[0] = static[0]
+    for k in range(1, n):
+        answer[k] = lag * answer[k - 1] + (1.0 - lag) * static[k - 1]
+    columns = {
+        'time': 1.7e9 + np.arange(n), 'LV': opening + 0.02 * rng.standard_normal(n),
+        'DP': difference, 'FT': answer + 0.002 * top * rng.standard_normal(n),
+        'TE': warm + 0.1 * rng.standard_normal(n),
+    }  # fmt: skip
+    return columns, knots, values

@@ -6,6 +6,7 @@ The command line prints it and exits with status 1; the node logs it and goes
 on. Errors of other libraries are translated at the edge where they arise.
 """
 
+import math
 import resource
 
 
@@ -57,6 +58,14 @@ def counted(number: float, one: str, many: str = '') -> str:
     """Write a number and its noun for a sentence: '1 row', '3 rows', '0.5 days'."""
     told = str(number) if isinstance(number, int) else f'{number:g}'
     return f'{told} {one if told == "1" else many or one + "s"}'
+
+
+def short(value: float, places: int = 0, sign: str = '') -> str:
+    """Write a number with so many decimals, and more where that leaves no two digits of it."""
+    size = abs(value)
+    if 0.0 < size < math.inf:
+        places = max(places, 1 - math.floor(math.log10(size)))
+    return f'{value:{sign}.{places}f}'
 
 
 # Compiled code ends the process without a word when it gets no memory. On two cores the engine

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from valveflow_ros.errors import ParameterError
+from valveflow_ros.records import FLOW_UNITS
 
 Value = bool | int | float | str
 
@@ -98,7 +99,7 @@ class Parameter:
 _OPENING_UNITS = ('%', 'percent', 'fraction')
 _PRESSURE_UNITS = ('MPa', 'kPa', 'Pa', 'bar', 'psi')
 _TEMPERATURE_UNITS = ('degC', 'K', 'degF')
-_POWER_UNITS = ('MW', 'kW', 'W')
+_POWER_UNITS = ('MW', 'kW', 'W', *FLOW_UNITS)
 
 _UNIT_AND_INPUTS = (
     Parameter('unit_tag', 'unit', '', 'Tag of the unit; frame_id and hardware_id of messages.'),
@@ -132,7 +133,9 @@ _UNIT_AND_INPUTS = (
         'Unit the gateway sends main_steam_temperature in.', choices=_TEMPERATURE_UNITS,
     ),
     Parameter(
-        'generated_power_unit', 'MW', '', 'Unit the gateway sends generated_power in.',
+        'generated_power_unit', 'MW', '',
+        'Unit the gateway sends generated_power in. A flow keeps it: parameters and results in MW '
+        'are in this unit then.',
         choices=_POWER_UNITS,
     ),
     Parameter(
@@ -149,11 +152,11 @@ _PLAUSIBLE = (
     Parameter('main_steam_pressure_low', 0.05, 'MPa', 'Lower values are rejected.', 0.0, 50.0),
     Parameter('main_steam_pressure_high', 40.0, 'MPa', 'Higher values are rejected.', 0.1, 100.0),
     Parameter('main_steam_temperature_low', 50.0, 'degC', 'Lower values are rejected.',
-              -50.0, 700.0),
+              -273.15, 700.0),
     Parameter('main_steam_temperature_high', 750.0, 'degC', 'Higher values are rejected.',
               50.0, 1000.0),
-    Parameter('generated_power_low', -100.0, 'MW', 'Lower values are rejected.', -1e4, 1e4),
-    Parameter('generated_power_high', 2500.0, 'MW', 'Higher values are rejected.', 1.0, 1e5),
+    Parameter('generated_power_low', -100.0, 'MW', 'Lower values are rejected.', -1e7, 1e7),
+    Parameter('generated_power_high', 2500.0, 'MW', 'Higher values are rejected.', 1e-6, 1e7),
 )  # fmt: skip
 
 _TIME_BASE = (
@@ -408,6 +411,12 @@ class Settings(Mapping[str, Value]):
             if not parameter(name).live:
                 raise ParameterError(name, 'cannot be changed while the monitor runs')
         return changed
+
+    @property
+    def output_unit(self) -> str:
+        """The unit of the output after conversion: MW, or that of a flow."""
+        unit = self.text('generated_power_unit')
+        return unit if unit in FLOW_UNITS else 'MW'
 
     @property
     def settle_s(self) -> float:

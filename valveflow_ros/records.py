@@ -40,6 +40,13 @@ class Quality(enum.IntEnum):
     BAD = 2
 
 
+# An output that is a flow keeps its unit: no factor turns tonnes into megawatts, and the engine
+# needs no certain unit. What is named ``_mw`` or told in MW is in this one then.
+FLOW_UNITS = (
+    't/h', 'kg/h', 'kg/s', 'm3/h', 'Nm3/h', 'l/s', 'l/min', 'klb/h', 'lb/h', 'gpm', 'scfm',
+)  # fmt: skip
+
+
 @dataclass(frozen=True, slots=True)
 class SignalInfo:
     """What a signal is called at the border and the unit the engine works in."""

@@ -17,7 +17,7 @@ def imported(run, shared_data, tmp_path):
             pytest.skip(f'{table} is not there')
         log = tmp_path / 'x.mcap'
         ran = run('import', table, '-o', log, '--column', f'valve_opening={opening}',
-                  '--column', f'generated_power={power}:MW', *CONSTANTS)  # fmt: skip
+                  '--column', f'generated_power={power}:t/h', *CONSTANTS)  # fmt: skip
         assert ran.status == 0, ran.err
         assert '10\u202f080 rows' in ran.out
         return log

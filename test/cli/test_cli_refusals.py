@@ -80,7 +80,7 @@ REFUSED = [
     ('validate LOG -o out --model LOG --tolerance 0', 2, '--tolerance must be'),
     ('validate LOG -o out', 2, '--model'),
     ('compensate --model x -o t.csv --points 1', 2, 'from 2 to 10000'),
-    ('compensate --model x -o t.csv --pressure 0', 2, 'in MPa from 0.05 to 40'),
+    ('compensate --model x -o t.csv --pressure 0', 2, 'in MPa from 1e-06 to 100'),
     ('compensate --model x -o t.csv --max-gain -1', 2, 'above 0'),
     ('completion tcsh', 2, "SHELL must be one of bash, zsh, fish, not 'tcsh'"),
     ('config make x', 2, "not 'make'"),

@@ -10,9 +10,9 @@ from streams import examples
 
 from valveflow_ros.errors import InputError
 from valveflow_ros.parameters import PARAMETERS
-from valveflow_ros.records import SIGNALS, Signal
+from valveflow_ros.records import FLOW_UNITS, SIGNALS, Signal
 from valveflow_ros.signals.static_form import integrated_input
-from valveflow_ros.signals.units import UNITS, convert, unit_of
+from valveflow_ros.signals.units import UNITS, convert, engine_unit, in_unit, unit_of
 
 # The same state of a plant, told in every unit there is (NIST SP 811 for the definitions).
 SAME = {
@@ -45,7 +45,8 @@ def test_every_unit_there_is_has_been_compared():
 
 @pytest.mark.parametrize('info', SIGNALS)
 def test_the_parameter_offers_exactly_these_units(info):
-    assert PARAMETERS[f'{info.topic}_unit'].choices == tuple(UNITS[info.signal])
+    flows = FLOW_UNITS if info.signal == Signal.GENERATED_POWER else ()
+    assert PARAMETERS[f'{info.topic}_unit'].choices == (*UNITS[info.signal], *flows)
     assert PARAMETERS[f'{info.topic}_unit'].default == info.unit
 
 
@@ -100,3 +101,38 @@ def test_empty_and_read_only_arrays():
     values.setflags(write=False)
     assert convert(Signal.GENERATED_POWER, 'kW', values).tolist() == [0.001, 0.002]
     assert integrated_input(values, values).shape == (2,)
+
+
+@pytest.mark.parametrize(
+    ('said', 'told'),
+    [
+        ('Power: 0.3 MW (0.1 MW², 0.1 MW^2).', 'Flow: 0.3 t/h (0.1 (t/h)², 0.1 (t/h)^2).'),
+        ('0.5 MPa/MW; 2 MW/(10 d); MW per unit', '0.5 MPa/(t/h); 2 (t/h)/(10 d); t/h per unit'),
+        ('the generated power, {"power": "power"}', 'the flow, {"power": "flow"}'),
+        ('Generated power of generated_power, rmse_mw', 'Flow of generated_power, rmse_mw'),
+        ("power.csv, 'Power [t/h]', --column generated_power=MW_GROSS:MW", ''),
+        ('GENERATED_POWER_MW of 12MW, MWh, powerful', ''),
+    ],
+)  # fmt: skip
+def test_a_sentence_in_megawatts_becomes_one_of_a_flow(said, told):
+    assert in_unit(said, 'MW') == said
+    assert in_unit(said, 't/h') == (told or said)
+    assert in_unit(in_unit(said, 't/h'), 't/h') == (told or said)
+
+
+@pytest.mark.parametrize('unit', FLOW_UNITS)
+def test_a_flow_keeps_its_unit_and_its_values(unit):
+    values = np.array([0.0, 1.25, 1e6])
+    assert (convert(Signal.GENERATED_POWER, unit, values) == values).all()
+    assert engine_unit(Signal.GENERATED_POWER, unit) == unit
+    assert engine_unit(Signal.GENERATED_POWER, 'kW') == 'MW'
+
+
+def test_a_pressure_difference_is_a_pressure_without_the_air():
+    for unit in ('MPa', 'kPa', 'Pa', 'bar', 'psi', 'mbar'):
+        there = np.array([0.5, 2.0])
+        absolute, difference = (
+            convert(Signal.MAIN_STEAM_PRESSURE, name, there) for name in (unit, f'{unit}d')
+        )
+        assert (absolute == difference).all()
+        assert engine_unit(Signal.MAIN_STEAM_PRESSURE, f'{unit}d') == 'MPad'

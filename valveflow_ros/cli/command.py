@@ -132,6 +132,7 @@ class Console(Progress):
         self._out = out
         self._as_json = as_json
         self._quiet = quiet
+        self._unit = 'MW'
         bar = err.isatty() and os.environ.get('TERM') != 'dumb'
         self._line = ProgressLine(err, bar, lambda told, what: share_of_time(verb, told, what))
 
@@ -140,30 +141,42 @@ class Console(Progress):
         if not self._quiet:
             self._line.at(share, _harmless(what))
 
+    def measured_in(self, unit: str) -> None:
+        """Print everything from now on as about an output in this unit."""
+        self._unit = unit
+
     def say(self, sentence: str) -> None:
         """Print something that is good to know."""
         if not self._quiet:
-            self._line.write(_harmless(sentence))
+            self._line.write(_harmless(self._told(sentence)))
 
     def warn(self, sentence: str) -> None:
         """Print something that must not be overlooked."""
-        self._line.write(_harmless(f'Warning: {sentence}'))
+        self._line.write(_harmless(f'Warning: {self._told(sentence)}'))
 
     def fail(self, sentence: str) -> None:
         """Print why it could not be done."""
         self._line.end()
-        self._line.write(_harmless(f'valveflow: {sentence}'))
+        self._line.write(_harmless(f'valveflow: {self._told(sentence)}'))
 
     def finish(self, outcome: VerbResult) -> None:
         """Print the result."""
         self._line.end()
         if self._as_json:
             text = json.dumps(_finite(outcome.data), indent=2, allow_nan=False, ensure_ascii=False)
+            text = self._told(text)
             self._out.write(_COMMANDS.sub(lambda c: f'\\u{ord(c[0]):04x}', text) + '\n')
         elif outcome.text:
-            text = outcome.text if outcome.drawn else _harmless(outcome.text)
+            text = outcome.text if outcome.drawn else _harmless(self._told(outcome.text))
             self._out.write(text.rstrip('\n') + '\n')
         self._out.flush()
+
+    def _told(self, text: str) -> str:
+        if self._unit == 'MW':
+            return text
+        from valveflow_ros.signals.units import in_unit
+
+        return in_unit(text, self._unit)
 
 
 def _harmless(text: str) -> str:
@@ -193,9 +206,11 @@ MAPPING_HELP = """\
 names and units (the usual unit first):
   valve_opening             %, fraction
   main_steam_pressure       MPa, kPa, Pa, bar, psi; absolute. MPag, kPag, barg, psig are gauge:
-                            0.101325 MPa of air is added
+                            0.101325 MPa of air is added; kPad, bard, mbard, psid are the
+                            difference over the valve
   main_steam_temperature    degC, K, degF
-  generated_power           MW, kW, W
+  generated_power           MW, kW, W; or a flow, which keeps its unit: t/h, kg/h, kg/s, m3/h,
+                            Nm3/h, l/s, l/min, klb/h, lb/h, gpm, scfm
   valve_command             %, fraction; optional
   time, date                date and time of the usual kinds, or Unix seconds
 Columns of a table that are named after what they hold need no --column."""

@@ -49,7 +49,7 @@ def arguments(parser: ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--pressure', metavar='MPA', action='append', default=[],
-        type=number('a pressure in MPa', 0.05, 40, '--pressure 16.7'),
+        type=number('a pressure in MPa', 1e-6, 100, '--pressure 16.7'),
         help='add a column with the opening at this main steam pressure; may be repeated',
     )  # fmt: skip
     parser.add_argument(
@@ -81,6 +81,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
     check_output(options.output, TABLES, source=options.model, overwrite=options.overwrite)
     curve = load_characteristic(options.model)
+    console.measured_in(curve.output_unit)
     pressures, shown = sorted(set(options.pressure)), curve
     if curve.axis == OPENING:
         # Its knees stand at other powers at each pressure.

@@ -99,7 +99,7 @@ def _covariates(said: list[str]) -> dict[str, str]:
 def _text(found: DiagnosisResult) -> str:
     from valveflow_ros.diagnosis.result import NAMED, NOTHING, UNEXPLAINED
     from valveflow_ros.report.diagnosis import cells
-    from valveflow_ros.report.words import decimals
+    from valveflow_ros.report.words import level
 
     verdicts = {
         NAMED: 'cause found', NOTHING: 'nothing is wrong', UNEXPLAINED: 'something is unexplained',
@@ -122,8 +122,8 @@ def _text(found: DiagnosisResult) -> str:
         f'Not told apart: {", ".join(d.not_told_apart)}.' if d.not_told_apart else '',
         *(f'What would tell them apart: {e}' for e in d.experiments),
         'Error (RMSE) on blocks of time that nothing was fitted to: simulation '
-        f'{decimals(d.rmse_simulation, 3)} MW, extended model {decimals(d.rmse_extended, 3)} MW, '
-        f'noise alone about {decimals(d.rmse_noise_floor, 3)} MW.',
+        f'{level(d.rmse_simulation, 3)} MW, extended model {level(d.rmse_extended, 3)} MW, '
+        f'noise alone about {level(d.rmse_noise_floor, 3)} MW.',
         '\n'.join(['Not judged:', *judged]) if judged else '',
         *d.notes,
     )

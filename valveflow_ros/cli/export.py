@@ -45,8 +45,9 @@ def run(options: Namespace, console: Console) -> VerbResult:
     check_output(options.output, TABLES, source=options.log, overwrite=options.overwrite)
     console(0.1, 'reading')
     log = open_log(options.log, mapping, progress=console)
+    given, told = log.parameters(given)
     settings, notes = settings_for(log.steps(), 0.0, given)
-    for sentence in notes:
+    for sentence in [*told, *notes]:
         console.say(sentence)
     table, resets, counts = align(log.readings, settings, console)
     if not len(table):
@@ -64,6 +65,10 @@ def run(options: Namespace, console: Console) -> VerbResult:
         f'Wrote {counted(len(table), "row")}, one every {step}, {moment(first)} to '
         f'{moment(last)}, to {options.output}.\n{rejected_words(counts)}'
     )
+    if log.output_unit != 'MW':
+        # The columns of the contract have no place for another unit.
+        told_by = f'--column generated_power=generated_power_mw:{log.output_unit}'
+        text += f'\nThe table does not say that its flow is in {log.output_unit}: add {told_by}.'
     data = {
         'table': str(options.output),
         'rows': len(table),

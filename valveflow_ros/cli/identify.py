@@ -151,7 +151,7 @@ def _text(found: Identified) -> str:
 
 def _pieces(found: Identified) -> str:
     from valveflow_ros.report.answer import opening_gain
-    from valveflow_ros.report.words import count, decimals, input_unit_plain, plain, with_error
+    from valveflow_ros.report.words import count, input_unit_plain, plain, span, with_error
 
     c = found.shown
     rows = []
@@ -161,7 +161,7 @@ def _pieces(found: Identified) -> str:
         rows.append(
             [
                 str(k + 1),
-                f'{decimals(piece.u_from, 1)} to {decimals(piece.u_to, 1)}',
+                span(piece.u_from, piece.u_to, 1),
                 with_error(piece.slope, piece.slope_stderr),
                 with_error(piece.intercept, piece.intercept_stderr),
                 at,
@@ -175,10 +175,10 @@ def _pieces(found: Identified) -> str:
 
 
 def _breakpoints(c: Characteristic) -> str:
-    from valveflow_ros.report.words import decimals, interval
+    from valveflow_ros.report.words import interval, level
 
     rows = [
-        [decimals(piece.u_to, 1), f'{interval(low, high)}', f'{decimals(float(value), 1)} MW']
+        [level(piece.u_to, 1), f'{interval(low, high)}', f'{level(float(value), 1)} MW']
         for piece, (low, high), value in zip(
             c.pieces[:-1], c.breakpoint_intervals, c.values()[1:-1], strict=True
         )
@@ -187,11 +187,11 @@ def _breakpoints(c: Characteristic) -> str:
 
 
 def _dynamics(c: Characteristic) -> str:
-    from valveflow_ros.report.words import decimals, time_with_error
+    from valveflow_ros.report.words import span, time_with_error
 
     rows = [
         [
-            f'{decimals(d.power_from, 0)} to {decimals(d.power_to, 0)} MW',
+            f'{span(d.power_from, d.power_to)} MW',
             time_with_error(d.time_constant_s, d.time_constant_stderr_s, 's'),
             time_with_error(d.delay_s, d.delay_stderr_s, 's'),
         ]

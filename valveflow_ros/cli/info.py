@@ -59,7 +59,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
         compression.longest_s if compression is not None and log.updates is not None else 0.0
     )
     jump = {'clock_jump': min(2.0 * stands_s, 3600.0)} if stands_s > 0.0 else {}
-    settings, _ = settings_for(steps, 0.0, jump)
+    settings, _ = settings_for(steps, 0.0, log.parameters(jump)[0])
     counts = _fates(log.recorded, parts, settings)
     contents = log.contents
     start, end = contents.start_ns, contents.end_ns
@@ -230,6 +230,7 @@ def _facts(
 
     from valveflow_ros.records import SIGNALS
     from valveflow_ros.report.data import gaps
+    from valveflow_ros.signals.units import engine_unit
 
     values, times = part.value, part.time_ns
     usual_s = max(step_s, 1.1 * stands_s / _GAP_STEPS)
@@ -243,7 +244,7 @@ def _facts(
     return {
         'topic': SIGNALS[signal].topic,
         'source': 'constant' if signal in log.constants else log.name_of(signal),
-        'unit': SIGNALS[signal].unit,
+        'unit': engine_unit(signal, log.units.get(signal, '')),
         'readings': len(values),
         'step_s': step_s,
         'low': float(low),

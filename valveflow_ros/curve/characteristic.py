@@ -14,6 +14,7 @@ from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import FloatArray, IntArray
 from valveflow_ros.signals.static_form import INTEGRATED_INPUT, OPENING, StaticForm
+from valveflow_ros.signals.units import in_unit
 
 _COMMON_MPA = 10.0
 
@@ -202,6 +203,8 @@ class Characteristic:
         Median pressure of the data, NaN where it is not known; see `shown_at_mpa`.
     form : FormEvidence or None
         How this form compares with the other; None where they were not compared.
+    output_unit : str
+        MW, or the unit of a flow: everything that is named ``_mw`` or told in MW is in it.
     """
 
     pressure_exponent: float
@@ -221,6 +224,7 @@ class Characteristic:
     offset_mw: float = field(default=0.0, repr=False)
     reference_pressure_mpa: float = field(default=math.nan, repr=False)
     form: FormEvidence | None = field(default=None, repr=False)
+    output_unit: str = field(default='MW', repr=False)
 
     @property
     def static_form(self) -> StaticForm:
@@ -324,8 +328,8 @@ class Characteristic:
         if np.any(m.slopes() <= 0.0):
             falling = int(np.argmin(m.slopes())) + 1
             raise DataError(
-                f'The curve has no inverse: piece {falling} does not rise '
-                f'(slope {m.slopes()[falling - 1]:.4g} MW per unit of u).'
+                f'The curve has no inverse: piece {falling} does not rise (slope '
+                f'{m.slopes()[falling - 1]:.4g} {self.output_unit} per unit of u).'
             )
         x, u = _rising_points(m)
         power = np.asarray(power_mw, dtype=np.float64)
@@ -408,12 +412,20 @@ class Characteristic:
         known = reached & (opening >= 0.0) & (opening <= 100.0 * (1.0 + 1e-12))
         return np.where(known, np.minimum(opening, 100.0), np.nan)
 
+    def measured_in(self, unit: str) -> Characteristic:
+        """Return the same numbers as those of an output in ``unit``, and sentences that say so."""
+        return replace(
+            self, output_unit=unit, notes=tuple(in_unit(note, unit) for note in self.notes),
+            choice=replace(self.choice, note=in_unit(self.choice.note, unit)),
+        ).with_id()  # fmt: skip
+
     def with_id(self) -> Characteristic:
         """Return a copy whose `model_id` is a hash of its numbers."""
         # Held causes count where there are some; the names of other curves stay what they were.
         told = repr(replace(self, model_id='')) + (repr(self.held) if self.held else '')
         if self.axis == OPENING:
             told += repr((self.axis, self.pressure_scale_exponent, self.offset_mw))
+        told += '' if self.output_unit == 'MW' else self.output_unit
         digest = hashlib.sha256(told.encode()).hexdigest()
         return replace(self, model_id=digest[:12])
 

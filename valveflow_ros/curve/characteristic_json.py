@@ -35,6 +35,7 @@ from valveflow_ros.curve.json_schema import (
     fail,
 )
 from valveflow_ros.errors import DataError
+from valveflow_ros.records import FLOW_UNITS
 from valveflow_ros.signals.static_form import AXES, INTEGRATED_INPUT, StaticForm
 
 # Causes held while a curve was fitted, as JSON.
@@ -154,6 +155,7 @@ def to_json(c: Characteristic) -> dict[str, Any]:
         'format': FORMAT,
         'version': VERSION,
         'model_id': c.model_id,
+        'output_unit': c.output_unit,
         'axis': c.axis,
         'pressure_exponent': c.pressure_exponent,
         'pressure_scale_exponent': c.pressure_scale_exponent,
@@ -227,6 +229,7 @@ _ANGLE = Members(Number(-360.0, 360.0, null=True), pieces=True)
 _WORST = ('opening_percent', 'pressure_mpa', 'apart_mw')
 _MANY_MW = Number(0.0, 1e12)
 _PERHAPS_MW = Number(0.0, 1e12, null=True)
+OUTPUT_UNIT = Maybe(Text(('MW', *FLOW_UNITS)))
 _FORM = {
     'chosen': Text(AXES), 'told': Maybe(Flag()), 'log_likelihood_gain': Number(-1e15, 1e15),
     'rmse_mw': Maybe(_PERHAPS_MW), 'rmse_other_mw': _MANY_MW, 'other': Maybe(Text()),
@@ -236,11 +239,12 @@ _FORM = {
 }  # fmt: skip
 _SCHEMA = {
     'model_id': Maybe(Text()),
+    'output_unit': OUTPUT_UNIT,
     'axis': Maybe(Text(AXES)),
     'pressure_exponent': Number(0.0, 2.0),
     'pressure_scale_exponent': Maybe(Number(0.0, 2.0)),
     'offset_mw': Maybe(Number(*MW)),
-    'reference_pressure_mpa': Maybe(Number(1e-3, 100.0, null=True)),
+    'reference_pressure_mpa': Maybe(Number(1e-6, 100.0, null=True)),
     'form': Maybe(_FORM),
     'pieces': ListOf(
         {**PIECE, 'identifiable': Maybe(Flag()), 'support': Maybe(_SUPPORT)}, 1, MOST_PIECES
@@ -343,6 +347,7 @@ def from_json(raw: object) -> Characteristic:
         offset_mw=top['offset_mw'] or 0.0,
         reference_pressure_mpa=math.nan if pressure is None else pressure,
         form=_form(top['form']),
+        output_unit=top['output_unit'] or 'MW',
     )  # fmt: skip
 
 

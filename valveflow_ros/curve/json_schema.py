@@ -69,7 +69,7 @@ class Maybe:
 
 # Where a plant can be, by the outer bounds of the parameters: -50 to 1000 % and 100 MPa to the
 # power of 2; a curve drawn beyond what was measured may be a hundred times off.
-U, MW, DEGC = (-5e5, 1e7), (-1e7, 1e7), (-50.0, 1000.0)
+U, MW, DEGC = (-5e5, 1e7), (-1e7, 1e7), (-273.15, 1000.0)
 NS = 2**63 - 1
 MOST_PIECES = 100
 

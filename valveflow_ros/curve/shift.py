@@ -20,7 +20,7 @@ from valveflow_ros.curve.segment_residual import (
     scan,
     segment_residuals,
 )
-from valveflow_ros.errors import DataError
+from valveflow_ros.errors import DataError, short
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SpecialSegment
 
 # The judgement of a shift in words an operator understands.
@@ -58,7 +58,8 @@ def _judgement(shift: Shift) -> str:
         if not smallest:
             return f'No shift against {reference} is seen, but no error of the curves is known.'
         low, high = min(smallest), max(smallest)
-        span = f'{low:.1f}' if f'{low:.1f}' == f'{high:.1f}' else f'{low:.1f} to {high:.1f}'
+        least, most = short(low, 1), short(high, 1)
+        span = least if least == most else f'{least} to {most}'
         return (
             f'The curve agrees with {reference}; a shift of {span} MW, by piece, '
             'would have been seen.'
@@ -67,9 +68,10 @@ def _judgement(shift: Shift) -> str:
     side = 'more' if worst.shift_mw > 0.0 else 'less'
     others = [k + 1 for k, p in enumerate(shift.pieces) if p.moved and k + 1 != number]
     return (
-        f'Piece {number} (u {worst.u_from:.0f} to {worst.u_to:.0f}) gives '
-        f'{abs(worst.shift_mw):.1f} MW ({abs(worst.percent):.1f} %) {side} than {reference}, '
-        f'{_since_words(shift)}, confidence {_confidence(worst)}.{_others(shift, others)}'
+        f'Piece {number} (u {short(worst.u_from)} to {short(worst.u_to)}) gives '
+        f'{short(abs(worst.shift_mw), 1)} MW ({abs(worst.percent):.1f} %) {side} than '
+        f'{reference}, {_since_words(shift)}, confidence {_confidence(worst)}.'
+        f'{_others(shift, others)}'
     )
 
 
@@ -109,7 +111,9 @@ def _confidence(piece: PieceShift) -> str:
 def _others(shift: Shift, numbers: list[int]) -> str:
     if not numbers:
         return ''
-    told = ', '.join(f'piece {k} by {shift.pieces[k - 1].shift_mw:+.1f} MW' for k in numbers)
+    told = ', '.join(
+        f'piece {k} by {short(shift.pieces[k - 1].shift_mw, 1, "+")} MW' for k in numbers
+    )
     return f' {told[0].upper()}{told[1:]} too.'
 
 

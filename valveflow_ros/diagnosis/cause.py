@@ -181,6 +181,12 @@ class Unknown:
             self, unit='%', step=one * self.step, low=one * self.low, high=one * self.high
         )
 
+    def step_on(self, grids: Grids) -> float:
+        """Return the step for differences, in proportion to the output."""
+        if self.unit.endswith('/MW'):
+            return self.step / grids.size
+        return self.step * (grids.size if self.unit.startswith('MW') else 1.0)
+
 
 class SentenceValues(dict[str, float]):
     """Values by name, for a sentence.

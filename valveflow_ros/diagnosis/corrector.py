@@ -17,6 +17,7 @@ product of its change and the size of the cause.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -314,7 +315,7 @@ class ModelCorrector(Memory):
         check_streams(given.model.active)
         self._given, self._step_s = given, step_s
         self._model = given.model
-        self.held = ExtendedModel(given.model, given.form, given.start_ns, given.reference).held
+        self.held = replace(given, on_top_of=None).held
         self._inputs = self._model.at(Stage.INPUT)
         on_scale = [a for a in self._inputs if acts_on_scale(a, given.form)]
         self._flows, self._gains = self._model.at(Stage.FLOW), self._model.at(Stage.GAIN)

@@ -427,7 +427,7 @@ class Certainty:
 
         cause = self.model.active[c].cause
         unknown, here = cause.unknowns[k], self.model.active[c].values[k]
-        step = unknown.step
+        step = unknown.step_on(self.task.grids)
         if unknown.kind is Kind.LINE:
             most = cost(here) + _JUMP95 * self.variance * self._colour
             low, high = (_last_place(cost, here, sign * step, unknown, most)

@@ -22,6 +22,7 @@ from valveflow_ros.diagnosis.cause import Active, Stage
 from valveflow_ros.diagnosis.grids import Grids, Reference
 from valveflow_ros.records import ByteArray, FloatArray
 from valveflow_ros.signals.static_form import StaticForm
+from valveflow_ros.signals.units import in_unit
 
 _REMEMBERED = 24
 
@@ -188,6 +189,8 @@ class ExtendedModel:
     on_top_of : ExtendedModel, optional
         An earlier model: the causes of this one were found in rows that had been freed of
         the earlier ones.
+    output_unit : str
+        MW, or the unit of a flow.
     """
 
     model: Extended
@@ -195,6 +198,7 @@ class ExtendedModel:
     start_ns: int
     reference: Reference
     on_top_of: ExtendedModel | None = None
+    output_unit: str = 'MW'
 
     @property
     def pressure_exponent(self) -> float:
@@ -206,7 +210,11 @@ class ExtendedModel:
         """Return the causes, the earlier ones first."""
         earlier = () if self.on_top_of is None else self.on_top_of.held
         return earlier + tuple(
-            HeldCause(a.name, tuple(a.named().items()), a.sentence(self.start_ns))
+            HeldCause(
+                a.name,
+                tuple(a.named().items()),
+                in_unit(a.sentence(self.start_ns), self.output_unit),
+            )
             for a in self.model.active
         )
 
@@ -228,6 +236,7 @@ class ExtendedModel:
             pressure_scale_exponent=self.form.scale_exponent,
             offset_mw=self.model.base.offset,
             reference_pressure_mpa=math.exp(self.reference.log_pressure),
+            output_unit=self.output_unit,
         ).with_id()
 
 

@@ -232,13 +232,13 @@ def base_mask(task: Task, model: Extended) -> BoolArray:
     return free
 
 
-def _base_steps(model: RegionalModel) -> FloatArray:
-    """Return steps for differences in the packed parameters."""
+def _base_steps(model: RegionalModel, size: float) -> FloatArray:
+    """Return steps for differences in the packed parameters, at an output of this size."""
     j, i = model.pieces, model.regions
     span = float(model.knots[-1] - model.knots[0])
     return np.concatenate(
-        [np.ones(j + 1), np.full(j - 1, 1e-3 * span), np.ones(j - 1), np.full(i, 0.02),
-         np.full(i, 0.2), np.ones(model.size - (3 * j - 1 + 2 * i))]
+        [np.full(j + 1, size), np.full(j - 1, 1e-3 * span), np.full(j - 1, size),
+         np.full(i, 0.02), np.full(i, 0.2), np.full(model.size - (3 * j - 1 + 2 * i), size)]
     )  # fmt: skip
 
 
@@ -248,7 +248,7 @@ def base_tangents(task: Task, model: Extended) -> FloatArray:
     driven = drive(grids, model)
     path = region_path(model, flow_of(model, driven))
     here = answer(grids, model, driven, path)
-    packed, steps = model.base.pack(), _base_steps(model.base)
+    packed, steps = model.base.pack(), _base_steps(model.base, grids.size)
     columns = []
     for p in np.flatnonzero(base_mask(task, model)):
         moved = packed.copy()
@@ -286,7 +286,7 @@ def cause_tangents(task: Task, model: Extended) -> FloatArray:
     for c, k in slots:
         stage = model.active[c].cause.stage
         keep = None if stage == Stage.DYNAMICS else path
-        h = model.active[c].cause.unknowns[k].step
+        h = model.active[c].cause.unknowns[k].step_on(grids)
         up, down = _shifted(model, c, k, h), _shifted(model, c, k, -h)
         width = up.active[c].values[k] - down.active[c].values[k]
         change = answer(grids, up, None, keep) - answer(grids, down, None, keep)
@@ -301,7 +301,7 @@ def level_tangents(task: Task, model: Extended) -> FloatArray:
     columns = []
     for k in range(len(model.base.levels)):
         up, down = model.base.levels.copy(), model.base.levels.copy()
-        up[k], down[k] = up[k] + 1.0, down[k] - 1.0
+        up[k], down[k] = up[k] + task.grids.size, down[k] - task.grids.size
         high = answer(task.grids, replace(model, base=model.base.with_levels(up)))
         low = answer(task.grids, replace(model, base=model.base.with_levels(down)))
         columns.append(0.5 * (high - low))
@@ -370,9 +370,10 @@ def search_levels(
     task: Task, model: Extended, cost: float, steps: tuple[float, ...] = _LEVEL_STEPS_MW
 ) -> tuple[Extended, float]:
     """Move each level between regions along a line while the cost falls."""
+    size = task.grids.size
 
     def moved(model: Extended, level: int, by: float) -> Extended | None:
-        base = with_level_moved(model.base, level, by)
+        base = with_level_moved(model.base, level, by * size, size)
         return None if base is None else replace(model, base=base)
 
     for k in range(0 if task.fixed_dynamics else len(model.base.levels)):
@@ -381,7 +382,7 @@ def search_levels(
     return model, cost
 
 
-def _directions(cause: Cause) -> list[Values]:
+def _directions(cause: Cause, grids: Grids) -> list[Values]:
     """Return steps along which parameters of kind ``LINE`` are searched: each, and in pairs."""
     lines = [k for k, u in enumerate(cause.unknowns) if u.kind is Kind.LINE]
     out = []
@@ -390,7 +391,7 @@ def _directions(cause: Cause) -> list[Values]:
     for k, other in itertools.combinations(lines, 2):
         out += [{k: 1.0, other: 1.0}, {k: 1.0, other: -1.0}]
     return [
-        tuple(d.get(k, 0.0) * u.step for k, u in enumerate(cause.unknowns)) for d in out
+        tuple(d.get(k, 0.0) * u.step_on(grids) for k, u in enumerate(cause.unknowns)) for d in out
     ]  # fmt: skip
 
 
@@ -404,7 +405,7 @@ def _along(model: Extended, c: int, direction: Values, by: float) -> Extended:
 def search_lines(task: Task, model: Extended, cost: float) -> tuple[Extended, float]:
     """Move every parameter of kind ``LINE`` along a line while the cost falls."""
     for c, a in enumerate(model.active):
-        directions = _directions(a.cause)
+        directions = _directions(a.cause, task.grids)
         for share in _LINE_SHARES if directions else ():
             for direction, sign in itertools.product(directions, (1.0, -1.0)):
                 model, cost = descend(

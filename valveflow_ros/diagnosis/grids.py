@@ -8,6 +8,7 @@ import numpy as np
 
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.errors import TooFewSamplesError
+from valveflow_ros.numerics import output_size
 from valveflow_ros.records import NS_PER_S, BoolArray, ByteArray, FloatArray, SampleTable, Signal
 from valveflow_ros.signals.compression import Compression
 from valveflow_ros.signals.static_form import StaticForm
@@ -188,6 +189,11 @@ class Grids:
     def group(self) -> int:
         """Return the number of model rows in a scored mean."""
         return len(self.u) // len(self.power)
+
+    @property
+    def size(self) -> float:
+        """Return how large the output is beside that of a unit of 300 MW; see `output_size`."""
+        return output_size(self.power)
 
     @property
     def mean_s(self) -> float:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from valveflow_ros.curve.characteristic_json import form_of
+from valveflow_ros.curve.characteristic_json import OUTPUT_UNIT, form_of
 from valveflow_ros.curve.json_schema import (
     DEGC,
     MOST_PIECES,
@@ -34,6 +34,7 @@ from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
 from valveflow_ros.diagnosis.grids import COEFFICIENTS, COURSE, MEAN_S, Covariate, Reference
 from valveflow_ros.errors import DataError
 from valveflow_ros.signals.static_form import AXES, OPENING, StaticForm
+from valveflow_ros.signals.units import in_unit
 
 NAMED, NOTHING, UNEXPLAINED = 'named', 'nothing', 'unexplained'
 
@@ -138,6 +139,25 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     mean_s: float = MEAN_S
 
+    def measured_in(self, unit: str) -> Diagnosis:
+        """Return the same numbers as those of an output in ``unit``, and sentences that say so."""
+        causes = tuple(
+            dataclasses.replace(
+                c, sentence=in_unit(c.sentence, unit), experiment=in_unit(c.experiment, unit),
+                parameters={
+                    key: dataclasses.replace(e, unit=in_unit(e.unit, unit))
+                    for key, e in c.parameters.items()
+                },
+            )
+            for c in self.causes
+        )  # fmt: skip
+        return dataclasses.replace(
+            self, causes=causes, sentence=in_unit(self.sentence, unit),
+            experiments=tuple(in_unit(one, unit) for one in self.experiments),
+            rejected=tuple((name, in_unit(why, unit)) for name, why in self.rejected),
+            notes=tuple(in_unit(note, unit) for note in self.notes),
+        )  # fmt: skip
+
 
 # The extended model as JSON: what ``extended_model.json`` holds, and what is believed of one.
 
@@ -153,6 +173,7 @@ def model_to_json(given: ExtendedModel) -> dict[str, Any]:
     return {
         'format': MODEL_FORMAT,
         'version': MODEL_VERSION,
+        **({} if given.output_unit == 'MW' else {'output_unit': given.output_unit}),
         'pressure_exponent': given.pressure_exponent,
         **_form_json(given),
         'start_ns': given.start_ns,
@@ -198,6 +219,7 @@ def is_model(raw: object) -> bool:
 
 _TIME = Number(-4e7, 4e7)  # seconds from the model's start, 400 days and more
 _SCHEMA = {
+    'output_unit': OUTPUT_UNIT,
     'axis': Maybe(Text(AXES)),
     'pressure_exponent': Number(0.0, 2.0),
     'pressure_scale_exponent': Maybe(Number(0.0, 2.0)),
@@ -257,7 +279,7 @@ def model_from_json(raw: object, depth: int = 0) -> ExtendedModel:
     given = ExtendedModel(
         Extended(_base(top, inside), _causes(top['causes'], f'{inside}causes', form)),
         form, top['start_ns'], Reference(**reference, opening_noise=noise),
-        earlier,
+        earlier, top['output_unit'] or 'MW',
     )  # fmt: skip
     if earlier is not None and earlier.form != given.form:
         raise fail(_WHOLE, f'{inside}on_top_of', 'is a model over another input u')

@@ -194,17 +194,20 @@ class Drift:
         Root mean square of the wander about its mean over the record, in MW.
     time_scale_s : float
         Time after which it has forgotten about two thirds of where it was.
+    least_mw : float
+        A smaller one is none.
     """
 
     gain: float
     rms_mw: float
     time_scale_s: float
+    least_mw: float = _LEAST_DRIFT_MW
 
     @property
     def there(self) -> bool:
         """Tell whether it is more than chance, and slow."""
         slow = self.time_scale_s >= 3600.0 * _SLOWEST_OF_NOISE_H
-        return slow and self.gain > _LEAST_DRIFT_GAIN and self.rms_mw > _LEAST_DRIFT_MW
+        return slow and self.gain > _LEAST_DRIFT_GAIN and self.rms_mw > self.least_mw
 
 
 def drift(task: Task, model: Extended) -> Drift:
@@ -234,4 +237,5 @@ def drift(task: Task, model: Extended) -> Drift:
     left = noise_mw2 * (wander - wander @ seen @ wander)
     unseen = float(np.trace(left) / k - left.mean())
     rms = float(np.sqrt(np.var(level) + unseen))
-    return Drift(best.restricted - none.restricted, rms, 3600.0 * best.hours)
+    least_mw = _LEAST_DRIFT_MW * task.grids.size
+    return Drift(best.restricted - none.restricted, rms, 3600.0 * best.hours, least_mw)

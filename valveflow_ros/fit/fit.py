@@ -96,10 +96,9 @@ def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
     """
     begun = _begin(task, progress)
     task = begun.formed.task
-    if not task.settings.flag('refine'):
-        return with_support(begun.static, task.contents, task.input_noise).with_id()
-    refined = _refined(begun, progress)
-    return with_support(refined, task.contents, task.input_noise).with_id()
+    found = _refined(begun, progress) if task.settings.flag('refine') else begun.static
+    found = with_support(found, task.contents, task.input_noise)
+    return found.measured_in(task.settings.output_unit)
 
 
 def form_of_data(task: FitTask) -> StaticForm:

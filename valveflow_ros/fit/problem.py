@@ -12,7 +12,7 @@ import numpy as np
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.fit.descent import descend, gauss_newton
 from valveflow_ros.fit.kernels import answer_residual, normal_sums, square_sum, tangents
-from valveflow_ros.numerics import cores, run_in_threads, runs
+from valveflow_ros.numerics import cores, output_size, run_in_threads, runs
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
 # What reacts to the power within the rows averaged, as a load controller does, would be
@@ -112,6 +112,7 @@ class Problem:
         self.scale = np.ascontiguousarray(samples.scale_or_ones[:cut])
         power = np.where(self.usable > 0, samples.power_mw[:cut], 0.0)
         self.power = power.reshape(m, samples.group).mean(axis=1)
+        self.size = output_size(self.power)
         self._threads = cores()
 
     def answer(self, model: RegionalModel) -> tuple[FloatArray, ByteArray]:
@@ -253,7 +254,7 @@ def move(
 def with_level_moved(
     model: RegionalModel, level: int, by: float, least: float = 1.0
 ) -> RegionalModel | None:
-    """Return the model with one level moved by some MW; None if two come closer than ``least``."""
+    """Return the model with one level moved; None if two come closer than ``least`` MW."""
     levels = model.levels.copy()
     levels[level] += by
     return None if np.any(np.diff(levels) <= least) else model.with_levels(levels)
@@ -267,6 +268,8 @@ def search_levels(
         for step, sign in itertools.product(_LEVEL_STEPS_MW, (1.0, -1.0)):
             model, cost = descend(
                 model, cost, lambda m: problem.cost(m, ar),
-                partial(with_level_moved, level=k, by=sign * step),
+                partial(
+                    with_level_moved, level=k, by=sign * step * problem.size, least=problem.size
+                ),
             )  # fmt: skip
     return model, cost

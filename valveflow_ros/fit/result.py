@@ -16,7 +16,7 @@ from valveflow_ros.curve.characteristic import (
     Support,
 )
 from valveflow_ros.curve.regional_model import RegionalModel
-from valveflow_ros.errors import counted
+from valveflow_ros.errors import counted, short
 from valveflow_ros.fit.piece_selection import evidence_words
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.fit.refine import Refined
@@ -289,7 +289,7 @@ def _distinct(levels: list[float], apart: float) -> list[float]:
 
 def _sentence(number: int, piece: Piece, found: Support) -> str:
     """Say what a piece rests on, and what would settle it."""
-    name = f'Piece {number} (u {piece.u_from:.0f} to {piece.u_to:.0f})'
+    name = f'Piece {number} (u {short(piece.u_from)} to {short(piece.u_to)})'
     if not found.samples:
         rests = 'rests on no special sample'
     elif not found.levels and not found.slope_response:
@@ -298,9 +298,11 @@ def _sentence(number: int, piece: Piece, found: Support) -> str:
     elif not found.levels:
         rests = 'rests on slope responses that hardly move in it'
     else:
-        rests = f'rests on one steady level, u {found.levels[0]:.0f}'
+        rests = f'rests on one steady level, u {short(found.levels[0])}'
     places = _missing(piece, np.array(found.levels))
-    loads = ' and '.join(f'u {u:.0f} ({piece.slope * u + piece.intercept:.0f} MW)' for u in places)
+    loads = ' and '.join(
+        f'u {short(u)} ({short(piece.slope * u + piece.intercept)} MW)' for u in places
+    )
     each = ' each' if len(places) > 1 else ''
     return (
         f'{name} {rests}: its slope comes from the neighbours and from fast moves; '

@@ -226,4 +226,4 @@ def _characteristic(
         ),
         partition_pieces=pieces,
         notes=(note, form_note(pressure)),
-    ).with_id()  # fmt: skip
+    ).measured_in(settings.output_unit)  # fmt: skip

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valveflow_ros.errors import short
 from valveflow_ros.fit.whitening import yule_walker
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SampleTable, Signal
@@ -247,9 +248,8 @@ def _level(
     moved = float(power[half:].mean() - power[:half].mean())
     problem = ''
     if moving:
-        problem = (
-            f'had not settled: its power still went by {2.0 * moved:+.1f} MW while it was held'
-        )
+        went = short(2.0 * moved, 1, '+')
+        problem = f'had not settled: its power still went by {went} MW while it was held'
     return Level(
         a, b, held_s, float(opening[a:b].mean()),
         float(table.column(Signal.MAIN_STEAM_PRESSURE)[a:b].mean()), float(u[a:b].mean()),

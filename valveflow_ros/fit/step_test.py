@@ -423,7 +423,7 @@ def _characteristic(
         residuals=_residuals(table, u, good, line, settings),
         partition_pieces=pieces,
         notes=notes,
-    ).with_id()
+    ).measured_in(settings.output_unit)
 
 
 def pieces_of_line(line: BrokenLine, u: FloatArray) -> tuple[Piece, ...]:

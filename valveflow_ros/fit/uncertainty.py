@@ -101,12 +101,13 @@ def _blocks(problem: Problem) -> int:
 
 def _level_tangents(problem: Problem, model: RegionalModel, columns: FloatArray) -> None:
     """Write the answer's change per MW of each level, shape (m, I - 1)."""
+    step_mw = _LEVEL_STEP_MW * problem.size
     for k in range(len(model.levels)):
         half = np.zeros(len(model.levels))
-        half[k] = 0.5 * _LEVEL_STEP_MW
+        half[k] = 0.5 * step_mw
         low, _ = problem.answer(model.with_levels(model.levels - half))
         high, _ = problem.answer(model.with_levels(model.levels + half))
-        columns[:, k] = (low - high) / _LEVEL_STEP_MW
+        columns[:, k] = (low - high) / step_mw
 
 
 def bend_certainty(problem: Problem, model: RegionalModel, ar: FloatArray) -> FloatArray:

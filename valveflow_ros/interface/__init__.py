@@ -21,6 +21,9 @@ class Progress:
     def warn(self, sentence: str) -> None:
         """Report something that must not be overlooked."""
 
+    def measured_in(self, unit: str) -> None:
+        """Be told that the output is in this unit; sentences speak of power in MW all the same."""
+
     def part(self, start: float, width: float) -> Callable[[float, str], None]:
         """Return a callable for a part of the work that is ``width`` of the whole."""
         return lambda share, what: self(start + width * share, what)

@@ -20,6 +20,7 @@ from valveflow_ros.interface.files import Result
 from valveflow_ros.interface.logs import Log, as_log
 from valveflow_ros.interface.models import (
     Model,
+    check_output,
     load_characteristic,
     load_model,
     load_truth,
@@ -54,6 +55,11 @@ class ComparisonResult(Result):
     data: Compared
 
     @property
+    def output_unit(self) -> str:
+        """Return the unit of the log's output."""
+        return self.data.result.characteristic.output_unit
+
+    @property
     def comparison(self) -> comparison.Comparison:
         """Return curves, errors and tests."""
         return self.data.result
@@ -67,6 +73,7 @@ class ComparisonResult(Result):
         data = self.data
         content = {
             **comparison.to_json(data.result),
+            'output_unit': self.output_unit,
             'learnt_from': data.source,
             'judged_on': data.other,
             'held_out': data.held_out,
@@ -88,6 +95,11 @@ class ValidationResult(Result):
     data: Validated
 
     @property
+    def output_unit(self) -> str:
+        """Return the unit of the curve's output, which is that of the log's."""
+        return self.data.result.characteristic.output_unit
+
+    @property
     def validation(self) -> validation.Validation:
         """Return verdict, pieces and errors."""
         return self.data.result
@@ -101,6 +113,7 @@ class ValidationResult(Result):
         data = self.data
         content = {
             **validation.to_json(data.result),
+            'output_unit': self.output_unit,
             'log': data.source,
             'model': data.model,
             'against': data.other or None,
@@ -206,6 +219,9 @@ def validate(
     """
     curve, second, given = check_models(model, against, parameters or {})
     log = _not_empty(as_log(log, progress))
+    for one, called in ((curve, 'The model'), (second, 'The second curve')):
+        if one is not None:
+            check_output(one, log.output_unit, called)
     extended = None
     if isinstance(curve, ExtendedModel):
         extended, curve = curve, curve.characteristic()

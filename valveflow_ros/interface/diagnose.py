@@ -26,7 +26,7 @@ from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.alignment import align
 from valveflow_ros.interface.files import Result, signed
 from valveflow_ros.interface.logs import Log, as_log, read_covariate
-from valveflow_ros.interface.models import Model, load_model, with_exponent
+from valveflow_ros.interface.models import Model, check_output, load_model, with_exponent
 from valveflow_ros.interface.monitor import recorded_history
 from valveflow_ros.interface.observation import Observed, observe_log, settings_of
 from valveflow_ros.parameters import Settings
@@ -65,7 +65,14 @@ class DiagnosisResult(Result):
     def extended_model(self) -> ExtendedModel:
         """Return the model extended by the causes that were found."""
         d = self.diagnosis
-        return ExtendedModel(d.final, self.form, self.data.start_ns, d.reference, self.on_top_of)
+        return ExtendedModel(
+            d.final, self.form, self.data.start_ns, d.reference, self.on_top_of, self.output_unit
+        )
+
+    @property
+    def output_unit(self) -> str:
+        """Return the unit of the log's output."""
+        return self.data.output_unit
 
     def page(self) -> Page:
         """Return the report."""
@@ -74,7 +81,7 @@ class DiagnosisResult(Result):
     def texts(self) -> dict[str, str]:
         """Return ``diagnosis.json`` and ``extended_model.json``."""
         contents = {
-            'diagnosis.json': to_json(self.diagnosis),
+            'diagnosis.json': {**to_json(self.diagnosis), 'output_unit': self.output_unit},
             'extended_model.json': signed(model_to_json(self.extended_model), self.verb),
         }
         return {
@@ -168,6 +175,8 @@ def diagnose(
             model = load_diagnosable(model)
         given = with_exponent(model, given, name)
     log = as_log(log, progress)
+    if model is not None:
+        check_output(model, log.output_unit, 'The model')
     check_covariates(covariates or {})
     settings, notes = settings_of(log, given, progress)
     earlier = model if isinstance(model, ExtendedModel) and model.held else None
@@ -205,10 +214,11 @@ def diagnose(
     kept = () if log.compression is None else (log.compression.sentence,)
     signatures, answers, maps = views(record, found)
     found = replace(found, notes=(*log.contents.warnings, *kept, *notes, *found.notes))
+    found = found.measured_in(settings.output_unit)
     times = rows.table.time_ns
     data = Diagnosed(
         log.name, int(times[0]), int(times[-1]), found, signatures, answers, maps,
-        recorded_history(log.contents), form.input_exponent,
+        recorded_history(log.contents), form.input_exponent, settings.output_unit,
     )  # fmt: skip
     return DiagnosisResult(data, form, earlier)
 

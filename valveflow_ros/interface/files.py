@@ -226,6 +226,11 @@ class Result:
 
     verb: ClassVar[str]
 
+    @property
+    def output_unit(self) -> str:
+        """Return the unit of the output: MW, or that of a flow."""
+        return 'MW'
+
     def page(self) -> Page:
         """Return the report."""
         raise NotImplementedError
@@ -236,8 +241,17 @@ class Result:
 
     def to_json(self) -> dict[str, Any]:
         """Return the result as a dict, equal to the content of its JSON file."""
-        content: dict[str, Any] = json.loads(next(iter(self.texts().values())))
+        content: dict[str, Any] = json.loads(next(iter(self._told().values())))
         return content
+
+    def _told(self) -> dict[str, str]:
+        """Return the files with their sentences in the unit of the output; models have none."""
+        from valveflow_ros.signals.units import in_unit
+
+        return {
+            name: content if name.endswith('_model.json') else in_unit(content, self.output_unit)
+            for name, content in self.texts().items()
+        }
 
     def plot(self, name: str = '') -> Any:
         """Return a picture of the report as a plotly figure.
@@ -263,7 +277,7 @@ class Result:
 
         from valveflow_ros.report.drawing import palette
 
-        drawn = {figure.name: figure for figure in self.page().figures}
+        drawn = {f.name: f for f in self.page().in_unit(self.output_unit).figures}
         if (name and name not in drawn) or not drawn:
             there = ', '.join(drawn) or 'none'
             raise InputError(f"The report has no picture '{name}'; it has: {there}.")
@@ -302,8 +316,8 @@ class Result:
         """
         folder = Path(folder)
         check_results(folder, figures, tables)
-        page = self.page()
-        content = {**self.texts(), REPORT: page.to_html()}
+        page = self.page().in_unit(self.output_unit)
+        content = {**self._told(), REPORT: page.to_html()}
         backup = back_up(folder, self.verb, content)
         files = write_texts(folder, content)
         *most, last = [str(files[REPORT]), *(name for name in content if name != REPORT)]

@@ -24,7 +24,12 @@ from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.alignment import align
 from valveflow_ros.interface.files import Result, signed
 from valveflow_ros.interface.logs import Log, as_log
-from valveflow_ros.interface.models import load_characteristic, load_extended, with_exponent
+from valveflow_ros.interface.models import (
+    check_output,
+    load_characteristic,
+    load_extended,
+    with_exponent,
+)
 from valveflow_ros.interface.monitor import recorded_history
 from valveflow_ros.interface.observation import check_signals, observe_log, settings_of
 from valveflow_ros.records import (
@@ -83,6 +88,11 @@ class Identification(Result):
     def notes(self) -> tuple[str, ...]:
         """Return sentences about how the data were read, and about the curve."""
         return (*self.data.notes, *self.characteristic.notes)
+
+    @property
+    def output_unit(self) -> str:
+        """Return the unit of the curve's output."""
+        return self.characteristic.output_unit
 
     def page(self) -> Page:
         """Return the report."""
@@ -151,6 +161,9 @@ def identify(
     if reference is not None and not isinstance(reference, Characteristic):
         reference = load_characteristic(reference)
     log = as_log(log, progress)
+    for curve, called in ((model, 'The model'), (reference, 'The reference')):
+        if curve is not None:
+            check_output(curve, log.output_unit, called)
     found = (
         _step_test(log, given, progress) if step_test
         else _identified(log, given, model, reference, progress)

@@ -18,16 +18,19 @@ from valveflow_ros.interface.plausibility import (
     air_note,
     check_constants,
     doubt,
+    limits_beside_steam,
     refuse_guesses,
     refuse_impossible,
     with_constants,
 )
 from valveflow_ros.logs import LogContents
 from valveflow_ros.logs import open_log as read_file
+from valveflow_ros.logs.names import signal_of
 from valveflow_ros.logs.tables.cells import QUALITY_SUFFIX
 from valveflow_ros.logs.tables.match import TIME
-from valveflow_ros.parameters import Settings
+from valveflow_ros.parameters import PARAMETERS, Settings
 from valveflow_ros.records import (
+    FLOW_UNITS,
     N_SIGNALS,
     SIGNALS,
     FloatArray,
@@ -39,7 +42,14 @@ from valveflow_ros.records import (
     table_to_readings,
 )
 from valveflow_ros.signals.compression import Compression, find_compression, held_readings
-from valveflow_ros.signals.units import UNITS, convert
+from valveflow_ros.signals.units import (
+    DIFFERENCES,
+    Unit,
+    convert,
+    engine_unit,
+    known_units,
+    unit_of,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +65,7 @@ class Log:
     readings : Readings
         In engine units; constants stand at the times of another signal.
     units : dict
-        The unit each measured signal was taken to have.
+        The unit each signal was taken to have, and each constant was given in.
     constants : dict
         Value of each constant signal, engine units.
     doubts : list of Doubt
@@ -96,6 +106,64 @@ class Log:
         """Return sentences about how the file was read."""
         kept = () if self.compression is None else (self.compression.sentence,)
         return (*self.contents.warnings, *(d.sentence for d in self.doubts), *kept)
+
+    @property
+    def output_unit(self) -> str:
+        """Return the unit of the readings of generated_power: MW, or that of a flow."""
+        unit = self.units.get(Signal.GENERATED_POWER, 'MW')
+        return engine_unit(Signal.GENERATED_POWER, unit)
+
+    def parameters(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+        """Return what is given and what follows from the units of the log, and sentences on that.
+
+        Parameters that are in MW are for a unit of some 300 MW; where the output is a flow they
+        are for one of its size. The unit of the output is always the log's.
+
+        Raises
+        ------
+        InputError
+            Another unit of a flow is given.
+        """
+        found: dict[str, Any] = {**limits_beside_steam(self.units, self.constants)}
+        told: list[str] = []
+        unit = self.output_unit
+        wanted = given.get('generated_power_unit', unit)
+        if wanted in FLOW_UNITS and wanted != unit:
+            theirs = self.name_of(Signal.GENERATED_POWER)
+            raise InputError(
+                f'generated_power_unit is {wanted}, and generated_power of the log is in {unit}: '
+                f"say what it is with --column 'generated_power={theirs}:{wanted}'."
+            )
+        if self.units.get(Signal.MAIN_STEAM_PRESSURE) in DIFFERENCES:
+            found['pressure_exponent'] = _OF_DIFFERENCE
+            m = given.get('pressure_exponent', _OF_DIFFERENCE)
+            told.append(
+                'main_steam_pressure is the pressure difference over the valve: '
+                f'pressure_exponent is {m:g} unless the data choose another.'
+            )
+        if unit != 'MW':
+            mine = self.readings.signal == Signal.GENERATED_POWER
+            sizes = np.abs(self.readings.value[mine])
+            sizes = sizes[np.isfinite(sizes)]
+            top = float(np.quantile(sizes, _FULL)) if len(sizes) else 0.0
+            found['generated_power_unit'] = unit
+            if top > 0.0:
+                sized = {'generated_power_low': -_MOST * top, 'generated_power_high': _MOST * top}
+                for name in ('alarm_floor', 'shift_least'):
+                    sized[name] = float(PARAMETERS[name].default) * top / _USUAL_MW
+                for name, value in sized.items():
+                    low, high = PARAMETERS[name].low, PARAMETERS[name].high
+                    found[name] = min(max(value, low or 0.0), high or value)
+            own = ', '.join(
+                f'{n} {found[n]:.3g}' for n in ('alarm_floor', 'shift_least')
+                if n in found and n not in given
+            )  # fmt: skip
+            told.append(
+                f'The output is a flow, up to {top:.4g} {unit}; numbers called _mw are in {unit}.'
+                + (f' Adapted to it: {own} {unit}.' if own else '')
+            )
+        units = {'generated_power_unit': unit} if unit != 'MW' else {}
+        return {**found, **given, **units}, told
 
     def name_of(self, signal: Signal) -> str:
         """Return the topic or column a signal comes from, empty if it is not there."""
@@ -280,6 +348,9 @@ class Series:
         return out
 
 
+# Flow goes as the root of the pressure difference, the limits of a flow are so many times what it
+# is at full flow, and parameters in MW are for a unit of this size.
+_OF_DIFFERENCE, _MOST, _FULL, _USUAL_MW = 0.5, 10.0, 0.995, 300.0
 _GAP_S, _GAP_STEPS = 3600.0, 5.0
 # A reader gives numbers for signals only: the column is read in place of one, before units.
 _READ_AS = Signal.VALVE_COMMAND
@@ -336,17 +407,20 @@ def _understood(name: str, contents: LogContents, mapping: LogMapping, progress:
     told = _units_told(contents)
     units = {s: mapping.unit_of(s, told) for s in contents.signals}
     constants = mapping.constant_signals
-    check_constants(constants)
+    stated = {**units, **mapping.constant_units}
+    output = engine_unit(Signal.GENERATED_POWER, stated.get(Signal.GENERATED_POWER, ''))
+    progress.measured_in(output)
+    settings = Settings(limits_beside_steam(stated, constants))
+    check_constants(constants, settings)
     measured_signals = sorted(units.keys() - constants.keys())
     for signal in measured_signals:
         if note := air_note(signal, units[signal], contents.signals[signal]):
             progress.say(note)
-    raw, settings = contents.readings, Settings()
-    doubts = [
-        found
-        for s in measured_signals
-        if (found := doubt(s, raw.value[raw.signal == s], units[s], settings)) is not None
-    ]
+    raw, steam = contents.readings, output == 'MW'
+    judged = (
+        doubt(s, raw.value[raw.signal == s], units[s], settings, steam) for s in measured_signals
+    )
+    doubts = [found for found in judged if found is not None]
     refuse_guesses(contents.path, doubts, contents.grounds, contents.signals)
     if not contents.topics:  # a table
         refuse_impossible(contents.path, doubts, contents.signals)
@@ -363,7 +437,7 @@ def _understood(name: str, contents: LogContents, mapping: LogMapping, progress:
         progress.say(compression.sentence)
     if compression is None or not compression.own_times:
         readings = with_constants(measured, constants)
-        return Log(name, contents, readings, units, constants, doubts, compression)
+        return Log(name, contents, readings, stated, constants, doubts, compression)
     held = with_constants(held_readings(measured, compression), constants)
     there = np.isfinite(measured.value)
     kept = Readings(
@@ -371,17 +445,24 @@ def _understood(name: str, contents: LogContents, mapping: LogMapping, progress:
         measured.quality[there],
     )  # fmt: skip
     recorded = with_constants(kept, constants)
-    return Log(name, contents, held, units, constants, doubts, compression, recorded)
+    return Log(name, contents, held, stated, constants, doubts, compression, recorded)
 
 
 def _units_told(contents: LogContents) -> dict[Signal, str]:
     """Return the units that a log names itself.
 
-    The columns of a table may name them. A monitor records what the gateway sent, as it was
+    The columns of a table may name them. What was imported stands in the engine's units, and
+    names those that are not the contract's. A monitor records what the gateway sent, as it was
     sent, and its own parameters beside it; stamped samples carry the units of the contract.
     """
     if contents.units:
         return dict(contents.units)
+    try:
+        rows = json.loads(contents.attachments['import.json'])['signals']
+        named = {signal_of(row['topic']): str(row['unit']) for row in rows}
+        return {s: unit for s, unit in named.items() if unit in known_units(s)}
+    except (KeyError, ValueError, TypeError, InputError):
+        pass
     try:
         parameters = json.loads(contents.attachments['parameters.json'])
         named = {s: parameters.get(f'{SIGNALS[s].topic}_unit') for s in contents.signals}
@@ -390,14 +471,14 @@ def _units_told(contents: LogContents) -> dict[Signal, str]:
     return {
         signal: unit
         for signal, unit in named.items()
-        if unit in UNITS[signal] and not contents.signals[signal].endswith('plant_sample')
+        if unit in known_units(signal) and not contents.signals[signal].endswith('plant_sample')
     }
 
 
 def _converted(readings: Readings, units: dict[Signal, str]) -> Readings:
     value = readings.value
     for signal, unit in units.items():
-        if unit == SIGNALS[signal].unit:
+        if unit_of(signal, unit) == Unit(1.0):
             continue
         mine = readings.signal == signal
         value = value.copy() if value is readings.value else value

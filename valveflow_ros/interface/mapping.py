@@ -70,11 +70,20 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class LogMapping:
-    """Columns and constants by the topic's name; constants in the engine's units."""
+    """Columns and constants by the topic's name.
+
+    Constants are in the engine's units; ``units`` are those in which they were written.
+    """
 
     columns: dict[str, Column] = field(default_factory=dict)
     constants: dict[str, float] = field(default_factory=dict)
     table: TableOptions = AS_SEEN
+    units: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def constant_units(self) -> dict[Signal, str]:
+        """Return the units the constants were given in, by signal."""
+        return {_BY_NAME[name].signal: unit for name, unit in self.units.items()}
 
     @property
     def constant_signals(self) -> dict[Signal, float]:
@@ -147,12 +156,13 @@ def read_mapping(columns: Sequence[str], constants: Sequence[str], **table: str)
             raise UsageError(f'--column {column.name} is given twice.')
         found.columns[column.name] = column
     for text in constants:
-        name, value = _constant(text)
+        name, value, unit = _constant(text)
         if name in found.constants:
             raise UsageError(f'--constant {name} is given twice.')
         if name in found.columns:
             raise UsageError(f'{name} is given both as --column and as --constant; leave one out.')
         found.constants[name] = value
+        found.units[name] = unit
     return found
 
 
@@ -179,7 +189,7 @@ def _column(text: str) -> Column:
     return Column(SIGNALS[signal].topic, theirs.strip(), _unit(signal, unit), whole)
 
 
-def _constant(text: str) -> tuple[str, float]:
+def _constant(text: str) -> tuple[str, float, str]:
     name, rest = _split('constant', text)
     signal = _signal(name, 'constant')
     number, colon, unit = rest.partition(':')
@@ -189,12 +199,13 @@ def _constant(text: str) -> tuple[str, float]:
         raise UsageError(f"--constant {name}: '{number}' is no number.") from None
     if not math.isfinite(value):
         raise UsageError(f'--constant {name}: the value must be finite.')
+    unit = _unit(signal, unit) if colon else SIGNALS[signal].unit
     if colon:
         try:
-            value = float(convert(signal, _unit(signal, unit), np.array([value]))[0])
+            value = float(convert(signal, unit, np.array([value]))[0])
         except InputError as error:
             raise UsageError(f'--constant {name}: {error}') from None
-    return SIGNALS[signal].topic, value
+    return SIGNALS[signal].topic, value, unit
 
 
 def _split(option: str, text: str) -> tuple[str, str]:
@@ -278,7 +289,7 @@ def _answered(mapping: LogMapping, remedies: Iterable[Remedy]) -> LogMapping:
             constants[column.name] = _STAND_IN[column.name]
         else:
             raise UsageError(f'--column {column.name}={THEIRS} has to be answered first.')
-    return LogMapping(columns, constants, table)
+    return LogMapping(columns, constants, table, mapping.units)
 
 
 def merge_refusals(

@@ -98,6 +98,22 @@ def with_exponent(model: Model, given: Mapping[str, Any], name: object) -> dict[
     return {**given, 'pressure_exponent': model.pressure_exponent}
 
 
+def check_output(model: Model, unit: str, name: object) -> None:
+    """Refuse a model whose output is in another unit than the one of the log.
+
+    Raises
+    ------
+    UsageError
+        ``name`` is what the sentence calls the model.
+    """
+    if model.output_unit != unit:
+        raise UsageError(
+            f'{name} is a curve of an output in {model.output_unit}, and that of the log is in '
+            f'{unit}: name its unit with --column generated_power=THEIRS:{model.output_unit}, or '
+            'leave the curve out.'
+        )
+
+
 def load_truth(path: str | Path) -> Truth:
     """Return the truth in a file that ``simulate --truth`` wrote, or in a characteristic.
 

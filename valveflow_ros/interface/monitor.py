@@ -80,6 +80,11 @@ class MonitorResult(Result):
     settings: Settings
 
     @property
+    def output_unit(self) -> str:
+        """Return what the output is measured in."""
+        return self.settings.output_unit
+
+    @property
     def curves(self) -> list[tuple[int, Characteristic]]:
         """Return each curve with the time (ns) of the row after which it was adopted."""
         adopted = [e.characteristic for e in self.events if isinstance(e, CurveAdopted)]
@@ -233,8 +238,9 @@ def monitor(
         reference = load_characteristic(reference)
     log = as_log(log, progress)
     # The window stays as long as that of a live monitor, however long the log is.
+    given, told = log.parameters(given)
     settings, notes = settings_for(log.steps(), 0.0, given, live=True)
-    for sentence in notes:
+    for sentence in (*told, *notes):
         progress.say(sentence)
     corrector = None if model is None else corrector_of(model, settings.real('sample_period'))
     aligner, engine = Aligner(settings), Monitor(settings, corrector)

@@ -106,7 +106,9 @@ def settings_of(
     ParameterError
         Values are at odds with each other.
     """
+    given, told = log.parameters(given)
     settings, notes = settings_for(log.steps(), log.span_s, given, held=log.updates is not None)
+    notes = [*told, *notes]
     if constants:
         notes += [
             f'{SIGNALS[s].topic} was not logged and is taken as {value:g} {SIGNALS[s].unit}.'

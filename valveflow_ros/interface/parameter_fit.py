@@ -22,7 +22,7 @@ from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.terminal.text import clean
 from valveflow_ros.report.words import duration
 from valveflow_ros.signals.align import Aligner
-from valveflow_ros.signals.units import air_in
+from valveflow_ros.signals.units import DIFFERENCES, air_in
 
 # A transient cut short spoils segments, one too long only costs some: up in small steps,
 # down in large ones.
@@ -103,6 +103,7 @@ def _units(log: Log, found: Fitted) -> None:
         if signal in log.constants or unit == PARAMETERS[name].default:
             continue
         said = f"'{log.name_of(signal)}' of the log is in {unit}"
+        unit = unit.removesuffix('d') if unit in DIFFERENCES else unit
         if unit in PARAMETERS[name].choices:
             found.put(name, unit, said)
             continue
@@ -110,6 +111,9 @@ def _units(log: Log, found: Fitted) -> None:
             said += ', a gauge pressure, and the monitor wants it absolute'
         choices = ', '.join(PARAMETERS[name].choices)
         found.left.append(f'{name}: {clean(said)}; let the gateway send one of {choices}.')
+    for name, value in log.parameters({})[0].items():
+        if name not in found:
+            found.put(name, value, 'the fluid of the log, and the size of its output')
 
 
 def _steps(log: Log, found: Fitted) -> None:

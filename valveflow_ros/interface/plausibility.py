@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterable
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,9 +11,9 @@ import numpy as np
 from valveflow_ros.errors import DataError, UsageError
 from valveflow_ros.logs.tables.match import choosing, option
 from valveflow_ros.logs.tables.refusal import THEIRS, RefusedError
-from valveflow_ros.parameters import Settings
-from valveflow_ros.records import SIGNALS, FloatArray, Quality, Readings, Signal
-from valveflow_ros.signals.units import UNITS, air_in, unit_of
+from valveflow_ros.parameters import PARAMETERS, Settings
+from valveflow_ros.records import FLOW_UNITS, SIGNALS, FloatArray, Quality, Readings, Signal
+from valveflow_ros.signals.units import DIFFERENCES, UNITS, air_in, unit_of
 
 # What the signals of a steam unit in operation usually read, in engine units.
 _USUAL = {
@@ -23,6 +23,8 @@ _USUAL = {
     Signal.GENERATED_POWER: (3.0, 1800.0),
     Signal.VALVE_COMMAND: (3.0, 102.0),
 }
+# A pressure must be positive, and nothing is colder than this.
+_LEAST_MPA, _COLDEST_DEGC = 1e-6, -273.15
 _MANY = 0.02  # share of impossible values that is reported
 _MOST = 0.5  # with so many, a column is not the signal it is named after
 
@@ -66,7 +68,34 @@ def limits(signal: Signal, settings: Settings) -> tuple[float, float]:
     return settings.real(f'{name}_low'), settings.real(f'{name}_high')
 
 
-def doubt(signal: Signal, written: FloatArray, unit: str, settings: Settings) -> Doubt | None:
+def limits_beside_steam(
+    units: Mapping[Signal, str], constants: Mapping[Signal, float]
+) -> dict[str, float]:
+    """Return the limits of values, as parameters, that are not those of a steam unit's signals.
+
+    A flow may be of any fluid; a pressure difference may be small; a person knows how warm it is
+    who gives that as a constant.
+    """
+    found: dict[str, float] = {}
+    if units.get(Signal.MAIN_STEAM_PRESSURE) in DIFFERENCES:
+        found['main_steam_pressure_low'] = _LEAST_MPA
+    if (told := constants.get(Signal.MAIN_STEAM_TEMPERATURE)) is not None:
+        usual = float(PARAMETERS['main_steam_temperature_low'].default)
+        found['main_steam_temperature_low'] = max(min(told, usual), _COLDEST_DEGC)
+    if units.get(Signal.GENERATED_POWER) in FLOW_UNITS:
+        names = ('main_steam_pressure', 'main_steam_temperature', 'generated_power')
+        for name in names:
+            low, high = PARAMETERS[f'{name}_low'].low, PARAMETERS[f'{name}_high'].high
+            assert low is not None
+            assert high is not None
+            found |= {f'{name}_low': low, f'{name}_high': high}
+        found['main_steam_pressure_low'] = _LEAST_MPA
+    return found
+
+
+def doubt(
+    signal: Signal, written: FloatArray, unit: str, settings: Settings, steam: bool = True
+) -> Doubt | None:
     """Judge the values of one signal.
 
     Parameters
@@ -75,6 +104,10 @@ def doubt(signal: Signal, written: FloatArray, unit: str, settings: Settings) ->
         As they stand in the log.
     unit : str
         The unit they are taken to have.
+    settings : Settings
+        With the limits of what is possible.
+    steam : bool
+        What is usual in a steam unit can be expected, too.
     """
     written = written[np.isfinite(written)]
     if not len(written):
@@ -83,7 +116,7 @@ def doubt(signal: Signal, written: FloatArray, unit: str, settings: Settings) ->
     taken = unit_of(signal, unit)
     values = written * taken.scale + taken.offset
     impossible = float(((values < low) | (values > high)).mean())
-    fitting = _better_units(signal, written, unit, (low, high))
+    fitting = _better_units(signal, written, unit, (low, high)) if steam else ()
     looks_like = fitting[0] if fitting else ''
     if impossible < _MANY and not looks_like:
         return None
@@ -194,14 +227,13 @@ def air_note(signal: Signal, unit: str, theirs: str) -> str:
     )
 
 
-def check_constants(constants: dict[Signal, float]) -> None:
-    """Refuse constants that the engine would reject at each row.
+def check_constants(constants: dict[Signal, float], settings: Settings) -> None:
+    """Refuse constants that the engine would reject at each row with these limits.
 
     Raises
     ------
     UsageError
     """
-    settings = Settings()
     for signal, value in constants.items():
         low, high = limits(signal, settings)
         if not low <= value <= high:

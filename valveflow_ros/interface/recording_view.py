@@ -21,7 +21,7 @@ from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
 from valveflow_ros.report.terminal.board import ALARM, CURVE, DIAGNOSIS, KEPT, PREDICTION, Board
 from valveflow_ros.report.terminal.frame import OK, STALE, WARN, Frame, HealthView
 from valveflow_ros.report.words import counted, duration, plain
-from valveflow_ros.signals.units import UNITS, convert
+from valveflow_ros.signals.units import convert, known_units
 
 _SILENT_S = 5.0
 _SILENT_STEPS = 10.0
@@ -59,7 +59,7 @@ class InputWatch:
             # Of another version, perhaps: the defaults judge well enough for a look.
             return
         named = {info.signal: given.get(f'{info.topic}_unit') for info in SIGNALS}
-        self._units = {s: str(unit) for s, unit in named.items() if unit in UNITS[s]}
+        self._units = {s: str(unit) for s, unit in named.items() if unit in known_units(s)}
 
     def take(self, signal: Signal, topic: str, rows: Rows) -> None:
         """Take readings of a signal, in their order."""

@@ -23,6 +23,7 @@ from valveflow_ros.interface.plausibility import (
     air_note,
     check_constants,
     doubt,
+    limits_beside_steam,
     refuse_guesses,
     refuse_impossible,
     with_constants,
@@ -44,7 +45,7 @@ from valveflow_ros.records import (
     table_to_readings,
 )
 from valveflow_ros.report.data import Gap, gaps
-from valveflow_ros.signals.units import convert
+from valveflow_ros.signals.units import convert, engine_unit
 
 _SAMPLE = 500_000  # so many values are enough to judge a unit by
 _ROWS = 200_000  # in memory at a time
@@ -201,10 +202,17 @@ class TableImport:
             lambda names: TableReader(path, names, list(mapping.constants), mapping.table)
         )
         self._constants = mapping.constant_signals
-        check_constants(self._constants)
         names = self._reader.names
         told = {_BY_COLUMN[n].signal: unit for n, unit in self._reader.units.items()}
         self._units = {name: mapping.unit_of(_BY_COLUMN[name].signal, told) for name in names}
+        measured = {_BY_COLUMN[name].signal: unit for name, unit in self._units.items()}
+        self._stated = {**measured, **mapping.constant_units}
+        self._limits = Settings(limits_beside_steam(self._stated, self._constants))
+        check_constants(self._constants, self._limits)
+        self._output = engine_unit(
+            Signal.GENERATED_POWER, self._stated.get(Signal.GENERATED_POWER, '')
+        )
+        progress.measured_in(self._output)
         self._used = [n for n in names if _BY_COLUMN[n].signal not in self._constants]
         self._spool: Spool | None = None
         self._statistics = {name: _Statistics() for name in self._used}
@@ -306,7 +314,8 @@ class TableImport:
         sources = []
         reader = self._reader
         for info in SIGNALS:
-            name, unit = info.column, info.unit
+            name = info.column
+            unit = engine_unit(info.signal, self._stated.get(info.signal, ''))
             if info.signal in self._constants:
                 value = self._constants[info.signal]
                 sources.append(SignalSource(info.topic, '', unit, unit, value, value, 0, True))
@@ -410,9 +419,9 @@ class TableImport:
 
     def _judge(self, refused: list[RefusedError]) -> None:
         """Refuse what was guessed wrongly, and warn of the rest; raises `RefusedError`."""
-        settings, reader = Settings(), self._reader
+        settings, reader, steam = self._limits, self._reader, self._output == 'MW'
         judged = (
-            doubt(_BY_COLUMN[name].signal, found.sample(), self._units[name], settings)
+            doubt(_BY_COLUMN[name].signal, found.sample(), self._units[name], settings, steam)
             for name, found in self._statistics.items()
         )
         doubts = [found for found in judged if found is not None]

@@ -28,6 +28,7 @@ from valveflow_ros.report.words import (
     input_unit,
     interval,
     is_known,
+    level,
     percent,
     plain,
     span,
@@ -161,10 +162,10 @@ def _bends(c: Characteristic) -> str:
     steep = max(c.pieces, key=lambda p: p.slope)
     flat = min(c.pieces, key=lambda p: p.slope)
     said = (
-        f' The valve moves the unit most between u = {decimals(steep.u_from, 0)} and '
-        f'{decimals(steep.u_to, 0)} ({plain(steep.slope, 3)} MW per unit of u)'
+        f' The valve moves the unit most between u = {level(steep.u_from, 0)} and '
+        f'{level(steep.u_to, 0)} ({plain(steep.slope, 3)} MW per unit of u)'
     )
-    there = f'between {decimals(flat.u_from, 0)} and {decimals(flat.u_to, 0)}'
+    there = f'between {level(flat.u_from, 0)} and {level(flat.u_to, 0)}'
     if flat.slope <= 0.0:
         return f'{said}; {there} opening further <b>does not raise the power</b>.'
     weak = ': there it hardly answers' if flat.slope < _FLAT * steep.slope else ''
@@ -211,7 +212,7 @@ def breakpoints_table(c: Characteristic) -> str:
     if len(c.pieces) < 2:
         return ''
     rows = [
-        [str(k), decimals(piece.u_to, 1), interval(low, high), decimals(float(value), 1)]
+        [str(k), level(piece.u_to, 1), interval(low, high), level(float(value), 1)]
         for k, (piece, (low, high), value) in enumerate(
             zip(c.pieces[:-1], c.breakpoint_intervals, c.values()[1:-1], strict=True), 1
         )

@@ -134,7 +134,7 @@ def _caption(data: Identified) -> str:
 
 def _line(
     pieces: tuple[Piece, ...], name: str, colour: str, width: float, dash: str = '',
-    hover: str = 'u %{x:.0f}<br>%{y:.1f} MW',
+    hover: str = 'u %{x:.4~g}<br>%{y:.4~g} MW',
 ) -> Spec:  # fmt: skip
     """Return the lines of all pieces, a gap between two."""
     x = [v for p in pieces for v in (p.u_from, p.u_to, math.nan)]
@@ -188,7 +188,7 @@ def _heat(u: FloatArray, power: FloatArray) -> Spec:
         'z': [[c or None for c in row] for row in counts.tolist()],
         'zmin': 1, 'zmax': max(2, most), 'hoverongaps': False,
         'colorscale': [[float(p), token(f'density-{k}')] for k, p in enumerate(places)],
-        'hovertemplate': 'u %{x:.0f}<br>%{y:.1f} MW<br>%{z} samples<extra></extra>',
+        'hovertemplate': 'u %{x:.4~g}<br>%{y:.4~g} MW<br>%{z} samples<extra></extra>',
     }  # fmt: skip
 
 
@@ -250,9 +250,9 @@ def segments_figure(data: Identified) -> Figure | None:
     y, marker = rounded(found.residual_mw), {'opacity': 0.75}
     traces = [
         points(rounded(found.u, 6), y, 'over u', 'chosen',
-               f'u %{{x:.0f}} {unit}<br>%{{y:+.2f}} MW<extra></extra>', marker=marker),
+               f'u %{{x:.4~g}} {unit}<br>%{{y:+.3~g}} MW<extra></extra>', marker=marker),
         points(packed(found.time_ns / 1e6), y, 'over time', 'chosen',
-               f'{DAY_HOUR}%{{y:+.2f}} MW<extra></extra>', marker=marker, xaxis='x2', yaxis='y2'),
+               f'{DAY_HOUR}%{{y:+.3~g}} MW<extra></extra>', marker=marker, xaxis='x2', yaxis='y2'),
     ]  # fmt: skip
     layout: Spec = {
         'xaxis': axis(f'u ({unit})', domain=[0.0, 0.47], anchor='y'),
@@ -321,7 +321,7 @@ def _shift_figure(shift: Shift, found: SegmentResiduals) -> Figure:
     traces = [
         points(
             packed(part.time_ns / 1e6), rounded(part.residual_mw), name, colour,
-            f'{DAY_HOUR}u %{{customdata:.0f}}<br>%{{y:+.2f}} MW<extra>{name}</extra>',
+            f'{DAY_HOUR}u %{{customdata:.4~g}}<br>%{{y:+.3~g}} MW<extra>{name}</extra>',
             customdata=rounded(part.u),
         )
         for keep, name, colour in looks if keep.any() for part in (found.part(keep),)

@@ -291,11 +291,11 @@ def signals_figure(data: Identified) -> Figure:
         f'{counted(steady, "steady-state segment")} and '
         f'{counted(slope, "slope-response segment")} marked.'
     )
-    traces = [*_panel(data, data.u, 'y', unit, 0), *_panel(data, data.power, 'y2', 'MW', 1)]
+    traces = [*_panel(data, data.u, 'y', unit), *_panel(data, data.power, 'y2', 'MW')]
     return Figure('signals', caption, words, traces, layout, height=560)
 
 
-def _panel(data: Identified, values: FloatArray, up: str, unit: str, places: int) -> list[Spec]:
+def _panel(data: Identified, values: FloatArray, up: str, unit: str) -> list[Spec]:
     """Return the measured signal in grey and its special segments in colour."""
     time_ns = data.table.time_ns
     shown: Spec = {'yaxis': up, 'showlegend': up == 'y'}
@@ -308,7 +308,7 @@ def _panel(data: Identified, values: FloatArray, up: str, unit: str, places: int
     traces = [measured]
     for kind, name, colour in _KINDS:
         times, means = segment_path(time_ns, values, data.rows_of(kind), _SEGMENT_POINTS)
-        hover = f'{DAY_HOUR}%{{y:.{places}f}} {unit}<extra>{name}</extra>'
+        hover = f'{DAY_HOUR}%{{y:.4~g}} {unit}<extra>{name}</extra>'
         traces.append(line(
             packed(times), rounded(means), name, colour, hover, width=2.2, legendgroup=name,
             **shown,

@@ -41,11 +41,11 @@ from valveflow_ros.report.page import (
 from valveflow_ros.report.words import (
     UNKNOWN,
     counted,
-    decimals,
     duration,
     input_unit,
     input_unit_plain,
     interval,
+    level,
     percent,
     period,
     plain,
@@ -70,6 +70,7 @@ class Diagnosed:
     maps: tuple[ResidualMap, ...] = ()
     history: History | None = None
     exponent: float = math.nan
+    output_unit: str = 'MW'
 
 
 def diagnosis_page(data: Diagnosed) -> Page:
@@ -104,9 +105,9 @@ def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
         parts.append(notice(doubt))
     parts.append(paragraph(
         'On blocks of time that nothing was fitted to, the simulation misses the measured '
-        f'power by {decimals(d.rmse_simulation, 2)} MW, the extended model by '
-        f'{decimals(d.rmse_extended, 2)} MW; noise alone makes about '
-        f'{decimals(d.rmse_noise_floor, 2)} MW.'
+        f'power by {level(d.rmse_simulation, 2)} MW, the extended model by '
+        f'{level(d.rmse_extended, 2)} MW; noise alone makes about '
+        f'{level(d.rmse_noise_floor, 2)} MW.'
     ))  # fmt: skip
     if ranked:
         parts.append(signature_figure(ranked[0], data, _HOW))
@@ -178,9 +179,9 @@ def _model(data: Diagnosed) -> Section:
 def _proof(data: Diagnosed) -> Section:
     d = data.diagnosis
     rows = [
-        ['simulation', decimals(d.rmse_simulation, 3)],
-        ['extended model', decimals(d.rmse_extended, 3)],
-        ['noise alone (estimate)', decimals(d.rmse_noise_floor, 3)],
+        ['simulation', level(d.rmse_simulation, 3)],
+        ['extended model', level(d.rmse_extended, 3)],
+        ['noise alone (estimate)', level(d.rmse_noise_floor, 3)],
     ]
     parts: list[str | Figure] = [
         paragraph(
@@ -193,7 +194,7 @@ def _proof(data: Diagnosed) -> Section:
     gains = [(c.name, c.gain) for c in d.causes if math.isfinite(c.gain.p_value)]
     if gains:
         rows = [
-            [text(name), decimals(g.rmse_before, 3), decimals(g.rmse_after, 3),
+            [text(name), level(g.rmse_before, 3), level(g.rmse_after, 3),
              percent(g.reduction), plain(g.p_value, 2)]
             for name, g in gains
         ]  # fmt: skip
@@ -353,7 +354,7 @@ def answer_figure(answers: Sequence[Answer]) -> Figure:
         for (name, _, dash), values in zip(_BOTH, (a.before, a.after), strict=True):
             traces.append(_marked(
                 rounded(a.time_s, 6), values, f'{name}, {way}', 'steady' if a.up else 'slope',
-                dash, '%{x:.0f} s<br>%{y:+.2f} MW',
+                dash, '%{x:.0f} s<br>%{y:+.3~g} MW',
             ))  # fmt: skip
     chance = max(a.chance for a in answers)
     return Figure(

@@ -7,15 +7,17 @@ import functools
 import gzip
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from importlib import resources
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from valveflow_ros import __version__
 from valveflow_ros.errors import InputError
 from valveflow_ros.report.figure import Figure, without_tags
+from valveflow_ros.signals.units import in_unit
 
 
 def read_text(name: str) -> str:
@@ -63,6 +65,9 @@ _POLICY = (
 )
 
 
+_FIGURE_WORDS = ('caption', 'description', 'traces', 'layout')
+
+
 @dataclass(frozen=True, slots=True)
 class Section:
     """A part of the page.
@@ -99,6 +104,30 @@ class Page:
     sections: list[Section]
     foot: str
     verb: str
+
+    def in_unit(self, unit: str) -> Page:
+        """Return the page with its texts and pictures about an output in another unit than MW."""
+        if unit == 'MW':
+            return self
+
+        def told(value: Any) -> Any:
+            if isinstance(value, str):
+                return in_unit(value, unit)
+            if isinstance(value, list | tuple):
+                return [told(v) for v in value]
+            if isinstance(value, dict):
+                return {key: told(v) for key, v in value.items()}
+            if isinstance(value, Figure):
+                # The name is the element's id, and that of files.
+                words = (told(getattr(value, name)) for name in _FIGURE_WORDS)
+                return replace(value, **dict(zip(_FIGURE_WORDS, words, strict=True)))
+            return value
+
+        sections = [Section(told(s.title), told(s.parts)) for s in self.sections]
+        return replace(
+            self, title=told(self.title), lead=told(self.lead), sections=sections,
+            foot=told(self.foot),
+        )  # fmt: skip
 
     @property
     def figures(self) -> list[Figure]:

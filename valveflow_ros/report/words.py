@@ -46,6 +46,11 @@ def decimals(value: float, places: int) -> str:
     return text.replace('-', _MINUS)
 
 
+def level(value: float, places: int) -> str:
+    """Write ``value`` as `decimals` does, with more of them where those leave no two digits."""
+    return decimals(value, max(places, places_for(abs(value))))
+
+
 def signed(value: float, places: int = 1) -> str:
     """Write a number with its sign and a fixed number of decimals."""
     text = decimals(value, places)
@@ -99,7 +104,8 @@ def interval(low: float, high: float) -> str:
 
 
 def span(low: float, high: float, places: int = 0) -> str:
-    """Write 'low to high' with a fixed number of decimals."""
+    """Write 'low to high' with a fixed number of decimals; more where they are close together."""
+    places = max(places, places_for(abs(high - low)))
     return f'{decimals(float(low), places)} to {decimals(float(high), places)}'
 
 

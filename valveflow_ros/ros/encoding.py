@@ -32,6 +32,7 @@ from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.records import NS_PER_S, FloatArray
 from valveflow_ros.records import SpecialSegment as SegmentRecord
+from valveflow_ros.signals.units import in_unit
 
 # The latest time whose seconds a stamp can hold.
 LAST_NS = (1 << 31) * NS_PER_S - 1
@@ -163,6 +164,24 @@ def array_message(values: FloatArray | Sequence[float], label: str) -> Float64Mu
     message = Float64MultiArray(data=numbers)
     message.layout.dim = [MultiArrayDimension(label=label, size=len(numbers), stride=len(numbers))]
     return message
+
+
+# What is said to people; names and ids stay.
+_WORDS = (
+    'sentence', 'text', 'cause', 'shift_sentence', 'unit', 'rejected_reasons', 'parameter_units',
+)  # fmt: skip
+
+
+def tell_in(message: Any, unit: str) -> None:
+    """Put the unit of the output in place of MW in what a message says to people."""
+    for name in _WORDS if unit != 'MW' else ():
+        said = getattr(message, name, None)
+        if isinstance(said, str):
+            setattr(message, name, in_unit(said, unit))
+        elif said is not None:
+            setattr(message, name, [in_unit(one, unit) for one in said])
+    for cause in getattr(message, 'causes', ()):
+        tell_in(cause, unit)
 
 
 def no_diagnosis_message(

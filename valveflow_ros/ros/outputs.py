@@ -31,6 +31,7 @@ from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.ros import encoding
 from valveflow_ros.signals.static_form import OPENING
+from valveflow_ros.signals.units import in_unit
 
 NO_CURVE_YET = 'No curve yet: not enough special segments.'
 
@@ -88,6 +89,8 @@ class Outputs:
     ----------
     tag : str
         The unit's tag, the frame_id of every message.
+    output_unit : str
+        What stands in sentences in place of MW.
 
     Notes
     -----
@@ -95,8 +98,8 @@ class Outputs:
     messages depend on nothing but their order.
     """
 
-    def __init__(self, tag: str) -> None:
-        self._tag = tag
+    def __init__(self, tag: str, output_unit: str = 'MW') -> None:
+        self._tag, self._unit = tag, output_unit
         self.curve: Characteristic | None = None
         self.status = CurveStatus.UNKNOWN
         self.cause = NO_CURVE_YET
@@ -137,10 +140,10 @@ class Outputs:
         tag = self._tag
         if isinstance(event, engine.SegmentClosed):
             message = encoding.segment_message(event.segment, tag)
-            yield _output('segments', message, event.segment.end_ns)
+            yield self._output('segments', message, event.segment.end_ns)
         elif isinstance(event, AlarmChange):
             self._alarms[event.name] = event
-            yield _output('alarms', encoding.alarm_message(event, tag), event.time_ns)
+            yield self._output('alarms', encoding.alarm_message(event, tag), event.time_ns)
         elif isinstance(event, engine.CurveAdopted):
             self.curve, self.cause = event.characteristic, event.provisional
             self.status = CurveStatus.PROVISIONAL if self.cause else CurveStatus.FRESH
@@ -153,7 +156,7 @@ class Outputs:
             self._diagnosed = event
             yield self._diagnosis()
         elif isinstance(event, engine.JournalEntry):
-            yield _output('journal', encoding.journal_message(event, tag), event.time_ns)
+            yield self._output('journal', encoding.journal_message(event, tag), event.time_ns)
             if event.kind == JournalKind.RESUMED:
                 # A subscriber to the restarted process must find everything there.
                 self.shift = None
@@ -181,18 +184,22 @@ class Outputs:
         told = sorted(self._alarms.values(), key=lambda change: (change.time_ns, change.name))
         for change in told:
             if change.state != AlarmState.NORMAL:
-                yield _output('alarms', encoding.alarm_message(change, self._tag), change.time_ns)
+                yield self._output(
+                    'alarms', encoding.alarm_message(change, self._tag), change.time_ns
+                )
 
     def _diagnosis(self) -> Output:
         event, tag = self._diagnosed, self._tag
         if event is None:
-            return _output('diagnosis', encoding.no_diagnosis_message(encoding.NOT_YET, tag), 0)
+            return self._output(
+                'diagnosis', encoding.no_diagnosis_message(encoding.NOT_YET, tag), 0
+            )
         task = event.task
         if event.content:
             message = encoding.diagnosis_message(json.loads(event.content), task, tag)
         else:
             message = encoding.no_diagnosis_message(event.reason, tag, task)
-        return _output('diagnosis', message, task.window_end_ns)
+        return self._output('diagnosis', message, task.window_end_ns)
 
     def _note(self, entry: engine.JournalEntry) -> bool:
         """Take over what an entry tells about the curve; return True if it tells anything."""
@@ -211,7 +218,7 @@ class Outputs:
         message = encoding.curve_message(
             curve, self.status, self.cause, self._tag, self.reference_id, self.shift
         )
-        yield _output('characteristic', message, time_ns)
+        yield self._output('characteristic', message, time_ns)
         knots = [] if curve is None else curve.breakpoints
         slopes = [] if curve is None else [p.slope for p in curve.pieces]
         what, unit, rise = 'integrated input u', '% MPa^e', 'MW / (% MPa^e)'
@@ -219,10 +226,10 @@ class Outputs:
             what, unit, rise = 'valve opening', '%', 'MW / (% MPa^s)'
         for name, values, label in (
             ('breakpoints', knots, f'{what} at the ends of the pieces [{unit}]'),
-            ('slopes', slopes, f'slope of each piece [{rise}]'),
+            ('slopes', slopes, in_unit(f'slope of each piece [{rise}]', self._unit)),
         ):
-            yield _output(name, encoding.array_message(values, label), time_ns)
+            yield self._output(name, encoding.array_message(values, label), time_ns)
 
-
-def _output(name: str, message: Any, time_ns: int) -> Output:
-    return Output(name, encoding.encode(message), max(0, time_ns))
+    def _output(self, name: str, message: Any, time_ns: int) -> Output:
+        encoding.tell_in(message, self._unit)
+        return Output(name, encoding.encode(message), max(0, time_ns))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
 
 from valveflow_ros.errors import InputError
-from valveflow_ros.records import SIGNALS, FloatArray, Signal
+from valveflow_ros.records import FLOW_UNITS, SIGNALS, FloatArray, Signal
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +61,52 @@ FURTHER: dict[Signal, dict[str, Unit]] = {
     Signal.GENERATED_POWER: {'GW': Unit(1e3)},
 }
 
+FURTHER[Signal.GENERATED_POWER] |= dict.fromkeys(FLOW_UNITS, Unit(1.0))
+# The pressure difference over the valve in place of the pressure before it, as instrument makers
+# spell it ('psid').
+DIFFERENCES = {f'{name}d': unit for name, unit in _PRESSURE.items()} | {'mbard': Unit(1e-4)}
+FURTHER[Signal.MAIN_STEAM_PRESSURE] |= DIFFERENCES
+
+
+def engine_unit(signal: Signal, name: str) -> str:
+    """Return the unit of values after `convert` from the unit ``name``.
+
+    That of the contract, but for flows, which keep theirs, and pressure differences (MPad).
+    """
+    if signal == Signal.GENERATED_POWER and name in FLOW_UNITS:
+        return name
+    if signal == Signal.MAIN_STEAM_PRESSURE and name in DIFFERENCES:
+        return 'MPad'
+    return SIGNALS[signal].unit
+
+
+# Not within names: those of files ('power.csv'), keys ("power": ...), and columns, which sentences
+# put between quotes or behind an equals sign.
+_OUTPUT_WORDS = re.compile(
+    r"""(?<![\w.\\=:'-])(?:MW(?P<more>²|\\u00b2|\^2|/)?"""
+    r"""|(?P<made>[Gg]enerated )?(?<!/)(?P<power>[Pp]owers?))(?!\w|[.=:-]\w|"\s*:)"""
+)
+
+
+def in_unit(text: str, unit: str) -> str:
+    """Return a sentence or page about power in MW as one about a flow in ``unit``.
+
+    Keys and names of files and columns (``rmse_mw``, ``generated_power``) stay as they are, and
+    with a unit that is no flow's the whole text does.
+    """
+    if unit not in FLOW_UNITS:
+        return text
+
+    def told(found: re.Match[str]) -> str:
+        if word := found['power']:
+            flow = 'Flow' if (found['made'] or word)[0].isupper() else 'flow'
+            return flow + word[5:]
+        more = found['more'] or ''
+        divides = found.start() > 0 and found.string[found.start() - 1] == '/'
+        return f'({unit}){more}' if divides or more else unit
+
+    return _OUTPUT_WORDS.sub(told, text)
+
 
 def known_units(signal: Signal) -> dict[str, Unit]:
     """Return every unit that a signal of a log may have."""
@@ -83,7 +130,7 @@ def unit_of(signal: Signal, name: str) -> Unit:
     for spelling, unit in known_units(signal).items():
         if spelling.lower() == name.strip().lower():
             return unit
-    known = ', '.join(UNITS[signal])
+    known = ', '.join(known_units(signal))
     raise InputError(f"Unit '{name}' is unknown for {SIGNALS[signal].topic}: use one of {known}.")
 
 

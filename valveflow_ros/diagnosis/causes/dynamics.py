@@ -22,6 +22,7 @@ from valveflow_ros.diagnosis.cause import (
 from valveflow_ros.diagnosis.fitting import improve
 from valveflow_ros.diagnosis.grids import Grids
 from valveflow_ros.diagnosis.screening import Screening
+from valveflow_ros.errors import short
 from valveflow_ros.records import FloatArray
 
 _TRIED_SHARES = (0.1, 0.3, 0.5, 0.7)
@@ -67,8 +68,8 @@ def region_lag_sentence(values: SentenceValues) -> str:
         for name, digits in (('time_s', 3), ('delay_s', 2))
     )
     return (
-        f'Above {values["level_mw"]:.0f} MW the unit answers with a time constant {time_s} and a '
-        f'delay {delay_s}, unlike the model.'
+        f'Above {short(values["level_mw"])} MW the unit answers with a time constant {time_s} and '
+        f'a delay {delay_s}, unlike the model.'
     )
 
 

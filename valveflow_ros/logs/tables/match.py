@@ -17,6 +17,7 @@ from valveflow_ros.logs.tables.words import (
     LIKELY,
     TAG,
     Spelling,
+    flow_spelled,
     folded,
     is_foreign,
     marks,
@@ -109,7 +110,10 @@ class Matcher:
             if place is None:
                 absent[signal] = theirs
             else:
-                chosen[signal] = Chosen(place, self.names[place], self.unit_of(place))
+                unit = self.unit_of(place)
+                if signal == Signal.GENERATED_POWER:
+                    unit = unit or flow_spelled(self._units[place])
+                chosen[signal] = Chosen(place, self.names[place], unit)
         marked = self._marked({c.place for c in chosen.values()})
         several: list[str] = []
         missing: list[str] = []

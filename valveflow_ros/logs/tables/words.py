@@ -11,7 +11,7 @@ import re
 import unicodedata
 from dataclasses import dataclass
 
-from valveflow_ros.records import SIGNALS, Signal
+from valveflow_ros.records import FLOW_UNITS, SIGNALS, Signal
 
 # What a unit measures.
 OPENING, PRESSURE, TEMPERATURE, POWER = 'opening', 'pressure', 'temperature', 'power'
@@ -64,14 +64,18 @@ def _spellings() -> dict[str, Spelling]:
 
 
 SPELLINGS = _spellings()
+# Units of flows, which none of the signals is taken to be unless a person names the column.
+_FLOWS = {unit.lower(): unit for unit in FLOW_UNITS} | {
+    'tph': 't/h', 't/hr': 't/h', 'kg/hr': 'kg/h', 'kg/sec': 'kg/s', 'm³/h': 'm3/h',
+    'nm³/h': 'Nm3/h', 'm3/hr': 'm3/h', 'klb/hr': 'klb/h', 'lb/hr': 'lb/h', 'lpm': 'l/min',
+}  # fmt: skip
 # Units of what is certainly none of the five signals.
 _OTHERS = frozenset({
-    'mvar', 'kvar', 'var', 'mva', 'kva', 'hz', 'rpm', '1/min', 'u/min', 'min-1', 't/h', 'kg/s',
-    'kg/h', 'm3/h', 'm³/h', 'nm3/h', 'l/h', 'l/s', 'kj/kg', 'kj', 'mj', 'gj', 'mwh', 'kwh', 'gwh',
-    'a', 'ka', 'ma', 'v', 'kv', 'mv', 'mm', 'cm', 'm', 'm/s', 'mm/s', 'um', 'µm', 'ppm', 'ppb',
-    'mg/m3', 'mg/nm3', 'mg/m³', 'ph', 's', 'sec', 'min', 'h', 'cosphi', 'lb/h', 'klb/h', 'kg', 't',
-    'gpm', 'cfm', 'scfm', 'btu', 'btu/h', 'mw/min', '%/min', 'k/min', 'k/h', 'µs/cm', 'us/cm',
-    'deg', 'rad', 'mwth', 'mw(th)', 'mw_th',
+    'mvar', 'kvar', 'var', 'mva', 'kva', 'hz', 'rpm', '1/min', 'u/min', 'min-1', 'l/h', 'kj/kg',
+    'kj', 'mj', 'gj', 'mwh', 'kwh', 'gwh', 'a', 'ka', 'ma', 'v', 'kv', 'mv', 'mm', 'cm', 'm',
+    'm/s', 'mm/s', 'um', 'µm', 'ppm', 'ppb', 'mg/m3', 'mg/nm3', 'mg/m³', 'ph', 's', 'sec', 'min',
+    'h', 'cosphi', 'kg', 't', 'cfm', 'btu', 'btu/h', 'mw/min', '%/min', 'k/min', 'k/h', 'µs/cm',
+    'us/cm', 'deg', 'rad', 'mwth', 'mw(th)', 'mw_th', *_FLOWS,
 })  # fmt: skip
 _BRACKETED = re.compile(
     r'^(?P<name>.*?)\s*[\[({<]\s*(?P<unit>[^\])}>]*(?:\([^)]*\))?)\s*[\])}>]\s*$'
@@ -141,9 +145,15 @@ def of_gauge(found: Spelling | None, told: str) -> Spelling | None:
     return Spelling(found.dimension, _OF_GAUGE[_squeezed(found.written)], found.written)
 
 
+def flow_spelled(text: str) -> Spelling | None:
+    """Return the unit of a flow that a text spells, ``None`` if it is none."""
+    unit = _FLOWS.get(_squeezed(text))
+    return None if unit is None else Spelling(POWER, unit, text.strip())
+
+
 def unit_named(signal: Signal, text: str) -> str:
     """Return the unit of this signal that a text spells, empty if it spells none."""
-    found = spelling(text)
+    found = spelling(text) or flow_spelled(text)
     return found.unit if found is not None and found.dimension == DIMENSIONS[signal] else ''
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from rclpy.event_handler import PublisherEventCallbacks
@@ -26,6 +27,7 @@ from valveflow_ros.ros.node.state_store import StateStore
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs, OutputTopic
 from valveflow_ros.ros.polled_subscription import PolledSubscription
 from valveflow_ros.ros.worker import DiagnosisWorker, FitWorker
+from valveflow_ros.signals.units import in_unit
 from valveflow_ros.state import State
 
 DIAGNOSTICS = '/diagnostics'
@@ -73,7 +75,7 @@ class Session:
         self._fit_worker = FitWorker(settings.real('refit_timeout'))
         self._fit_worker.start()
         self._diagnosis_worker = DiagnosisWorker(settings.real('diagnosis_timeout'))
-        self._messages = Outputs(settings.text('unit_tag'))
+        self._messages = Outputs(settings.text('unit_tag'), settings.output_unit)
         self._recovery: BackgroundRecovery | None = None
         try:
             # Each event costs the executor time at every look, and nobody listens to these.
@@ -202,8 +204,7 @@ class Session:
                 statistics, engine.aligner.counts(), self._publishers_seen,
                 now_s, now_s - self._listening_since_s, engine.aligner.newest_ns,
             )  # fmt: skip
-        return [
-            *items,
+        items += [
             health.fit_item(monitor, self._fit_worker, engine.last_fit_s),
             health.alarm_item(monitor),
             health.reference_item(monitor),
@@ -212,6 +213,14 @@ class Session:
             health.recorder_item(self.recording),
             self._store.item(),
         ]
+        unit = self._settings.output_unit
+        return [
+            replace(
+                item, sentence=in_unit(item.sentence, unit),
+                values={in_unit(key, unit): value for key, value in item.values.items()},
+            )
+            for item in items
+        ]  # fmt: skip
 
     def record(self, topic: str, data: bytes, time_ns: int) -> None:
         """Record a message; one that belongs to no time of the plant gets that of the log."""

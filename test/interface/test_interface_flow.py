@@ -1,0 +1,113 @@
+"""A flow in place of the power, a pressure difference in place of the pressure, any fluid."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from streams import flow_valve
+
+import valveflow_ros as vf
+from valveflow_ros.errors import InputError, UsageError, ValveflowError
+
+POWER = 'generated_power_mw'
+IN_MW = re.compile(r'\bMW\b|\b[Pp]ower\b')
+
+
+def curve_of(log, **how):
+    return vf.identify(log, **how).characteristic
+
+
+@pytest.fixture(scope='module')
+def frame(log):
+    return log.to_dataframe()
+
+
+@pytest.fixture(scope='module')
+def usual(log):
+    return curve_of(log)
+
+
+def flow(frame, factor, unit='t/h'):
+    scaled = frame.assign(**{POWER: factor * frame[POWER]})
+    return vf.open_log(scaled, columns={'generated_power': f'{POWER}:{unit}'})
+
+
+@pytest.mark.parametrize(('factor', 'unit'), [(0.01, 'kg/s'), (3.0, 't/h'), (1e4, 'lb/h')])
+def test_a_scaled_output_gives_the_scaled_curve(frame, usual, factor, unit):
+    found = curve_of(flow(frame, factor, unit))
+    assert found.output_unit == unit
+    assert found.breakpoints == pytest.approx(usual.breakpoints, rel=2e-3)
+    assert found.values() / factor == pytest.approx(usual.values(), rel=2e-3)
+    assert found.residuals.rmse_mw / factor == pytest.approx(usual.residuals.rmse_mw, rel=2e-3)
+    assert found.residuals.width_mw / factor == pytest.approx(usual.residuals.width_mw, rel=1e-2)
+    for mine, theirs in zip(found.dynamics, usual.dynamics, strict=True):
+        assert mine.time_constant_s == pytest.approx(
+            theirs.time_constant_s, abs=0.5 * theirs.time_constant_stderr_s
+        )
+        assert mine.delay_s == pytest.approx(theirs.delay_s, abs=0.5 * theirs.delay_stderr_s)
+
+
+def test_everything_that_is_told_of_a_flow_is_in_its_unit(frame, tmp_path):
+    found = vf.identify(flow(frame, 3.0))
+    found.write(tmp_path, tables=True)
+    names = [f'tables/{f.name}.csv' for f in found.page().figures]
+    for name in ('characteristic.json', *names):
+        assert not IN_MW.search((tmp_path / name).read_text()), name
+    page = (tmp_path / 'report.html').read_text()
+    page = page[page.index('<main>') : page.index('<script id="library"')]
+    assert not IN_MW.search(page)
+    assert 'flow (t/h)' in page
+    assert found.plot().layout.yaxis.title.text == 'flow (t/h)'
+    assert found.to_json()['output_unit'] == 't/h'
+
+
+def test_the_unit_stays_with_the_curve_and_another_one_is_refused(frame, log, usual, tmp_path):
+    made = vf.identify(flow(frame, 3.0))
+    made.write(tmp_path)
+    read = vf.load_characteristic(tmp_path)
+    assert (read.output_unit, read.model_id) == ('t/h', made.characteristic.model_id)
+    assert vf.validate(flow(frame, 3.0), tmp_path).output_unit == 't/h'
+    for wrong, curve in ((log, read), (flow(frame, 3.0), usual), (flow(frame, 3.0, 'kg/s'), read)):
+        for call in (
+            lambda one, c: vf.validate(one, c),
+            lambda one, c: vf.identify(one, reference=c),
+            lambda one, c: vf.diagnose(one, model=c),
+        ):
+            with pytest.raises(UsageError, match='name its unit with --column'):
+                call(wrong, curve)
+
+
+def test_a_unit_among_the_parameters_does_not_rename_what_the_log_holds(log):
+    with pytest.raises(InputError, match='say what it is with --column'):
+        vf.identify(log, parameters={'generated_power_unit': 't/h'})
+
+
+def test_an_unknown_unit_is_told_the_known_ones(frame):
+    with pytest.raises(ValveflowError, match='use one of MW, kW, W, GW, t/h, '):
+        vf.open_log(frame, columns={'generated_power': f'{POWER}:barrels'})
+
+
+@pytest.mark.parametrize(
+    ('kpa', 'top', 'unit', 'warm'),
+    [(8.0, 5.0, 'kg/s', 20.0), (400.0, 2000.0, 'm3/h', -160.0)],
+    ids=['water', 'cold gas'],
+)
+def test_a_flow_over_a_pressure_difference_gives_its_curve(kpa, top, unit, warm):
+    import pandas as pd
+
+    columns, knots, values = flow_valve(kpa, top, warm)
+    log = vf.open_log(pd.DataFrame(columns), columns={
+        'valve_opening': 'LV', 'main_steam_pressure': 'DP:kPad', 'generated_power': f'FT:{unit}',
+        'main_steam_temperature': 'TE',
+    })  # fmt: skip
+    assert not log.doubts
+    found = vf.identify(log)
+    c = found.characteristic
+    assert (c.output_unit, c.pressure_exponent, c.axis) == (unit, 0.5, 'integrated_input')
+    refused = [n for by in found.data.counts.values() for r, n in by.items() if r != 'accepted']
+    assert sum(refused) == 0
+    u = np.linspace(c.breakpoints[0], c.breakpoints[-1], 50)
+    assert c(u) == pytest.approx(np.interp(u, knots, values), abs=0.003 * top)
+    assert np.isfinite(c.source.temperature_mean_degc)
