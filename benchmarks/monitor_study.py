@@ -1,9 +1,9 @@
-"""Whether a fault stands in the monitor's alarms to the end, and how often a healthy unit raises one.
+"""Whether a fault stands in the alarms to the end, and how often a healthy unit raises one.
 
-Run: ``python -m benchmarks.monitor_study --kinds choked,sequence --recording minute --days 20
---seeds 10 --first 401 --effect gain_step:g=-0.04,t0_days=10``. Each seed is a unit of
-``plant/thermal_unit.py``; without ``--effect`` it is healthy. The monitor runs over the whole record
-without diagnoses, with the defaults of its parameters, none of which was set on these seeds.
+Run: ``python -m benchmarks.monitor_study --seeds 10 --first 401 --effect
+gain_step:g=-0.04,t0_days=10``. Each seed is a unit of ``plant/thermal_unit.py``; without
+``--effect`` it is healthy. The monitor runs over the whole record without diagnoses, with the
+defaults of its parameters, none of which was set on these seeds.
 """
 
 from __future__ import annotations
@@ -22,8 +22,10 @@ def row_of(
     seed: int, kind: str, days: float, recording: str, effects: list[str]
 ) -> dict[str, Any]:
     """Run the monitor over one unit; return what it told."""
-    unit = {'unit': f'{kind}:number={seed}', 'recording': recording} if kind != 'paper' else {}
-    log, begin = vf.simulate(days, seed, effects, **unit).log, time.process_time()
+    simulation = vf.simulate(
+        days, seed, effects, unit=f'{kind}:number={seed}', recording=recording
+    )
+    log, begin = simulation.log, time.process_time()
     found = vf.monitor(log, diagnose=False)
     content = found.to_json()
     alarms = {

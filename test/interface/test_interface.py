@@ -274,7 +274,10 @@ class TestMonitor:
             assert alarm['cleared'] is None or alarm['cleared'] >= alarm['raised']
             assert alarm['sentence'].endswith('.')
         assert [d['causes'] for d in content['diagnoses']] == [['output_offset_drift']]
-        assert content['reference'] is None
+        # What went wrong leaves the curve of before as the reference.
+        first = min(a['raised'] for a in content['alarms'])
+        assert content['reference']['set'] >= first
+        assert content['reference']['model_id'] in [c['model_id'] for c in content['curves']]
         columns = told.predictions()
         assert len({len(column) for column in columns.values()}) == 1
         assert len(columns['time_ns']) == 1.2 * 86400

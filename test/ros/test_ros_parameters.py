@@ -189,7 +189,7 @@ def test_from_afar_bad_values_come_back_with_the_sentence(context: Any, node: Mo
     wait_until(lambda: executor.spin_once(timeout_sec=0.05) or future.done(), 'the answer', 20.0)
     results = future.result().results
     assert [result.successful for result in results] == [False] * 5 + [True]
-    assert results[0].reason == "Parameter 'alarm_off_delay' must be from 0 to 86400 s, not nan."
+    assert results[0].reason == "Parameter 'alarm_off_delay' must be from 0 to 864000 s, not nan."
     assert results[1].reason == "Parameter 'alarm_off_delay' must be a number, not 'high'."
     assert 'cannot be changed while the monitor runs' in results[2].reason
     assert 'alarm_off_delay' in results[3].reason
@@ -199,7 +199,7 @@ def test_from_afar_bad_values_come_back_with_the_sentence(context: Any, node: Mo
     wait_until(describe.service_is_ready, 'the service', 20.0)
     future = describe.call_async(DescribeParameters.Request(names=['alarm_off_delay']))
     wait_until(lambda: executor.spin_once(timeout_sec=0.05) or future.done(), 'the answer', 20.0)
-    assert future.result().descriptors[0].floating_point_range[0].to_value == 86400.0
+    assert future.result().descriptors[0].floating_point_range[0].to_value == 864000.0
     executor.shutdown()
     asking.destroy_node()
 

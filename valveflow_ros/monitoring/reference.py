@@ -191,7 +191,7 @@ class ReferenceCurve:
         self, current: Characteristic, time_ns: int, settings: Settings
     ) -> Characteristic | None:
         """Return the curve that is to be the reference from now on; None if that is as before."""
-        if self.fault_ns is not None:
+        if self.fault_ns is not None or current.source.window_start_ns < self.regime_ns:
             return None
         if self.first is not None and self._beyond_budget(current, settings):
             self._candidate = None
