@@ -122,7 +122,7 @@ def test_the_same_curve_has_not_moved():
     assert shift.largest is None
     assert [p.confidence for p in shift.pieces] == [0.0] * 4
     smallest = min(p.smallest_mw for p in shift.pieces)
-    assert f'a shift of {smallest:.1f} to' in shift.sentence
+    assert f'a shift of {smallest:.2f} to' in shift.sentence
     assert 'would have been seen' in shift.sentence
 
 
