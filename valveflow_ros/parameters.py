@@ -261,8 +261,8 @@ _ALARM = (
               60.0, 604800.0, live=True),
     Parameter('alarm_suppress_time', 3600.0, 's',
               'The residual alarm is suppressed when it could not be judged for this long; it '
-              'comes back when it could be for alarm_off_delay or five alarm_block, or at once if '
-              'it changes.',
+              'comes back when it could be for the shorter of alarm_off_delay and five '
+              'alarm_block, or at once if it changes.',
               1.0, 86400.0, live=True),
     Parameter('alarm_flood', 5, '',
               'Most announcements of one alarm in ten minutes; more are counted and held back.',

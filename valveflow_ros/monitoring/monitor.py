@@ -36,6 +36,8 @@ from valveflow_ros.state import Memory
 BY_HAND = 'asked for by hand'
 BY_ITSELF = 'nothing was wrong for long enough'
 IN_TIME = 'it is from before something went wrong'
+WORN = 'the curve is further from the first reference than wear_budget allows'
+OF_ITSELF = (BY_ITSELF, IN_TIME, WORN)
 MIXED = 'The rows of this fit are from before and since something went wrong; the next are not.'
 
 
@@ -197,7 +199,8 @@ class Monitor(Memory):
         events = [*begun, *told, *self._follow_health()]
         healthy = self.reference.renewed(characteristic, self._last_ns, self.settings)
         if healthy is not None:
-            return [*events, *self._renew(healthy, BY_ITSELF)]
+            reason = WORN if healthy is self.reference.first else BY_ITSELF
+            return [*events, *self._renew(healthy, reason)]
         if self.reference.curve is None:
             self._force.predict_from(characteristic, self._window)
         return events
@@ -222,7 +225,7 @@ class Monitor(Memory):
         """
         if self.fit_pending:
             raise DataError('A fit is running already.')
-        if not self._window.segments:
+        if not self._window.special_segments(self.reference.regime_ns):
             raise DataError('There is no special segment to fit yet.')
         return self._ask(BY_HAND)
 

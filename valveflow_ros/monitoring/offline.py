@@ -20,7 +20,7 @@ from valveflow_ros.monitoring.events import (
     JournalEntry,
     JournalKind,
 )
-from valveflow_ros.monitoring.monitor import BY_HAND, BY_ITSELF, IN_TIME, Monitor
+from valveflow_ros.monitoring.monitor import BY_HAND, OF_ITSELF, Monitor
 from valveflow_ros.records import Readings, SampleTable
 from valveflow_ros.signals.align import Aligned, Aligner
 
@@ -245,7 +245,7 @@ def _from_outside(entry: JournalEntry) -> bool:
     if entry.kind == JournalKind.FIT_REQUESTED:
         return entry.text == BY_HAND
     if entry.kind == JournalKind.SET_REFERENCE:
-        return entry.text not in (BY_ITSELF, IN_TIME)
+        return entry.text not in OF_ITSELF
     return entry.kind != JournalKind.DIAGNOSE or entry.text == ASKED
 
 

@@ -70,6 +70,8 @@ class ReferenceCurve:
         Onset of what is wrong; 0 where it is not known, None if nothing is.
     regime_ns : int
         Fits use rows from this time on.
+    set_ns : int
+        When the reference was set from outside last; 0 before.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -122,8 +124,8 @@ class ReferenceCurve:
 
         Later curves are judged against it, and fits get its form.
         """
-        self._take(curve, time_ns)
-        self.first, self._worn = curve, []
+        self._take(curve)
+        self.set_ns, self.first, self._worn = time_ns, curve, []
         self.fault_ns, self._since_ns = None, 0
         return self.alarm.reset('There is a new reference.', time_ns, curve.model_id, settings)
 
@@ -195,7 +197,8 @@ class ReferenceCurve:
             return None
         if self.first is not None and self._beyond_budget(current, settings):
             self._candidate = None
-            return None if self.curve is self.first else self.first
+            worn = self.curve is None or self.curve.model_id != self.first.model_id
+            return self.first if worn else None
         after_ns = round(settings.real('reference_after') * _DAY_NS)
         full_ns = round(_FULL * settings.real('window_days') * _DAY_NS)
         before = self._candidate
@@ -209,9 +212,9 @@ class ReferenceCurve:
         self, curve: Characteristic, segments: Sequence[SpecialSegment], time_ns: int
     ) -> None:
         """Let a curve be the reference by itself, and note how far it is from the first one."""
-        self._take(curve, time_ns)
+        self._take(curve)
         self.first = self.first or curve
-        if curve is not self.first:
+        if curve.model_id != self.first.model_id:
             found = segment_residuals(self.first, segments)
             if len(found):
                 at_ns = int(np.average(found.time_ns - time_ns, weights=found.weights)) + time_ns
@@ -232,8 +235,8 @@ class ReferenceCurve:
         slope = float(np.polyfit(np.append(0.0, months), np.append(0.0, mw), 1)[0])
         return Wear(since_ns, float(mw[-1]), slope)
 
-    def _take(self, curve: Characteristic, time_ns: int) -> None:
-        self.curve, self.set_ns, self._candidate = curve, time_ns, None
+    def _take(self, curve: Characteristic) -> None:
+        self.curve, self._candidate = curve, None
         self.shift, self.problem = None, ''
 
     def _beyond_budget(self, current: Characteristic, settings: Settings) -> bool:
