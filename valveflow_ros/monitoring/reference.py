@@ -152,7 +152,12 @@ class ReferenceCurve:
         if self.fault_ns is None:
             # What went wrong before, and is over, is no shift of today.
             segments = [s for s in segments if s.start_ns >= self.regime_ns]
-        limits = ShiftLimits(settings.real('shift_confidence'), settings.real('shift_least'))
+        # The reference is some days old, in which wear within its budget is no shift.
+        days_ns = current.source.window_end_ns - self.curve.source.window_end_ns
+        oldest_ns = 2 * round(settings.real('reference_after') * _DAY_NS)
+        worn = settings.real('wear_budget') * min(max(days_ns, 0), oldest_ns) / MONTH_NS
+        least = settings.real('shift_least') + worn
+        limits = ShiftLimits(settings.real('shift_confidence'), least)
         try:
             self.shift = judge_shift(self.curve, current, segments, limits)
         except DataError as error:

@@ -189,7 +189,7 @@ class Story:
             self._tell(time_ns, f'new curve: {self._last_curve}')
 
     def on_alarm(self, message: Alarm) -> None:
-        """Tell that an alarm came, or came again, and how the first one went on."""
+        """Tell that an alarm came, and how the first one went on."""
         time_ns, state = from_time(message.header.stamp), message.state
         goes_on = len(self._raised_ns) == 1 and message.previous_state != Alarm.SUPPRESSED
         if state == Alarm.UNACKNOWLEDGED:
@@ -199,11 +199,7 @@ class Story:
                 return
             self._occurrences[message.name] = message.occurrence
             self._raised_ns.append(time_ns)
-            times = len(self._raised_ns)
-            nth = {2: 'second', 3: 'third'}.get(times, f'{times}th')
-            again = f'the alarm comes again, the {nth} time'
-            told = f'ALARM {message.name}: {message.sentence}' if times == 1 else again
-            self._tell(time_ns, told)
+            self._tell(time_ns, f'ALARM {message.name}: {message.sentence}')
         elif goes_on and state in _STATES:
             self._tell(time_ns, _STATES[state])
 
@@ -230,13 +226,9 @@ class Story:
         if not told:
             return 'The fault raised no alarm.'
         hours = (told[0] - self._fault_ns) / _HOUR_NS
-        text = f'The fault began {moment(self._fault_ns)}; the alarm came {hours:.1f} h later'
-        if len(told) > 1:
-            text += (
-                f', and {len(told)} times in all: the fault is that of one valve, and shows only '
-                'while that valve is at work'
-            )
-        return f'{text}.'
+        more = '' if len(told) == 1 else f'; alarms in all: {len(told)}'
+        began = f'The fault began {moment(self._fault_ns)}'
+        return f'{began}; the first alarm came {hours:.1f} h later{more}.'
 
     def reached(self, time_ns: int) -> None:
         """Tell that the fault begins, once the plant has come so far."""
