@@ -282,8 +282,9 @@ _SHIFT = (
     Parameter('shift_confidence', 0.999, '',
               'How sure a shift of the curve must be before it is called one.',
               0.9, 0.999999, live=True),
-    Parameter('shift_least', 0.3, 'MW', 'Smaller shifts of the curve do not count; the monitor adds wear within its budget.', 0.0, 1e4,
-              live=True),
+    Parameter('shift_least', 0.3, 'MW',
+              'Smaller shifts of the curve do not count; the monitor adds wear within its budget.',
+              0.0, 1e4, live=True),
 )  # fmt: skip
 
 _DIAGNOSIS = (

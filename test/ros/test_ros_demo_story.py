@@ -93,5 +93,5 @@ def test_an_alarm_before_the_fault_is_not_its_alarm(capsys: pytest.CaptureFixtur
     story.on_alarm(alarm(FAULT - HOUR, 1))
     assert story.outcome() == 'The fault raised no alarm.'
     story.on_alarm(alarm(FAULT + HOUR, 2))
-    assert story.outcome().endswith('the alarm came 1.0 h later.')
+    assert story.outcome().endswith('the first alarm came 1.0 h later.')
     assert len(lines(capsys)) == 3
