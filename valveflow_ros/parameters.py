@@ -247,7 +247,7 @@ _ALARM = (
               0.0, 1e5, live=True),
     Parameter('alarm_average', 300.0, 's', 'Time constant of the running mean of the residual.',
               1.0, 86400.0),
-    Parameter('alarm_on_delay', 0.0, 's', 'The limit must be exceeded this long.',
+    Parameter('alarm_on_delay', 900.0, 's', 'The limit must be exceeded this long.',
               0.0, 86400.0, live=True),
     Parameter('alarm_off_delay', 86400.0, 's',
               'The return must last this long, at openings where the alarm was seen.',
