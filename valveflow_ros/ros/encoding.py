@@ -168,7 +168,8 @@ def array_message(values: FloatArray | Sequence[float], label: str) -> Float64Mu
 
 # What is said to people; names and ids stay.
 _WORDS = (
-    'sentence', 'text', 'cause', 'shift_sentence', 'unit', 'rejected_reasons', 'parameter_units',
+    'sentence', 'meaning', 'text', 'cause', 'shift_sentence', 'unit', 'rejected_reasons',
+    'parameter_units',
 )  # fmt: skip
 
 
@@ -228,6 +229,8 @@ def _cause_message(cause: Mapping[str, Any]) -> DiagnosisCause:
     return DiagnosisCause(
         name=str(cause['name']),
         sentence=str(cause['sentence']),
+        meaning=str(cause.get('meaning', '')),
+        to_do=str(cause.get('to_do', '')),
         parameter_names=[str(name) for name in parameters],
         parameter_values=[_number(p['value']) for p in parameters.values()],
         parameter_lows=[_number(p['low']) for p in parameters.values()],
