@@ -96,8 +96,11 @@ class Parameter:
         return int(value) if whole else float(value)
 
 
-_OPENING_UNITS = ('%', 'percent', 'fraction')
-_PRESSURE_UNITS = ('MPa', 'kPa', 'Pa', 'bar', 'psi')
+# YAML takes a bare % for the beginning of a directive.
+_OPENING_UNITS = ('percent', '%', 'fraction')
+_PRESSURE_UNITS = (
+    'MPa', 'kPa', 'Pa', 'bar', 'mbar', 'psi', 'kg/cm2', 'MPag', 'kPag', 'barg', 'psig',
+)  # fmt: skip
 _TEMPERATURE_UNITS = ('degC', 'K', 'degF')
 _POWER_UNITS = ('MW', 'kW', 'W', *FLOW_UNITS)
 
@@ -120,12 +123,13 @@ _UNIT_AND_INPUTS = (
         choices=('best_effort', 'reliable'),
     ),
     Parameter(
-        'valve_opening_unit', '%', '', 'Unit the gateway sends valve_opening in.',
+        'valve_opening_unit', 'percent', '', 'Unit the gateway sends valve_opening in.',
         choices=_OPENING_UNITS,
     ),
     Parameter(
         'main_steam_pressure_unit', 'MPa', '',
-        'Unit the gateway sends main_steam_pressure in; absolute pressure.',
+        'Unit the gateway sends main_steam_pressure in: absolute, or gauge (MPag, barg, ...), to '
+        'which the standard atmosphere is added.',
         choices=_PRESSURE_UNITS,
     ),
     Parameter(
@@ -139,7 +143,7 @@ _UNIT_AND_INPUTS = (
         choices=_POWER_UNITS,
     ),
     Parameter(
-        'valve_command_unit', '%', '', 'Unit the gateway sends valve_command in.',
+        'valve_command_unit', 'percent', '', 'Unit the gateway sends valve_command in.',
         choices=_OPENING_UNITS,
     ),
 )  # fmt: skip
