@@ -25,8 +25,9 @@ from valveflow_ros.plant.thermal_effects import thermal_catalogue
 
 _DAY_NS = 86_400_000_000_000
 _PAPER = 'paper'
-# What spoils values is no change of the plant; a limit has no size that could be multiplied.
-_LEFT_OUT = ('flatline', 'quantisation', 'rate_limit', 'saturation', 'spikes')
+# What spoils values is no change of the plant; a limit has no size that could be multiplied, and
+# the back pressure of a choked valve cannot be three times as high.
+_LEFT_OUT = ('choked', 'flatline', 'quantisation', 'rate_limit', 'saturation', 'spikes')
 
 
 def record_of(kind: str, seed: int, days: float, effects: list[str]) -> pd.DataFrame:

@@ -11,10 +11,11 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from datetime import tzinfo
 from typing import Any
 
-from valveflow_ros.errors import ParameterError
-from valveflow_ros.records import FLOW_UNITS
+from valveflow_ros.errors import InputError, ParameterError
+from valveflow_ros.records import FLOW_UNITS, zone_of
 
 Value = bool | int | float | str
 
@@ -106,6 +107,8 @@ _POWER_UNITS = ('MW', 'kW', 'W', *FLOW_UNITS)
 
 _UNIT_AND_INPUTS = (
     Parameter('unit_tag', 'unit', '', 'Tag of the unit; frame_id and hardware_id of messages.'),
+    Parameter('time_zone', '', '', 'Zone in which sentences tell times, such as Europe/Berlin or '
+              '+01:00; empty: UTC. Numbers and files stay in UTC.'),
     Parameter('autostart', True, '', 'Configure and activate the node by itself at start.'),
     Parameter(
         'stamp_source',
@@ -424,6 +427,11 @@ class Settings(Mapping[str, Value]):
         return unit if unit in FLOW_UNITS else 'MW'
 
     @property
+    def zone(self) -> tzinfo | None:
+        """The zone in which people are told times; None: UTC."""
+        return zone_of(self.text('time_zone'))
+
+    @property
     def settle_s(self) -> float:
         """The transient after a move begins, 5 T + tau (Table I of the paper)."""
         return 5.0 * self.real('time_constant') + self.real('delay')
@@ -439,8 +447,17 @@ def parameter(name: str) -> Parameter:
     return row
 
 
+def _check_zone(name: str) -> None:
+    try:
+        zone_of(name)
+    except InputError:
+        told = 'use a name such as Europe/Berlin, or an offset such as +01:00'
+        raise ParameterError('time_zone', f"is no zone, '{name}'; {told}") from None
+
+
 def _check_together(values: Mapping[str, Value]) -> None:
     """Refuse values that are each in range and yet at odds."""
+    _check_zone(str(values['time_zone']))
     for signal in ('valve_opening', 'main_steam_pressure', 'main_steam_temperature',
                    'generated_power'):  # fmt: skip
         low, high = float(values[f'{signal}_low']), float(values[f'{signal}_high'])

@@ -11,6 +11,7 @@ import functools
 import math
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import tzinfo
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -32,6 +33,7 @@ from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.records import NS_PER_S, FloatArray
 from valveflow_ros.records import SpecialSegment as SegmentRecord
+from valveflow_ros.report.words import in_zone
 from valveflow_ros.signals.units import in_unit
 
 # The latest time whose seconds a stamp can hold.
@@ -173,16 +175,16 @@ _WORDS = (
 )  # fmt: skip
 
 
-def tell_in(message: Any, unit: str) -> None:
-    """Put the unit of the output in place of MW in what a message says to people."""
-    for name in _WORDS if unit != 'MW' else ():
+def tell_in(message: Any, unit: str, zone: tzinfo | None = None) -> None:
+    """Put the unit of the output and the time zone into what a message says to people."""
+    for name in _WORDS if unit != 'MW' or zone is not None else ():
         said = getattr(message, name, None)
         if isinstance(said, str):
-            setattr(message, name, in_unit(said, unit))
+            setattr(message, name, in_zone(in_unit(said, unit), zone))
         elif said is not None:
-            setattr(message, name, [in_unit(one, unit) for one in said])
+            setattr(message, name, [in_zone(in_unit(one, unit), zone) for one in said])
     for cause in getattr(message, 'causes', ()):
-        tell_in(cause, unit)
+        tell_in(cause, unit, zone)
 
 
 def no_diagnosis_message(
