@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 
@@ -146,6 +147,19 @@ class TestIdentify:
         assert identified.plot('signals') != figure
         with pytest.raises(InputError, match="no picture 'nothing'; it has: curve"):
             identified.plot('nothing')
+
+    @pytest.mark.parametrize('step', [0.0, -0.02])
+    def test_a_curve_of_before_and_after_a_change_is_told_to_be_a_mixture(self, step):
+        # Means over a minute; the thermal unit shares no formula with the curve.
+        effects = [f'gain_step:g={step},t0_days=3'] if step else []
+        record = vf.simulate(6.0, 7, effects, unit='choked:number=451', recording='minute')
+        told = [n for n in vf.identify(record.log).notes if 'mixture of before and after' in n]
+        assert len(told) == bool(step)
+        for sentence in told:
+            onset = re.search(r'since about (\S+ \S+) UTC it gives ([\d.]+) MW less', sentence)
+            away = pd.Timestamp(onset[1], tz='UTC') - (record.to_dataframe()['time'][0])
+            assert abs(away - pd.Timedelta(days=3)) < pd.Timedelta(hours=6)
+            assert 2.0 < float(onset[2]) < 9.0  # 2 % of 130 to 330 MW, and days of weather
 
     def test_options_of_the_verb(self, log, identified, tmp_path):
         identified.write(tmp_path)

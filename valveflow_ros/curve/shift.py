@@ -127,6 +127,8 @@ def _others(shift: Shift, numbers: list[int]) -> str:
 # (benchmarks/shift_study.py --wander 1, seeds 1 to 5), without one not at all (seeds 1 to 12).
 _WIDER = 1.8
 _PROFILE = 101  # points along a piece
+# A change within the data of a curve is told where it is as sure as this.
+_MIXED_CHANCE, _MIXED_ERRORS = 1e-4, 3.0
 _TESTS = 2  # each piece is judged by the curves and by its segments
 
 
@@ -301,6 +303,38 @@ def judge_shift(
         int(found.time_ns[0]) if len(found) else 0, pieces, *since, '',
     )  # fmt: skip
     return replace(shift, sentence=shift_sentence(shift, reference.breakpoints))
+
+
+def mixture_sentence(curve: Characteristic, segments: Sequence[SpecialSegment]) -> str:
+    """Say that the unit changed within the data of a curve, which is then neither; or nothing.
+
+    Parameters
+    ----------
+    curve : Characteristic
+    segments : sequence of SpecialSegment
+        Those that it was fitted to.
+    """
+    found = segment_residuals(curve, segments)
+    change = scan(found.residual_mw, found.weights)
+    if change is None or change.p_value > _MIXED_CHANCE:
+        return ''
+    wander_mw, time_ns = curve.residuals.wander_mw, found.time_ns
+    since_ns = int(time_ns[change.place])
+    share = float(found.weights[change.place :].sum() / found.weights.sum())
+    error = math.hypot(
+        change.after_error / math.sqrt(1.0 - share),
+        level_error_mw(wander_mw, int(time_ns[0]), int(time_ns[change.place - 1])),
+        level_error_mw(wander_mw, since_ns, int(time_ns[-1])),
+    )
+    size = change.after - change.before
+    if not abs(size) > _MIXED_ERRORS * error:
+        return ''
+    side = 'more' if size > 0.0 else 'less'
+    return (
+        f'The unit changed within these data: since about {minute(since_ns)} it gives '
+        f'{short(abs(size), 1)} MW {side} at the same opening and pressure, so this curve is a '
+        'mixture of before and after. "valveflow diagnose" looks for the cause.'
+    )
 
 
 def _comparable(reference: Characteristic, current: Characteristic) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
-from valveflow_ros.curve.shift import ShiftLimits, judge_shift, shift_json
+from valveflow_ros.curve.shift import ShiftLimits, judge_shift, mixture_sentence, shift_json
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
 from valveflow_ros.diagnosis.result import model_to_json
 from valveflow_ros.errors import DataError, UsageError
@@ -210,6 +210,8 @@ def _identified(
         )
     if looks_like_step_test(observed.table, settings):
         told.append(STEP_TEST_ADVICE)
+    if mixture := mixture_sentence(characteristic, observed.segments):
+        told.append(mixture)
     for sentence in told:
         progress.warn(sentence)
     found = Identified(
