@@ -272,8 +272,8 @@ class TestMonitor:
     @pytest.fixture(scope='class')
     @classmethod
     def told(cls):
-        drifting = vf.simulate(1.2, 5, effects=['output_offset_drift:b_mw=30']).log
-        return vf.monitor(drifting, parameters={**QUICK, 'refit_segments': 40})
+        faulty = vf.simulate(1.2, 5, effects=['gain_step:g=-0.05,t0_days=0.8']).log
+        return vf.monitor(faulty, parameters={**QUICK, 'refit_segments': 40})
 
     def test_curves_alarms_and_predictions(self, told):
         content = told.to_json()
@@ -330,7 +330,7 @@ class TestMonitor:
         assert told.to_json()['reference'] == {'set': told.start_ns, 'model_id': model_id}
         assert len(told.curves) > 1
         for _, curve in told.curves:
-            assert [h.name for h in curve.held] == ['output_offset_drift']
+            assert [h.name for h in curve.held] == ['gain_step']
 
     def test_a_log_without_power_is_refused(self, simulation):
         frame = simulation.to_dataframe().head(5000).assign(generated_power_mw=np.nan)

@@ -76,7 +76,7 @@ def test_gain_of_one_percent_of_opening_is_slope_times_pressure(report):
 
 def test_pictures_hold_the_curve_the_segments_and_the_choice(report, identified):
     figures = figures_of(report)
-    assert list(figures) == ['curve', 'signals', 'choice', 'dynamics', 'coverage']
+    assert list(figures) == ['curve', 'opening', 'signals', 'choice', 'dynamics', 'coverage']
     for name in figures:
         assert f'id="{name}"' in report
     curve = next(t for t in figures['curve']['data'] if t['name'] == 'flow characteristic')
@@ -92,6 +92,17 @@ def test_pictures_hold_the_curve_the_segments_and_the_choice(report, identified)
     }
     names = [t['name'] for t in figures['signals']['data']]
     assert names == 2 * ['measured', 'steady state', 'slope response']
+
+
+def test_the_curve_against_the_opening_is_the_curve_at_pressures_of_the_record(report, identified):
+    drawn = figures_of(report)['opening']
+    for trace in drawn['data']:
+        pressure = float(trace['name'].split()[1])
+        v, mw = (np.array(trace[k], dtype=float) for k in ('x', 'y'))
+        expected = identified.characteristic.power(v, pressure)
+        both = np.isfinite(mw) & np.isfinite(expected)  # the name has three digits
+        assert both.sum() > 20
+        assert mw[both] == pytest.approx(expected[both], rel=0.01)
 
 
 def test_colours_of_the_pictures_are_in_the_style_sheet(report):

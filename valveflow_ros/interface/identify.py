@@ -210,14 +210,15 @@ def _identified(
         )
     if looks_like_step_test(observed.table, settings):
         told.append(STEP_TEST_ADVICE)
-    if mixture := mixture_sentence(characteristic, observed.segments):
-        told.append(mixture)
+    mixture = mixture_sentence(characteristic, observed.segments)
+    told += [mixture] if mixture else []
     for sentence in told:
         progress.warn(sentence)
     found = Identified(
         source=log.name, characteristic=characteristic, table=observed.table,
         segments=observed.segments, counts=observed.counts, settings=settings,
-        notes=(*log.notes, *notes, *told), history=recorded_history(log.contents),
+        notes=(*log.notes, *notes, *told), mixture=mixture,
+        history=recorded_history(log.contents),
     )  # fmt: skip
     opening, pressure = (
         observed.table.column(s) for s in (Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE)
