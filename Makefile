@@ -31,7 +31,7 @@ PARALLEL ?= -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 STRICT := $(wildcard $(addprefix valveflow_ros/,*.py signals segments partition curve fit \
   monitoring diagnosis baselines plant logs report interface cli) tools)
 BENCHMARKS := node_load partition reading ten_days
-STUDIES := paper_study coverage_study segment_study shift_study alarm_study \
+STUDIES := paper_study coverage_study segment_study shift_study monitor_study \
   compare_study study_figures refinery_valves
 
 help:

@@ -287,7 +287,7 @@ class TestMonitor:
             assert told.start_ns < alarm['raised'] <= told.end_ns
             assert alarm['cleared'] is None or alarm['cleared'] >= alarm['raised']
             assert alarm['sentence'].endswith('.')
-        assert [d['causes'] for d in content['diagnoses']] == [['output_offset_drift']]
+        assert [d['causes'] for d in content['diagnoses']] == [['gain_step']]
         # What went wrong leaves the curve of before as the reference.
         first = min(a['raised'] for a in content['alarms'])
         assert content['reference']['set'] >= first
@@ -330,7 +330,7 @@ class TestMonitor:
         assert told.to_json()['reference'] == {'set': told.start_ns, 'model_id': model_id}
         assert len(told.curves) > 1
         for _, curve in told.curves:
-            assert [h.name for h in curve.held] == ['gain_step']
+            assert [h.name for h in curve.held] == ['output_offset_drift']
 
     def test_a_log_without_power_is_refused(self, simulation):
         frame = simulation.to_dataframe().head(5000).assign(generated_power_mw=np.nan)
