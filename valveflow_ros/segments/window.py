@@ -12,8 +12,8 @@ import numpy as np
 from valveflow_ros.errors import DataError
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SegmentKind, SpecialSegment
-from valveflow_ros.segments.segmenter import FoundSegment
-from valveflow_ros.signals.static_form import PAPER_EXPONENT, pressure_of
+from valveflow_ros.segments.segmenter import FoundSegment, Segmenter
+from valveflow_ros.signals.static_form import PAPER_EXPONENT, integrated_input, pressure_of
 from valveflow_ros.state import State, perhaps
 
 # Special segments as plain values, for a saved state.
@@ -329,6 +329,38 @@ class RollingWindow:
         self._add(rows.time_ns, rows.number, rows.data)
         self._segments = deque(rows.segments)
         self._aside = None if aside is None else _rows_of(aside)
+
+    def find_segments_anew(
+        self, settings: Settings, exponent: float, found_before: int
+    ) -> Segmenter:
+        """Let the segments be those that these settings find; return what goes on finding them.
+
+        Rows set aside are forgotten.
+
+        Parameters
+        ----------
+        settings : Settings
+        exponent : float
+            m of the u = V p^m that the rows have; it becomes that of the window.
+        found_before : int
+            Segments are numbered on from here.
+        """
+        rows = slice(0, self._end)
+        if exponent != self._exponent:
+            u, opening = self._data[0, rows], self._data[3, rows]
+            pressure = pressure_of(u, opening, exponent)
+            known = np.where(u == 0.0, 0.0, math.nan)
+            anew = integrated_input(opening, pressure, self._exponent)
+            self._data[0, rows] = np.where(np.isfinite(pressure), anew, known)
+        segmenter, found = Segmenter.over(
+            settings, self._number[rows], self._time_ns[rows], self._data[:3, rows], self._seen,
+            found_before,
+        )  # fmt: skip
+        self._aside = None
+        self._segments.clear()
+        for segment in found:
+            self.add_segment(segment)
+        return segmenter
 
     def _clear(self) -> None:
         """Hold nothing."""

@@ -248,8 +248,8 @@ class Session:
 
     def _begin(self) -> None:
         """Publish what stands at the start, or continue where an earlier run ended."""
-        monitor, given = self.engine.monitor, self._reference
         self._send(self._restart.begin(self._settings, self.engine, self._messages))
+        monitor, given = self.engine.monitor, self._reference
         if self.recording.folder is not None:
             self._recovery = BackgroundRecovery(self.recording.folder, tag_of(self._settings))
         if self._model is not None:
