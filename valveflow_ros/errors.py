@@ -61,9 +61,9 @@ def counted(number: float, one: str, many: str = '') -> str:
     return f'{told} {one if told == "1" else many or one + "s"}'
 
 
-def listed(words: Sequence[str]) -> str:
+def listed(words: Sequence[str], last: str = 'and') -> str:
     """Write words as a list for a sentence: 'a', 'a and b', 'a, b and c'."""
-    return ' and '.join(filter(None, (', '.join(words[:-1]), *words[-1:])))
+    return f' {last} '.join(filter(None, (', '.join(words[:-1]), *words[-1:])))
 
 
 def short(value: float, places: int = 0, sign: str = '') -> str:

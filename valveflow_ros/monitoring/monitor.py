@@ -248,17 +248,17 @@ class Monitor(Memory):
             self._last_ns, self._window, self.predicting, self._diagnosed_since()
         )
 
-    def operate_alarms(self, action: AlarmAction) -> list[Event]:
-        """Acknowledge, shelve or unshelve the alarms.
+    def operate_alarms(self, action: AlarmAction, name: str | None = None) -> list[Event]:
+        """Acknowledge, shelve or unshelve the alarms, or the one of a name.
 
         Raises
         ------
         DataError
-            There is no alarm to which that can be done.
+            There is no alarm of that name, or none to which that can be done.
         """
         model_id = self._model_id()
-        changes = self._alarms.operate(action, self.judged, model_id)
-        entry = self._journal(JournalKind[action.name], 0, model_id, '')
+        changes = self._alarms.operate(action, self.judged, model_id, name)
+        entry = self._journal(JournalKind[action.name], 0, model_id, name or '')
         return [*changes, entry, *self._follow_health()]
 
     def set_reference(self, given: Characteristic | None = None) -> list[Event]:
