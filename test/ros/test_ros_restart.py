@@ -155,6 +155,9 @@ def test_what_a_service_confirmed_survives_a_kill_that_follows_at_once(
     ):
         answer = operate(name, action)
         assert (answer.success, answer.message) == (False, words)
+    # After these the state has just been saved, and is not due for a second.
+    assert operate('residual', 'shelve').success
+    assert operate('residual', 'unshelve').success
     begun_s = time.monotonic()
     answer = operate('residual', 'acknowledge')
     os.kill(first.pid, signal.SIGKILL)
