@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import lzma
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,6 +12,8 @@ from hypothesis import strategies as st
 from streams import QUICK_MONITOR, examples, plant_table, table_harms
 
 from valveflow_ros.errors import DataError
+from valveflow_ros.monitoring.alarm_state import AlarmAction
+from valveflow_ros.monitoring.alarms import AlarmState
 from valveflow_ros.monitoring.events import FitRequested, JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import CLOCK_BACK, feed_rows
@@ -226,6 +231,44 @@ def test_a_part_of_another_version_costs_that_part_alone(key, how):
     assert monitor.predicting is not None
     feed_rows(monitor, plant_table(9, 100, start_ns=int(before.last_ns) + NS_PER_S))
     assert monitor.rows == before.rows + 100
+
+
+OLD = {path.stem: path for path in sorted(Path(__file__).parent.glob('state_of_*.xz'))}
+
+
+@pytest.mark.parametrize('name', OLD)
+@pytest.mark.parametrize('changes', [{}, {'steady_min': 8.0, 'alarm_floor': 2.0}], ids=['', 'new'])
+def test_a_state_that_an_earlier_version_wrote_is_gone_on_with(name, changes):
+    """Window, curve, reference and the alarm that stood then; it takes them where they were."""
+    saved = from_bytes(lzma.decompress(OLD[name].read_bytes()))
+    then = Settings.earlier(saved['settings'])
+    assert saved['settings'].keys() < then.keys()
+    kept = saved['engine']['monitor']
+    monitor, sentence, _ = carried(kept, changes, then)
+    assert sentence.endswith('The curve, the reference and the alarms stay.')
+    assert monitor.rows == len(monitor.numbers()) == 900
+    assert monitor.characteristic.model_id == kept['force']['curve']['model_id']
+    assert monitor.reference.curve.model_id == kept['reference']['curve']['model_id']
+    assert (monitor.alarm.state, monitor.alarm.occurrence) == (AlarmState.UNACKNOWLEDGED, 1)
+    assert monitor.segments == (18 if not changes else len(monitor.special_segments())) > 10
+    change, _ = monitor.operate_alarms(AlarmAction.ACKNOWLEDGE, 'residual')
+    assert change.state == AlarmState.ACKNOWLEDGED
+    later = int(monitor.last_ns) + NS_PER_S
+    events = feed_rows(monitor, plant_table(5, 600, start_ns=later))
+    assert monitor.rows == 1500
+    assert [e for e in events if isinstance(e, FitRequested)]
+    # It writes a state of today.
+    again = Monitor(then.changed(changes))
+    again.restore(from_bytes(to_bytes(monitor.snapshot())))
+
+
+def test_a_shift_alarm_of_another_version_costs_no_reference():
+    before = with_reference()
+    saved = from_bytes(to_bytes(before.snapshot()))
+    saved['reference']['alarm'] = {'of': 'another version'}
+    monitor, sentence, _ = carried(saved, {})
+    assert same_curves(monitor, before)
+    assert 'Let go: the alarm on its shift.' in sentence
 
 
 def test_a_memory_of_the_predictor_of_another_version_costs_its_evidence_alone():

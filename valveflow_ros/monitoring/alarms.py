@@ -213,6 +213,7 @@ class ResidualAlarm(Alarm):
 
     def restore(self, saved: State) -> None:
         """Go on from a state; one of an earlier version does not know where it was seen."""
+        saved = {**saved.get('life', {}), **saved}
         memory = saved.get('memory')
         if 'span' not in saved and isinstance(memory, np.ndarray):
             saved = {

@@ -43,7 +43,7 @@ _OF_CHART = {'alarm_run_length', 'alarm_block', 'alarm_floor'}
 # Parts of a state in words.
 _PARTS = {
     'force': 'the curve', 'reference': 'the reference', 'diagnosing': 'the last diagnosis',
-    'alarm': 'the alarms',
+    'alarm': 'the residual alarm', 'part of reference': 'the alarm on its shift',
 }  # fmt: skip
 MIXED = 'The rows of this fit are from before and since something went wrong; the next are not.'
 
@@ -345,7 +345,7 @@ class Monitor(Memory):
         self._chart_due = self._chart_due or bool(changed.keys() & _OF_CHART)
         if self._chart_due or lost & {'segmenter', 'refits'}:
             self._refits.count_as_new(self.segments)
-        if lost & {'force', 'predictor', 'reference'}:
+        if lost & {'force', 'part of force', 'reference'}:
             self._predict()
         self._went_back = True
         text = json.dumps(changed, sort_keys=True)
@@ -472,6 +472,7 @@ class Monitor(Memory):
         pieces = {
             'force': {'predictor': None},
             'diagnosing': {'mismatch': empty['diagnosing']['mismatch']},
+            'reference': {'alarm': empty['reference']['alarm']},
         }
         if 'window' in lost:
             lost |= {'refits', 'correction'}
@@ -480,7 +481,7 @@ class Monitor(Memory):
             given = saved.get(key)
             tries = [(given, '')] if key in saved else []
             if key in pieces and isinstance(given, dict):
-                tries.append(({**given, **pieces[key]}, next(iter(pieces[key]))))
+                tries.append(({**given, **pieces[key]}, f'part of {key}'))
             for part, without in tries:
                 if _fits(Monitor(self.settings, corrector), {**empty, key: part}):
                     parts[key] = part
@@ -506,16 +507,19 @@ class Monitor(Memory):
             told += ' The window of rows begins anew.'
         elif 'segmenter' in lost:
             told += f' Segments were found anew in {counted(len(self._window), "row")}.'
-        gone = [words for key, words in _PARTS.items() if key in lost]
-        if gone:
+        if gone := [words for key, words in _PARTS.items() if key in lost]:
             told += f' Let go: {listed(gone)}.'
         there = {
-            'force': self.characteristic, 'diagnosing': self.diagnosing.last,
-            'reference': self.reference.curve, 'alarm': self.alarm,
+            'force': self.characteristic, 'reference': self.reference.curve,
+            'diagnosing': self.diagnosing.last,
         }  # fmt: skip
-        stays = [w for key, w in _PARTS.items() if key not in lost and there[key] is not None]
+        stays = [_PARTS[key] for key, held in there.items() if held and key not in lost]
+        if not lost & {'alarm', 'part of reference'}:
+            stays.append('the alarms')
         kept = listed(stays).capitalize() or 'Nothing else'
-        return f'{told} {kept} stay{"" if len(stays) > 1 else "s"}.'.strip()
+        return (
+            f'{told} {kept} stay{"" if len(stays) > 1 or "the alarms" in stays else "s"}.'.strip()
+        )
 
     def _provisional(self) -> str:
         """Say what the running curve is made from while something is wrong."""
