@@ -14,7 +14,7 @@ from streams import QUICK_MONITOR, examples, plant_table, table_harms
 from valveflow_ros.errors import DataError
 from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.alarms import AlarmState
-from valveflow_ros.monitoring.events import FitRequested, JournalKind
+from valveflow_ros.monitoring.events import FitRequested, JournalKind, ReferenceSet
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import CLOCK_BACK, feed_rows
 from valveflow_ros.monitoring.prediction import PredictionBlock
@@ -346,6 +346,21 @@ def test_the_next_fit_brings_the_reference_a_chart_of_other_parameters(changes):
     # The curve itself is what it was.
     assert monitor.reference.curve.model_id == before.model_id
     assert monitor.reference.curve.pieces == before.pieces
+
+
+def test_no_later_reference_brings_the_old_chart_back():
+    """A curve that waits to be the reference was fitted with the old parameters."""
+    soon = WATCHED.changed({'reference_after': 0.003})  # 259 s
+    monitor = Monitor(soon)
+    events = feed_rows(monitor, plant_table(3, N))
+    monitor.reconfigure(soon.changed({'alarm_floor': 20.0, 'refit_period': 100.0}))
+    for seed in range(4, 10):
+        later = int(monitor.last_ns) + NS_PER_S
+        events += feed_rows(monitor, plant_table(seed, 200, start_ns=later))
+        for chart in (monitor.characteristic.residuals.chart, *charts(monitor)):
+            # Half of the floor is not beyond one innovation.
+            assert chart.innovation_mw >= 0.999 * 10.0 * (1.0 - chart.correlation)
+    assert [e for e in events if isinstance(e, ReferenceSet)]
 
 
 def test_no_chart_is_taken_from_a_plant_in_which_something_is_wrong():

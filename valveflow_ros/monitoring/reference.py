@@ -229,10 +229,12 @@ class ReferenceCurve:
 
     def take_chart(self, chart: ChartDesign) -> None:
         """Watch the residual of the reference by another chart; the curve stays what it was."""
-        self.curve, self.first = (
+        since_ns, candidate = self._candidate or (0, None)
+        self.curve, self.first, candidate = (
             c and replace(c, residuals=replace(c.residuals, chart=chart))
-            for c in (self.curve, self.first)
+            for c in (self.curve, self.first, candidate)
         )
+        self._candidate = None if candidate is None else (since_ns, candidate)
 
     @property
     def wear(self) -> Wear | None:

@@ -156,12 +156,11 @@ class StateFolder:
         """
         with contextlib.suppress(OSError):
             if not self.aside.exists() or self.aside.lstat().st_size < self.path.lstat().st_size:
-                between = self.folder / f'.{ASIDE}.tmp'
-                between.unlink(missing_ok=True)
-                os.link(self.path, between)
-                between.replace(self.aside)
-                if not of_use:
-                    self.path.unlink()
+                if of_use:
+                    self.aside.unlink(missing_ok=True)
+                    os.link(self.path, self.aside)
+                else:
+                    self.path.replace(self.aside)
                 return True
         return False
 
