@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import json
+import textwrap
 from typing import Any
 
 from docs.page_tables import table
@@ -36,9 +37,14 @@ def trial(name: str) -> dict[str, Any]:
 
 def part(name: str, which: str) -> str:
     """Return a generated part of the page of an effect."""
-    return {'physics': _physics, 'picture': _picture, 'numbers': _numbers, 'others': _others}[
-        which
-    ](name)
+    return {
+        'physics': _physics, 'picture': _picture, 'numbers': _numbers, 'others': _others,
+        'to_do': _to_do,
+    }[which](name)  # fmt: skip
+
+
+def _to_do(name: str) -> str:
+    return textwrap.fill(causes.TO_DO[name], 116, break_on_hyphens=False) + '\n'
 
 
 def _docstring(name: str) -> str:

@@ -13,10 +13,11 @@ import difflib
 import enum
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from datetime import tzinfo
 from typing import Any
 
-from valveflow_ros.errors import ParameterError
-from valveflow_ros.records import FLOW_UNITS
+from valveflow_ros.errors import InputError, ParameterError
+from valveflow_ros.records import FLOW_UNITS, zone_of
 
 Value = bool | int | float | str
 
@@ -129,13 +130,20 @@ class Parameter:
         return int(value) if whole else float(value)
 
 
-_OPENING_UNITS = ('%', 'percent', 'fraction')
-_PRESSURE_UNITS = ('MPa', 'kPa', 'Pa', 'bar', 'psi')
+# YAML takes a bare % for the beginning of a directive.
+_OPENING_UNITS = ('percent', '%', 'fraction')
+# Two names of one value: a state does not depend on which was given.
+_SAME: dict[Value, Value] = {'%': 'percent'}
+_PRESSURE_UNITS = (
+    'MPa', 'kPa', 'Pa', 'bar', 'mbar', 'psi', 'kg/cm2', 'MPag', 'kPag', 'barg', 'psig',
+)  # fmt: skip
 _TEMPERATURE_UNITS = ('degC', 'K', 'degF')
 _POWER_UNITS = ('MW', 'kW', 'W', *FLOW_UNITS)
 
 _UNIT_AND_INPUTS = (
     Parameter('unit_tag', 'unit', '', 'Tag of the unit; frame_id and hardware_id of messages.'),
+    Parameter('time_zone', '', '', 'Zone in which sentences tell times, such as Europe/Berlin or '
+              '+01:00; empty: UTC. Numbers and files stay in UTC.'),
     Parameter('autostart', True, '', 'Configure and activate the node by itself at start.'),
     Parameter(
         'stamp_source',
@@ -153,12 +161,13 @@ _UNIT_AND_INPUTS = (
         choices=('best_effort', 'reliable'),
     ),
     Parameter(
-        'valve_opening_unit', '%', '', 'Unit the gateway sends valve_opening in.',
+        'valve_opening_unit', 'percent', '', 'Unit the gateway sends valve_opening in.',
         choices=_OPENING_UNITS,
     ),
     Parameter(
         'main_steam_pressure_unit', 'MPa', '',
-        'Unit the gateway sends main_steam_pressure in; absolute pressure.',
+        'Unit the gateway sends main_steam_pressure in: absolute, or gauge (MPag, barg, ...), to '
+        'which the standard atmosphere is added.',
         choices=_PRESSURE_UNITS,
     ),
     Parameter(
@@ -172,7 +181,7 @@ _UNIT_AND_INPUTS = (
         choices=_POWER_UNITS,
     ),
     Parameter(
-        'valve_command_unit', '%', '', 'Unit the gateway sends valve_command in.',
+        'valve_command_unit', 'percent', '', 'Unit the gateway sends valve_command in.',
         choices=_OPENING_UNITS,
     ),
 )  # fmt: skip
@@ -282,7 +291,7 @@ _ALARM = (
               0.0, 1e5, live=True),
     Parameter('alarm_average', 300.0, 's', 'Time constant of the running mean of the residual.',
               1.0, 86400.0, live=True),
-    Parameter('alarm_on_delay', 0.0, 's', 'The limit must be exceeded this long.',
+    Parameter('alarm_on_delay', 900.0, 's', 'The limit must be exceeded this long.',
               0.0, 86400.0, live=True),
     Parameter('alarm_off_delay', 86400.0, 's',
               'The return must last this long, at openings where the alarm was seen.',
@@ -442,7 +451,7 @@ class Settings(Mapping[str, Value]):
         ParameterError
             One differs that may not be changed while the monitor runs.
         """
-        changed = {k: v for k, v in wanted.items() if v != self[k]}
+        changed = wanted.changes(self)
         for name in changed:
             if not parameter(name).live:
                 raise ParameterError(name, 'cannot be changed while the monitor runs')
@@ -463,15 +472,24 @@ class Settings(Mapping[str, Value]):
                 known[name] = parameter(name).check(value)
         return cls(known)
 
-    def retuned(self, then: Settings) -> tuple[str, ...]:
-        """Return what of `Parameter.of_state` had another value ``then``, in the table's order."""
-        return tuple(n for n, v in self.items() if v != then[n] and parameter(n).of_state)
+    def changes(self, then: Mapping[str, Value]) -> dict[str, Value]:
+        """Return what had a value of another meaning ``then``, in the table's order."""
+        return {n: v for n, v in self.items() if _SAME.get(v, v) != _SAME.get(then[n], then[n])}
+
+    def retuned(self, then: Mapping[str, Value]) -> tuple[str, ...]:
+        """Return the names of those changes that are of `Parameter.of_state`."""
+        return tuple(n for n in self.changes(then) if parameter(n).of_state)
 
     @property
     def output_unit(self) -> str:
         """The unit of the output after conversion: MW, or that of a flow."""
         unit = self.text('generated_power_unit')
         return unit if unit in FLOW_UNITS else 'MW'
+
+    @property
+    def zone(self) -> tzinfo | None:
+        """The zone in which people are told times; None: UTC."""
+        return zone_of(self.text('time_zone'))
 
     @property
     def settle_s(self) -> float:
@@ -489,8 +507,17 @@ def parameter(name: str) -> Parameter:
     return row
 
 
+def _check_zone(name: str) -> None:
+    try:
+        zone_of(name)
+    except InputError:
+        told = 'use a name such as Europe/Berlin, or an offset such as +01:00'
+        raise ParameterError('time_zone', f"is no zone, '{name}'; {told}") from None
+
+
 def _check_together(values: Mapping[str, Value]) -> None:
     """Refuse values that are each in range and yet at odds."""
+    _check_zone(str(values['time_zone']))
     for signal in ('valve_opening', 'main_steam_pressure', 'main_steam_temperature',
                    'generated_power'):  # fmt: skip
         low, high = float(values[f'{signal}_low']), float(values[f'{signal}_high'])

@@ -7,7 +7,9 @@ import gzip
 import json
 import math
 import re
+import zoneinfo
 from dataclasses import replace
+from datetime import timedelta, timezone
 
 import numpy as np
 import pytest
@@ -21,9 +23,10 @@ from valveflow_ros.report.answer import confidence_table
 from valveflow_ros.report.curve import band
 from valveflow_ros.report.data import gaps, rejected, usable_share
 from valveflow_ros.report.diagnosis import diagnosis_page
-from valveflow_ros.report.figure import Figure, packed, rounded
+from valveflow_ros.report.figure import Figure, packed, rounded, time_axis, upright
 from valveflow_ros.report.identification import identification_page, identification_report
-from valveflow_ros.report.page import packed_plotly, read_text
+from valveflow_ros.report.page import Page, Section, packed_plotly, read_text
+from valveflow_ros.report.words import in_zone
 
 MEGABYTE = 1_000_000
 
@@ -282,3 +285,37 @@ def test_pointing_at_anything_tells_a_unit(identified):
             assert all(unit.search(h) or h.startswith('breakpoint') for h in told), (
                 figure.name, trace['name'],
             )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('zone', 'said', 'hours'),
+    [
+        (zoneinfo.ZoneInfo('Europe/Berlin'), '2024-01-02 01:30 CET', 1),
+        (zoneinfo.ZoneInfo('America/Sao_Paulo'), '2024-01-01 21:30 -03', -3),
+        (timezone(timedelta(hours=5, minutes=30)), '2024-01-02 06:00 UTC+05:30', 5.5),
+    ],
+)
+def test_times_are_told_in_a_zone_in_words_and_along_the_axes(zone, said, hours):
+    at_ms = 1_704_155_400_000.0  # 2024-01-02 00:30 UTC
+    trace = {'type': 'scatter', 'x': [at_ms, None, at_ms + 1.0], 'y': [at_ms, 2.0, 3.0]}
+    layout = {'xaxis': time_axis(range=[at_ms, at_ms]), 'shapes': [upright(at_ms, 'ink', 1.0)]}
+    drawn = Figure('one', 'since 2024-01-02 00:30 UTC', 'nothing', [trace], layout)
+    made = Page('At 2024-01-02 00:30 UTC', '', [Section('2024-01-02', [drawn])], '', 'identify')
+    told = made.in_zone(zone)
+    assert told.title == f'At {said}'
+    assert told.sections[0].title == '2024-01-02'  # a day has no zone
+    (moved,) = told.figures
+    shift = 3_600_000.0 * hours
+    assert moved.caption == f'since {said}'
+    assert moved.traces[0]['x'] == [at_ms + shift, None, at_ms + 1.0 + shift]
+    assert moved.traces[0]['y'] == trace['y']
+    assert moved.layout['xaxis']['range'] == [at_ms + shift, at_ms + shift]
+    assert moved.layout['xaxis']['title']['text'] == f'time ({zone})'
+    assert moved.layout['shapes'][0]['x0'] == at_ms + shift
+    assert made.in_zone(None) == made
+
+
+def test_the_hour_that_comes_twice_is_told_by_the_name_of_the_clock():
+    zone = zoneinfo.ZoneInfo('Europe/Berlin')
+    both = 'from 2024-10-27 00:30 UTC to 2024-10-27 01:30 UTC'
+    assert in_zone(both, zone) == 'from 2024-10-27 02:30 CEST to 2024-10-27 02:30 CET'

@@ -323,7 +323,7 @@ class Monitor(Memory):
         DataError
             Nothing of it can be used.
         """
-        changed = {n: v for n, v in self.settings.items() if v != then[n]}
+        changed = self.settings.changes(then)
         depends = max((parameter(n).depends for n in changed), default=Depends.NOTHING)
         lost = {'window'} if depends == Depends.ROWS else set()
         parts = self._usable(saved, lost)

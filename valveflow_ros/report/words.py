@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from datetime import datetime, timezone
+import re
+from datetime import datetime, timezone, tzinfo
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -157,6 +158,21 @@ def moment(time_ns: int) -> str:
     except (OverflowError, OSError, ValueError):
         return f'{second} s since 1970'
     return f'{at:%Y-%m-%d %H:%M:%S} UTC'
+
+
+_UTC_MOMENT = re.compile(r'(\d{4}-\d\d-\d\d \d\d:\d\d(?::\d\d)?) UTC\b')
+
+
+def in_zone(said: str, zone: tzinfo | None) -> str:
+    """Return a text with its times, as '2023-11-15 00:00 UTC', told in a time zone; None: UTC."""
+    if zone is None:
+        return said
+
+    def local(found: re.Match[str]) -> str:
+        at = datetime.fromisoformat(f'{found[1]}+00:00').astimezone(zone)
+        return f'{at:%Y-%m-%d %H:%M:%S}'[: len(found[1])] + f' {at.tzname()}'
+
+    return _UTC_MOMENT.sub(local, said)
 
 
 def period(start_ns: int, end_ns: int) -> str:
