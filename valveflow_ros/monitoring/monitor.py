@@ -62,7 +62,8 @@ class Monitor(Memory):
     The state changes by rows and by the calls `adopt`, `refuse`, `operate_alarms`, `request_fit`,
     `set_reference`, `request_diagnosis`, `restart`, `resume` and `reconfigure`, and those of
     `diagnosing`, nothing else, and each such call leaves a `JournalEntry` with the number of rows
-    before it. Rows and journal together give the same events again, bit for bit.
+    before it. Rows and journal together give the same events again, bit for bit. `carry` begins
+    with a state that they do not lead to: a recording from there on cannot be replayed alone.
     """
 
     REMEMBERED = (
