@@ -120,7 +120,11 @@ def service_names() -> list[str]:
 
 def services() -> str:
     """Return the services."""
-    rows = ((f'`~/{name}`', _SERVICES[name]) for name in service_names())
+    rows = [(f'`~/{name}`', _SERVICES[name]) for name in service_names()]
+    rows.append(
+        ('`~/operate_alarm`, `valveflow_msgs/OperateAlarm`',
+         'acknowledge, shelve or unshelve the alarm of a name')
+    )  # fmt: skip
     return table(('service, `std_srvs/Trigger`', 'does'), rows)
 
 

@@ -54,8 +54,10 @@ each_file = pytest.mark.parametrize('path', FILES, ids=lambda p: p.stem)
 
 def test_all_are_built():
     """Every file is named in CMakeLists.txt, and no other."""
-    named = re.findall(r'\$\{root\}:msg/(\w+)\.msg', (MSG / 'CMakeLists.txt').read_text())
+    text = (MSG / 'CMakeLists.txt').read_text()
+    named = re.findall(r'\$\{root\}:msg/(\w+)\.msg', text)
     assert sorted(named) == [p.stem for p in FILES]
+    assert re.findall(r':(srv/\w+\.srv)', text) == ['srv/OperateAlarm.srv']
     assert len(FILES) == 8
 
 
@@ -161,6 +163,27 @@ def message_class(name: str) -> type:
             raise
         pytest.skip(f'valveflow_msgs is not built here ({error}); run make setup')
     return getattr(module, name)
+
+
+def test_the_service_answers_as_a_trigger_does_and_is_built_as_written():
+    text = (MSG / 'srv' / 'OperateAlarm.srv').read_text(encoding='utf-8')
+    parts = [
+        re.findall(r'^(\w+) (\w+) +# \[\w+\] ', part, re.MULTILINE)
+        for part in text.split('\n---\n')
+    ]
+    assert parts == [
+        [('string', 'name'), ('string', 'action')], [('bool', 'success'), ('string', 'message')]
+    ]  # fmt: skip
+    try:
+        kind = importlib.import_module('valveflow_msgs.srv').OperateAlarm
+    except ImportError as error:
+        if os.environ.get('VALVEFLOW_REQUIRE_ROS'):
+            raise
+        pytest.skip(f'valveflow_msgs is not built here ({error}); run make setup')
+    built = (kind.Request, kind.Response)
+    assert [list(b.get_fields_and_field_types()) for b in built] == [
+        [name for _, name in part] for part in parts
+    ]
 
 
 @each_file

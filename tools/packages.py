@@ -34,7 +34,7 @@ def messages_key(wheels: str) -> str:
     """Hash what the interface package is built from."""
     compiler = [os.environ.get(name, '') for name in ('CC', 'CXX', 'CFLAGS', 'CXXFLAGS')]
     words = [x.encode() for x in (wheels, *compiler)]
-    files = [*sorted((ROOT / 'msg').iterdir()), QUICK, Path(__file__)]
+    files = [*sorted(p for p in (ROOT / 'msg').rglob('*') if p.is_file()), QUICK, Path(__file__)]
     return digest(words + list(contents(files)))
 
 

@@ -8,6 +8,7 @@ on. Errors of other libraries are translated at the edge where they arise.
 
 import math
 import resource
+from collections.abc import Sequence
 
 
 class ValveflowError(Exception):
@@ -58,6 +59,11 @@ def counted(number: float, one: str, many: str = '') -> str:
     """Write a number and its noun for a sentence: '1 row', '3 rows', '0.5 days'."""
     told = str(number) if isinstance(number, int) else f'{number:g}'
     return f'{told} {one if told == "1" else many or one + "s"}'
+
+
+def listed(words: Sequence[str], last: str = 'and') -> str:
+    """Write words as a list for a sentence: 'a', 'a and b', 'a, b and c'."""
+    return f' {last} '.join(filter(None, (', '.join(words[:-1]), *words[-1:])))
 
 
 def short(value: float, places: int = 0, sign: str = '') -> str:

@@ -8,7 +8,9 @@ against their range and then together.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import enum
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import tzinfo
@@ -20,12 +22,38 @@ from valveflow_ros.records import FLOW_UNITS, zone_of
 Value = bool | int | float | str
 
 
-# What the engine's memory does not depend on.
+# What the engine's decisions do not depend on.
 _APART = frozenset({
     'autostart', 'input_reliability', 'refit_timeout', 'diagnosis_timeout', 'reference_file',
     'record', 'record_directory', 'record_flush', 'record_rotation', 'record_queue',
     'record_keep', 'keep_state', 'state_directory', 'state_period',
 })  # fmt: skip
+
+
+class Depends(enum.IntEnum):
+    """What of a saved state is of no use with another value of a parameter.
+
+    `SEGMENTS` are found anew in the rows of the window; with `ROWS` the window goes, and curve,
+    reference and alarms stay; `ALL` belongs to another unit, or to values in another unit.
+    """
+
+    NOTHING = 0
+    SEGMENTS = 1
+    ROWS = 2
+    ALL = 3
+
+
+_DEPENDS = {
+    **dict.fromkeys((
+        'pressure_exponent', 'time_constant', 'delay', 'block', 'longest_segment', 'steady_min',
+        'slope_min', 'input_noise', 'power_noise', 'break_limit', 'steady_limit', 'slope_limit',
+    ), Depends.SEGMENTS),
+    'sample_period': Depends.ROWS,
+    **dict.fromkeys((
+        'unit_tag', 'valve_opening_unit', 'main_steam_pressure_unit',
+        'main_steam_temperature_unit', 'generated_power_unit', 'valve_command_unit', 'model_file',
+    ), Depends.ALL),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +81,13 @@ class Parameter:
 
     @property
     def of_state(self) -> bool:
-        """Tell whether a state made with another value cannot be gone on with."""
+        """Tell whether the engine decides by it, and it may not change while the monitor runs."""
         return not (self.live or self.name in _APART)
+
+    @property
+    def depends(self) -> Depends:
+        """Return what of a saved state is of no use with another value."""
+        return _DEPENDS.get(self.name, Depends.NOTHING)
 
     def check(self, value: object) -> Value:
         """Return ``value`` in this row's type, or raise `ParameterError`.
@@ -99,6 +132,8 @@ class Parameter:
 
 # YAML takes a bare % for the beginning of a directive.
 _OPENING_UNITS = ('percent', '%', 'fraction')
+# Two names of one value: a state does not depend on which was given.
+_SAME: dict[Value, Value] = {'%': 'percent'}
 _PRESSURE_UNITS = (
     'MPa', 'kPa', 'Pa', 'bar', 'mbar', 'psi', 'kg/cm2', 'MPag', 'kPag', 'barg', 'psig',
 )  # fmt: skip
@@ -245,15 +280,17 @@ _FIT = (
 _ALARM = (
     Parameter('alarm_run_length', 30.0, 'd',
               'Mean time between false residual alarms; limits follow from the clean residual.',
-              0.5, 3650.0),
+              0.5, 3650.0, live=True),
     Parameter('alarm_block', 60.0, 's', 'Time over which the alarm averages the residual at once.',
-              1.0, 86400.0),
-    Parameter('alarm_floor', 1.0, 'MW', 'Lasting shifts below this need not be found.', 0.0, 1e4),
+              1.0, 86400.0, live=True),
+    Parameter('alarm_floor', 1.0, 'MW',
+              'Lasting shifts below this need not be found; in force from the next fit on, as '
+              'alarm_run_length and alarm_block.', 0.0, 1e4, live=True),
     Parameter('alarm_limit', 0.0, 'MW',
               'Fixed limit of the running mean of the residual; 0 leaves it to alarm_run_length.',
               0.0, 1e5, live=True),
     Parameter('alarm_average', 300.0, 's', 'Time constant of the running mean of the residual.',
-              1.0, 86400.0),
+              1.0, 86400.0, live=True),
     Parameter('alarm_on_delay', 900.0, 's', 'The limit must be exceeded this long.',
               0.0, 86400.0, live=True),
     Parameter('alarm_off_delay', 86400.0, 's',
@@ -414,11 +451,34 @@ class Settings(Mapping[str, Value]):
         ParameterError
             One differs that may not be changed while the monitor runs.
         """
-        changed = {k: v for k, v in wanted.items() if v != self[k]}
+        changed = wanted.changes(self)
         for name in changed:
             if not parameter(name).live:
                 raise ParameterError(name, 'cannot be changed while the monitor runs')
         return changed
+
+    @classmethod
+    def earlier(cls, values: Mapping[str, object]) -> Settings:
+        """Return the settings of an earlier version; what no longer exists or fits is left out.
+
+        Raises
+        ------
+        ParameterError
+            Two values are at odds.
+        """
+        known: dict[str, object] = {}
+        for name, value in values.items():
+            with contextlib.suppress(ParameterError):
+                known[name] = parameter(name).check(value)
+        return cls(known)
+
+    def changes(self, then: Mapping[str, Value]) -> dict[str, Value]:
+        """Return what had a value of another meaning ``then``, in the table's order."""
+        return {n: v for n, v in self.items() if _SAME.get(v, v) != _SAME.get(then[n], then[n])}
+
+    def retuned(self, then: Mapping[str, Value]) -> tuple[str, ...]:
+        """Return the names of those changes that are of `Parameter.of_state`."""
+        return tuple(n for n in self.changes(then) if parameter(n).of_state)
 
     @property
     def output_unit(self) -> str:

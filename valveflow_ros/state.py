@@ -138,6 +138,7 @@ def put_back(arrays: Mapping[str, NDArray[Any]], saved: State) -> None:
 
 FORMAT = b'valveflow-state'
 VERSION = 2
+_READ = (b'1', b'2')  # what differs in the parts of version 1 their owners know
 _ARRAY = '$array'
 _DIGEST = 64
 
@@ -172,7 +173,7 @@ def from_bytes(data: bytes) -> State:
     words = line.split(b' ')
     if len(words) != 3 or words[0] != FORMAT or len(words[2]) != _DIGEST:
         raise DataError('The saved state is none, or its beginning is damaged.')
-    if words[1] != b'%d' % VERSION:
+    if words[1] not in _READ:
         version = words[1][:20].decode(errors='replace')
         raise DataError(f'The saved state has version {version}, this program reads {VERSION}.')
     if hashlib.sha256(content).hexdigest().encode() != words[2]:

@@ -5,6 +5,7 @@ import os
 import sys
 import threading
 import time
+from dataclasses import replace
 
 import pytest
 import yaml
@@ -150,6 +151,29 @@ def test_what_was_flushed_is_readable_while_recording(tmp_path):
     assert recorder.status().file == 'log_0.mcap'
     assert values_on_disk(tmp_path / 'log') == list(range(100))
     assert recorder.close().written == 100
+
+
+def test_what_somebody_waits_for_is_on_disk_before_its_time(tmp_path):
+    recorder = recorder_of(tmp_path / 'log', replace(QUICK, flush_period_s=600.0))
+    for first in (0, 100, 200):
+        record(recorder, first, 100)
+        assert recorder.flush(20.0)
+        assert values_on_disk(tmp_path / 'log') == list(range(first + 100))
+    assert recorder.flush(0.0)
+    assert recorder.close().written == 300
+    # There is nobody left to write what comes now.
+    record(recorder, 300, 1)
+    assert not recorder.flush(20.0)
+
+
+def test_nobody_waits_longer_for_a_disk_than_told(tmp_path):
+    disk = Disk(lambda number: errno.ENOSPC)
+    recorder = recorder_of(tmp_path / 'log', open_file=disk)
+    record(recorder, 0, 10)
+    begun_s = time.monotonic()
+    assert not recorder.flush(0.2)
+    assert 0.2 <= time.monotonic() - begun_s < 20.0
+    recorder.close()
 
 
 @pytest.mark.parametrize('error', [errno.ENOSPC, errno.EIO])

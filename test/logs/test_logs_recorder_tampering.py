@@ -81,7 +81,7 @@ def move_folder(path: Path) -> None:
 
 def empty_folder(path: Path) -> None:
     shutil.rmtree(path.parent)
-    path.parent.mkdir()
+    path.parent.mkdir(exist_ok=True)  # the recorder may have been quicker
 
 
 GONE = (unlink, move_away, replace_by_another)

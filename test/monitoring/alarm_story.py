@@ -88,9 +88,9 @@ class Desk:
         now_ns = START_NS + second * S
         return self._tell(self.shift.judge(judgement(by_mw), now_ns, self.settings))
 
-    def press(self, act, second=0):
+    def press(self, act, second=0, name=None):
         judged = Judged(START_NS + second * S, 0.0, 0.0)
-        return self._tell(self.alarms.operate(AlarmAction(act), judged, 'm'))
+        return self._tell(self.alarms.operate(AlarmAction(act), judged, 'm', name))
 
     def taken_up(self):
         """Return the desk as a new process restores it."""

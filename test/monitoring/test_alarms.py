@@ -36,6 +36,7 @@ from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.records import NS_PER_S, SampleTable, Signal
 
+ACTS = tuple(JournalKind[act.name] for act in AlarmAction)
 NORMAL, UNACKNOWLEDGED, ACKNOWLEDGED, RETURNED, SHELVED, SUPPRESSED, _ = AlarmState
 HOURS_S = 3 * 3600
 LONG = Settings({**NERVOUS, 'alarm_suppress_time': 60.0, 'alarm_shelve_time': 604_800.0})
@@ -58,6 +59,23 @@ def test_first_out_is_the_alarm_that_came_first_of_those_that_stand():
     assert (cleared.name, cleared.state, cleared.first_out) == ('curve_shift', NORMAL, 'residual')
     (last,) = desk.rows([0.0], 30)
     assert (last.state, last.first_out) == (NORMAL, '')
+
+
+@pytest.mark.parametrize('name', ['residual', 'curve_shift'])
+def test_of_two_that_stand_one_can_be_acknowledged_shelved_and_taken_back(name):
+    desk = Desk(LONG)
+    desk.judge(2.0)
+    desk.rows([2.0], 10)
+    other = {'residual': 'curve_shift', 'curve_shift': 'residual'}[name]
+    for act, state in (
+        ('acknowledge', ACKNOWLEDGED), ('shelve', SHELVED), ('unshelve', UNACKNOWLEDGED)
+    ):  # fmt: skip
+        (change,) = desk.press(act, name=name)
+        assert (change.name, change.state) == (name, state)
+        states = {a.NAME: a.state for a in (desk.residual, desk.shift)}
+        assert states == {name: state, other: UNACKNOWLEDGED}
+    with pytest.raises(DataError, match=f'The alarm {name} is not shelved'):
+        desk.press('unshelve', name=name)
 
 
 def test_a_new_alarm_is_not_hidden_by_one_on_the_shelf():
@@ -239,6 +257,37 @@ def test_an_outage_suppresses_and_gives_back_what_was():
     for act in AlarmAction:
         with pytest.raises(DataError, match=r'no alarm to|no shelved alarm'):
             monitor.operate_alarms(act)
+
+
+@pytest.mark.parametrize('name', ['residual', 'curve_shift'])
+def test_an_act_on_one_alarm_is_one_on_all_where_only_that_one_stands(name):
+    """And none where the other is meant."""
+    both = []
+    for target in (None, name):
+        monitor, events = run(SETTINGS, table().part(0, 850), {})
+        assert (monitor.alarm.standing, monitor.reference.alarm.standing) == (True, False)
+        for act in AlarmAction:
+            if target == 'curve_shift':
+                with pytest.raises(DataError, match='alarm curve_shift'):
+                    monitor.operate_alarms(act, target)
+                continue
+            events += monitor.operate_alarms(act, target)
+        both.append((changes_of(events), monitor.alarm.snapshot(), events))
+    told = [e.text for e in both[1][2] if isinstance(e, JournalEntry) and e.kind in ACTS]
+    if name == 'residual':
+        assert repr(both[0][:2]) == repr(both[1][:2])
+        assert told == ['residual'] * 3
+    else:
+        assert repr(both[1][0]) == repr(changes_of(run(SETTINGS, table().part(0, 850), {})[1]))
+        assert told == []
+
+
+@pytest.mark.parametrize('act', AlarmAction)
+@pytest.mark.parametrize('name', ['', 'Residual', 'residual '])
+def test_an_alarm_that_is_none_is_told_from_those_there_are(act, name):
+    monitor = Monitor(SETTINGS)
+    with pytest.raises(DataError, match='choose residual or curve_shift'):
+        monitor.operate_alarms(act, name)
 
 
 # --- an upset -------------------------------------------------------------------------------

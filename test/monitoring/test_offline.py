@@ -90,8 +90,9 @@ class LiveRun:
         """Do what a person, a worker or a clock does between two rows."""
         monitor = self.monitor
         try:
-            if button in ACTIONS:
-                self.events += monitor.operate_alarms(AlarmAction(button))
+            action, _, name = button.partition(' ')
+            if action in ACTIONS:
+                self.events += monitor.operate_alarms(AlarmAction(action), name or None)
             elif button == 'set reference':
                 self.events += monitor.set_reference()
             elif button == 'request':
@@ -131,7 +132,8 @@ def same(live, again):
 
 
 BUTTONS = [
-    *ACTIONS, 'nothing', 'set reference', 'request', 'time out', 'restart', 'limit', 'period',
+    *ACTIONS, 'acknowledge residual', 'shelve residual', 'unshelve curve_shift', 'nothing',
+    'set reference', 'request', 'time out', 'restart', 'limit', 'period',
 ]  # fmt: skip
 # Alarms come and go, once there is a curve.
 FAULTS = [('fault', 400, 60), ('nan_power', 500, 60), ('fault', 600, 90)]

@@ -13,11 +13,13 @@ import pytest
 from listener import LATCHED, MONITOR, Listener, start_monitor
 from ros_helpers import Processes
 from valveflow_msgs.msg import Alarm
+from valveflow_msgs.srv import OperateAlarm
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import open_log
+from valveflow_ros.monitoring.events import JournalKind
 from valveflow_ros.plant.simulator import simulate
-from valveflow_ros.ros.decoding import PLANT_SAMPLE
+from valveflow_ros.ros.decoding import PLANT_SAMPLE, journal_entry
 from valveflow_ros.ros.player import Player
 from valveflow_ros.ros.simulator_main import effects_of, stamped_steps
 from valveflow_ros.ros.verify import verify
@@ -85,7 +87,8 @@ def test_killed_and_started_again_it_goes_on_with_curve_alarm_and_recording(
     before = len(plant.alarms)
 
     plant.curves.clear()
-    second = start_monitor(processes, tmp_path)
+    # Another parameter of the alarms changes nothing of that.
+    second = start_monitor(processes, tmp_path, alarm_floor=2.0)
     begun = time.monotonic()
     found = plant.until(lambda: plant.curves and plant.curves[-1], 'the curve')
     print(f'curve again after {time.monotonic() - begun:.1f} s')
@@ -119,6 +122,82 @@ def test_killed_and_started_again_it_goes_on_with_curve_alarm_and_recording(
     result = verify(folder)
     assert result.difference == '', result.difference
     assert result.compared['alarms'] >= 2
+
+
+@pytest.mark.parametrize('kept_by', ['recording', 'state'])
+def test_what_a_service_confirmed_survives_a_kill_that_follows_at_once(
+    processes: Processes, plant: Plant, tmp_path: Path, kept_by: str
+) -> None:
+    # Nothing is written in its time: what is on disk is there because it was confirmed.
+    given: dict[str, object] = {'record_flush': 60.0, 'alarm_suppress_time': 86400.0}
+    if kept_by == 'state':
+        given |= {'record': False, 'state_directory': str(tmp_path / 'state')}
+    first = start_monitor(processes, tmp_path, **given)
+    plant.play(0, 21000)
+    plant.until(
+        lambda: plant.alarms and plant.alarms[-1].state == Alarm.UNACKNOWLEDGED, 'the alarm'
+    )
+    plant.quiet(3.0)
+
+    def operate(name: str, action: str) -> OperateAlarm.Response:
+        request = OperateAlarm.Request(name=name, action=action)
+        return plant.call(OperateAlarm, 'operate_alarm', request)
+
+    for name, action, words in (
+        ('nothing', 'shelve', "There is no alarm 'nothing'; choose residual or curve_shift."),
+        ('', 'shelve', "There is no alarm ''; choose residual or curve_shift."),
+        ('residual', 'stop', "There is no action 'stop'; choose acknowledge, shelve or unshelve."),
+        ('residual', 'unshelve', 'The alarm residual is not shelved.'),
+        (
+            'curve_shift',
+            'acknowledge',
+            'There is nothing to acknowledge of the alarm curve_shift.',
+        ),
+    ):
+        answer = operate(name, action)
+        assert (answer.success, answer.message) == (False, words)
+    # After these the state has just been saved, and is not due for a second.
+    assert operate('residual', 'shelve').success
+    assert operate('residual', 'unshelve').success
+    begun_s = time.monotonic()
+    answer = operate('residual', 'acknowledge')
+    os.kill(first.pid, signal.SIGKILL)
+    print(f'confirmed after {time.monotonic() - begun_s:.3f} s')
+    assert (answer.success, answer.message) == (True, 'The alarm residual is acknowledged.')
+    first.wait()
+    known = plant.listeners()
+
+    # The parameters of the alarms and those of the segments may be other ones.
+    second = start_monitor(processes, tmp_path, **given, alarm_floor=2.0, steady_min=150.0)
+    plant.until(lambda: goes_on(processes, second), 'the sentence', 240.0)
+    told = processes.output(second)
+    assert 'from before, alarm residual, acknowledged' in told
+    assert 'Since the state was saved steady_min changed. Segments were found anew in ' in told
+    late: list[Alarm] = []
+    plant.node.create_subscription(Alarm, f'{MONITOR}/alarms', late.append, LATCHED)
+    plant.until(lambda: late, 'the standing alarm')
+    assert [(a.name, a.state) for a in late] == [('residual', Alarm.ACKNOWLEDGED)]
+    answer = operate('residual', 'shelve')
+    assert answer.success
+    assert answer.message.startswith('The alarm residual is put aside for 8 h; then it comes back')
+    plant.until(lambda: plant.listeners() - known, 'the new listener')
+    plant.play(21000, 21100)
+    plant.quiet(1.0)
+    second.send_signal(signal.SIGTERM)
+    assert second.wait(10.0) == 0, processes.output(second)
+    folders = sorted(tmp_path.glob('valveflow_*'))
+    if kept_by == 'state':
+        assert folders == []
+        return
+    # Other parameters make another recording; the one before holds all that was confirmed.
+    assert len(folders) == 2
+    result = verify(folders[0])
+    assert result.difference == '', result.difference
+    entries = [
+        journal_entry(m.data) for m in open_log(folders[0]).iter_messages([f'{MONITOR}/journal'])
+    ]
+    (entry,) = [e for e in entries if e.kind == JournalKind.ACKNOWLEDGE]
+    assert entry.text == 'residual'
 
 
 def test_a_second_monitor_on_the_same_state_is_refused_and_the_first_goes_on(

@@ -29,12 +29,13 @@ from hypothesis import strategies as st
 
 from valveflow_ros.errors import DataError, RecordingError
 from valveflow_ros.logs import LoggedMessage
-from valveflow_ros.monitoring.events import CurveAdopted
+from valveflow_ros.monitoring.events import CurveAdopted, JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.parameters import Settings
+from valveflow_ros.ros.decoding import journal_entry
 from valveflow_ros.ros.node import restart, state_store
 from valveflow_ros.ros.node.diagnostics import Level
-from valveflow_ros.ros.node.engine import example_curve
+from valveflow_ros.ros.node.engine import LiveEngine, example_curve
 from valveflow_ros.ros.node.restart import Restart
 from valveflow_ros.ros.node.state_store import (
     ASIDE,
@@ -45,7 +46,7 @@ from valveflow_ros.ros.node.state_store import (
     StateStore,
     state_folder,
 )
-from valveflow_ros.ros.outputs import Output
+from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
 from valveflow_ros.signals.align import Aligner
 from valveflow_ros.state import (
     FORMAT,
@@ -176,7 +177,8 @@ def test_nothing_in_a_state_is_executed_however_well_it_is_signed(
         (FORMAT + b' 1 ' + b'0' * 64 + b' more\n', 'is none, or its beginning is damaged'),
         (FORMAT + b' 2 ' + b'0' * 64 + b'\nwhatever', 'its checksum is another one'),
         (signed(b'', version=3), 'has version 3, this program reads 2'),
-        (signed(b'', version=1), 'has version 1, this program reads 2'),
+        (signed(b'', version=1), r'cannot be read \('),
+        (signed(b'', version=0), 'has version 0, this program reads 2'),
         (FORMAT + b' ' + b'9' * 50 + b' ' + b'0' * 64 + b'\n', f'version {"9" * 20}, this'),
         (FORMAT + b' \xff ' + b'0' * 64 + b'\n', 'version \ufffd, this'),
         (signed(b''), r'cannot be read \('),
@@ -528,14 +530,19 @@ def test_only_one_at_a_time_and_the_next_as_soon_as_it_is_gone(tmp_path: Path) -
 @pytest.mark.parametrize(
     ('more', 'words'),
     [
-        ({'sample_period': 2.0}, 'It was made with another sample_period.'),
-        ({'block': 20.0, 'window_days': 5.0}, 'It was made with another window_days and block.'),
+        ({'generated_power_unit': 'kW'}, 'It was made with another generated_power_unit.'),
+        (
+            {'main_steam_pressure_unit': 'bar', 'model_file': 'x', 'block': 20.0},
+            'It was made with another main_steam_pressure_unit and model_file.',
+        ),
+        ({'sample_period': 2.0}, ''),
+        ({'block': 20.0, 'window_days': 5.0}, ''),
         ({'alarm_limit': 3.0, 'refit_period': 60.0}, ''),
         ({'record_keep': 5, 'refit_timeout': 50.0}, ''),
     ],
 )
-def test_a_state_of_other_parameters_is_used_only_where_they_do_not_matter(
-    tmp_path: Path, more: dict[str, float], words: str
+def test_a_state_of_other_parameters_is_used_unless_it_is_of_another_unit(
+    tmp_path: Path, more: dict[str, object], words: str
 ) -> None:
     written(tmp_path)
     store = StateStore(settings(tmp_path, **more))
@@ -546,27 +553,60 @@ def test_a_state_of_other_parameters_is_used_only_where_they_do_not_matter(
     store.close()
 
 
-def test_a_mistyped_parameter_costs_no_state(tmp_path: Path) -> None:
+def test_a_mistyped_unit_costs_no_state(tmp_path: Path) -> None:
     written(tmp_path)
     for _ in range(2):
-        store = StateStore(settings(tmp_path, window_days=5.0))
+        store = StateStore(settings(tmp_path, valve_opening_unit='fraction'))
         assert store.saved is None
         assert 'a run that it fits takes it up again' in store.sentence
         store.close()
         # A young state takes its place at once.
-        written(tmp_path, {'numbers': np.arange(1.0)}, window_days=5.0)
+        written(tmp_path, {'numbers': np.arange(1.0)}, valve_opening_unit='fraction')
         mended = StateStore(settings(tmp_path))
         assert mended.sentence == ''
         assert mended.saved is not None
         np.testing.assert_array_equal(mended.saved['numbers'], STATE_A['numbers'])
         mended.close()
         # The other one is not lost either.
-        again = StateStore(settings(tmp_path, window_days=5.0))
+        again = StateStore(settings(tmp_path, valve_opening_unit='fraction'))
         assert again.saved is not None
         assert len(again.saved['numbers']) == 1
         again.close()
         written(tmp_path)
         (tmp_path / 'state_unit' / ASIDE).unlink()
+
+
+def test_a_mistyped_period_costs_no_window(tmp_path: Path) -> None:
+    written(tmp_path)
+    other = StateStore(settings(tmp_path, sample_period=2.0))
+    # Its curve and reference are of use; its rows are kept for whoever corrects the mistake.
+    assert other.saved is not None
+    assert other.sentence == ''
+    other.close()
+    assert (tmp_path / 'state_unit' / STATE).read_bytes() == (
+        tmp_path / 'state_unit' / ASIDE
+    ).read_bytes()
+    written(tmp_path, {'numbers': np.arange(1.0)}, sample_period=2.0)
+    mended = StateStore(settings(tmp_path))
+    assert mended.saved is not None
+    np.testing.assert_array_equal(mended.saved['numbers'], STATE_A['numbers'])
+    mended.close()
+
+
+def test_a_state_of_a_version_with_other_parameters_is_used(tmp_path: Path) -> None:
+    store = StateStore(settings(tmp_path))
+    then = {
+        **settings(tmp_path), 'no_longer_there': 3.0, 'alarm_floor': 1e9, 'refit_period': 'daily',
+        'alarm_off_delay': 300.0,
+    }  # fmt: skip
+    del then['reference_after']
+    store.write({'settings': then, **STATE_A}, lambda: True)
+    store.close()
+    found = StateStore(settings(tmp_path))
+    assert found.saved is not None
+    # What it knew holds; the rest is as by default.
+    assert found.saved['settings'] == settings(tmp_path, alarm_off_delay=300.0)
+    found.close()
 
 
 @pytest.mark.parametrize('given', ['/proc/nothing', '~nobody_of_that_name/x'])
@@ -787,6 +827,66 @@ def test_each_output_stands_in_the_recording_once(
     assert ours.log_ns == (LOG_NS if said else 1)
     assert list(ours.begin(given, engine, outputs)) == again
     assert logged == [(Level.OK, 'Going on after 0 rows of an earlier run.')]
+
+
+def test_a_run_with_other_parameters_goes_on_in_a_new_recording_and_says_what_it_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(restart, 'recover_leftovers', lambda _: [])
+    monkeypatch.setattr(restart, 'messages_since', lambda _folder, _log_ns: [])
+    then, now = Settings(), Settings({'steady_min': 180.0, 'alarm_floor': 2.0})
+    names = {name: f'/m/{name}' for name in OUTPUTS}
+    worker: Any = SimpleNamespace(poll=list)
+
+    def make(settings: Settings) -> LiveEngine:
+        return LiveEngine(settings, worker)
+
+    first = make(then)
+    first.monitor.set_reference(CURVE)
+    saved = {
+        'settings': then, 'log_ns': 1, 'recording': 'folder', 'began': {}, 'topics': names,
+        'engine': first.snapshot(),
+    }  # fmt: skip
+    for wanted, folder in ((now, None), (then.changed({'alarm_floor': 2.0}), Path('folder'))):
+        store: Any = SimpleNamespace(saved=saved, problem='', sentence='', curve=None)
+        logged: list[tuple[Level, str]] = []
+        ours = Restart(wanted, store, {}, names, lambda *line, to=logged: to.append(line))
+        engine = ours.engine(make)
+        assert (ours.continues, ours.folder) == (True, folder)
+        messages = list(ours.begin(wanted, engine, Outputs('unit')))
+        assert engine.monitor.settings == wanted
+        assert engine.monitor.reference.curve == CURVE
+        kinds = [journal_entry(m.data).kind for m in messages if m.name == 'journal']
+        assert kinds == [JournalKind.RESUMED, JournalKind.SETTINGS]
+        told = (
+            Level.OK,
+            'Since the state was saved steady_min changed. Segments were found anew in 0 rows. '
+            'The reference and the alarms stay.',
+        )
+        assert (told in logged) == (folder is None)
+
+
+@pytest.mark.parametrize('how', ['absent', 'other'])
+def test_a_state_of_another_version_is_used_where_it_fits_and_the_rest_is_told(how: str) -> None:
+    given, worker = Settings(), SimpleNamespace(poll=list)
+    first = LiveEngine(given, worker)  # type: ignore[arg-type]
+    first.monitor.set_reference(CURVE)
+    engine = first.snapshot()
+    if how == 'absent':
+        del engine['monitor']['diagnosing']
+    else:
+        engine['monitor']['diagnosing'] = {'another': 'version'}
+    saved = {'settings': given, 'log_ns': 1, 'recording': None, 'engine': engine}
+    store: Any = SimpleNamespace(saved=saved, problem='', sentence='', curve=None)
+    logged: list[tuple[Level, str]] = []
+    ours = Restart(given, store, {}, {}, lambda *line: logged.append(line))
+    found = ours.engine(lambda settings: LiveEngine(settings, worker))  # type: ignore[arg-type]
+    assert ours.continues
+    assert found.monitor.reference.curve == CURVE
+    assert logged == [(
+        Level.WARN, 'The saved state is of another version. Let go: the last diagnosis. The '
+        'reference and the alarms stay.',
+    )]  # fmt: skip
 
 
 @pytest.mark.parametrize('what', ['state', 'lock', 'everything', 'folder', 'folder moved'])

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -73,11 +75,13 @@ class NaiveWindow:
         oldest = self.rows[-1][1] - self.window_s * NS_PER_S
         inside = [row for row in self.rows if row[1] > oldest]
         numbers = [row[0] for row in inside]
-        spans = [
-            [numbers.index(s.first_row), numbers.index(s.end_row - 1) + 1, int(s.segment.kind)]
-            for s in self.segments
-            if {s.first_row, s.end_row - 1} <= set(numbers)
-        ]
+        spans = []
+        for s in self.segments:
+            # A step of the clock cuts off the end of one, and what is left is one.
+            there = [n for n in range(s.first_row, s.end_row) if n in set(numbers)]
+            if len(there) > 1 and there[0] == s.first_row:
+                first, last = numbers.index(there[0]), numbers.index(there[-1])
+                spans.append([first, last + 1, int(s.segment.kind)])
         return inside, spans
 
 
@@ -163,6 +167,48 @@ def test_counters_follow_segments_out_of_the_window():
     assert (window.segments, window.special_samples) == (1, 15)
     window.append(rows_after(int(more[-1]), 60), *np.zeros((3, 60)))
     assert (window.segments, window.special_samples) == (0, 0)
+
+
+@pytest.mark.parametrize('least_s', [None, 60.0, 61.0])
+@pytest.mark.parametrize('open_then', [False, True])
+def test_a_segment_that_a_step_of_the_clock_cuts_goes_on_to_there_in_its_line(least_s, open_then):
+    least = None if least_s is None else {SegmentKind.SLOPE: least_s}
+    window = RollingWindow(86400.0, 1.0, 1.0, least)
+    line = np.arange(101.0)
+    time_ns = rows_after(START_NS, 101)
+    opening = 20.0 + 0.1 * line
+    window.append(time_ns, 16.0 * opening, 5.0 * line, np.full(101, 540.0), opening)
+    found = segment(7, 0, 101, int(time_ns[0]), SegmentKind.SLOPE)
+    record = replace(found.segment, u_start=320.0, u_end=480.0, power_end_mw=500.0)
+    found = replace(found, segment=record)
+    back = slice(60, 61)
+
+    def go_back():
+        window.go_back(int(time_ns[60]))
+        window.append(time_ns[back], *np.zeros((3, 1)))
+
+    for act in (go_back, None) if open_then else (None, go_back):
+        (act or (lambda: window.add_segment(found)))()
+    if least_s == 61.0:
+        assert window.special_segments() == ()
+        return
+    (cut,) = window.special_segments()
+    assert (cut.number, cut.kind, cut.start_ns) == (7, SegmentKind.SLOPE, int(time_ns[0]))
+    assert (cut.samples, cut.end_ns) == (60, int(time_ns[59]))
+    ends = (
+        cut.u_start,
+        cut.u_end,
+        cut.power_end_mw,
+        cut.opening_end_percent,
+        cut.pressure_end_mpa,
+    )
+    np.testing.assert_allclose(ends, (320.0, 16.0 * 25.9, 5.0 * 59.0, 25.9, 16.0))
+    # Should the clock have been wrong only for a moment, it is whole again.
+    later = rows_after(int(time_ns[-1]), 5)
+    window.append(later, *np.zeros((3, 5)))
+    (again,) = window.special_segments()
+    assert (again.samples, again.end_ns, again.u_end) == (101, int(time_ns[100]), 480.0)
+    assert window.contents().spans.tolist() == [[0, 101, 2]]
 
 
 def feed(window, first_s, end_s, marks):

@@ -422,8 +422,8 @@ class Alarm(AlarmStateMachine, ABC):
         return {**super().snapshot(), 'last': self.last and self.last.snapshot()}
 
     def restore(self, saved: State) -> None:
-        """Go on from a state."""
-        super().restore(saved)
+        """Go on from a state; in those of version 1 the machine's own part stands in another."""
+        super().restore({**saved.get('life', {}), **saved})
         self.last = saved['last'] and AlarmChange.restored(saved['last'])
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from valveflow_ros.curve.shift import PieceShift, Shift
-from valveflow_ros.errors import DataError
+from valveflow_ros.errors import DataError, listed
 from valveflow_ros.monitoring.alarm_state import (
     Alarm,
     AlarmAction,
@@ -213,6 +213,7 @@ class ResidualAlarm(Alarm):
 
     def restore(self, saved: State) -> None:
         """Go on from a state; one of an earlier version does not know where it was seen."""
+        saved = {**saved.get('life', {}), **saved}
         memory = saved.get('memory')
         if 'span' not in saved and isinstance(memory, np.ndarray):
             saved = {
@@ -448,6 +449,11 @@ _NOTHING_TO_DO = {
     AlarmAction.SHELVE: 'There is no alarm to shelve.',
     AlarmAction.UNSHELVE: 'There is no shelved alarm.',
 }
+_NOTHING_TO_DO_TO = {
+    AlarmAction.ACKNOWLEDGE: 'There is nothing to acknowledge of the alarm {}.',
+    AlarmAction.SHELVE: 'The alarm {} does not stand, or is shelved already.',
+    AlarmAction.UNSHELVE: 'The alarm {} is not shelved.',
+}
 
 
 class Alarms:
@@ -478,8 +484,10 @@ class Alarms:
         )
         return [change for _, change in changes]
 
-    def operate(self, action: AlarmAction, judged: Judged, model_id: str) -> list[AlarmChange]:
-        """Do to every alarm what an operator asks; return what is announced.
+    def operate(
+        self, action: AlarmAction, judged: Judged, model_id: str, name: str | None = None
+    ) -> list[AlarmChange]:
+        """Do to every alarm, or to one, what an operator asks; return what is announced.
 
         Parameters
         ----------
@@ -488,14 +496,21 @@ class Alarms:
             What was judged last.
         model_id : str
             The curve it was judged by.
+        name : str, optional
+            Of the alarm; all without it.
 
         Raises
         ------
         DataError
-            There is no alarm to which that can be done.
+            There is no alarm of that name, or none to which that can be done.
         """
+        meant = [alarm for alarm in self._all if name in (None, alarm.NAME)]
+        if not meant:
+            names = listed([alarm.NAME for alarm in self._all], 'or')
+            raise DataError(f"There is no alarm '{name}'; choose {names}.")
         self._residual.judged = judged
-        done = [alarm.operate(action, judged.time_ns, model_id) for alarm in self._all]
+        done = [alarm.operate(action, judged.time_ns, model_id) for alarm in meant]
         if not any(could for could, _ in done):
-            raise DataError(_NOTHING_TO_DO[action])
+            words = _NOTHING_TO_DO if name is None else _NOTHING_TO_DO_TO
+            raise DataError(words[action].format(name))
         return [change for _, changes in done for change in changes]

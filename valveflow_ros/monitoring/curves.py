@@ -68,7 +68,7 @@ class RunningCurve:
         """Take settings of which only live ones differ."""
         self._settings = settings
         if self._predictor is not None:
-            self._predictor.limit_mw = settings.real('alarm_limit')
+            self._predictor.configure(settings)
 
     def adopt(self, characteristic: Characteristic, provisional: str = '') -> None:
         """Hold the curve of a fit; ``provisional`` says what it is no curve of health for."""
@@ -124,7 +124,8 @@ class RunningCurve:
         predicting = saved.get('predicting', saved['curve'])
         if predicting is not None:
             self._predictor = Predictor.of(from_json(predicting), self._settings)
-            self._predictor.restore(saved['predictor'])
+            if saved['predictor'] is not None:
+                self._predictor.restore(saved['predictor'])
         self.status, self.cause = CurveStatus(saved['status']), saved['cause']
 
 
@@ -212,12 +213,12 @@ class Refits(Memory):
         self.pending_ns = None
         return True
 
-    def ask_again(self) -> None:
-        """Wait no longer for the outcome that was asked for; its segments count as new."""
+    def ask_again(self, segments: int = 1) -> None:
+        """Wait no longer for the outcome that was asked for; so many segments count as new."""
         if self.pending_ns is not None:
             self.pending_ns = None
-            self.count_as_new()
+            self.count_as_new(segments)
 
-    def count_as_new(self) -> None:
-        """Let the segments of the last request count as new."""
-        self._segments_at_request = min(self._segments_at_request, self.segments_seen - 1)
+    def count_as_new(self, segments: int = 1) -> None:
+        """Let so many of the segments seen last count as new."""
+        self._segments_at_request = min(self._segments_at_request, self.segments_seen - segments)

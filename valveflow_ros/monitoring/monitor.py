@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
 from valveflow_ros.curve.shift import minute
-from valveflow_ros.errors import DataError
+from valveflow_ros.errors import DataError, counted, listed
 from valveflow_ros.fit.task import FitTask
 from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.alarms import Alarms, Judged, ResidualAlarm
@@ -26,18 +27,24 @@ from valveflow_ros.monitoring.events import (
 from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.monitoring.reference import ReferenceCurve
 from valveflow_ros.monitoring.rows import Correction, Corrector, Fed, Rows
-from valveflow_ros.parameters import Settings
+from valveflow_ros.parameters import Depends, Settings, parameter
 from valveflow_ros.records import IntArray, SampleTable, SpecialSegment
 from valveflow_ros.segments.segmenter import NoiseLevel, Segmented, Segmenter
 from valveflow_ros.segments.window import RollingWindow
-from valveflow_ros.signals.static_form import StaticForm
-from valveflow_ros.state import Memory
+from valveflow_ros.signals.static_form import INTEGRATED_INPUT, StaticForm
+from valveflow_ros.state import Memory, State
 
 BY_HAND = 'asked for by hand'
 BY_ITSELF = 'nothing was wrong for long enough'
 IN_TIME = 'it is from before something went wrong'
 WORN = 'the curve is further from the first reference than wear_budget allows'
 OF_ITSELF = (BY_ITSELF, IN_TIME, WORN)
+_OF_CHART = {'alarm_run_length', 'alarm_block', 'alarm_floor'}
+# Parts of a state in words.
+_PARTS = {
+    'force': 'the curve', 'reference': 'the reference', 'diagnosing': 'the last diagnosis',
+    'alarm': 'the residual alarm', 'part of reference': 'the alarm on its shift',
+}  # fmt: skip
 MIXED = 'The rows of this fit are from before and since something went wrong; the next are not.'
 
 
@@ -55,12 +62,13 @@ class Monitor(Memory):
     The state changes by rows and by the calls `adopt`, `refuse`, `operate_alarms`, `request_fit`,
     `set_reference`, `request_diagnosis`, `restart`, `resume` and `reconfigure`, and those of
     `diagnosing`, nothing else, and each such call leaves a `JournalEntry` with the number of rows
-    before it. Rows and journal together give the same events again, bit for bit.
+    before it. Rows and journal together give the same events again, bit for bit. `carry` begins
+    with a state that they do not lead to: a recording from there on cannot be replayed alone.
     """
 
     REMEMBERED = (
         '_correction', '_segmenter', '_window', 'alarm', '_force', '_refits', 'reference',
-        'diagnosing', '_rows', '_last_ns', '_went_back', 'judged',
+        'diagnosing', '_rows', '_last_ns', '_went_back', 'judged', '_chart_due',
     )  # fmt: skip
 
     def __init__(self, settings: Settings, corrector: Corrector | None = None) -> None:
@@ -73,6 +81,7 @@ class Monitor(Memory):
         self._rows = 0
         self._last_ns = 0
         self._went_back = False
+        self._chart_due = False  # the parameters of the residual's chart have changed
         self.judged = Judged(0, math.nan, math.nan)
         self._refits = Refits()
         self.reference = ReferenceCurve(settings)
@@ -150,6 +159,10 @@ class Monitor(Memory):
         self.settings = self.diagnosing.settings = settings
         self._alarms.configure(settings)
         self._force.configure(settings)
+        if changed.keys() & _OF_CHART:
+            # The next fit brings another chart, and is not to wait for new segments.
+            self._chart_due = True
+            self._refits.count_as_new(self.segments)
         text = json.dumps(changed, sort_keys=True)
         return [self._journal(JournalKind.SETTINGS, 0, '', text)]
 
@@ -186,6 +199,7 @@ class Monitor(Memory):
             return [*begun, *self.refuse(request_ns, MIXED)]
         self._refits.settle(request_ns)
         self._force.adopt(characteristic, self._provisional())
+        self._take_chart(characteristic)
         segments = self._window.special_segments()
         shift, changes = self.reference.judge(
             characteristic, segments, self._last_ns, self.settings
@@ -235,17 +249,17 @@ class Monitor(Memory):
             self._last_ns, self._window, self.predicting, self._diagnosed_since()
         )
 
-    def operate_alarms(self, action: AlarmAction) -> list[Event]:
-        """Acknowledge, shelve or unshelve the alarms.
+    def operate_alarms(self, action: AlarmAction, name: str | None = None) -> list[Event]:
+        """Acknowledge, shelve or unshelve the alarms, or the one of a name.
 
         Raises
         ------
         DataError
-            There is no alarm to which that can be done.
+            There is no alarm of that name, or none to which that can be done.
         """
         model_id = self._model_id()
-        changes = self._alarms.operate(action, self.judged, model_id)
-        entry = self._journal(JournalKind[action.name], 0, model_id, '')
+        changes = self._alarms.operate(action, self.judged, model_id, name)
+        entry = self._journal(JournalKind[action.name], 0, model_id, name or '')
         return [*changes, entry, *self._follow_health()]
 
     def set_reference(self, given: Characteristic | None = None) -> list[Event]:
@@ -286,9 +300,62 @@ class Monitor(Memory):
         self._force.restart(reason)
         return [*events, self._journal(JournalKind.RESET, 0, '', reason)]
 
+    def carry(self, saved: State, then: Settings) -> tuple[str, list[Event]]:
+        """Go on from a state of other settings or another version, with all of it that is of use.
+
+        Call it before the first row. A few rows may be missing before that, and its time may be
+        any.
+
+        Parameters
+        ----------
+        saved : State
+            What `snapshot` gave.
+        then : Settings
+            With which it was made.
+
+        Returns
+        -------
+        tuple of str and list of Event
+            What changed, what was found anew and what was let go, in sentences; and the line of
+            the journal with the parameters that changed.
+
+        Raises
+        ------
+        DataError
+            Nothing of it can be used.
+        """
+        changed = self.settings.changes(then)
+        depends = max((parameter(n).depends for n in changed), default=Depends.NOTHING)
+        lost = {'window'} if depends == Depends.ROWS else set()
+        parts = self._usable(saved, lost)
+        if depends == Depends.ALL or 'rows' in lost or {'window', 'force', 'reference'} <= lost:
+            raise DataError('Nothing of it can be used.')
+        if 'window' in lost:
+            parts['window']['seen'] = parts['rows']
+        self.restore(parts)
+        curve = self.reference.curve
+        if changed.keys() & {'axis', 'pressure_exponent'} and self._asks_for_another_form(curve):
+            self.reference.restore(Monitor(self.settings).reference.snapshot())
+            lost.add('reference')
+        if depends or lost & {'window', 'segmenter'}:
+            exponent = then.real('pressure_exponent')
+            self._segmenter = self._window.find_segments_anew(
+                self.settings, exponent, _found_before(saved)
+            )
+            lost.add('segmenter')
+        self._chart_due = self._chart_due or bool(changed.keys() & _OF_CHART)
+        if self._chart_due or lost & {'segmenter', 'refits'}:
+            self._refits.count_as_new(self.segments)
+        if lost & {'force', 'part of force', 'reference'}:
+            self._predict()
+        self._went_back = True
+        text = json.dumps(changed, sort_keys=True)
+        entry = [self._journal(JournalKind.SETTINGS, 0, '', text)] if changed else []
+        return self._carried(self.settings.retuned(then), lost), [*entry]
+
     def resume(self, reason: str) -> list[Event]:
         """Ask again in its time for what was being computed when the monitor ended."""
-        self._refits.ask_again()
+        self._refits.ask_again(self.segments)
         self.diagnosing.ask_again(reason)
         return [self._journal(JournalKind.RESUMED, 0, self._model_id(), reason)]
 
@@ -386,6 +453,75 @@ class Monitor(Memory):
         if curve is not None:
             self._force.predict_from(curve, self._window, afresh=afresh)
 
+    def _take_chart(self, curve: Characteristic) -> None:
+        """Let the reference have the chart of a curve, where other parameters ask for another.
+
+        It says what the residual of the healthy plant is like, so a provisional curve has none
+        to give.
+        """
+        chart = curve.residuals.chart
+        if self._chart_due and chart is not None and self.reference.fault_ns is None:
+            self._chart_due = False
+            self.reference.take_chart(chart)
+            if self.reference.curve is not None:
+                self._predict()
+
+    def _usable(self, saved: State, lost: set[str]) -> State:
+        """Return the parts of a state that fit; the others are empty, and added to ``lost``."""
+        corrector = self._correction.corrector
+        empty = Monitor(self.settings, corrector).snapshot()
+        pieces = {
+            'force': {'predictor': None},
+            'diagnosing': {'mismatch': empty['diagnosing']['mismatch']},
+            'reference': {'alarm': empty['reference']['alarm']},
+        }
+        if 'window' in lost:
+            lost |= {'refits', 'correction'}
+        parts = dict(empty)
+        for key in empty.keys() - lost:
+            given = saved.get(key)
+            tries = [(given, '')] if key in saved else []
+            if key in pieces and isinstance(given, dict):
+                tries.append(({**given, **pieces[key]}, f'part of {key}'))
+            for part, without in tries:
+                if _fits(Monitor(self.settings, corrector), {**empty, key: part}):
+                    parts[key] = part
+                    lost |= {without} - {''}
+                    break
+            else:
+                lost.add(key)
+        return parts
+
+    def _asks_for_another_form(self, curve: Characteristic | None) -> bool:
+        """Tell whether the settings ask for another form of the curve than a given one has."""
+        axis, exponent = self.settings.text('axis'), self.settings.real('pressure_exponent')
+        if curve is None or axis == 'auto':
+            return False
+        if axis == INTEGRATED_INPUT:
+            return curve.static_form != StaticForm(INTEGRATED_INPUT, exponent)
+        return curve.axis != axis
+
+    def _carried(self, names: Sequence[str], lost: set[str]) -> str:
+        """Say what changed since a state was saved, and what of it was let go."""
+        told = f'Since the state was saved {listed(names)} changed.' if names else ''
+        if 'window' in lost:
+            told += ' The window of rows begins anew.'
+        elif 'segmenter' in lost:
+            told += f' Segments were found anew in {counted(len(self._window), "row")}.'
+        if gone := [words for key, words in _PARTS.items() if key in lost]:
+            told += f' Let go: {listed(gone)}.'
+        there = {
+            'force': self.characteristic, 'reference': self.reference.curve,
+            'diagnosing': self.diagnosing.last,
+        }  # fmt: skip
+        stays = [_PARTS[key] for key, held in there.items() if held and key not in lost]
+        if not lost & {'alarm', 'part of reference'}:
+            stays.append('the alarms')
+        kept = listed(stays).capitalize() or 'Nothing else'
+        return (
+            f'{told} {kept} stay{"" if len(stays) > 1 or "the alarms" in stays else "s"}.'.strip()
+        )
+
     def _provisional(self) -> str:
         """Say what the running curve is made from while something is wrong."""
         since_ns = self.reference.fault_ns
@@ -412,7 +548,27 @@ class Monitor(Memory):
     def _model_id(self) -> str:
         return '' if self.characteristic is None else self.characteristic.model_id
 
+    def restore(self, saved: State) -> None:
+        """Go on from a state; raises `DataError` if it does not fit."""
+        super().restore({'chart_due': False, **saved})  # which earlier versions do not know
+
     def _journal(
         self, kind: JournalKind, request_ns: int, model_id: str, text: str
     ) -> JournalEntry:
         return JournalEntry(self._last_ns, kind, request_ns, self._rows, model_id, text)
+
+
+def _fits(fresh: Monitor, saved: State) -> bool:
+    """Tell whether a state fits a monitor, which is not to be used afterwards."""
+    try:
+        fresh.restore(saved)
+    except (DataError, LookupError, TypeError, ValueError, AttributeError):
+        return False
+    return True
+
+
+def _found_before(saved: State) -> int:
+    """Return how many segments a state of any version has numbered."""
+    segmenter = saved.get('segmenter')
+    number = segmenter.get('number') if isinstance(segmenter, dict) else 0
+    return number if type(number) is int else 0

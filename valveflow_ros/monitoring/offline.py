@@ -197,7 +197,7 @@ class JournalReplayer:
             self._tasks.pop(entry.request_ns, None)
             return monitor.refuse(entry.request_ns, entry.text)
         if entry.kind in _ALARM_ACTIONS:
-            return monitor.operate_alarms(_ALARM_ACTIONS[entry.kind])
+            return monitor.operate_alarms(_ALARM_ACTIONS[entry.kind], entry.text or None)
         if entry.kind == JournalKind.RESET:
             self._reset_at = monitor.rows
             return monitor.restart(entry.text)

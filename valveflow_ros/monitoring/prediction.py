@@ -226,6 +226,12 @@ class Predictor(Memory):
             settings.real('pressure_exponent'),
         )  # fmt: skip
 
+    def configure(self, settings: Settings) -> None:
+        """Take the fixed limit and the time constant of the running mean; the mean goes on."""
+        self.limit_mw = settings.real('alarm_limit')
+        forget = math.exp(-settings.real('sample_period') / settings.real('alarm_average'))
+        self._filter = self._filter._replace(forget=forget)
+
     @property
     def warm_up_rows(self) -> int:
         """Return how many rows bring the filter into its stride."""

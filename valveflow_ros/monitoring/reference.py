@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.characteristic import Characteristic, ChartDesign
 from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.curve.segment_residual import segment_residuals
 from valveflow_ros.curve.shift import Shift, ShiftLimits, judge_shift
@@ -225,6 +226,15 @@ class ReferenceCurve:
                 at_ns = int(np.average(found.time_ns - time_ns, weights=found.weights)) + time_ns
                 worn = float(np.average(found.residual_mw, weights=found.weights))
                 self._worn = [*self._worn[1 - _KEPT :], (at_ns, worn)]
+
+    def take_chart(self, chart: ChartDesign) -> None:
+        """Watch the residual of the reference by another chart; the curve stays what it was."""
+        since_ns, candidate = self._candidate or (0, None)
+        self.curve, self.first, candidate = (
+            c and replace(c, residuals=replace(c.residuals, chart=chart))
+            for c in (self.curve, self.first, candidate)
+        )
+        self._candidate = None if candidate is None else (since_ns, candidate)
 
     @property
     def wear(self) -> Wear | None:

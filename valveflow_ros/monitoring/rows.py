@@ -73,6 +73,11 @@ class Correction:
         self._ahead: SampleTable | None = None
 
     @property
+    def corrector(self) -> Corrector | None:
+        """Return what changes the rows; None if nothing does."""
+        return self._corrector
+
+    @property
     def on(self) -> bool:
         """Tell whether rows are changed."""
         return self._corrector is not None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -112,6 +113,46 @@ class Segmenter(Memory):
         self._histograms = np.zeros((2, BINS))
         self._found = np.zeros(kernel.SEG_SIZE)
         self._number = 0
+
+    @classmethod
+    def over(
+        cls,
+        settings: Settings,
+        number: IntArray,
+        time_ns: IntArray,
+        values: FloatArray,
+        next_number: int,
+        found_before: int = 0,
+    ) -> tuple[Segmenter, list[FoundSegment]]:
+        """Return a segmenter that has followed rows of the past, and what it found in them.
+
+        Parameters
+        ----------
+        settings : Settings
+        number : int64 (n,)
+            Numbers of the rows, rising. Where some are missing nothing goes on.
+        time_ns : int64 (n,)
+        values : float64 (3, n)
+            ``u``, power in MW and temperature in degC, as for `feed`.
+        next_number : int
+            Of the row that it is to be fed next.
+        found_before : int
+            Segments are numbered on from here.
+        """
+        made = cls(settings)
+        made._number = found_before
+        found: list[FoundSegment] = []
+        period_ns = round(made._period_s * NS_PER_S)
+        begins = np.flatnonzero(np.diff(number, prepend=-2) != 1)
+        for start, end in pairwise([*begins.tolist(), len(number)]):
+            made._state[[kernel.ROW, kernel.FIRST_ROW]] = number[start]
+            found += [f for _, f in made.feed(time_ns[start:end], *values[:, start:end]).found]
+            if number[end - 1] + 1 != (next_number if end == len(number) else number[end]):
+                # A row without data ends what is open.
+                after_ns = time_ns[end - 1 : end] + period_ns
+                found += [f for _, f in made.feed(after_ns, *np.full((3, 1), math.nan)).found]
+        made._state[[kernel.ROW, kernel.FIRST_ROW]] += next_number - made._state[kernel.ROW]
+        return made, found
 
     def noise(self) -> NoiseLevel:
         """Return the noise level in use now."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -12,8 +13,8 @@ import numpy as np
 from valveflow_ros.errors import DataError
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SegmentKind, SpecialSegment
-from valveflow_ros.segments.segmenter import FoundSegment
-from valveflow_ros.signals.static_form import PAPER_EXPONENT, pressure_of
+from valveflow_ros.segments.segmenter import FoundSegment, Segmenter
+from valveflow_ros.signals.static_form import PAPER_EXPONENT, integrated_input, pressure_of
 from valveflow_ros.state import State, perhaps
 
 # Special segments as plain values, for a saved state.
@@ -125,6 +126,8 @@ class RollingWindow:
         Length of the window and step of the rows; together they bound the memory.
     exponent : float
         m of the u = V p^m of the rows.
+    least_s : mapping of SegmentKind to float, optional
+        Shortest segment of a kind that is kept where a step of the clock cuts it.
 
     Notes
     -----
@@ -136,8 +139,17 @@ class RollingWindow:
     window without gaps, and is inside again when the leap is taken back.
     """
 
-    def __init__(self, window_s: float, period_s: float, exponent: float = PAPER_EXPONENT) -> None:
+    def __init__(
+        self,
+        window_s: float,
+        period_s: float,
+        exponent: float = PAPER_EXPONENT,
+        least_s: Mapping[SegmentKind, float] | None = None,
+    ) -> None:
         self._exponent = exponent
+        self._least = {
+            kind: math.ceil(seconds / period_s) for kind, seconds in (least_s or {}).items()
+        }
         self._window_ns = round(window_s * NS_PER_S)
         self._period_ns = round(period_s * NS_PER_S)
         self._doubt = max(1, math.ceil(_DOUBT_S / period_s))
@@ -156,6 +168,10 @@ class RollingWindow:
         return cls(
             86400.0 * settings.real('window_days'), settings.real('sample_period'),
             settings.real('pressure_exponent'),
+            {
+                SegmentKind.STEADY: settings.real('steady_min'),
+                SegmentKind.SLOPE: settings.real('slope_min'),
+            },
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -214,15 +230,36 @@ class RollingWindow:
         self._forget()
 
     def add_segment(self, found: FoundSegment) -> None:
-        """Remember a special segment that has closed."""
+        """Remember a special segment that has closed.
+
+        Of one that was open when the clock went back the part before that stays.
+        """
         aside = self._aside
         if aside is not None and _has(aside.number, found.end_row - 1):
-            # It was open when the clock went back.
             aside.segments.append(self._with_ends(found, aside.number, aside.data))
-        elif _has(self._number[: self._end], found.end_row - 1):
-            number, data = self._number[: self._end], self._data[:, : self._end]
-            self._segments.append(self._with_ends(found, number, data))
-            self._forget()
+        self._segments.extend(self._part(found))
+        self._forget()
+
+    def _part(self, found: FoundSegment) -> list[FoundSegment]:
+        """Return the part of a segment whose rows are held; none if it is too short for one.
+
+        What is cut off goes on in a straight line with what is left.
+        """
+        number, s = self._number[: self._end], found.segment
+        first, end = (int(k) for k in np.searchsorted(number, (found.first_row, found.end_row)))
+        rows = end - first
+        if rows == s.samples:
+            return [self._with_ends(found, number, self._data[:, : self._end])]
+        if rows < max(2, self._least.get(s.kind, 2)) or number[first] != found.first_row:
+            return []
+        share = (rows - 1) / (s.samples - 1)
+        part = replace(
+            s, samples=rows, end_ns=int(self._time_ns[end - 1]),
+            u_end=s.u_start + share * (s.u_end - s.u_start),
+            power_end_mw=s.power_start_mw + share * (s.power_end_mw - s.power_start_mw),
+        )  # fmt: skip
+        cut = FoundSegment(part, found.first_row, int(number[end - 1]) + 1)
+        return [self._with_ends(cut, number, self._data[:, : self._end])]
 
     def _with_ends(self, found: FoundSegment, number: IntArray, data: FloatArray) -> FoundSegment:
         """Return a segment with opening and pressure at the ends of a line through its rows."""
@@ -254,14 +291,18 @@ class RollingWindow:
             self._data[:, cut:stop].copy(), [],
         )  # fmt: skip
         newest = -1 if stop == cut else int(passed.number[-1])
+        known = {found.first_row for found in old.segments} if old is not None else set()
+        self._end = cut
         stay: deque[FoundSegment] = deque()
         for found in self._segments:
             if found.segment.end_ns < time_ns:
                 stay.append(found)
-            elif found.end_row - 1 <= newest:
+                continue
+            # What an earlier step back has cut is set aside as a whole already.
+            if found.end_row - 1 <= newest and found.first_row not in known:
                 passed.segments.append(found)
+            stay.extend(self._part(found))
         self._segments = stay
-        self._end = cut
         self._give_back_room()
         if old is not None:
             passed = _Aside(
@@ -330,6 +371,38 @@ class RollingWindow:
         self._segments = deque(rows.segments)
         self._aside = None if aside is None else _rows_of(aside)
 
+    def find_segments_anew(
+        self, settings: Settings, exponent: float, found_before: int
+    ) -> Segmenter:
+        """Let the segments be those that these settings find; return what goes on finding them.
+
+        Rows set aside are forgotten.
+
+        Parameters
+        ----------
+        settings : Settings
+        exponent : float
+            m of the u = V p^m that the rows have; it becomes that of the window.
+        found_before : int
+            Segments are numbered on from here.
+        """
+        rows = slice(0, self._end)
+        if exponent != self._exponent:
+            u, opening = self._data[0, rows], self._data[3, rows]
+            pressure = pressure_of(u, opening, exponent)
+            known = np.where(u == 0.0, 0.0, math.nan)
+            anew = integrated_input(opening, pressure, self._exponent)
+            self._data[0, rows] = np.where(np.isfinite(pressure), anew, known)
+        segmenter, found = Segmenter.over(
+            settings, self._number[rows], self._time_ns[rows], self._data[:3, rows], self._seen,
+            found_before,
+        )  # fmt: skip
+        self._aside = None
+        self._segments.clear()
+        for segment in found:
+            self.add_segment(segment)
+        return segmenter
+
     def _clear(self) -> None:
         """Hold nothing."""
         self._room = min(_FIRST_ROOM, self._most_room)
@@ -375,7 +448,10 @@ class RollingWindow:
         """Put the rows set aside in the place of those since."""
         last = aside.number[-1]
         self._end = int(np.searchsorted(self._number[: self._end], last))
-        self._segments = deque(s for s in self._segments if s.end_row - 1 <= last)
+        whole = {found.first_row for found in aside.segments}
+        self._segments = deque(
+            s for s in self._segments if s.end_row - 1 <= last and s.first_row not in whole
+        )
         self._segments.extend(aside.segments)
         self._add(aside.time_ns, aside.number, aside.data)
 

@@ -28,6 +28,7 @@ from valveflow_ros.logs.source import os_errors
 DROPS_SHOWN_S = 2.0
 # So often somebody looks whether finished files are there as they were left.
 _LOOK_S = 2.0
+_FLUSH_LOOK_S = 0.001
 # At the end nobody waits long.
 _LAST_LOOK_BYTES = 256 * 1024 * 1024
 # More waiting messages than this wake the thread before its time.
@@ -241,7 +242,7 @@ class NewTopic(NamedTuple):
 
 
 class RecorderLoop:
-    """Runs the writer; `put`, `ask_rotation` and `stop` may be called from other threads."""
+    """Runs the writer; all but `start` may be called from other threads."""
 
     def __init__(
         self,
@@ -282,6 +283,10 @@ class RecorderLoop:
         self._queue.append(item)
         if len(self._queue) >= _WAKE_AT:
             self._wake.set()
+
+    def wake(self) -> None:
+        """Write what waits before its time."""
+        self._wake.set()
 
     def ask_rotation(self) -> None:
         """Begin a new split at the next opportunity."""
@@ -579,6 +584,23 @@ class Recorder:
             return False
         self._loop.put(Message(topic, data, log_time_ns, publish_time_ns))
         return True
+
+    def flush(self, timeout_s: float) -> bool:
+        """Have all messages handed in up to now in the file, where a killed process leaves them.
+
+        Returns
+        -------
+        bool
+            False if they are not there within that time.
+        """
+        received = self.status().received
+        until_s = time.monotonic() + timeout_s
+        self._loop.wake()
+        while (status := self.status()).received - status.queued < received:
+            if time.monotonic() >= until_s:
+                return False
+            time.sleep(_FLUSH_LOOK_S)
+        return status.state != RecorderState.STOPPED
 
     def rotate(self) -> None:
         """Ask for a new split; returns at once."""

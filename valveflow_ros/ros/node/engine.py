@@ -130,6 +130,13 @@ class LiveEngine:
         self.aligner.restore(saved['aligner'])
         self.monitor.restore(saved['monitor'])
 
+    def carry(self, saved: State, then: Settings) -> tuple[str, list[Event]]:
+        """Continue from a snapshot of other settings; see `Monitor.carry`.
+
+        Readings that waited for their row then are left out.
+        """
+        return self.monitor.carry(saved['monitor'], then)
+
     def _feed_rows(self, table: SampleTable) -> list[Event]:
         events: list[Event] = []
         done = 0

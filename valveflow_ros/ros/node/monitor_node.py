@@ -23,8 +23,9 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
+from valveflow_msgs.srv import OperateAlarm
 
-from valveflow_ros.errors import ParameterError, ValveflowError, counted
+from valveflow_ros.errors import DataError, ParameterError, ValveflowError, counted, listed
 from valveflow_ros.logs import RecorderState, RecorderStatus
 from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.parameters import Settings
@@ -41,6 +42,7 @@ from valveflow_ros.ros.process import StopFlag, with_place
 _SUCCESS = TransitionCallbackReturn.SUCCESS
 _LOOK_AROUND_S = 5.0
 _NOT_RUNNING = 'The monitor is not active; activate it first.'
+_NOT_ON_DISK = 'It is not on disk yet; see recorder and state in /diagnostics.'
 # A look costs the same for one message as for ten, and a plant is in no hurry. Where much comes,
 # as from a replay, the next look follows at once.
 _PERIOD_S = 0.02
@@ -67,6 +69,12 @@ _ALARM_SERVICES = {
         'cause is still there. New alarms are not hidden.',
     ),
     'unshelve_alarms': (AlarmAction.UNSHELVE, 'The alarms are no longer put aside.'),
+}
+_ONE_ALARM = {
+    AlarmAction.ACKNOWLEDGE: 'The alarm {} is acknowledged.',
+    AlarmAction.SHELVE: 'The alarm {} is put aside for {:g} h; then it comes back by itself if '
+    'its cause is still there.',
+    AlarmAction.UNSHELVE: 'The alarm {} is no longer put aside.',
 }
 
 
@@ -236,6 +244,9 @@ class MonitorNode(LifecycleNode):
             )
             for name in SERVICES
         ]
+        self._operate_service = self.create_service(
+            OperateAlarm, '~/operate_alarm', self._operate, qos_profile=_REQUESTS
+        )
 
     # Parameters
 
@@ -398,18 +409,39 @@ class MonitorNode(LifecycleNode):
     def _serve(
         self, name: str, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        """Do what a service asks for; the answer is always a sentence."""
-        response.success = False
+        """Do what a service asks for."""
+        response.success, response.message = self._done(functools.partial(self._answer, name))
+        return response
+
+    def _operate(
+        self, request: OperateAlarm.Request, response: OperateAlarm.Response
+    ) -> OperateAlarm.Response:
+        """Do to one alarm what is asked for."""
+
+        def answer(session: Session) -> str:
+            actions = [action.value for action in AlarmAction]
+            if request.action not in actions:
+                raise DataError(
+                    f"There is no action '{request.action}'; choose {listed(actions, 'or')}."
+                )
+            action = AlarmAction(request.action)
+            session.publish(session.engine.monitor.operate_alarms(action, request.name))
+            hours = self.settings.real('alarm_shelve_time') / 3600.0
+            return _ONE_ALARM[action].format(request.name, hours)
+
+        response.success, response.message = self._done(answer)
+        return response
+
+    def _done(self, answer: Callable[[Session], str]) -> tuple[bool, str]:
+        """Return whether something was done, and a sentence; what was done is on disk then."""
         session = self.session
         if session is None or not session.listening:
-            response.message = _NOT_RUNNING
-            return response
+            return False, _NOT_RUNNING
         try:
-            response.message = self._answer(name, session)
-            response.success = True
+            sentence = answer(session)
         except ValveflowError as error:
-            response.message = str(error)
-        return response
+            return False, str(error)
+        return True, sentence if session.confirm() else f'{sentence} {_NOT_ON_DISK}'
 
     def _answer(self, name: str, session: Session) -> str:
         monitor, engine = session.engine.monitor, session.engine

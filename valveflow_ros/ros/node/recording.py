@@ -196,6 +196,10 @@ class Recording:
 
         return ready
 
+    def flush(self, longest_s: float) -> bool:
+        """Have all messages up to now on disk; return False if they are not within this time."""
+        return self._recorder is not None and self._recorder.flush(longest_s)
+
     def close(self) -> RecorderStatus | None:
         """Finish the file; return the account."""
         recorder, self._recorder = self._recorder, None

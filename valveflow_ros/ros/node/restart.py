@@ -11,7 +11,7 @@ from valveflow_ros.errors import DataError, RecordingError, ValveflowError
 from valveflow_ros.logs import LoggedMessage, messages_since, recover_leftovers
 from valveflow_ros.logs.part_file import PART_SUFFIX, is_held
 from valveflow_ros.monitoring.alarms import AlarmState
-from valveflow_ros.monitoring.events import JournalEntry, JournalKind
+from valveflow_ros.monitoring.events import Event, JournalEntry, JournalKind
 from valveflow_ros.monitoring.offline import JournalReplayer
 from valveflow_ros.parameters import Settings, parameter
 from valveflow_ros.records import Readings
@@ -24,6 +24,7 @@ from valveflow_ros.state import State
 
 REASON = 'The monitor was started again; it goes on from its saved state.'
 _BLOCK = 500
+_DOES_NOT_FIT = (ValveflowError, LookupError, TypeError, ValueError, AttributeError)
 
 
 class Restart:
@@ -78,13 +79,12 @@ class Restart:
 
     def engine(self, make: Callable[[Settings], LiveEngine]) -> LiveEngine:
         """Return the engine, where it was left if there is a state that can be used."""
-        saved = self._store.saved
+        saved, self._make = self._store.saved, make
         if saved is not None:
             try:
-                engine = make(self._settings_then(saved))
                 self._find_recording(saved)
-                engine.restore(saved['engine'])
-            except (ValveflowError, LookupError, TypeError, ValueError, AttributeError) as error:
+                engine = self._restored(saved['engine'], self._settings_then(saved))
+            except _DOES_NOT_FIT as error:
                 known = isinstance(error, ValveflowError)
                 self._store.drop(str(error) if known else 'It does not fit this program.')
                 self.log_ns, self.folder, self._tail = 0, None, []
@@ -109,9 +109,17 @@ class Restart:
         if problems:
             what = ' '.join(dict.fromkeys(problems))
             self._log(Level.WARN, f'Not all of the earlier recording could be followed: {what}')
+        retuned = settings.retuned(engine.monitor.settings)
+        events: list[Event] = []
+        if retuned:
+            made = self._make(settings)
+            sentence, events = made.carry(engine.snapshot(), engine.monitor.settings)
+            self._log(Level.OK, sentence)
+            engine.aligner, engine.monitor = made.aligner, made.monitor
+            outputs.restore(engine.monitor)
         monitor = engine.monitor
         yield from outputs.of(monitor.resume(REASON))
-        yield from outputs.of(monitor.reconfigure(settings))
+        yield from outputs.of(events if retuned else monitor.reconfigure(settings))
         self._tail.clear()
         self._log(Level.OK, f'Going on after {monitor.rows} rows of an earlier run.')
         for last in (monitor.alarm.last, monitor.reference.alarm.last):
@@ -158,9 +166,22 @@ class Restart:
             )
 
     def _settings_then(self, saved: State) -> Settings:
-        """Return the settings of now with those that may change while running as they were."""
+        """Return the settings of then, and of now what the engine does not decide by."""
         now, then = self._settings, saved['settings']
-        return now.changed({n: then[n] for n in now if parameter(n).live and n in then})
+        apart = (n for n in now if not (parameter(n).of_state or parameter(n).live))
+        return Settings({**then, **{n: now[n] for n in apart}})
+
+    def _restored(self, saved: State, then: Settings) -> LiveEngine:
+        """Return an engine that goes on from a snapshot, as far as it fits this version."""
+        engine = self._make(then)
+        try:
+            engine.restore(saved)
+        except _DOES_NOT_FIT:
+            engine = self._make(then)
+            sentence, _ = engine.carry(saved, then)
+            self._log(Level.WARN, f'The saved state is of another version. {sentence}')
+            self.folder = None  # a replay would not come to this
+        return engine
 
     def _find_recording(self, saved: State) -> None:
         """Find what was recorded after the state was saved, and whether it is continued."""
@@ -173,8 +194,12 @@ class Restart:
             self._tail = list(messages_since(folder, self.log_ns))
             if any(map(_written_now, folder.glob(f'*{PART_SUFFIX}'))):
                 self._missing = f'Another process records into {folder}; a new recording is begun.'
-            # With the same names on the topics it is one recording, and a replay finds all of it.
-            elif saved['topics'] == self._topics and not self._result_lost():
+            # With the same parameters and names of topics it is one recording for a replay.
+            elif (
+                saved['topics'] == self._topics
+                and not self._settings.retuned(saved['settings'])
+                and not self._result_lost()
+            ):
                 self.folder = folder
         except (RecordingError, DataError) as error:
             self._missing = f'What was recorded after the state was saved is not there: {error}'

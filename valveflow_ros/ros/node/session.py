@@ -32,6 +32,8 @@ from valveflow_ros.signals.units import in_unit
 from valveflow_ros.state import State
 
 DIAGNOSTICS = '/diagnostics'
+# Who asked a service waits so long for a disk; the samples wait meanwhile.
+_CONFIRM_S = 0.5
 # A look at the graph costs a fraction of a millisecond.
 _GRAPH_S = 0.5
 _DEPTH = 1000
@@ -182,6 +184,20 @@ class Session:
         self._store.note(events)
         self._send(self._messages.of(events))
 
+    def confirm(self) -> bool:
+        """Have what has happened on disk, and return whether it is there.
+
+        A run that follows a kill finds it in the recording, which it feeds from the saved state
+        on. Without that the state alone must have it.
+        """
+        written = self.recording.flush(_CONFIRM_S)
+        follows = written and self.recording.whole and self._store.saved_s is not None
+        if follows or not self._store.on:
+            return written or not self.recording.on
+        self._save_state()
+        self._store.finish()
+        return not (self._store.busy or self._store.problem)
+
     def reconfigure(self, settings: Settings) -> None:
         """Take settings of which only live ones differ."""
         self._settings = self._health.settings = settings
@@ -249,8 +265,8 @@ class Session:
 
     def _begin(self) -> None:
         """Publish what stands at the start, or continue where an earlier run ended."""
-        monitor, given = self.engine.monitor, self._reference
         self._send(self._restart.begin(self._settings, self.engine, self._messages))
+        monitor, given = self.engine.monitor, self._reference
         if self.recording.folder is not None:
             self._recovery = BackgroundRecovery(self.recording.folder, tag_of(self._settings))
         if self._model is not None:

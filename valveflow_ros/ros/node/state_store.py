@@ -8,12 +8,12 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import from_json, to_json
-from valveflow_ros.errors import DataError, RecordingError, ValveflowError
+from valveflow_ros.errors import DataError, RecordingError, ValveflowError, listed
 from valveflow_ros.logs.part_file import FILE_MODE, make_folder, mark_of, write_whole
 from valveflow_ros.monitoring.alarms import AlarmChange
 from valveflow_ros.monitoring.events import (
@@ -24,7 +24,7 @@ from valveflow_ros.monitoring.events import (
     JournalKind,
     ReferenceSet,
 )
-from valveflow_ros.parameters import Settings, parameter
+from valveflow_ros.parameters import Depends, Settings, parameter
 from valveflow_ros.ros.node.diagnostics import Item, Level
 from valveflow_ros.ros.node.recording import DEFAULT_FOLDER, expand_home, tag_of
 from valveflow_ros.state import State, from_bytes, perhaps, to_bytes
@@ -141,8 +141,13 @@ class StateFolder:
         except OSError as error:
             raise RecordingError(path, f'cannot be read ({_reason(error)})') from None
 
-    def set_aside(self) -> bool:
-        """Keep a state that cannot be used from being overwritten; of two the larger one stays.
+    def set_aside(self, of_use: bool = False) -> bool:
+        """Keep a state from being overwritten; of two the larger one stays.
+
+        Parameters
+        ----------
+        of_use : bool
+            Whether it is also to stay where it is, until there is another.
 
         Returns
         -------
@@ -151,7 +156,11 @@ class StateFolder:
         """
         with contextlib.suppress(OSError):
             if not self.aside.exists() or self.aside.lstat().st_size < self.path.lstat().st_size:
-                self.path.replace(self.aside)
+                if of_use:
+                    self.aside.unlink(missing_ok=True)
+                    os.link(self.path, self.aside)
+                else:
+                    self.path.replace(self.aside)
                 return True
         return False
 
@@ -436,46 +445,45 @@ class StateStore:
             self.saved_s = time.monotonic()
 
     def _find(self, folder: StateFolder, settings: Settings) -> None:
-        """Find a state that fits: the last one, or one that was set aside because it did not."""
+        """Find the state of most use: the last one, or one that was set aside."""
         try:
-            self.saved = _fitting(folder.read(), settings)
-        except _OtherError as error:
-            # Whoever corrects a mistyped parameter gets back what was there before.
-            with contextlib.suppress(ValveflowError, KeyError, TypeError):
-                self.saved = _fitting(folder.read(folder.aside), settings)
-            if self.saved is None:
-                self.drop(str(error), whole=True)
-            else:
-                folder.swap_aside()
+            self.saved = _whole(folder.read())
         except (ValveflowError, KeyError, TypeError) as error:
             self.drop(str(error) if isinstance(error, ValveflowError) else 'It is not whole.')
+        if self.saved is None:
+            return
+        names = _changed(self.saved, settings, Depends.ROWS)
+        if not names:
+            return
+        # Whoever corrects a mistyped parameter gets back what was there before.
+        with contextlib.suppress(ValveflowError, KeyError, TypeError):
+            aside = _whole(folder.read(folder.aside))
+            if aside is not None and not _changed(aside, settings, Depends.ROWS):
+                self.saved = aside
+                folder.swap_aside()
+                return
+        if others := _changed(self.saved, settings, Depends.ALL):
+            self.drop(f'It was made with another {listed(others)}.', whole=True)
+        else:
+            folder.set_aside(of_use=True)
 
 
-class _OtherError(DataError):
-    """A state was made with other parameters."""
-
-
-def _fitting(data: bytes | None, settings: Settings) -> State | None:
-    """Return the state in those bytes, None if there are none.
-
-    Raises
-    ------
-    _OtherError
-        It was made with other parameters.
-    DataError
-        It is damaged.
-    """
+def _whole(data: bytes | None) -> State | None:
+    """Return the state in those bytes, None if there are none; raises `DataError`."""
     if data is None:
         return None
     saved = from_bytes(data)
     for name in saved.keys() & _KINDS.keys():
         perhaps(saved, name, _KINDS[name])
-    then: Mapping[str, object] = Settings(saved['settings'])
-    names = [n for n, v in settings.items() if v != then[n] and parameter(n).of_state]
-    if names:
-        other = ' and '.join(filter(None, (', '.join(names[:-1]), names[-1])))
-        raise _OtherError(f'It was made with another {other}.')
+    # Of an earlier version too; it may have had other parameters.
+    saved['settings'] = Settings.earlier(saved['settings'])
     return saved
+
+
+def _changed(saved: State, settings: Settings, depends: Depends) -> list[str]:
+    """Return the parameters that changed and on which so much of a state, or more, depends."""
+    then: Settings = saved['settings']
+    return [n for n in settings.retuned(then) if parameter(n).depends >= depends]
 
 
 def _is_named(path: Path, descriptor: int) -> bool:
