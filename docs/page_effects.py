@@ -11,6 +11,7 @@ from docs.page_tables import table
 from docs.picture_data import DATA, commands
 from valveflow_ros.diagnosis import causes
 from valveflow_ros.plant import effects
+from valveflow_ros.report.words import advice
 
 FAULTS = ('flatline', 'quantisation', 'spikes')
 _STAGES = {
@@ -36,9 +37,10 @@ def trial(name: str) -> dict[str, Any]:
 
 def part(name: str, which: str) -> str:
     """Return a generated part of the page of an effect."""
-    return {'physics': _physics, 'picture': _picture, 'numbers': _numbers, 'others': _others}[
-        which
-    ](name)
+    return {
+        'physics': _physics, 'picture': _picture, 'numbers': _numbers, 'others': _others,
+        'advice': advice,
+    }[which](name)  # fmt: skip
 
 
 def _docstring(name: str) -> str:

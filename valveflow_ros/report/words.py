@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from datetime import datetime, timezone
 from fractions import Fraction
+from importlib import resources
 from typing import TYPE_CHECKING
 
 from valveflow_ros.records import NS_PER_S
@@ -198,6 +200,20 @@ def input_axis(value: float) -> dict[str, str]:
         return {'text': 'u = V, valve opening (%)', 'short': 'u = V (%)'}
     long = f'integrated input u = V p<sup>{exponent(value)}</sup> ({input_unit(value)})'
     return {'text': long, 'short': f'u ({input_unit(value)})'}
+
+
+@functools.cache
+def _advice() -> dict[str, str]:
+    # It is read where a cause was named only.
+    import yaml
+
+    file = resources.files('valveflow_ros.report').joinpath('advice.yaml')
+    return dict(yaml.safe_load(file.read_text(encoding='utf-8')))
+
+
+def advice(name: str) -> str:
+    """Return what to do about a cause, a paragraph with `code` in backquotes; empty: not known."""
+    return _advice().get(name, '').strip()
 
 
 # Causes whose change is counted from the mean of the record, see `diagnosis.causes`.
