@@ -1,0 +1,43 @@
+// The live page: pictures in the page's colours, and a word when the server is silent.
+const valveflow = (function () {
+  const silentAfter = 7000;
+  let heard = Date.now();
+  let generation = null;
+
+  function picture(made, name) {
+    if (!made || !made[name]) return window.dash_clientside.no_update;
+    const colour = colours();
+    const narrow = window.innerWidth < 560;
+    const given = painted(made[name], colour);
+    const layout = Object.assign(baseLayout(colour), {
+      // What was chosen by hand stays while new data come.
+      uirevision: name, dragmode: narrow ? false : 'pan', autosize: true,
+      margin: { l: 52, r: 10, t: narrow ? 46 : 28, b: narrow ? 40 : 44 },
+    });
+    for (const key of Object.keys(given.layout)) {
+      layout[key] = /^[xy]axis/.test(key) ? styledAxis(given.layout[key], colour, narrow) : given.layout[key];
+    }
+    document.documentElement.dataset.drawn = 'yes';
+    return { data: given.data, layout };
+  }
+
+  function pulse(seen) {
+    const now = Date.now();
+    const asked = window.dash_clientside.callback_context.triggered_id;
+    if (asked === 'seen') {
+      heard = now;
+      generation = generation || seen.generation;
+      // Other units, or a server that was started anew: nothing here can be relied on.
+      if (seen.generation !== generation) window.location.reload();
+    }
+    const lost = now - heard > silentAfter;
+    document.documentElement.classList.toggle('silent', lost);
+    if (!lost) return '';
+    const since = new Date(heard).toISOString().slice(11, 19);
+    return 'No answer from the page\'s process since ' + since + ' UTC: what stands here is old. It is asked again by itself.';
+  }
+
+  // Colours are looked up when a picture is drawn.
+  matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => window.location.reload());
+  return { picture, pulse };
+})();
