@@ -15,11 +15,14 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from valveflow_ros.errors import DataError, InputError, RecordingError, UsageError, ValveflowError
-from valveflow_ros.page.unit import Shown
+
+if TYPE_CHECKING:
+    # A verb that only names the options need not load it.
+    from valveflow_ros.page.unit import Shown
 
 PORT = 8350
 # Open connections beyond which the answer is 503, and beyond which none is accepted.
@@ -63,6 +66,10 @@ def page_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         '--name', metavar='NAME', action='append', default=[],
         help='a further name by which browsers and Prometheus reach this machine',
+    )  # fmt: skip
+    parser.add_argument(
+        '--token-file', metavar='FILE', type=Path,
+        help='let a browser that knows the token in this file acknowledge and shelve alarms',
     )  # fmt: skip
     parser.add_argument(
         '--on-alarm', metavar='COMMAND',

@@ -54,7 +54,7 @@ _MOST_RECENT = 300
 _LEVELS = {OK: ('ok', 'good'), WARN: ('look', 'warn'), ERROR: ('fault', 'bad'),
            STALE: ('silent', 'bad')}  # fmt: skip
 PARTS = ('head', 'alarms', 'curve_words', 'now', 'diagnosis', 'health')
-PICTURES = {'curve': 300, 'recent': 250, 'day': 290}
+PICTURES = {'curve': 300, 'recent': 250, 'day': 340}
 # What may be asked of a monitor from the page.
 ASKED = {'acknowledge_alarms': 'Acknowledge', 'shelve_alarms': 'Shelve'}
 _TRIES, _WAIT_S = 5, 30.0
@@ -338,7 +338,8 @@ def _versions(told: Mapping[str, Any]) -> dict[str, Made]:
 # The page.
 
 _CONFIG: Any = {
-    'displaylogo': False, 'displayModeBar': 'hover', 'responsive': True, 'plotlyServerURL': '', 'showSendToCloud': False,
+    'displaylogo': False, 'displayModeBar': 'hover', 'responsive': True,
+    'plotlyServerURL': '', 'showSendToCloud': False,
     # A list of our own: the usual one has a button that sends the data to a server.
     'modeBarButtons': [['toImage'], ['zoom2d', 'pan2d'], ['resetScale2d']],
     'toImageButtonOptions': {'format': 'svg'},

@@ -9,7 +9,6 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NoAnswer
-from pathlib import Path
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -120,10 +119,6 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         '--node', metavar='NAME', action='append', default=[],
         help='a monitor to show; may be given several times (default: every one that runs)',
-    )  # fmt: skip
-    made.add_argument(
-        '--token-file', metavar='FILE', type=Path,
-        help='let a browser that knows the token in this file acknowledge and shelve alarms',
     )  # fmt: skip
     page_arguments(made)
     return made
