@@ -15,9 +15,9 @@ from valveflow_ros.page.unit import Shown, Unit
 
 pytest.importorskip('prometheus_client', reason='the page is an extra')
 
-from prometheus_client.parser import text_string_to_metric_families  # noqa: E402
+from prometheus_client.parser import text_string_to_metric_families
 
-from valveflow_ros.page.metrics import Metrics  # noqa: E402
+from valveflow_ros.page.metrics import Metrics
 
 BOARD = Path(__file__).resolve().parents[2] / 'config' / 'grafana_board.json'
 

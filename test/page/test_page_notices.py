@@ -10,8 +10,8 @@ import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
-from page_units import alarm, predict
 from monitor_recording import START_NS
+from page_units import alarm, predict
 
 from valveflow_ros.errors import UsageError
 from valveflow_ros.page.notices import (

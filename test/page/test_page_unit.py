@@ -1,4 +1,4 @@
-"""What the page keeps of a unit: bounded, in the plant's time, and each change of an alarm once."""
+"""What the page keeps of a unit: bounded, in the plant's time, each alarm's change told once."""
 
 from __future__ import annotations
 

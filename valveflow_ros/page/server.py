@@ -33,6 +33,7 @@ IDLE_S, _LONGEST_S = 20, 120.0
 _SWEEP_S = 5.0
 _MOST_HEAD, _MOST_BODY = 16384, 65536
 _THREADS = 4
+_MOST_FILES = 64
 _STATIC = '/_dash-component-suites/'
 _PATHS = {'/': 'GET', '/_dash-layout': 'GET', '/_dash-dependencies': 'GET', '/metrics': 'GET',
           '/_dash-update-component': 'POST'}  # fmt: skip
@@ -172,8 +173,8 @@ class Guard:
                 ])  # fmt: skip
                 return [text]
             if path.startswith(_STATIC):
-                return self._file(path, environ, begin)
-            return self._application(environ, begin)
+                return self._file(path, environ, begin, start)
+            return self._asked(environ, begin, start)
         except Exception:  # noqa: BLE001 - whatever a strange request makes of the library
             self.refused += 1
             return self._say(start, '400 Bad Request', 'This request cannot be answered.')
@@ -214,25 +215,37 @@ class Guard:
 
     def _say(self, start: Start, status: str, sentence: str) -> list[bytes]:
         body = f'{sentence}\n'.encode()
-        head = [('Content-Type', 'text/plain; charset=utf-8'), ('Content-Length', str(len(body))),
-                ('Connection', 'close'), ('Retry-After', '10')]  # fmt: skip
-        start(status, head[:3] if not status.startswith('503') else head)
+        head = [('Content-Type', 'text/plain; charset=utf-8'), ('Content-Length', str(len(body)))]
+        if status.startswith('503'):
+            head.append(('Retry-After', '10'))
+        start(status, head)
         return [body]
 
-    def _file(self, path: str, environ: dict[str, Any], begin: Start) -> Iterable[bytes]:
+    def _asked(self, environ: dict[str, Any], begin: Start, start: Start) -> Iterable[bytes]:
+        """Return the library's answer; where it is an error, its number and a sentence."""
+        status, head, body = _whole(self._application, environ)
+        if status[0] in '45':
+            self.refused += 1
+            return self._say(start, status, 'This request cannot be answered.')
+        begin(status, head)
+        return [body]
+
+    def _file(
+        self, path: str, environ: dict[str, Any], begin: Start, start: Start
+    ) -> Iterable[bytes]:
         """Return a file of the library; each is kept once, whoever reads it and however slowly."""
+        if 'gzip' not in str(environ.get('HTTP_ACCEPT_ENCODING', '')):
+            return self._asked(environ, begin, start)
         if path not in self._static:
-            status, head, body = _whole(self._application, environ)
-            if not status.startswith('200') or len(self._static) > 64:
-                begin(status, head)
-                return [body]
+            whole = {**environ, 'REQUEST_METHOD': 'GET'}
+            status, head, body = _whole(self._application, whole)
+            if not status.startswith('200') or len(self._static) > _MOST_FILES:
+                return self._asked(environ, begin, start)
             packed = gzip.compress(body, 6, mtime=0)
             kept = [(k, v) for k, v in head if k.lower() not in ('content-length', 'server')]
             more = [('Content-Encoding', 'gzip'), ('Content-Length', str(len(packed)))]
             self._static[path] = (kept + more, packed)
         head, packed = self._static[path]
-        if 'gzip' not in str(environ.get('HTTP_ACCEPT_ENCODING', '')):
-            return self._application(environ, begin)
         begin('200 OK', head)
         return environ['wsgi.file_wrapper'](io.BytesIO(packed))  # type: ignore[no-any-return]
 
@@ -244,7 +257,7 @@ def _whole(application: Wsgi, environ: dict[str, Any]) -> tuple[str, Any, bytes]
     def start(status: str, head: list[tuple[str, str]], *_: Any) -> None:
         kept[:] = [status, head]
 
-    answer = application({**environ, 'REQUEST_METHOD': 'GET'}, start)
+    answer = application(environ, start)
     try:
         body = b''.join(answer)
     finally:
@@ -304,7 +317,8 @@ class PageServer:
             self.guard = Guard(app.server, policy, metrics.text, names, self.connections)
             self._server = create_server(
                 self.guard, map=self._sockets, sockets=[listener], threads=_THREADS,
-                connection_limit=_MOST_ACCEPTED, channel_timeout=IDLE_S, cleanup_interval=5,
+                connection_limit=_MOST_ACCEPTED, channel_timeout=IDLE_S,
+                cleanup_interval=max(1, round(_SWEEP_S)),
                 max_request_header_size=_MOST_HEAD, max_request_body_size=_MOST_BODY,
                 asyncore_use_poll=True, ident=None, log_socket_errors=False, backlog=128,
                 clear_untrusted_proxy_headers=True,
@@ -334,10 +348,17 @@ class PageServer:
     def close(self) -> None:
         """End; open connections are closed."""
         self._ended.set()
-        with suppress(OSError, RuntimeError):
-            self._server.close()
+        # In the thread that waits for the sockets, so that it need not be waited for.
+        with suppress(OSError):
+            self._server.trigger.pull_trigger(self._close_all)
         for thread in self._threads:
             thread.join(timeout=2.0)
+
+    def _close_all(self) -> None:
+        self._server.task_dispatcher.shutdown(cancel_pending=True, timeout=1)
+        for channel in list(self._sockets.values()):
+            channel.close()
+        self._sockets.clear()
 
     def _counters(self) -> dict[str, tuple[str, float]]:
         return {'valveflow_page_requests_refused': ('Requests refused.', self.guard.refused)}

@@ -214,7 +214,7 @@ def recent_picture(frame: Frame) -> Spec:
     if not found:
         return _empty('No sample has come yet.')
     t = [_ms(s.time_ns) for s in found]
-    return _against(t, columns, '95 % limits', frame.now_ns - RECENT_S * NS_PER_S, frame.now_ns)
+    return _against(t, columns, '95 % limits')
 
 
 def day_picture(unit: Snapshot) -> Spec:
@@ -234,9 +234,7 @@ def day_picture(unit: Snapshot) -> Spec:
         values = (m.measured_mw, m.predicted_mw, m.low_mw, m.high_mw)
         for column, value in zip(columns, values, strict=True):
             column.append(value)
-    made = _against(
-        t, columns, 'least to largest', day[0].start_ns, day[-1].start_ns + MINUTE_NS
-    )  # fmt: skip
+    made = _against(t, columns, 'least to largest')
     made['layout']['xaxis']['rangeslider'] = {
         'thickness': 0.16, 'bgcolor': token('panel'), 'borderwidth': 1,
         'bordercolor': token('rule'),
@@ -244,9 +242,7 @@ def day_picture(unit: Snapshot) -> Spec:
     return made
 
 
-def _against(
-    t: Sequence[float], columns: Sequence[Sequence[float]], band: str, begin_ns: int, end_ns: int
-) -> Spec:
+def _against(t: Sequence[float], columns: Sequence[Sequence[float]], band: str) -> Spec:
     """Return a picture over time; columns: measured, predicted, and the edges of a band."""
     measured, predicted, low, high = map(rounded, columns)
     edge: Any = {'line': {'width': 0}, 'showlegend': False}
@@ -256,10 +252,11 @@ def _against(
         line(t, predicted, 'predicted', 'curve', '%{y:.1f} MW predicted<extra></extra>'),
         line(t, measured, 'measured', 'steady', '%{y:.1f} MW measured<extra></extra>', width=1.5),
     ]
-    shown = {'range': [_ms(begin_ns), _ms(end_ns)], 'tickangle': 0, 'nticks': 6}
+    # No range: one that changes would take away what was scrolled to by hand.
+    across = axis('', type='date', tickangle=0, nticks=6)
     return {
         'data': traces,
-        'layout': {'xaxis': axis('', type='date', **shown), 'yaxis': axis('power (MW)')},
+        'layout': {'xaxis': across, 'yaxis': axis('power (MW)')},
     }
 
 
@@ -390,6 +387,7 @@ def _block(number: int, told: Mapping[str, Made], may_ask: bool) -> Any:
 def _page(maker: Maker, may_ask: bool) -> Any:
     units = maker.shown.units
     blocks = [_block(k, maker.parts(unit), may_ask) for k, unit in enumerate(units)]
+    blocks = blocks or [_nowhere()]
     token_field = [
         html.Label(['Token for the buttons: ', dcc.Input(id='token', type='password', value='')],
                    className='token'),
@@ -405,6 +403,12 @@ def _page(maker: Maker, may_ask: bool) -> Any:
     ], id='page')  # fmt: skip
 
 
+def _nowhere() -> Any:
+    """Return the parts of a unit that is not there: without any, Dash would not tick at all."""
+    parts = [_part(-1, name) for name in PARTS]
+    return html.Div([*parts, dcc.Store(id={'unit': -1, 'part': 'pictures'})], hidden=True)
+
+
 class Asking:
     """Lets a browser with the token ask a monitor for something.
 
@@ -417,7 +421,7 @@ class Asking:
     """
 
     def __init__(self, token: str, ask: Ask) -> None:
-        self._token = token.encode()
+        self._token = _bytes(token)
         self._ask = ask
         self._lock = threading.Lock()
         self._wrong = 0
@@ -432,7 +436,7 @@ class Asking:
         try:
             if time.monotonic() < self._until_s:
                 return False, f'Too many wrong tokens; wait {_WAIT_S:.0f} s.'
-            if not hmac.compare_digest(token.encode(), self._token):
+            if not hmac.compare_digest(_bytes(token), self._token):
                 self._wrong += 1
                 if self._wrong >= _TRIES:
                     self._wrong, self._until_s = 0, time.monotonic() + _WAIT_S
@@ -441,6 +445,11 @@ class Asking:
             return self._ask(unit, service)
         finally:
             self._lock.release()
+
+
+def _bytes(token: str) -> bytes:
+    # A browser may send what is no text.
+    return token.encode(errors='backslashreplace')
 
 
 def make_app(shown: Shown, asking: Asking | None = None) -> tuple[Dash, str]:
