@@ -61,6 +61,14 @@ def drag(browser, element, by):
     browser.settle()
 
 
+@pytest.fixture(autouse=True)
+def away(browser):
+    """Leave the page, so that what another test sets does not reach it."""
+    yield
+    browser.call('Page.navigate', url='about:blank')
+    browser.look(DESKTOP)
+
+
 @pytest.fixture
 def unit() -> Unit:
     made = told()

@@ -109,8 +109,8 @@ REFUSED = {
         '/_dash-update-component', 'POST', {'Origin': 'http://evil.example'}, 403
     ),
     'no such page': ('/etc/passwd', 'GET', {}, 404),
-    'a way out': ('/_dash-component-suites/../../etc/passwd', 'GET', {}, 500),
-    'a file the library does not offer': ('/_dash-component-suites/dash/dash.py', 'GET', {}, 500),
+    'a way out': ('/_dash-component-suites/../../etc/passwd', 'GET', {}, 400),
+    'a file the library does not offer': ('/_dash-component-suites/dash/dash.py', 'GET', {}, 400),
     'a method': ('/', 'POST', {}, 405),
     'another method': ('/metrics', 'DELETE', {}, 405),
     'a head that is too large': ('/', 'GET', {'X': 'y' * 20000}, 431),
@@ -138,7 +138,7 @@ def test_garbage_where_a_browser_asks(serve, body, capfd):
     status, _, text = asked(
         server, '/_dash-update-component', 'POST', body.encode(), Content_Type='application/json'
     )
-    assert status in (400, 500)
+    assert status == 400
     assert 'Traceback' not in text + capfd.readouterr().err
     assert asked(server)[0] == 200
 
@@ -245,6 +245,33 @@ def test_slow_peers_are_left(serve, monkeypatch, kind):
                     pass
             time.sleep(0.1)
     assert asked(server)[0] == 200
+
+
+def test_a_unit_of_which_little_is_known_is_shown(serve):
+    from valveflow_ros.page.unit import Unit
+    from valveflow_ros.report.terminal.board import CURVE
+
+    unit, nan, never = Unit('/m'), float('nan'), {'sec': 0, 'nanosec': 0}
+    unit.take(CURVE, {
+        'header': {'stamp': never, 'frame_id': 'U1'}, 'breakpoints': [], 'values': [], 'status': 0,
+        'cause': 'No curve yet.', 'model_id': '', 'samples': 0, 'window_start': never,
+        'window_end': never, 'rmse_mw': nan, 'pressure_exponent': nan,
+    })  # fmt: skip
+    said = []
+    server = serve(shown_now(Unit('/n'), unit), complain=said.append)
+    status, _, text = asked(server, '/_dash-layout')
+    assert status == 200
+    assert 'No curve yet.' in text
+    assert said == []
+
+
+def test_an_error_of_the_page_is_told_once(serve):
+    said = []
+    server = serve(Shown(), complain=said.append)
+    server.guard._metrics = lambda: {}['nothing']
+    for _ in range(3):
+        assert asked(server, '/metrics')[0] == 400
+    assert said == ["A request of /metrics was not answered (KeyError: 'nothing')."]
 
 
 def test_without_a_token_nothing_can_be_asked(serve):

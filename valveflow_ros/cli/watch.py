@@ -117,7 +117,12 @@ def _page_of_log(options: Namespace, console: Console) -> VerbResult:
     try:
         with ending():
             server = PageServer(
-                shown, options.host, options.port, options.name, counters=notices.counters
+                shown,
+                options.host,
+                options.port,
+                options.name,
+                counters=notices.counters,
+                complain=console.warn,
             )
             console.say(f'The page is at {server.address}')
             while True:

@@ -34,6 +34,7 @@ _SWEEP_S = 5.0
 _MOST_HEAD, _MOST_BODY = 16384, 65536
 _THREADS = 4
 _MOST_FILES = 64
+_TELL_S = 60.0
 _STATIC = '/_dash-component-suites/'
 _PATHS = {'/': 'GET', '/_dash-layout': 'GET', '/_dash-dependencies': 'GET', '/metrics': 'GET',
           '/_dash-update-component': 'POST'}  # fmt: skip
@@ -128,6 +129,8 @@ class Guard:
         Names of this machine beside its addresses and its host name.
     connections : callable
         Returns how many connections are open.
+    complain : callable
+        Takes a sentence where a request could not be answered, at most once a minute.
     """
 
     def __init__(
@@ -137,12 +140,15 @@ class Guard:
         metrics: Callable[[], bytes],
         names: Sequence[str] = (),
         connections: Callable[[], int] = lambda: 0,
+        complain: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._application = application
         self._metrics = metrics
         host = socket.gethostname().lower()
         self._names = {'localhost', host, *(name.lower() for name in names)}
         self._connections = connections
+        self._complain = complain
+        self._told_s = -_TELL_S
         self._static: dict[str, tuple[list[tuple[str, str]], bytes]] = {}
         self._head = [
             ('Content-Security-Policy', policy), ('X-Content-Type-Options', 'nosniff'),
@@ -175,8 +181,12 @@ class Guard:
             if path.startswith(_STATIC):
                 return self._file(path, environ, begin, start)
             return self._asked(environ, begin, start)
-        except Exception:  # noqa: BLE001 - whatever a strange request makes of the library
+        except Exception as error:  # noqa: BLE001 - whatever a strange request brings about
             self.refused += 1
+            if time.monotonic() - self._told_s >= _TELL_S:
+                self._told_s = time.monotonic()
+                what = f'{type(error).__name__}: {str(error)[:200]}'
+                self._complain(f'A request of {path[:80]} was not answered ({what}).')
             return self._say(start, '400 Bad Request', 'This request cannot be answered.')
 
     def _refusal(self, environ: dict[str, Any]) -> tuple[str, str] | None:
@@ -286,6 +296,8 @@ class PageServer:
         For whoever may ask a monitor for something.
     counters : callable, optional
         Further counters for the metrics.
+    complain : callable
+        Takes a sentence where a request could not be answered.
 
     Raises
     ------
@@ -301,6 +313,7 @@ class PageServer:
         names: Sequence[str] = (),
         asking: Any = None,
         counters: Callable[[], dict[str, tuple[str, float]]] = dict,
+        complain: Callable[[str], None] = lambda _: None,
     ) -> None:
         # Whoever else holds the port is told of before the libraries are loaded.
         listener = _listener(host, port)
@@ -314,7 +327,11 @@ class PageServer:
             app, policy = make_app(shown, asking)
             self._sockets: dict[int, Any] = {}
             metrics = Metrics(shown, lambda: {**counters(), **self._counters()})
-            self.guard = Guard(app.server, policy, metrics.text, names, self.connections)
+            # An error is told by the guard in a sentence.
+            app.server.config['PROPAGATE_EXCEPTIONS'] = True
+            self.guard = Guard(
+                app.server, policy, metrics.text, names, self.connections, complain
+            )  # fmt: skip
             self._server = create_server(
                 self.guard, map=self._sockets, sockets=[listener], threads=_THREADS,
                 connection_limit=_MOST_ACCEPTED, channel_timeout=IDLE_S,

@@ -141,12 +141,14 @@ def main(args: Sequence[str] | None = None) -> int:
         rclpy.try_shutdown()
 
 
+def _say(sentence: str) -> None:
+    print(sentence, file=sys.stderr, flush=True)
+
+
 def _run(options: argparse.Namespace, stop: StopFlag) -> int:
     shown = Shown()
     shown.put((), waiting_for(' and '.join(map(full_name, options.node))))
-    notices = Notices(
-        options.on_alarm, options.webhook, lambda text: print(text, file=sys.stderr, flush=True)
-    )
+    notices = Notices(options.on_alarm, options.webhook, _say)
     node = PageNode(options.node)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
@@ -158,9 +160,9 @@ def _run(options: argparse.Namespace, stop: StopFlag) -> int:
 
             asking = Asking(read_token(options.token_file), node.ask)
         server = PageServer(
-            shown, options.host, options.port, options.name, asking, notices.counters
+            shown, options.host, options.port, options.name, asking, notices.counters, _say
         )
-        print(f'The page is at {server.address}', file=sys.stderr, flush=True)
+        _say(f'The page is at {server.address}')
         looked_s = -_LOOK_S
         while not stop:
             if time.monotonic() - looked_s >= _LOOK_S:
