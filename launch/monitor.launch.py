@@ -102,9 +102,6 @@ def bridge(context: LaunchContext) -> list[Node]:
                     'address': '127.0.0.1',
                     'port': int(port),
                     'capabilities': ['connectionGraph'],
-                    'client_topic_whitelist': [''],
-                    'service_whitelist': [''],
-                    'param_whitelist': [''],
                 }
             ],
             output='screen',
