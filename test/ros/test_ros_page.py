@@ -77,6 +77,8 @@ def test_every_monitor_is_shown_asked_and_told_of(context, speaker, processes, p
         return metrics(port).count('valveflow_power_residual_watts{') == 2
 
     wait_until(both, 'both monitors')
+    for publisher in (speaker.predictions, speaker.health, other.predictions):
+        publisher.publish(b'\x00\x01\x00\x00no message')
     text = metrics(port)
     # Two units of one tag are told apart by their monitors.
     assert 'valveflow_power_residual_watts{unit="/other"} 1.5e+06' in text
