@@ -1,9 +1,11 @@
 """Whether a fault stands in the alarms to the end, and how often a healthy unit raises one.
 
-Run: ``python -m benchmarks.monitor_study --seeds 10 --first 401 --effect
-gain_step:g=-0.04,t0_days=10``. Each seed is a unit of ``plant/thermal_unit.py``; without
-``--effect`` it is healthy. The monitor runs over the whole record without diagnoses, with the
-defaults of its parameters, none of which was set on these seeds.
+Run: ``python -m benchmarks.monitor_study --seeds 10 --first 431`` for healthy units, and with
+``--effect gain_step --times 3`` for units on which that effect begins after half of the days,
+three times as large as by default; ``--effect all`` takes each effect of the catalogue, one at a
+time. Units are those of ``plant/thermal_unit.py``, and ``paper`` the one of the paper, all as
+means over a minute. The monitor runs over the record without diagnoses, with the defaults of its
+parameters; what was set there by looking at such units was set on seeds 421 to 430.
 """
 
 from __future__ import annotations
@@ -12,66 +14,118 @@ import time
 from functools import partial
 from typing import Any
 
+import numpy as np
+import pandas as pd
+
 import valveflow_ros as vf
 from benchmarks import study
+from valveflow_ros.plant.effect import Effect
+from valveflow_ros.plant.effects import catalogue
+from valveflow_ros.plant.thermal_effects import thermal_catalogue
 
 _DAY_NS = 86_400_000_000_000
+_PAPER = 'paper'
+# What spoils values is no change of the plant; a limit has no size that could be multiplied, and
+# the back pressure of a choked valve cannot be three times as high.
+_LEFT_OUT = ('choked', 'flatline', 'quantisation', 'rate_limit', 'saturation', 'spikes')
 
 
-def row_of(
-    seed: int, kind: str, days: float, recording: str, effects: list[str]
-) -> dict[str, Any]:
+def record_of(kind: str, seed: int, days: float, effects: list[str]) -> pd.DataFrame:
+    """Return means over a minute of a unit."""
+    if kind != _PAPER:
+        unit = f'{kind}:number={seed}'
+        return vf.simulate(days, seed, effects, unit=unit, recording='minute').to_dataframe()
+    table = vf.simulate(days, seed, effects).to_dataframe().set_index('time')
+    return table.resample('60s').mean().reset_index()
+
+
+def joined(healthy: pd.DataFrame, faulty: pd.DataFrame) -> pd.DataFrame:
+    """Return a record that is healthy for its first half: every effect gets an onset by that."""
+    middle = healthy['time'].iloc[0] + (healthy['time'].iloc[-1] - healthy['time'].iloc[0]) / 2
+    parts = [healthy[healthy['time'] < middle], faulty[faulty['time'] >= middle]]
+    return pd.concat(parts, ignore_index=True)
+
+
+def effect_at(effect: Effect, times: float) -> str:
+    """Return an effect so many times its default size, from the first row on where it can be."""
+    size = next(p for p in effect.parameters if not isinstance(p.default, str))
+    value = min(max(times * size.default, size.low), size.high)
+    onset = ',t0_days=0' if any(p.name == 't0_days' for p in effect.parameters) else ''
+    return f'{effect.name}:{size.name}={value:g}{onset}'
+
+
+def row_of(seed: int, kind: str, days: float, effect: str = '') -> dict[str, Any]:
     """Run the monitor over one unit; return what it told."""
-    simulation = vf.simulate(
-        days, seed, effects, unit=f'{kind}:number={seed}', recording=recording
-    )
-    log, begin = simulation.log, time.process_time()
-    found = vf.monitor(log, diagnose=False)
+    record = record_of(kind, seed, days, [])
+    if effect:
+        record = joined(record, record_of(kind, seed, days, [effect]))
+    begin = time.process_time()
+    found = vf.monitor(record, diagnose=False)
     content = found.to_json()
+
+    def day(time_ns: int) -> float:
+        return round((time_ns - found.start_ns) / _DAY_NS, 2)
+
     alarms = {
         name: {
-            'times': len(own),
-            'raised_days': [round((a['raised'] - found.start_ns) / _DAY_NS, 2) for a in own],
+            'raised_days': [day(a['raised']) for a in own],
             'state': own[-1]['state'] if own else '',
-            'stands': bool(own) and own[-1]['cleared'] is None,
+            'stands': bool(own) and (own[-1]['cleared'] is None or _hidden(own[-1])),
         }
         for name in ('residual', 'curve_shift')
         for own in [[a for a in content['alarms'] if a['name'] == name]]
     }
+    reference = content['reference']
     return {
-        'kind': kind, 'seed': seed, 'alarms': alarms, 'curves': len(content['curves']),
-        'cpu_s': round(time.process_time() - begin, 1),
+        'kind': kind, 'seed': seed, 'effect': effect, 'alarms': alarms,
+        'reference_day': None if reference is None else day(reference['set']),
+        'curves': len(content['curves']), 'cpu_s': round(time.process_time() - begin, 1),
     }  # fmt: skip
 
 
-def summary_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return what the units of one kind come to."""
-    every = [r['alarms'].values() for r in rows]
-    found = [any(a['times'] for a in own) for own in every]
+def _hidden(alarm: dict[str, Any]) -> bool:
+    """Tell whether an alarm is only not to be judged for the moment."""
+    return alarm['state'] == 'suppressed'
+
+
+def summary_of(rows: list[dict[str, Any]], onset_days: float) -> dict[str, Any]:
+    """Return what the units of one kind come to; only alarms since the onset count."""
+    since = [
+        [[d for d in a['raised_days'] if d >= onset_days] for a in r['alarms'].values()]
+        for r in rows
+    ]
+    found = [any(own) for own in since]
+    stands = [any(a['stands'] for a in r['alarms'].values()) for r in rows]
     return {
         'units': len(rows), 'with_alarm': sum(found),
-        'standing_at_the_end': sum(any(a['stands'] for a in own) for own in every),
-        'most_occurrences': max(a['times'] for own in every for a in own),
+        'alarms': sum(len(d) for own in since for d in own),
+        'standing_at_the_end': sum(np.logical_and(found, stands).tolist()),
+        'most_occurrences': max(len(d) for own in since for d in own),
     }  # fmt: skip
 
 
 def main() -> None:
     """Run the study and write it beside the others."""
-    parser = study.options(__doc__, seeds=10, first=401, days=20.0)
-    parser.add_argument('--recording', default='minute')
-    parser.add_argument('--kinds', default='choked,sequence')
+    parser = study.options(__doc__, seeds=10, first=431, days=20.0, times=3.0)
+    parser.add_argument('--kinds', default='choked,sequence,paper')
     parser.add_argument('--effect', action='append', default=[])
     given = parser.parse_args()
-    work = partial(row_of, days=given.days, recording=given.recording, effects=given.effect)
-    rows = {
-        kind: study.rows_of(partial(work, kind=kind), study.seeds(given.first, given.seeds))
-        for kind in given.kinds.split(',')
-    }
-    what = '_'.join(e.partition(':')[0] for e in given.effect) or 'healthy'
+    onset_days = 0.5 * given.days if given.effect else 0.0
+    rows: list[dict[str, Any]] = []
+    for kind in given.kinds.split(','):
+        own = catalogue() if kind == _PAPER else thermal_catalogue()
+        named = [e for e in own.values() if e.name not in _LEFT_OUT]
+        chosen = [e for e in named if e.name in given.effect or 'all' in given.effect]
+        effects = [effect_at(e, given.times) for e in chosen] if given.effect else ['']
+        for effect in effects:
+            work = partial(row_of, kind=kind, days=given.days, effect=effect)
+            rows += study.rows_of(work, study.seeds(given.first, given.seeds))
+    what = f'{"_".join(given.effect)}_times_{given.times:g}' if given.effect else 'healthy'
+    groups = {r['kind']: [s for s in rows if s['kind'] == r['kind']] for r in rows}
     study.keep(
-        study.name_of(f'monitor_{what}_{given.recording}', given.first, given.seeds),
-        summary={kind: summary_of(own) for kind, own in rows.items()},
-        rows=[row for own in rows.values() for row in own],
+        study.name_of(f'monitor_{what}', given.first, given.seeds),
+        summary={kind: summary_of(own, onset_days) for kind, own in groups.items()},
+        rows=rows,
     )
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import functools
 import inspect
 import json
+import textwrap
 from typing import Any
 
 from docs.page_tables import table
 from docs.picture_data import DATA, commands
 from valveflow_ros.diagnosis import causes
 from valveflow_ros.plant import effects
-from valveflow_ros.report.words import advice
 
 FAULTS = ('flatline', 'quantisation', 'spikes')
 _STAGES = {
@@ -39,8 +39,12 @@ def part(name: str, which: str) -> str:
     """Return a generated part of the page of an effect."""
     return {
         'physics': _physics, 'picture': _picture, 'numbers': _numbers, 'others': _others,
-        'advice': advice,
+        'to_do': _to_do,
     }[which](name)  # fmt: skip
+
+
+def _to_do(name: str) -> str:
+    return textwrap.fill(causes.TO_DO[name], 116, break_on_hyphens=False) + '\n'
 
 
 def _docstring(name: str) -> str:

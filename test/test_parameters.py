@@ -100,6 +100,11 @@ def test_an_unknown_name_is_refused_and_the_nearest_one_suggested(name, near):
     assert (near in sentence) if near else ('did you mean' not in sentence)
 
 
+def test_a_zone_that_is_none_is_refused_and_one_suggested():
+    assert 'Europe/Berlin' in refusal({'time_zone': 'Nowhere'})
+    assert Settings({'time_zone': 'UTC'}).zone is Settings().zone is None
+
+
 @pytest.mark.parametrize('key', [5, None, 2.5, True, ('a',)])
 def test_a_name_that_is_no_text_is_refused_too(key):
     """A file can have any key: ``5: 3`` is good YAML."""

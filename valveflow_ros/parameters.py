@@ -11,10 +11,11 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from datetime import tzinfo
 from typing import Any
 
-from valveflow_ros.errors import ParameterError
-from valveflow_ros.records import FLOW_UNITS
+from valveflow_ros.errors import InputError, ParameterError
+from valveflow_ros.records import FLOW_UNITS, zone_of
 
 Value = bool | int | float | str
 
@@ -96,13 +97,18 @@ class Parameter:
         return int(value) if whole else float(value)
 
 
-_OPENING_UNITS = ('%', 'percent', 'fraction')
-_PRESSURE_UNITS = ('MPa', 'kPa', 'Pa', 'bar', 'psi')
+# YAML takes a bare % for the beginning of a directive.
+_OPENING_UNITS = ('percent', '%', 'fraction')
+_PRESSURE_UNITS = (
+    'MPa', 'kPa', 'Pa', 'bar', 'mbar', 'psi', 'kg/cm2', 'MPag', 'kPag', 'barg', 'psig',
+)  # fmt: skip
 _TEMPERATURE_UNITS = ('degC', 'K', 'degF')
 _POWER_UNITS = ('MW', 'kW', 'W', *FLOW_UNITS)
 
 _UNIT_AND_INPUTS = (
     Parameter('unit_tag', 'unit', '', 'Tag of the unit; frame_id and hardware_id of messages.'),
+    Parameter('time_zone', '', '', 'Zone in which sentences tell times, such as Europe/Berlin or '
+              '+01:00; empty: UTC. Numbers and files stay in UTC.'),
     Parameter('autostart', True, '', 'Configure and activate the node by itself at start.'),
     Parameter(
         'stamp_source',
@@ -120,12 +126,13 @@ _UNIT_AND_INPUTS = (
         choices=('best_effort', 'reliable'),
     ),
     Parameter(
-        'valve_opening_unit', '%', '', 'Unit the gateway sends valve_opening in.',
+        'valve_opening_unit', 'percent', '', 'Unit the gateway sends valve_opening in.',
         choices=_OPENING_UNITS,
     ),
     Parameter(
         'main_steam_pressure_unit', 'MPa', '',
-        'Unit the gateway sends main_steam_pressure in; absolute pressure.',
+        'Unit the gateway sends main_steam_pressure in: absolute, or gauge (MPag, barg, ...), to '
+        'which the standard atmosphere is added.',
         choices=_PRESSURE_UNITS,
     ),
     Parameter(
@@ -139,7 +146,7 @@ _UNIT_AND_INPUTS = (
         choices=_POWER_UNITS,
     ),
     Parameter(
-        'valve_command_unit', '%', '', 'Unit the gateway sends valve_command in.',
+        'valve_command_unit', 'percent', '', 'Unit the gateway sends valve_command in.',
         choices=_OPENING_UNITS,
     ),
 )  # fmt: skip
@@ -247,7 +254,7 @@ _ALARM = (
               0.0, 1e5, live=True),
     Parameter('alarm_average', 300.0, 's', 'Time constant of the running mean of the residual.',
               1.0, 86400.0),
-    Parameter('alarm_on_delay', 0.0, 's', 'The limit must be exceeded this long.',
+    Parameter('alarm_on_delay', 900.0, 's', 'The limit must be exceeded this long.',
               0.0, 86400.0, live=True),
     Parameter('alarm_off_delay', 86400.0, 's',
               'The return must last this long, at openings where the alarm was seen.',
@@ -420,6 +427,11 @@ class Settings(Mapping[str, Value]):
         return unit if unit in FLOW_UNITS else 'MW'
 
     @property
+    def zone(self) -> tzinfo | None:
+        """The zone in which people are told times; None: UTC."""
+        return zone_of(self.text('time_zone'))
+
+    @property
     def settle_s(self) -> float:
         """The transient after a move begins, 5 T + tau (Table I of the paper)."""
         return 5.0 * self.real('time_constant') + self.real('delay')
@@ -435,8 +447,17 @@ def parameter(name: str) -> Parameter:
     return row
 
 
+def _check_zone(name: str) -> None:
+    try:
+        zone_of(name)
+    except InputError:
+        told = 'use a name such as Europe/Berlin, or an offset such as +01:00'
+        raise ParameterError('time_zone', f"is no zone, '{name}'; {told}") from None
+
+
 def _check_together(values: Mapping[str, Value]) -> None:
     """Refuse values that are each in range and yet at odds."""
+    _check_zone(str(values['time_zone']))
     for signal in ('valve_opening', 'main_steam_pressure', 'main_steam_temperature',
                    'generated_power'):  # fmt: skip
         low, high = float(values[f'{signal}_low']), float(values[f'{signal}_high'])

@@ -9,10 +9,15 @@ from __future__ import annotations
 
 import enum
 import math
+import re
+import zoneinfo
 from dataclasses import dataclass
+from datetime import timedelta, timezone, tzinfo
 
 import numpy as np
 from numpy.typing import NDArray
+
+from valveflow_ros.errors import InputError
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -247,3 +252,30 @@ class SpecialSegment:
     pressure_start_mpa: float = math.nan
     pressure_end_mpa: float = math.nan
     exponent: float = math.nan
+
+
+_OFFSET = re.compile(r'(?:UTC|GMT)?\s*([+-])(\d{1,2})(?::?(\d{2}))?')
+
+
+def zone_of(name: str) -> tzinfo | None:
+    """Return a time zone by its name or offset; ``None`` for UTC.
+
+    Raises
+    ------
+    InputError
+        If there is no such zone.
+    """
+    text = name.strip()
+    if text.upper() in ('', 'UTC', 'Z', 'GMT'):
+        return None
+    offset = _OFFSET.fullmatch(text)
+    if offset and int(offset[2]) <= 14:
+        minutes = 60 * int(offset[2]) + int(offset[3] or 0)
+        return timezone(timedelta(minutes=minutes if offset[1] == '+' else -minutes))
+    try:
+        return zoneinfo.ZoneInfo(text)
+    except (zoneinfo.ZoneInfoNotFoundError, ValueError, OSError):
+        raise InputError(
+            f"Time zone '{name}' is not known; use a name such as Europe/Berlin, or an offset "
+            'such as +01:00.'
+        ) from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -27,20 +28,21 @@ from valveflow_ros.records import SampleTable, Signal
 pytestmark = needs_jit
 HALF_DAY_ROWS = 21_600
 SHORT = 2.0  # days
+FULL_MW = 295.0  # where the curve of the paper's unit is flat
 
 
 # Two days hold half the evidence of the four of the slow test below; the slack is larger by about
 # the root of two for it, and the drift, which also has half the time to grow, by twice that.
 @pytest.mark.parametrize(
-    ('effect', 'key', 'truth'),
+    ('effect', 'key', 'truth', 'at_full_load_mw'),
     [
-        ('temperature:k=-0.0016', 'k', -0.0016),
-        ('gain_step:g=0.008,t0_days=0.9', 'g', 0.008),
-        ('output_offset_drift:b_mw=17', 'b_mw', 17.0),
-        ('backlash:w_percent=0.8', 'w_percent', 0.8),
+        ('temperature:k=-0.0016', 'k', -0.0016, None),
+        ('gain_step:g=0.008,t0_days=0.9', 'g', 0.008, 0.008 * FULL_MW),
+        ('output_offset_drift:b_mw=17', 'b_mw', 17.0, 17.0 * SHORT / 10.0),
+        ('backlash:w_percent=0.8', 'w_percent', 0.8, None),
     ],
 )
-def test_a_hidden_effect_is_named_sized_and_worth_its_gain(effect, key, truth):
+def test_a_hidden_effect_is_named_sized_and_worth_its_gain(effect, key, truth, at_full_load_mw):
     found = diagnosed(effect, days=SHORT)
     name = effect.partition(':')[0]
     assert found.verdict == 'named'
@@ -52,6 +54,12 @@ def test_a_hidden_effect_is_named_sized_and_worth_its_gain(effect, key, truth):
     assert found.rmse_extended < found.rmse_simulation
     assert cause.gain.p_value < 0.05
     assert found.rmse_noise_floor <= found.rmse_extended
+    assert cause.to_do
+    more = re.fullmatch(r'At full load \(from \d+ MW on\) it is ([\d.]+) MW more\.', cause.meaning)
+    assert bool(more) == (at_full_load_mw is not None)
+    if more:
+        # The beginning and the end of a record are an eighth of it each.
+        assert float(more.group(1)) == pytest.approx(at_full_load_mw, rel=0.25)
 
 
 @pytest.mark.slow

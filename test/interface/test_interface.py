@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 
@@ -147,6 +148,19 @@ class TestIdentify:
         with pytest.raises(InputError, match="no picture 'nothing'; it has: curve"):
             identified.plot('nothing')
 
+    @pytest.mark.parametrize('step', [0.0, -0.02])
+    def test_a_curve_of_before_and_after_a_change_is_told_to_be_a_mixture(self, step):
+        # Means over a minute; the thermal unit shares no formula with the curve.
+        effects = [f'gain_step:g={step},t0_days=3'] if step else []
+        record = vf.simulate(6.0, 7, effects, unit='choked:number=451', recording='minute')
+        told = [n for n in vf.identify(record.log).notes if 'mixture of before and after' in n]
+        assert len(told) == bool(step)
+        for sentence in told:
+            onset = re.search(r'since about (\S+ \S+) UTC it gives ([\d.]+) MW less', sentence)
+            away = pd.Timestamp(onset[1], tz='UTC') - (record.to_dataframe()['time'][0])
+            assert abs(away - pd.Timedelta(days=3)) < pd.Timedelta(hours=6)
+            assert 2.0 < float(onset[2]) < 9.0  # 2 % of 130 to 330 MW, and days of weather
+
     def test_options_of_the_verb(self, log, identified, tmp_path):
         identified.write(tmp_path)
         again = vf.identify(log, parameters=QUICK, reference=tmp_path)
@@ -258,8 +272,8 @@ class TestMonitor:
     @pytest.fixture(scope='class')
     @classmethod
     def told(cls):
-        drifting = vf.simulate(1.2, 5, effects=['output_offset_drift:b_mw=30']).log
-        return vf.monitor(drifting, parameters={**QUICK, 'refit_segments': 40})
+        faulty = vf.simulate(1.2, 5, effects=['gain_step:g=-0.05,t0_days=0.8']).log
+        return vf.monitor(faulty, parameters={**QUICK, 'refit_segments': 40})
 
     def test_curves_alarms_and_predictions(self, told):
         content = told.to_json()
@@ -316,7 +330,7 @@ class TestMonitor:
         assert told.to_json()['reference'] == {'set': told.start_ns, 'model_id': model_id}
         assert len(told.curves) > 1
         for _, curve in told.curves:
-            assert [h.name for h in curve.held] == ['output_offset_drift']
+            assert [h.name for h in curve.held] == ['gain_step']
 
     def test_a_log_without_power_is_refused(self, simulation):
         frame = simulation.to_dataframe().head(5000).assign(generated_power_mw=np.nan)

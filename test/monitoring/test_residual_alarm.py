@@ -209,7 +209,7 @@ STORIES = {
         {}, [(0.0, 1), ([*[NAN] * 59, 0.0], 6000)], [(3725, SU)],
     ),
     'who misses one row a minute sees': (
-        {}, [(2.0, 3600), (NAN, 3700), ([*[2.0] * 59, NAN], 18_000)],
+        {'alarm_on_delay': 0.0}, [(2.0, 3600), (NAN, 3700), ([*[2.0] * 59, NAN], 18_000)],
         [(1, U), (7200, SU), (7610, U)],
     ),
     'told again after a day, it holds nothing new back': (
@@ -274,7 +274,7 @@ def test_what_waits_is_counted_once_whatever_else_happens_meanwhile():
 
 
 def test_with_its_own_delays_it_cannot_chatter():
-    delay = {'alarm_off_delay': 300.0}
+    delay = {'alarm_on_delay': 0.0, 'alarm_off_delay': 300.0}
     alarm, told = lived(delay, ([*[2.0] * 301, *[0.0] * 301], 6 * 3600))
     assert alarm.occurrence == sum(c.state == UNACKNOWLEDGED for _, c in told) == 36
     assert not any('held back' in c.sentence for _, c in told)

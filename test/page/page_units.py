@@ -44,7 +44,9 @@ def told(key: str = NODE, tag: str = 'U1', seconds: int = 200) -> Unit:
     })  # fmt: skip
     unit.take(DIAGNOSIS, {
         'header': head(START_NS, tag), 'verdict': 2, 'sentence': 'The valve sticks.',
-        'causes': [{'name': 'stiction'}],
+        'causes': [
+            {'name': 'stiction', 'meaning': 'Friction.', 'to_do': 'Lubricate, `retighten`.'},
+        ],
     })  # fmt: skip
     for k in range(seconds):
         predict(unit, k, measured=250.0 + k % 5, header=head(START_NS + k * SECOND, tag))

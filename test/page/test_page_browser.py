@@ -81,7 +81,7 @@ def test_everything_is_drawn_and_nothing_is_asked_elsewhere(serve, browser, unit
     server = serve(shown_now(unit, told('/other', tag='U2')))
     browser.look(width, dark=dark)
     browser.visit(server.address)
-    has(browser, 'What to do (stiction): Lubricate')
+    has(browser, 'What to do: Lubricate, retighten.')
     # Words of a message are words, whatever they look like.
     has(browser, 'The unit gives 9 MW less. <b>')
     until(browser, 'document.querySelectorAll(".js-plotly-plot").length', 6)

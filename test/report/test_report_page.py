@@ -7,7 +7,9 @@ import gzip
 import json
 import math
 import re
+import zoneinfo
 from dataclasses import replace
+from datetime import timedelta, timezone
 
 import numpy as np
 import pytest
@@ -21,9 +23,10 @@ from valveflow_ros.report.answer import confidence_table
 from valveflow_ros.report.curve import band
 from valveflow_ros.report.data import gaps, rejected, usable_share
 from valveflow_ros.report.diagnosis import diagnosis_page
-from valveflow_ros.report.figure import Figure, packed, rounded
+from valveflow_ros.report.figure import Figure, packed, rounded, time_axis, upright
 from valveflow_ros.report.identification import identification_page, identification_report
-from valveflow_ros.report.page import packed_plotly, read_text
+from valveflow_ros.report.page import Page, Section, packed_plotly, read_text
+from valveflow_ros.report.words import in_zone
 
 MEGABYTE = 1_000_000
 
@@ -73,7 +76,7 @@ def test_gain_of_one_percent_of_opening_is_slope_times_pressure(report):
 
 def test_pictures_hold_the_curve_the_segments_and_the_choice(report, identified):
     figures = figures_of(report)
-    assert list(figures) == ['curve', 'signals', 'choice', 'dynamics', 'coverage']
+    assert list(figures) == ['curve', 'opening', 'signals', 'choice', 'dynamics', 'coverage']
     for name in figures:
         assert f'id="{name}"' in report
     curve = next(t for t in figures['curve']['data'] if t['name'] == 'flow characteristic')
@@ -89,6 +92,17 @@ def test_pictures_hold_the_curve_the_segments_and_the_choice(report, identified)
     }
     names = [t['name'] for t in figures['signals']['data']]
     assert names == 2 * ['measured', 'steady state', 'slope response']
+
+
+def test_the_curve_against_the_opening_is_the_curve_at_pressures_of_the_record(report, identified):
+    drawn = figures_of(report)['opening']
+    for trace in drawn['data']:
+        pressure = float(trace['name'].split()[1])
+        v, mw = (np.array(trace[k], dtype=float) for k in ('x', 'y'))
+        expected = identified.characteristic.power(v, pressure)
+        both = np.isfinite(mw) & np.isfinite(expected)  # the name has three digits
+        assert both.sum() > 20
+        assert mw[both] == pytest.approx(expected[both], rel=0.01)
 
 
 def test_colours_of_the_pictures_are_in_the_style_sheet(report):
@@ -282,3 +296,37 @@ def test_pointing_at_anything_tells_a_unit(identified):
             assert all(unit.search(h) or h.startswith('breakpoint') for h in told), (
                 figure.name, trace['name'],
             )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('zone', 'said', 'hours'),
+    [
+        (zoneinfo.ZoneInfo('Europe/Berlin'), '2024-01-02 01:30 CET', 1),
+        (zoneinfo.ZoneInfo('America/Sao_Paulo'), '2024-01-01 21:30 -03', -3),
+        (timezone(timedelta(hours=5, minutes=30)), '2024-01-02 06:00 UTC+05:30', 5.5),
+    ],
+)
+def test_times_are_told_in_a_zone_in_words_and_along_the_axes(zone, said, hours):
+    at_ms = 1_704_155_400_000.0  # 2024-01-02 00:30 UTC
+    trace = {'type': 'scatter', 'x': [at_ms, None, at_ms + 1.0], 'y': [at_ms, 2.0, 3.0]}
+    layout = {'xaxis': time_axis(range=[at_ms, at_ms]), 'shapes': [upright(at_ms, 'ink', 1.0)]}
+    drawn = Figure('one', 'since 2024-01-02 00:30 UTC', 'nothing', [trace], layout)
+    made = Page('At 2024-01-02 00:30 UTC', '', [Section('2024-01-02', [drawn])], '', 'identify')
+    told = made.in_zone(zone)
+    assert told.title == f'At {said}'
+    assert told.sections[0].title == '2024-01-02'  # a day has no zone
+    (moved,) = told.figures
+    shift = 3_600_000.0 * hours
+    assert moved.caption == f'since {said}'
+    assert moved.traces[0]['x'] == [at_ms + shift, None, at_ms + 1.0 + shift]
+    assert moved.traces[0]['y'] == trace['y']
+    assert moved.layout['xaxis']['range'] == [at_ms + shift, at_ms + shift]
+    assert moved.layout['xaxis']['title']['text'] == f'time ({zone})'
+    assert moved.layout['shapes'][0]['x0'] == at_ms + shift
+    assert made.in_zone(None) == made
+
+
+def test_the_hour_that_comes_twice_is_told_by_the_name_of_the_clock():
+    zone = zoneinfo.ZoneInfo('Europe/Berlin')
+    both = 'from 2024-10-27 00:30 UTC to 2024-10-27 01:30 UTC'
+    assert in_zone(both, zone) == 'from 2024-10-27 02:30 CEST to 2024-10-27 02:30 CET'

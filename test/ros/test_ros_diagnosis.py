@@ -32,7 +32,8 @@ from valveflow_ros.monitoring.offline import JournalReplayer
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.unit import UnitDescription
-from valveflow_ros.records import NS_PER_S, Readings, table_to_readings
+from valveflow_ros.records import NS_PER_S, Readings, table_to_readings, zone_of
+from valveflow_ros.report.words import in_zone
 from valveflow_ros.ros import encoding
 from valveflow_ros.ros.node.diagnostics import Level, line_of
 from valveflow_ros.ros.node.engine import LiveEngine, example_curve, example_task
@@ -170,6 +171,12 @@ def test_the_night_and_a_hand_bring_a_diagnosis(
     assert messages[-1].verdict == encoding.VERDICTS[content['verdict']]
     assert messages[-1].sentence == content['sentence']
     assert [c.name for c in messages[-1].causes] == [c['name'] for c in content['causes']]
+    assert [c.to_do for c in messages[-1].causes] == [c['to_do'] for c in content['causes']]
+    assert all('MW' in c.meaning and c.to_do for c in messages[-1].causes)
+    local = [*Outputs('u', zone=zone_of('+05:00')).of([found[-1]])]
+    (told,) = [deserialize_message(o.data, Diagnosis) for o in local]
+    assert ' UTC+05:00' in told.sentence
+    assert told.sentence == in_zone(content['sentence'], zone_of('+05:00'))
     assert {'gain_step', 'curve_step'} & {c['name'] for c in content['causes']}
     assert messages[-1].rmse_extended < messages[-1].rmse_simulation
     level, line = line_of(found[-1]) or (Level.OK, '')

@@ -259,7 +259,7 @@ def test_the_value_is_named_as_it_was_sent() -> None:
     scene.says(Level.WARN, 'The last one, 65 fraction, is impossible')
     scene.counts['valve_opening']['impossible'] = 2
     scene.health.note('valve_opening', [(1, Signal.VALVE_OPENING, 6500.0, 0)])
-    scene.says(Level.WARN, 'Is valve_opening_unit % or percent rather than fraction?')
+    scene.says(Level.WARN, 'Is valve_opening_unit percent rather than fraction?')
 
 
 def test_a_stamped_value_has_no_other_unit() -> None:

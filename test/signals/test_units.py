@@ -12,7 +12,15 @@ from valveflow_ros.errors import InputError
 from valveflow_ros.parameters import PARAMETERS
 from valveflow_ros.records import FLOW_UNITS, SIGNALS, Signal
 from valveflow_ros.signals.static_form import integrated_input
-from valveflow_ros.signals.units import UNITS, convert, engine_unit, in_unit, unit_of
+from valveflow_ros.signals.units import (
+    DIFFERENCES,
+    UNITS,
+    convert,
+    engine_unit,
+    in_unit,
+    known_units,
+    unit_of,
+)
 
 # The same state of a plant, told in every unit there is (NIST SP 811 for the definitions).
 SAME = {
@@ -44,10 +52,22 @@ def test_every_unit_there_is_has_been_compared():
 
 
 @pytest.mark.parametrize('info', SIGNALS)
-def test_the_parameter_offers_exactly_these_units(info):
-    flows = FLOW_UNITS if info.signal == Signal.GENERATED_POWER else ()
-    assert PARAMETERS[f'{info.topic}_unit'].choices == (*UNITS[info.signal], *flows)
-    assert PARAMETERS[f'{info.topic}_unit'].default == info.unit
+def test_the_parameter_offers_the_units_that_a_log_may_have(info):
+    # A gateway sends no pressure difference, and nobody logs GW.
+    left_out = {'GW', *DIFFERENCES}
+    parameter = PARAMETERS[f'{info.topic}_unit']
+    assert set(parameter.choices) == set(known_units(info.signal)) - left_out
+    assert unit_of(info.signal, parameter.default) == unit_of(info.signal, info.unit)
+
+
+@pytest.mark.parametrize(
+    ('name', 'sent', 'mpa'),
+    [('barg', 159.0, 16.001325), ('psig', 0.0, 0.101325), ('kg/cm2', 100.0, 9.80665)],
+)
+def test_a_gauge_sends_what_is_above_the_air(name, sent, mpa):
+    assert name in PARAMETERS['main_steam_pressure_unit'].choices
+    got = convert(Signal.MAIN_STEAM_PRESSURE, name, np.array([sent]))
+    assert got[0] == pytest.approx(mpa, rel=1e-12)
 
 
 @pytest.mark.parametrize('spelling', ['mpa', ' MPA ', 'Mpa'])

@@ -240,8 +240,8 @@ def add_table(parser: ArgumentParser, gathered: str) -> None:
     about = parser.add_argument_group('how a table is written, where it does not show it itself')
     for option, metavar, told in (
         ('time-zone', 'ZONE',
-         'zone of times that name none, such as Europe/Berlin or +01:00; west of '
-         'Greenwich with an equals sign, --time-zone=-05:00 (default: UTC)'),
+         'zone of times that name none, and of those told to you, such as Europe/Berlin or '
+         '+01:00; west of Greenwich with an equals sign, --time-zone=-05:00 (default: UTC)'),
         ('date-order', 'dmy|mdy',
          'whether 01/02/2026 is in February (dmy) or in January (mdy)'),
         ('decimal', 'point|comma', 'what stands before the decimals of a number'),
@@ -328,7 +328,14 @@ def write_results(
     RecordingError
         They cannot be written.
     """
-    done = result.write(options.output, figures=options.figures, tables=options.table)
+    from valveflow_ros.records import zone_of
+    from valveflow_ros.report.words import in_zone
+
+    zone = mapping_of(options).table.time_zone
+    done = result.write(
+        options.output, figures=options.figures, tables=options.table, time_zone=zone
+    )
+    text = in_zone(text, zone_of(zone))
     files = {'files': {name: str(path) for name, path in done.files.items()}}
     kept = {'kept': dict(done.kept)} if done.kept else {}
     return VerbResult('\n'.join([text, *done.words]), {**data, **files, **kept})

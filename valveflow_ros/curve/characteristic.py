@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.errors import DataError
-from valveflow_ros.records import FloatArray, IntArray
+from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
 from valveflow_ros.signals.static_form import INTEGRATED_INPUT, OPENING, StaticForm
 from valveflow_ros.signals.units import in_unit
 
@@ -173,7 +173,8 @@ class ResidualStatistics:
     """What residuals of this curve look like on the data it was fitted to (MW).
 
     95 % of single measurements lie within +- ``width_mw`` of the prediction. ``chart`` watches
-    for a lasting shift; without one there is no alarm.
+    for a lasting shift; without one there is no alarm. ``wander_mw`` is the sd with which the
+    level moves from day to day while nothing is wrong (weather), NaN where that is not known.
     """
 
     rmse_mw: float
@@ -183,6 +184,25 @@ class ResidualStatistics:
     power_noise_mw: float
     width_mw: float = math.nan
     chart: ChartDesign | None = None
+    wander_mw: float = math.nan
+
+
+# Days of weather are alike for about so long.
+_WANDER_NS = 2 * 86_400 * NS_PER_S
+
+
+def level_error_mw(wander_mw: float, start_ns: int, end_ns: int) -> float:
+    """Return the standard error of a mean over some days, as one of many days.
+
+    Parameters
+    ----------
+    wander_mw : float
+        sd from day to day; the error is 0 where it is NaN, not known.
+    start_ns, end_ns : int
+        Of those days.
+    """
+    share = _WANDER_NS / (_WANDER_NS + max(end_ns - start_ns, 0))
+    return 0.0 if math.isnan(wander_mw) else wander_mw * math.sqrt(share)
 
 
 @dataclass(frozen=True, slots=True)

@@ -151,6 +151,7 @@ def _form_json(form: FormEvidence | None) -> dict[str, Any]:
 
 def to_json(c: Characteristic) -> dict[str, Any]:
     """Return the content of ``characteristic.json``."""
+    wander_mw = c.residuals.wander_mw
     return {
         'format': FORMAT,
         'version': VERSION,
@@ -201,6 +202,8 @@ def to_json(c: Characteristic) -> dict[str, Any]:
             'input_noise': c.residuals.input_noise,
             'power_noise_mw': c.residuals.power_noise_mw,
             'width_mw': _number(c.residuals.width_mw),
+            # A curve that does not know it has no such key, and keeps its name.
+            **({'wander_mw': wander_mw} if math.isfinite(wander_mw) else {}),
             **_chart_json(c.residuals.chart),
         }
         if math.isfinite(c.residuals.rmse_mw)
@@ -274,6 +277,7 @@ _SCHEMA = {
         'rmse_mw': Number(0.0, MW[1]), 'average_sd_mw': Number(0.0, MW[1]),
         'average_s': Number(1e-3, 1e7), 'input_noise': Number(0.0, U[1]),
         'power_noise_mw': Number(0.0, MW[1]), 'width_mw': Maybe(_ERROR),
+        'wander_mw': Maybe(_ERROR),
         'chart': Maybe({
             'block_s': Number(1e-3, 864_000.0), 'correlation': Number(0.0, 0.999),
             'innovation_mw': Number(1e-12, MW[1]), 'small': _SUM, 'large': _SUM,
@@ -410,14 +414,13 @@ def _support(pieces: list[dict[str, Any]]) -> tuple[Support, ...]:
 def _residuals(found: dict[str, Any] | None) -> ResidualStatistics:
     if found is None:
         return ResidualStatistics(math.nan, math.nan, math.nan, math.nan, math.nan)
-    width, chart = found['width_mw'], found['chart']
+    chart = found['chart']
     if chart is not None:
         sums = chart.pop('small'), chart.pop('large')
         slack, limit = ((sums[0][name], sums[1][name]) for name in ('slack', 'limit'))
         chart = ChartDesign(**chart, slack=slack, limit=limit)
-    return ResidualStatistics(
-        **{**found, 'width_mw': math.nan if width is None else width, 'chart': chart}
-    )
+    unknown = {k: math.nan for k in ('width_mw', 'wander_mw') if found[k] is None}
+    return ResidualStatistics(**{**found, **unknown, 'chart': chart})
 
 
 class Joint(enum.Enum):

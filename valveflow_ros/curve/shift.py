@@ -10,7 +10,12 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from valveflow_ros.curve.characteristic import Characteristic, Piece, curve_error
+from valveflow_ros.curve.characteristic import (
+    Characteristic,
+    Piece,
+    curve_error,
+    level_error_mw,
+)
 from valveflow_ros.curve.segment_residual import (
     LEAST_SIDE,
     Scan,
@@ -122,6 +127,8 @@ def _others(shift: Shift, numbers: list[int]) -> str:
 # (benchmarks/shift_study.py --wander 1, seeds 1 to 5), without one not at all (seeds 1 to 12).
 _WIDER = 1.8
 _PROFILE = 101  # points along a piece
+# A change within the data of a curve is told where it is as sure as this.
+_MIXED_CHANCE, _MIXED_ERRORS = 1e-4, 3.0
 _TESTS = 2  # each piece is judged by the curves and by its segments
 
 
@@ -283,7 +290,8 @@ def judge_shift(
     ]
     tests = _TESTS * sum(1 for piece in current.pieces if _common(reference, piece))
     pieces = tuple(
-        _judged(reference, current, k, scans[k], tests, limits) for k in range(len(current.pieces))
+        _judged(reference, current, k, series[k].time_ns, scans[k], tests, limits)
+        for k in range(len(current.pieces))
     )
     since = _since(pieces, series, scans)
     if since[0]:
@@ -295,6 +303,38 @@ def judge_shift(
         int(found.time_ns[0]) if len(found) else 0, pieces, *since, '',
     )  # fmt: skip
     return replace(shift, sentence=shift_sentence(shift, reference.breakpoints))
+
+
+def mixture_sentence(curve: Characteristic, segments: Sequence[SpecialSegment]) -> str:
+    """Say that the unit changed within the data of a curve, which is then neither; or nothing.
+
+    Parameters
+    ----------
+    curve : Characteristic
+    segments : sequence of SpecialSegment
+        Those that it was fitted to.
+    """
+    found = segment_residuals(curve, segments)
+    change = scan(found.residual_mw, found.weights)
+    if change is None or change.p_value > _MIXED_CHANCE:
+        return ''
+    wander_mw, time_ns = curve.residuals.wander_mw, found.time_ns
+    since_ns = int(time_ns[change.place])
+    share = float(found.weights[change.place :].sum() / found.weights.sum())
+    error = math.hypot(
+        change.after_error / math.sqrt(1.0 - share),
+        level_error_mw(wander_mw, int(time_ns[0]), int(time_ns[change.place - 1])),
+        level_error_mw(wander_mw, since_ns, int(time_ns[-1])),
+    )
+    size = change.after - change.before
+    if not abs(size) > _MIXED_ERRORS * error:
+        return ''
+    side = 'more' if size > 0.0 else 'less'
+    return (
+        f'The unit changed within these data: since about {minute(since_ns)} it gives '
+        f'{short(abs(size), 1)} MW {side} at the same opening and pressure, so this curve is a '
+        'mixture of before and after. "valveflow diagnose" looks for the cause.'
+    )
 
 
 def _comparable(reference: Characteristic, current: Characteristic) -> None:
@@ -328,11 +368,12 @@ def _judged(
     reference: Characteristic,
     current: Characteristic,
     index: int,
+    time_ns: IntArray,
     found: Scan | None,
     tests: int,
     limits: ShiftLimits,
 ) -> PieceShift:
-    """Judge one piece by the curves and by its segments."""
+    """Judge one piece by the curves and by its segments, whose times are given."""
     common = _common(reference, current.pieces[index])
     if common is None:
         nan = math.nan
@@ -342,13 +383,20 @@ def _judged(
     difference = (current.model.static(u) - reference.model.static(u))[1:-1]
     middle = u[_PROFILE // 2 : _PROFILE // 2 + 1]
     middle_mw = float(difference[_PROFILE // 2 - 1])
-    reference_error = _WIDER * float(curve_error(reference, middle)[0])
-    error = math.hypot(reference_error, _WIDER * float(curve_error(current, middle)[0]))
+    reference_error = _reference_error(reference, middle)
+    wander_mw, source = reference.residuals.wander_mw, current.source
+    level_error = level_error_mw(wander_mw, source.window_start_ns, source.window_end_ns)
+    error = math.hypot(
+        reference_error, _WIDER * float(curve_error(current, middle)[0]), level_error
+    )
     p_curves = _two_sided(middle_mw, error)
     now_mw = now_error = math.nan
     p_segments = 1.0
     if found is not None:
-        now_error = math.hypot(found.after_error, reference_error)
+        now_error = math.hypot(
+            found.after_error, reference_error,
+            level_error_mw(wander_mw, int(time_ns[found.place]), source.window_end_ns),
+        )  # fmt: skip
         p_segments = max(found.p_value, _two_sided(found.after, now_error))
         now_mw = found.after
     p = min(1.0, tests * min(p_curves, p_segments))
@@ -377,10 +425,21 @@ def _with_now(
     mean = float(np.average(after.residual_mw, weights=weights))
     scatter = float(np.average((after.residual_mw - mean) ** 2, weights=weights))
     middle = np.array([0.5 * (piece.u_from + piece.u_to)])
+    since_ns, until_ns = int(after.time_ns[0]), int(after.time_ns[-1])
     error = math.hypot(
-        math.sqrt(scatter / (len(after) - 1)), _WIDER * float(curve_error(reference, middle)[0])
-    )
+        math.sqrt(scatter / (len(after) - 1)), _reference_error(reference, middle),
+        level_error_mw(reference.residuals.wander_mw, since_ns, until_ns),
+    )  # fmt: skip
     return replace(piece, now_mw=mean, now_error_mw=error)
+
+
+def _reference_error(reference: Characteristic, u: FloatArray) -> float:
+    """Return the error of the reference at one u, with that of the days it was made from."""
+    source = reference.source
+    level_error = level_error_mw(
+        reference.residuals.wander_mw, source.window_start_ns, source.window_end_ns
+    )
+    return math.hypot(_WIDER * float(curve_error(reference, u)[0]), level_error)
 
 
 def _two_sided(value: float, error: float) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import actuator
-from valveflow_ros.diagnosis.cause import Estimate, SentenceValues
+from valveflow_ros.diagnosis.cause import Active, Estimate, SentenceValues
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.evidence import (
     Certainty,
@@ -21,7 +21,7 @@ from valveflow_ros.diagnosis.evidence import (
     rmse,
     sealed_gain,
 )
-from valveflow_ros.diagnosis.extended import Extended
+from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import Task, improve, search_levels, search_lines
 from valveflow_ros.diagnosis.grids import ORDER, CovariateRows, Grids, make_grids
 from valveflow_ros.diagnosis.record_faults import Fault, faults
@@ -162,6 +162,9 @@ _LEAST_SPREAD = 0.01
 _FAR_MORE = 8.0
 _OWN_MISFIT = 0.004  # of the power's range
 _LAST_STEPS = 10  # knots go slowly beside a bump
+_FULL_LOAD = 0.9  # quantile of the power
+_ACTS = 0.05  # share of the largest change below which there is none
+_PARTS = 8  # of the record, for its beginning and its end
 
 
 def _quiet(_share: float, _what: str) -> None:
@@ -407,6 +410,30 @@ def _final(found: Found) -> tuple[Task, Extended]:
     return task, inferred(task, model, np.ones(task.grids.subs, dtype=bool))
 
 
+def _meaning(task: Task, model: Extended, cause: Active) -> str:
+    """Say what a cause is worth at full load, against the model without it.
+
+    Of a change in time that is the difference between the end of the record and its beginning.
+    """
+    grids = task.grids
+    moved = (answer(grids, model) - answer(grids, model.without(cause.name)))[grids.whole]
+    power = grids.power[grids.whole]
+    full = float(np.quantile(power, _FULL_LOAD))
+    at_full = moved[power >= full]
+    part = -(-len(at_full) // _PARTS)
+    lasts = cause.cause.slow and not cause.extra and cause.name != 'diurnal'
+    level = float(np.mean(at_full[-part:]) - np.mean(at_full[:part])) if lasts else 0.0
+    if not lasts and np.ptp(np.sign(at_full)) == 0.0:
+        level = float(np.mean(at_full))
+    size, most = (float(np.quantile(np.abs(m), 0.95)) for m in (at_full, moved))
+    where = f'At full load (from {full:.0f} MW on)'
+    if not size > _ACTS * most:
+        return f'{where} it changes nothing, at other loads up to {most:.2g} MW.'
+    if not level:
+        return f'{where} it moves the power by up to {size:.2g} MW.'
+    return f'{where} it is {abs(level):.2g} MW {"more" if level > 0.0 else "less"}.'
+
+
 def _conclude(
     record: Record, found: Found, rest: _Rest, wrong: tuple[Fault, ...], progress: Progress
 ) -> Diagnosis:
@@ -419,7 +446,7 @@ def _conclude(
     causes = tuple(
         NamedCause(
             a.name, a.sentence(grids.start_ns, estimates[a.name]), estimates[a.name], gain,
-            a.cause.experiment, found.near.get(a.name, ()), a.extra,
+            a.cause.experiment, found.near.get(a.name, ()), a.extra, _meaning(task, final, a),
         )
         for a, gain in zip(final.active, gains, strict=True)
     )  # fmt: skip

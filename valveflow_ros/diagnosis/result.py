@@ -27,7 +27,7 @@ from valveflow_ros.curve.json_schema import (
 )
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import Active, Estimate
-from valveflow_ros.diagnosis.causes import catalogue
+from valveflow_ros.diagnosis.causes import TO_DO, catalogue
 from valveflow_ros.diagnosis.causes.covariate import covariate_cause
 from valveflow_ros.diagnosis.evidence import Gain, SegmentGain
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
@@ -41,7 +41,10 @@ NAMED, NOTHING, UNEXPLAINED = 'named', 'nothing', 'unexplained'
 
 @dataclass(frozen=True, slots=True)
 class NamedCause:
-    """A cause with its parameters and what it is worth on sealed blocks."""
+    """A cause with its parameters and what it is worth on sealed blocks.
+
+    ``meaning`` says how many MW it is at full load, empty where that is not known.
+    """
 
     name: str
     sentence: str
@@ -50,6 +53,12 @@ class NamedCause:
     experiment: str = ''
     not_told_apart: tuple[str, ...] = ()
     switches_s: tuple[float, ...] = ()
+    meaning: str = ''
+
+    @property
+    def to_do(self) -> str:
+        """Return what an operator does about it; empty for a covariate."""
+        return TO_DO.get(self.name, '').replace('`', '')
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +153,7 @@ class Diagnosis:
         causes = tuple(
             dataclasses.replace(
                 c, sentence=in_unit(c.sentence, unit), experiment=in_unit(c.experiment, unit),
+                meaning=in_unit(c.meaning, unit),
                 parameters={
                     key: dataclasses.replace(e, unit=in_unit(e.unit, unit))
                     for key, e in c.parameters.items()
@@ -341,6 +351,8 @@ def cause_json(c: NamedCause) -> dict[str, Any]:
     return {
         'name': c.name,
         'sentence': c.sentence,
+        'meaning': c.meaning,
+        'to_do': c.to_do,
         'parameters': {
             key: {
                 'value': _number(e.value), 'low': _number(e.low), 'high': _number(e.high),

@@ -189,6 +189,15 @@ _SPARE = 1.4
 _YOUNG_DAYS = 0.4
 _HIGHEST = 400.0
 _LEAST_LIMIT = 4.5  # more than one clipped block can add
+# Weather, cooling water and fouling move the output by megawatts over days, and a window of days
+# shows little of that. It shows how far the residual goes in six hours, and from there to the
+# spread of days it was a factor of 1.1 to 1.5 on units with weather (`benchmarks.wander`).
+_WANDER_S = 21_600.0
+_TO_DAYS = 1.5
+# Until six hours have passed some times, half of what need not be found is taken for it.
+_PRIOR_BLOCKS = 4.0
+# A unit may be so many spreads of its days away from the curve, and nothing is wrong.
+_WANDERS = 4.0
 
 
 def design_chart(
@@ -200,6 +209,7 @@ def design_chart(
     run_length_days: float,
     floor_mw: float,
     curve_error_mw: float,
+    wander_mw: float = 0.0,
 ) -> ChartDesign:
     """Return the chart for a curve whose clean residual is given.
 
@@ -218,6 +228,8 @@ def design_chart(
         Shifts below this need not be found.
     curve_error_mw : float
         How wrong the curve may be where it was fitted (standard error).
+    wander_mw : float
+        sd of the slow wander of the residual about this curve, see `slow_wander`.
     """
     block_s = max(block_s, step_s)
     rows = max(1, round(block_s / step_s))
@@ -227,9 +239,11 @@ def design_chart(
     seen = 1.0 - correlation  # share of a lasting shift that is left in an innovation
     # On a quiet unit what need not be found is many innovations wide, and innovations are
     # clipped: the slack would swallow every shift. There the width is that of what may pass.
-    sd = max(sd, (0.5 * floor_mw + 2.0 * curve_error_mw) * seen)
-    # Where the curve is wrong by two of its standard errors, that alone must not raise an alarm.
-    error = 2.0 * curve_error_mw * seen / sd
+    passes_mw = math.hypot(2.0 * curve_error_mw, _WANDERS * wander_mw)
+    sd = max(sd, (0.5 * floor_mw + passes_mw) * seen)
+    # Where the curve is wrong by two of its standard errors, or the unit is off as it is by
+    # weather, that alone must not raise an alarm.
+    error = passes_mw * seen / sd
     small = max(_SLACK_SMALL, 0.5 * floor_mw * seen / sd) + error
     slack = (small, max(_SLACK_LARGE + error, small))
     # Each of the two charts may give half of the false alarms.
@@ -243,6 +257,29 @@ def design_chart(
         for k in slack
     )
     return ChartDesign(block_s, correlation, sd, slack, (limit[0], limit[1]), run_length_days)
+
+
+def slow_wander(
+    residual_mw: FloatArray, weight: ByteArray, step_s: float, floor_mw: float
+) -> float:
+    """Return the sd with which the level of the residual wanders from day to day, MW.
+
+    Parameters
+    ----------
+    residual_mw : float64 (n,)
+        Of rows (or means of some) one after the other, on the data the curve was fitted to.
+    weight : uint8 (n,)
+        0 where it does not count.
+    step_s : float
+        Between those rows.
+    floor_mw : float
+        Lasting shifts below this need not be found.
+    """
+    means = block_means(residual_mw, weight, max(1, round(_WANDER_S / step_s)))
+    moves = np.diff(means)
+    moves = moves[np.isfinite(moves)]
+    power = _PRIOR_BLOCKS * (0.5 * floor_mw) ** 2 + float(np.sum(moves**2))
+    return _TO_DAYS * math.sqrt(power / (_PRIOR_BLOCKS + len(moves)))
 
 
 def block_means(residual: FloatArray, weight: ByteArray, rows: int) -> FloatArray:
@@ -356,4 +393,4 @@ def normal_limit(slack: float, run_length: float) -> float:
     return high
 
 
-__all__ = ['alarms', 'block_means', 'design_chart', 'limit_for', 'normal_limit']
+__all__ = ['alarms', 'block_means', 'design_chart', 'limit_for', 'normal_limit', 'slow_wander']

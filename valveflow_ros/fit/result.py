@@ -14,16 +14,17 @@ from valveflow_ros.curve.characteristic import (
     RegionDynamics,
     ResidualStatistics,
     Support,
+    level_error_mw,
 )
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.errors import counted, short
 from valveflow_ros.fit.piece_selection import evidence_words
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.fit.refine import Refined
-from valveflow_ros.fit.residual_chart import design_chart
+from valveflow_ros.fit.residual_chart import design_chart, slow_wander
 from valveflow_ros.fit.task import FitTask
 from valveflow_ros.numerics import running_average
-from valveflow_ros.records import ByteArray, FloatArray, SegmentKind
+from valveflow_ros.records import NS_PER_S, ByteArray, FloatArray, SegmentKind
 from valveflow_ros.segments.window import WindowContents
 
 _Z95 = 1.959963984540054
@@ -56,6 +57,10 @@ def residual_statistics(
     run = running_average(rest, forget)
     settled = run[min(len(run) // 4, int(3.0 * average_s / step_s)) :]
     sd = _MAD_TO_SD * float(np.median(np.abs(settled - np.median(settled))))
+    floor_mw = settings.real('alarm_floor')
+    wander_mw = slow_wander(residual, weight, step_s, floor_mw)
+    # The curve's own level is the mean of its days.
+    level_mw = level_error_mw(wander_mw, 0, round(len(residual) * step_s * NS_PER_S))
     return ResidualStatistics(
         rmse_mw=float(np.sqrt(np.mean(rest**2))),
         average_sd_mw=max(sd, 1e-9),
@@ -67,9 +72,11 @@ def residual_statistics(
             residual, weight, step_s,
             block_s=settings.real('alarm_block'),
             run_length_days=settings.real('alarm_run_length'),
-            floor_mw=settings.real('alarm_floor'),
+            floor_mw=floor_mw,
             curve_error_mw=curve_error_mw,
+            wander_mw=math.hypot(wander_mw, level_mw),
         ),
+        wander_mw=wander_mw,
     )  # fmt: skip
 
 

@@ -293,7 +293,12 @@ class Result:
         return go.Figure(content['data'], {**base, **content['layout']})
 
     def write(
-        self, folder: str | Path, *, figures: bool = False, tables: bool = False
+        self,
+        folder: str | Path,
+        *,
+        figures: bool = False,
+        tables: bool = False,
+        time_zone: str = '',
     ) -> WrittenFiles:
         """Write the files of the result, then pictures and tables where they are wanted.
 
@@ -306,18 +311,24 @@ class Result:
             Also write each picture of the report as PNG and SVG, into ``figures``.
         tables : bool
             Also write what each picture shows as CSV, into ``tables``.
+        time_zone : str
+            In which the report tells times: ``Europe/Berlin``, ``+01:00``; UTC by default. Files
+            for programs have UTC.
 
         Raises
         ------
         RecordingError
             The folder or a file cannot be written; then no file of the result is replaced.
         InputError
-            plotly is missing, or matplotlib and pictures are wanted.
+            plotly is missing, or matplotlib and pictures are wanted; or the zone is not known.
         """
-        folder = Path(folder)
+        from valveflow_ros.records import zone_of
+
+        folder, zone = Path(folder), zone_of(time_zone)
         check_results(folder, figures, tables)
         page = self.page().in_unit(self.output_unit)
-        content = {**self._told(), REPORT: page.to_html()}
+        local = page.in_zone(zone)
+        content = {**self._told(), REPORT: local.to_html()}
         backup = back_up(folder, self.verb, content)
         files = write_texts(folder, content)
         *most, last = [str(files[REPORT]), *(name for name in content if name != REPORT)]
@@ -331,7 +342,7 @@ class Result:
         if figures:
             from valveflow_ros.report.drawing import figure_files
 
-            made = {k: v for f in page.figures for k, v in figure_files(f).items()}
+            made = {k: v for f in local.figures for k, v in figure_files(f).items()}
             beside['pictures'] = folder / FIGURES_FOLDER, made
         for place, made in beside.values():
             replaced += [

@@ -12,7 +12,7 @@ import numpy as np
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
-from valveflow_ros.curve.shift import ShiftLimits, judge_shift, shift_json
+from valveflow_ros.curve.shift import ShiftLimits, judge_shift, mixture_sentence, shift_json
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
 from valveflow_ros.diagnosis.result import model_to_json
 from valveflow_ros.errors import DataError, UsageError
@@ -210,12 +210,15 @@ def _identified(
         )
     if looks_like_step_test(observed.table, settings):
         told.append(STEP_TEST_ADVICE)
+    mixture = mixture_sentence(characteristic, observed.segments)
+    told += [mixture] if mixture else []
     for sentence in told:
         progress.warn(sentence)
     found = Identified(
         source=log.name, characteristic=characteristic, table=observed.table,
         segments=observed.segments, counts=observed.counts, settings=settings,
-        notes=(*log.notes, *notes, *told), history=recorded_history(log.contents),
+        notes=(*log.notes, *notes, *told), mixture=mixture,
+        history=recorded_history(log.contents),
     )  # fmt: skip
     opening, pressure = (
         observed.table.column(s) for s in (Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE)

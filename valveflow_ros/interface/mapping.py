@@ -11,7 +11,6 @@ from typing import TypeVar
 import numpy as np
 
 from valveflow_ros.errors import InputError, UsageError, ValveflowError
-from valveflow_ros.logs.tables.dates import zone_of
 from valveflow_ros.logs.tables.refusal import (
     AS_SEEN,
     THEIRS,
@@ -20,7 +19,7 @@ from valveflow_ros.logs.tables.refusal import (
     TableOptions,
 )
 from valveflow_ros.logs.tables.words import unit_named
-from valveflow_ros.records import SIGNALS, Signal
+from valveflow_ros.records import SIGNALS, Signal, zone_of
 from valveflow_ros.signals.units import convert, known_units
 
 Answer = TypeVar('Answer')

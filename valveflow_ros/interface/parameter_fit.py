@@ -22,7 +22,7 @@ from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.terminal.text import clean
 from valveflow_ros.report.words import duration
 from valveflow_ros.signals.align import Aligner
-from valveflow_ros.signals.units import DIFFERENCES, air_in
+from valveflow_ros.signals.units import DIFFERENCES, unit_of
 
 # A transient cut short spoils segments, one too long only costs some: up in small steps,
 # down in large ones.
@@ -100,15 +100,14 @@ def fit_parameters(log: Any, unit_tag: str = '', *, progress: Progress = SILENT)
 def _units(log: Log, found: Fitted) -> None:
     for signal, unit in log.units.items():
         name = f'{SIGNALS[signal].topic}_unit'
-        if signal in log.constants or unit == PARAMETERS[name].default:
+        usual = unit_of(signal, str(PARAMETERS[name].default))
+        if signal in log.constants or unit_of(signal, unit) == usual:
             continue
         said = f"'{log.name_of(signal)}' of the log is in {unit}"
         unit = unit.removesuffix('d') if unit in DIFFERENCES else unit
         if unit in PARAMETERS[name].choices:
             found.put(name, unit, said)
             continue
-        if air_in(signal, unit):
-            said += ', a gauge pressure, and the monitor wants it absolute'
         choices = ', '.join(PARAMETERS[name].choices)
         found.left.append(f'{name}: {clean(said)}; let the gateway send one of {choices}.')
     for name, value in log.parameters({})[0].items():

@@ -45,7 +45,7 @@ from valveflow_ros.report.terminal.frame import (
     short_name,
 )
 from valveflow_ros.report.terminal.text import clean
-from valveflow_ros.report.words import advice, input_axis, moment
+from valveflow_ros.report.words import input_axis, moment
 
 TICK_MS = 2000
 # The newest samples as they are; what is older is shown a point a minute.
@@ -58,6 +58,8 @@ PICTURES = {'curve': 300, 'recent': 250, 'day': 340}
 # What may be asked of a monitor from the page.
 ASKED = {'acknowledge_alarms': 'Acknowledge', 'shelve_alarms': 'Shelve'}
 _TRIES, _WAIT_S = 5, 30.0
+# With it the sentence of a diagnosis goes on, once for each cause.
+_TO_DO = 'What to do:'
 Ask = Callable[[str, str], tuple[bool, str]]
 
 
@@ -112,11 +114,12 @@ def _code(text: str) -> list[Any]:
 
 
 def _diagnosis(frame: Frame) -> list[Any]:
-    made = [_said(diagnosis_words(frame.diagnosis))]
-    for name in () if frame.diagnosis is None else frame.diagnosis.causes[:8]:
-        if found := advice(name):
-            made.append(html.P([html.B(f'What to do ({name}): '), *_code(found)]))
-    return made
+    text, tone = diagnosis_words(frame.diagnosis)
+    said, *to_do = clean(text).split(_TO_DO)
+    return [
+        _said((said.strip(), tone)),
+        *(html.P([html.B(_TO_DO), ' ', *_code(paragraph)]) for paragraph in to_do),
+    ]
 
 
 def _row(item: HealthView) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 from valveflow_ros.curve.characteristic import Piece
 from valveflow_ros.curve.segment_residual import SegmentResiduals, segment_residuals
 from valveflow_ros.curve.shift import PieceShift, Shift
-from valveflow_ros.records import FloatArray, IntArray
+from valveflow_ros.records import FloatArray, IntArray, Signal
 from valveflow_ros.report.figure import (
     DAY_HOUR,
     Figure,
@@ -47,6 +47,8 @@ _DAY_NS = 86400 * 10**9
 _LONGER = 1.5  # of a log in days, for its last day to be worth marking
 _LEAST = 3  # segments that are worth a picture
 _SURE = 0.9999
+_SAME_PRESSURE = 0.02
+_OPENINGS = 121
 
 
 def band(piece: Piece, u_samples: FloatArray, u: FloatArray) -> FloatArray:
@@ -95,6 +97,38 @@ def curve_figure(data: Identified) -> Figure:
         f'({plain(float(values[-1]))} MW), over the density of special samples.'
     )
     return Figure('curve', _caption(data), words, traces, layout, height=500)
+
+
+def opening_figure(data: Identified) -> Figure | None:
+    """Return the power against the opening at pressures the unit ran at; None without any."""
+    opening, pressure = (
+        data.table.column(signal)[data.special]
+        for signal in (Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE)
+    )
+    known = np.isfinite(opening) & (pressure > 0.0)
+    if not known.any():
+        return None
+    low, middle, high = np.quantile(pressure[known], (0.05, 0.5, 0.95)).tolist()
+    wide = high - low > _SAME_PRESSURE * middle
+    v = np.linspace(float(opening[known].min()), float(opening[known].max()), _OPENINGS)
+    traces = [
+        line(
+            rounded(v), rounded(data.characteristic.power(v, p)), f'at {p:.3g} MPa', colour,
+            'opening %{x:.3~g} %<br>%{y:.4~g} MW', width=2.6 if p == middle else 1.6, dash=dash,
+        )
+        for p, colour, dash in (
+            (high, 'chosen', 'dot'), (middle, 'curve', ''), (low, 'raw', 'dash')
+        )
+        if p == middle or wide
+    ]  # fmt: skip
+    caption = (
+        '<b>How many MW one percent of opening gives.</b> The same curve against the opening of '
+        f'the valve, at the middle pressure of the record, {middle:.3g} MPa'
+        + (', and at those that nine tenths of it lie between.' if wide else '.')
+    )
+    words = f'Power against the valve opening at {middle:.3g} MPa.'
+    layout = {'xaxis': axis('valve opening (%)'), 'yaxis': axis('generated power (MW)')}
+    return Figure('opening', caption, words, traces, layout, height=360)
 
 
 def _caption(data: Identified) -> str:

@@ -103,6 +103,12 @@ def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
         if d.experiments:
             doubt += ' What would tell them apart: ' + ' '.join(text(e) for e in d.experiments)
         parts.append(notice(doubt))
+    for c in d.causes:
+        if c.to_do:
+            known = f'{text(c.meaning)} ' if c.meaning else ''
+            parts.append(paragraph(
+                f'<b>{text(c.name)}</b>: {known}<b>What to do:</b> {text(c.to_do)}'
+            ))  # fmt: skip
     parts.append(paragraph(
         'On blocks of time that nothing was fitted to, the simulation misses the measured '
         f'power by {level(d.rmse_simulation, 2)} MW, the extended model by '

@@ -13,7 +13,8 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timezone, tzinfo
 from html import unescape
 from itertools import pairwise
 from typing import Any
@@ -98,6 +99,53 @@ def packed(values: NDArray[Any]) -> Spec:
     """Return an array in plotly's binary form, exact and compact; NaN stays a gap."""
     data = np.ascontiguousarray(values, dtype='<f8')
     return {'dtype': 'f8', 'bdata': base64.b64encode(data.tobytes()).decode()}
+
+
+def in_zone(figure: Figure, zone: tzinfo) -> Figure:
+    """Return a picture with the times along its axes in a time zone."""
+    dates = [k for k, v in figure.layout.items() if isinstance(v, Mapping) and is_date(dict(v))]
+    if not dates:
+        return figure
+    layout = {k: v for k, v in figure.layout.items() if k not in ('shapes', 'annotations')}
+    for key in dates:
+        changed = dict(layout[key])
+        title = dict(changed.get('title', {}))
+        changed['title'] = {k: str(v).replace('UTC', str(zone)) for k, v in title.items()}
+        if 'range' in changed:
+            changed['range'] = [_local_ms(v, zone) for v in changed['range']]
+        layout[key] = changed
+    for key in ('shapes', 'annotations'):
+        if key in figure.layout:
+            layout[key] = [_moved(mark, dates, zone) for mark in figure.layout[key]]
+    traces = []
+    for trace in figure.traces:
+        new = dict(trace)
+        for letter in 'xy':
+            if is_date(axis_of(figure, trace, letter)):
+                new[letter] = [_local_ms(v, zone) for v in column(trace, letter)]
+                new.pop(f'{letter}0', None), new.pop(f'd{letter}', None)
+        traces.append(new)
+    return replace(figure, traces=traces, layout=layout)
+
+
+def _moved(mark: Spec, dates: Sequence[str], zone: tzinfo) -> Spec:
+    """Return a shape or an annotation with its places along axes of times in a zone."""
+    new = dict(mark)
+    for letter in 'xy':
+        ref = str(mark.get(f'{letter}ref', letter))
+        if ref[0] == letter and f'{letter}axis{ref[1:]}' in dates:
+            for key in (letter, f'{letter}0', f'{letter}1'):
+                if isinstance(new.get(key), int | float):
+                    new[key] = _local_ms(new[key], zone)
+    return new
+
+
+def _local_ms(ms: Any, zone: tzinfo) -> Any:
+    """Return ms since 1970 as the clocks of a zone show them; a gap and a word stay."""
+    if not isinstance(ms, int | float) or not math.isfinite(ms):
+        return None if isinstance(ms, float) else ms
+    offset = datetime.fromtimestamp(ms / 1000.0, timezone.utc).astimezone(zone).utcoffset()
+    return ms + (offset.total_seconds() * 1000.0 if offset else 0.0)
 
 
 # Traces, axes and marks. What a caller adds as a keyword is plotly's own and goes before.

@@ -17,7 +17,12 @@ from valveflow_ros.report.answer import (
     temperature_words,
     window_words,
 )
-from valveflow_ros.report.curve import curve_figure, segments_figure, shift_section
+from valveflow_ros.report.curve import (
+    curve_figure,
+    opening_figure,
+    segments_figure,
+    shift_section,
+)
 from valveflow_ros.report.data import (
     coverage_figure,
     presence_figure,
@@ -27,7 +32,17 @@ from valveflow_ros.report.data import (
 )
 from valveflow_ros.report.history import history_sections
 from valveflow_ros.report.identified import Identified
-from valveflow_ros.report.page import Page, Section, bullets, foot, paragraph, table, text, where
+from valveflow_ros.report.page import (
+    Page,
+    Section,
+    bullets,
+    foot,
+    notice,
+    paragraph,
+    table,
+    text,
+    where,
+)
 from valveflow_ros.report.words import period, plain
 
 
@@ -48,7 +63,9 @@ def identification_page(data: Identified) -> Page:
     missing = [presence_figure(data), coverage_figure(data)]
     sections = [
         Section('The answer', [
-            answer_words(data), curve_figure(data), pieces_table(data),
+            *([notice(text(data.mixture))] if data.mixture else []),
+            answer_words(data), curve_figure(data),
+            *([against] if (against := opening_figure(data)) else []), pieces_table(data),
             breakpoints_table(data.shown),
         ]),
         *([shift] if (shift := shift_section(data)) else []),

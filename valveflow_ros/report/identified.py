@@ -46,6 +46,8 @@ class Identified:
     reference : Characteristic, optional
     misfit : Misfit, optional
         Where the curve is wrong again and again.
+    mixture : str
+        That the unit changed within the data, as a sentence; empty if it did not.
     history : History, optional
         What a monitor published meanwhile, where the log is its recording.
     u : float64 (n,)
@@ -68,6 +70,7 @@ class Identified:
     shift: Shift | None = None
     reference: Characteristic | None = None
     misfit: Misfit | None = None
+    mixture: str = ''
     history: History | None = None
     u: FloatArray = field(init=False)
     static_mw: FloatArray = field(init=False)

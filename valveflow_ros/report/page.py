@@ -6,8 +6,9 @@ import base64
 import functools
 import gzip
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import tzinfo
 from html import escape
 from importlib import resources
 from importlib.util import find_spec
@@ -16,7 +17,9 @@ from typing import Any
 
 from valveflow_ros import __version__
 from valveflow_ros.errors import InputError
+from valveflow_ros.report import figure as pictures
 from valveflow_ros.report.figure import Figure, without_tags
+from valveflow_ros.report.words import in_zone
 from valveflow_ros.signals.units import in_unit
 
 
@@ -107,12 +110,27 @@ class Page:
 
     def in_unit(self, unit: str) -> Page:
         """Return the page with its texts and pictures about an output in another unit than MW."""
-        if unit == 'MW':
+        return self if unit == 'MW' else self._said(lambda text: in_unit(text, unit))
+
+    def in_zone(self, zone: tzinfo | None) -> Page:
+        """Return the page with the times in its texts and pictures in a time zone; None: UTC."""
+        if zone is None:
             return self
+        page = self._said(lambda text: in_zone(text, zone))
+        sections = [
+            Section(s.title, [
+                pictures.in_zone(p, zone) if isinstance(p, Figure) else p for p in s.parts
+            ])
+            for s in page.sections
+        ]  # fmt: skip
+        return replace(page, sections=sections)
+
+    def _said(self, change: Callable[[str], str]) -> Page:
+        """Return the page with all that is said on it changed."""
 
         def told(value: Any) -> Any:
             if isinstance(value, str):
-                return in_unit(value, unit)
+                return change(value)
             if isinstance(value, list | tuple):
                 return [told(v) for v in value]
             if isinstance(value, dict):

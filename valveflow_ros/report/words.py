@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import math
-from datetime import datetime, timezone
+import re
+from datetime import datetime, timezone, tzinfo
 from fractions import Fraction
-from importlib import resources
 from typing import TYPE_CHECKING
 
 from valveflow_ros.records import NS_PER_S
@@ -161,6 +160,21 @@ def moment(time_ns: int) -> str:
     return f'{at:%Y-%m-%d %H:%M:%S} UTC'
 
 
+_UTC_MOMENT = re.compile(r'(\d{4}-\d\d-\d\d \d\d:\d\d(?::\d\d)?) UTC\b')
+
+
+def in_zone(said: str, zone: tzinfo | None) -> str:
+    """Return a text with its times, as '2023-11-15 00:00 UTC', told in a time zone; None: UTC."""
+    if zone is None:
+        return said
+
+    def local(found: re.Match[str]) -> str:
+        at = datetime.fromisoformat(f'{found[1]}+00:00').astimezone(zone)
+        return f'{at:%Y-%m-%d %H:%M:%S}'[: len(found[1])] + f' {at.tzname()}'
+
+    return _UTC_MOMENT.sub(local, said)
+
+
 def period(start_ns: int, end_ns: int) -> str:
     """Write two times as 'from to'."""
     return f'{moment(int(start_ns))} to {moment(int(end_ns))}'
@@ -201,20 +215,6 @@ def input_axis(value: float) -> dict[str, str]:
     m = exponent(value) if math.isfinite(value) else 'm'
     long = f'integrated input u = V p<sup>{m}</sup> ({input_unit(value)})'
     return {'text': long, 'short': f'u ({input_unit(value)})'}
-
-
-@functools.cache
-def _advice() -> dict[str, str]:
-    # It is read where a cause was named only.
-    import yaml
-
-    file = resources.files('valveflow_ros.report').joinpath('advice.yaml')
-    return dict(yaml.safe_load(file.read_text(encoding='utf-8')))
-
-
-def advice(name: str) -> str:
-    """Return what to do about a cause, a paragraph with `code` in backquotes; empty: not known."""
-    return _advice().get(name, '').strip()
 
 
 # Causes whose change is counted from the mean of the record, see `diagnosis.causes`.

@@ -164,11 +164,8 @@ def _sample_rows(data: bytes, time_ns: int) -> list[Row]:
 def plausible_units(signal: Signal, settings: Settings, sent: float) -> list[str]:
     """Return the units in which ``sent`` would be a possible value of ``signal``."""
     low, high = plausible_range(signal, settings)
-    return [
-        name
-        for name, unit in UNITS[signal].items()
-        if low <= sent * unit.scale + unit.offset <= high
-    ]
+    named = {unit: name for name, unit in UNITS[signal].items()}  # each unit once
+    return [name for unit, name in named.items() if low <= sent * unit.scale + unit.offset <= high]
 
 
 def plausible_range(signal: Signal, settings: Settings) -> tuple[float, float]:

@@ -11,6 +11,7 @@ import functools
 import math
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import tzinfo
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -32,6 +33,7 @@ from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.records import NS_PER_S, FloatArray
 from valveflow_ros.records import SpecialSegment as SegmentRecord
+from valveflow_ros.report.words import in_zone
 from valveflow_ros.signals.units import in_unit
 
 # The latest time whose seconds a stamp can hold.
@@ -168,20 +170,21 @@ def array_message(values: FloatArray | Sequence[float], label: str) -> Float64Mu
 
 # What is said to people; names and ids stay.
 _WORDS = (
-    'sentence', 'text', 'cause', 'shift_sentence', 'unit', 'rejected_reasons', 'parameter_units',
+    'sentence', 'meaning', 'text', 'cause', 'shift_sentence', 'unit', 'rejected_reasons',
+    'parameter_units',
 )  # fmt: skip
 
 
-def tell_in(message: Any, unit: str) -> None:
-    """Put the unit of the output in place of MW in what a message says to people."""
-    for name in _WORDS if unit != 'MW' else ():
+def tell_in(message: Any, unit: str, zone: tzinfo | None = None) -> None:
+    """Put the unit of the output and the time zone into what a message says to people."""
+    for name in _WORDS if unit != 'MW' or zone is not None else ():
         said = getattr(message, name, None)
         if isinstance(said, str):
-            setattr(message, name, in_unit(said, unit))
+            setattr(message, name, in_zone(in_unit(said, unit), zone))
         elif said is not None:
-            setattr(message, name, [in_unit(one, unit) for one in said])
+            setattr(message, name, [in_zone(in_unit(one, unit), zone) for one in said])
     for cause in getattr(message, 'causes', ()):
-        tell_in(cause, unit)
+        tell_in(cause, unit, zone)
 
 
 def no_diagnosis_message(
@@ -228,6 +231,8 @@ def _cause_message(cause: Mapping[str, Any]) -> DiagnosisCause:
     return DiagnosisCause(
         name=str(cause['name']),
         sentence=str(cause['sentence']),
+        meaning=str(cause.get('meaning', '')),
+        to_do=str(cause.get('to_do', '')),
         parameter_names=[str(name) for name in parameters],
         parameter_values=[_number(p['value']) for p in parameters.values()],
         parameter_lows=[_number(p['low']) for p in parameters.values()],

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import tzinfo
 from typing import Any, NamedTuple
 
 from std_msgs.msg import Float64MultiArray
@@ -91,6 +92,8 @@ class Outputs:
         The unit's tag, the frame_id of every message.
     output_unit : str
         What stands in sentences in place of MW.
+    zone : tzinfo, optional
+        In which sentences tell times.
 
     Notes
     -----
@@ -98,8 +101,8 @@ class Outputs:
     messages depend on nothing but their order.
     """
 
-    def __init__(self, tag: str, output_unit: str = 'MW') -> None:
-        self._tag, self._unit = tag, output_unit
+    def __init__(self, tag: str, output_unit: str = 'MW', zone: tzinfo | None = None) -> None:
+        self._tag, self._unit, self._zone = tag, output_unit, zone
         self.curve: Characteristic | None = None
         self.status = CurveStatus.UNKNOWN
         self.cause = NO_CURVE_YET
@@ -231,5 +234,5 @@ class Outputs:
             yield self._output(name, encoding.array_message(values, label), time_ns)
 
     def _output(self, name: str, message: Any, time_ns: int) -> Output:
-        encoding.tell_in(message, self._unit)
+        encoding.tell_in(message, self._unit, self._zone)
         return Output(name, encoding.encode(message), max(0, time_ns))

@@ -175,7 +175,7 @@ class _Replay:
             if first is None or first.log_time_ns > messages[0].log_time_ns:
                 problem = 'goes on from an earlier recording and cannot be verified without it'
                 raise RecordingError(self._log.path, problem)
-        outputs = Outputs(settings.text('unit_tag'), settings.output_unit)
+        outputs = Outputs(settings.text('unit_tag'), settings.output_unit, settings.zone)
         yield from outputs.latched()
         monitor = Monitor(settings, corrector_of_run(self._log, settings))
         replayer = JournalReplayer(monitor, journal, diagnose_in_process)

@@ -10,6 +10,126 @@ from valveflow_ros.diagnosis.cause import Cause
 from valveflow_ros.diagnosis.causes.covariate import covariate_cause
 from valveflow_ros.diagnosis.grids import Grids
 
+# What an operator does about each cause and each fault of a record, by its name.
+TO_DO = {
+    'backlash': (
+        'Have the coupling between stem and plug, the lever and the feedback linkage looked at '
+        'in the next stop; measure the play by hand. Until then the controller hunts round '
+        'every set point by the width of the slack: keep its dead band above it. With '
+        '`model_file` the monitor takes the slack out and goes on judging the curve.'
+    ),
+    'choked': (
+        'First ask whether the extraction or the first stage behind the valve is fouled: a '
+        'pressure there that rose over the years gives the same picture. If the geometry '
+        'explains it, nothing is broken: use the extended model, or log the pressure behind the '
+        'valve and hold it against `kappa`.'
+    ),
+    'clock': (
+        'Compare the clocks of the two loggers, and turn on NTP or PTP on both. In a historian '
+        'look for a tag that is stamped at the server and one that is stamped at the source. '
+        'Then import the record again: no maintenance of the valve is needed.'
+    ),
+    'curve_shape': (
+        'A bump where two valves overlap is a matter of their cams or of the table in the '
+        'controller: hold its place against the lift diagram. A dent means too little overlap. '
+        'It costs nothing but linearity; `valveflow compensate` gives a table for the '
+        'controller that takes the bend out.'
+    ),
+    'curve_step': (
+        'Look at the valve that opens at `u_from`: its lift, its servo, its linkage, the broken '
+        'stem. Look into the log of the controller for a changed sequence at the time named. '
+        'Watch vibration and metal temperatures: with one valve shut the others and the first '
+        'stage are loaded unevenly.'
+    ),
+    'diurnal': (
+        'Usually not a fault: cold cooling water in the night, warm in the afternoon. Log the '
+        'pressure in the condenser and see whether it carries the wave. If the amplitude grows '
+        'from one year to the next, look at the condenser: air, fouling, the cooling tower.'
+    ),
+    'exponent': (
+        'First have the pressure transmitter checked, its zero above all: a wrong zero looks '
+        'like a wrong exponent. If it is right, set `pressure_exponent` of the monitor to the '
+        'value found and let it find the curve anew, or go on with the extended model.'
+    ),
+    'flatline': (
+        'Look at the transmitter, at the input card and at the gateway, which may be repeating '
+        'its last value. The rows are masked, so the curve stays right; but a monitor whose '
+        'inputs are masked for long is `SUPPRESSED` and guards nothing.'
+    ),
+    'gain_drift': (
+        'Plan for it: erosion and deposits in the blading, a heater that loses efficiency, '
+        'leaking extractions. Compare with the heat rate. A recalibrated power meter goes the '
+        'other way at once: ask for its protocol. Set a new reference only after the reason is '
+        'known.'
+    ),
+    'gain_step': (
+        'Ask what happened at the time named: a feed water heater or an extraction in or out '
+        'for good, work on the power meter, its current transformers or its scale. If it was '
+        'meant, ask for a new curve (`~/refit`) and set a new reference; if not, look for a '
+        'bypass that is open.'
+    ),
+    'input_drift': (
+        'Check pressure and position transmitters against a second instrument; a drift of a per '
+        'cent in ten days is an instrument, not a seat. If both are right the seat wears or the '
+        'plug is eroded: plan an inspection.'
+    ),
+    'input_step': (
+        'Look into the calibration log of pressure and position at the time named. If the new '
+        'reading is the right one, ask for a new curve and set a new reference. If it is the '
+        'wrong one, have it corrected: the load controller works with the same reading.'
+    ),
+    'intervals': (
+        'Log the state of extractions, heaters and auxiliary steam beside the power: it usually '
+        'falls on the same hours. Nothing is broken if it is meant; the monitor should be told, '
+        'or the alarm shelved while it lasts. A valve that should be shut and is not shows here '
+        'too.'
+    ),
+    'output_offset_drift': (
+        'Check the zero of the power transducer and whether auxiliary load was moved between '
+        'the meters. A drift of megawatts that no load explains is an instrument.'
+    ),
+    'quantisation': (
+        'Raise the resolution of the analogue card, or turn down the dead band (exception '
+        'deviation) of the historian for the four signals. Short ramps carry nothing when a '
+        'step is as large as they are.'
+    ),
+    'rate_limit': (
+        'Look at oil pressure, filter and pump, at the servo valve and at friction in the stem. '
+        'The unit keeps its load but not its promise of primary frequency control: test the '
+        'answer to a step, and tell the grid operator if it falls short.'
+    ),
+    'region_lag': (
+        'Usually not a fault but physics that the model did not have: more steam is stored '
+        'above that load. Let the monitor refit. A change from one month to the next points to '
+        'the reheater, its valves, or to another mode of boiler control above that load.'
+    ),
+    'reheater': (
+        'Not a fault: a share of the turbine lies behind the reheater. Use the extended model '
+        'for frequency studies, where the first seconds count. If the slow part grew, look at '
+        'the intercept valves and the reheater pressure.'
+    ),
+    'saturation': (
+        'Look for a limiter left in the controller, for a mechanical stop, or for a stem that '
+        'meets its end. Until it is mended the unit has less reserve than its operators '
+        'believe: tell them the opening named.'
+    ),
+    'spikes': (
+        'Look for a loose terminal, a shield grounded at both ends, or a restart of the '
+        'gateway. The rows are masked. A rising number of them is worth a work order before the '
+        'signal is lost.'
+    ),
+    'stiction': (
+        'Lubricate, retighten or renew the packing; check the positioner and the oil. Do not '
+        'tune the controller round it: a faster integral makes it hunt. With `valve_command` '
+        'published the monitor also sees friction in front of the position sensor.'
+    ),
+    'temperature': (
+        'Hold the temperature better: sprays, burners, the boiler master. If it has to move, '
+        'use the extended model. The paper assumes it unchanged, and beyond '
+        '`temperature_spread_limit` the curve itself says that it is to be doubted.'
+    ),
+}
+
 
 @functools.cache
 def catalogue() -> dict[str, Cause]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-import zoneinfo
 from dataclasses import dataclass
-from datetime import timedelta, timezone, tzinfo
+from datetime import tzinfo
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -143,32 +142,7 @@ def _month(word: str) -> str:
     return MONTHS.get(word.lower(), word[:3].lower())
 
 
-_OFFSET = re.compile(r'(?:UTC|GMT)?\s*([+-])(\d{1,2})(?::?(\d{2}))?')
 _HOUR_NS = 3_600_000_000_000
-
-
-def zone_of(name: str) -> tzinfo | None:
-    """Return a time zone by its name or offset; ``None`` for UTC.
-
-    Raises
-    ------
-    InputError
-        If there is no such zone.
-    """
-    text = name.strip()
-    if text.upper() in ('', 'UTC', 'Z', 'GMT'):
-        return None
-    offset = _OFFSET.fullmatch(text)
-    if offset and int(offset[2]) <= 14:
-        minutes = 60 * int(offset[2]) + int(offset[3] or 0)
-        return timezone(timedelta(minutes=minutes if offset[1] == '+' else -minutes))
-    try:
-        return zoneinfo.ZoneInfo(text)
-    except (zoneinfo.ZoneInfoNotFoundError, ValueError, OSError):
-        raise InputError(
-            f"--time-zone '{name}' is not known; use a name such as Europe/Berlin, or an offset "
-            'such as +01:00.'
-        ) from None
 
 
 class LocalClock:

@@ -15,10 +15,9 @@ from valveflow_ros.logs.tables.dates import (
     date_style,
     english,
     tidied,
-    zone_of,
 )
 from valveflow_ros.logs.tables.refusal import AS_SEEN, RefusedError, Remedy, TableOptions
-from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
+from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, zone_of
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -164,7 +164,11 @@ def decoded(
         )  # fmt: skip
     if type_name == DIAGNOSIS:
         causes = tuple(str(cause['name']) for cause in fields['causes'])
-        said = str(fields['sentence']).strip()
+        parts = [str(fields['sentence']).strip()]
+        for cause in fields['causes']:  # recordings of earlier versions do not have these
+            parts.append(str(cause.get('meaning', '')))
+            parts.append(f'What to do: {cause["to_do"]}' if cause.get('to_do') else '')
+        said = ' '.join(p for p in parts if p)
         return time_ns, DiagnosisView(int(fields['verdict']), said, causes, time_ns)
     return time_ns, CurveView(
         _floats(fields['breakpoints']), _floats(fields['values']), int(fields['status']),

@@ -16,6 +16,7 @@ from rosgraph_msgs.msg import Clock
 from valveflow_ros.logs import RecorderStatus
 from valveflow_ros.monitoring.events import Event
 from valveflow_ros.parameters import Settings
+from valveflow_ros.report.words import in_zone
 from valveflow_ros.ros.decoding import INPUTS, Decoder
 from valveflow_ros.ros.node import health, parameter_files
 from valveflow_ros.ros.node.diagnostics import Item, Level, line_of
@@ -75,7 +76,7 @@ class Session:
         self._fit_worker = FitWorker(settings.real('refit_timeout'))
         self._fit_worker.start()
         self._diagnosis_worker = DiagnosisWorker(settings.real('diagnosis_timeout'))
-        self._messages = Outputs(settings.text('unit_tag'), settings.output_unit)
+        self._messages = Outputs(settings.text('unit_tag'), settings.output_unit, settings.zone)
         self._recovery: BackgroundRecovery | None = None
         try:
             # Each event costs the executor time at every look, and nobody listens to these.
@@ -213,10 +214,10 @@ class Session:
             health.recorder_item(self.recording),
             self._store.item(),
         ]
-        unit = self._settings.output_unit
+        unit, zone = self._settings.output_unit, self._settings.zone
         return [
             replace(
-                item, sentence=in_unit(item.sentence, unit),
+                item, sentence=in_zone(in_unit(item.sentence, unit), zone),
                 values={in_unit(key, unit): value for key, value in item.values.items()},
             )
             for item in items
