@@ -18,6 +18,7 @@ README = Path(__file__).resolve().with_name('README.md')
 COMMAND = ['valveflow = valveflow_ros.cli.main:main']
 NODES = [
     'monitor = valveflow_ros.ros.monitor_main:main',
+    'page = valveflow_ros.ros.page_main:main',
     'plant_simulator = valveflow_ros.ros.simulator_main:main',
     'replay = valveflow_ros.ros.replay_main:main',
     'watch = valveflow_ros.ros.watch_main:main',
@@ -72,10 +73,11 @@ setup(
         'scipy',
         'zstandard',
     ],
-    # What only some need: reading .xlsx, and pictures as files.
+    # What only some need: reading .xlsx, pictures as files, the page in the browser.
     extras_require={
         'excel': ['python-calamine'],
         'figures': ['matplotlib'],
+        'page': ['dash>=3', 'prometheus-client', 'waitress>=3'],
         'parquet': ['pyarrow'],
     },
     data_files=[

@@ -3,6 +3,7 @@
 import json
 from tempfile import NamedTemporaryFile
 
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
 from launch.conditions import IfCondition
 from launch.launch_description_sources import PythonLaunchDescriptionSource
@@ -75,6 +76,39 @@ def monitor(context: LaunchContext) -> list[Node]:
     ]
 
 
+def bridge(context: LaunchContext) -> list[Node]:
+    """Make the bridge for Foxglove, where it is wanted and installed."""
+    port = LaunchConfiguration('foxglove_port').perform(context).strip()
+    if not port:
+        return []
+    try:
+        get_package_prefix('foxglove_bridge')
+    except PackageNotFoundError:
+        raise RuntimeError(
+            'foxglove_port was given and foxglove_bridge is not installed: '
+            'sudo apt install ros-jazzy-foxglove-bridge'
+        ) from None
+    if not port.isdecimal() or not 1 <= int(port) <= 65535:
+        raise ValueError(f"foxglove_port must be a port such as 8765, not '{port}'")
+    return [
+        Node(
+            package='foxglove_bridge',
+            executable='foxglove_bridge',
+            name='foxglove_bridge',
+            namespace=LaunchConfiguration('namespace').perform(context),
+            # It only looks: nothing can be published, called or set through it.
+            parameters=[
+                {
+                    'address': '127.0.0.1',
+                    'port': int(port),
+                    'capabilities': ['connectionGraph'],
+                }
+            ],
+            output='screen',
+        )
+    ]
+
+
 def generate_launch_description() -> LaunchDescription:
     """Describe the launch."""
     share = FindPackageShare('valveflow_ros')
@@ -96,6 +130,10 @@ def generate_launch_description() -> LaunchDescription:
                 '(true, false).',
                 'false',
             ),
+            argument(
+                'foxglove_port',
+                'Port of foxglove_bridge on 127.0.0.1, such as 8765; empty: it is not started.',
+            ),
             *(
                 argument(name, f'{about} Empty: as in the parameter file.')
                 for name, (_, about) in OVERRIDES.items()
@@ -105,5 +143,6 @@ def generate_launch_description() -> LaunchDescription:
                 condition=IfCondition(LaunchConfiguration('loopback_only')),
             ),
             OpaqueFunction(function=monitor),
+            OpaqueFunction(function=bridge),
         ]
     )

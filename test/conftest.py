@@ -13,6 +13,7 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+from chromium import BROWSERS, Chromium, installed
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -95,3 +96,14 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f'no real plant data in {folder}; VALVEFLOW_SHARED_DATA names another folder')
     return folder
+
+
+@pytest.fixture(scope='session')
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
+    """Return a browser without a head; one for all tests."""
+    found = installed()
+    if found is None:
+        pytest.skip(f'none of {", ".join(BROWSERS)} is installed')
+    opened = Chromium(found, tmp_path_factory.mktemp('browser'))
+    yield opened
+    opened.close()

@@ -19,7 +19,7 @@ SIGNAL = BASE | {'signals'}
 SEGMENT = SIGNAL | {'segments', 'partition'}
 MODEL = SEGMENT | {'curve', 'fit'}
 METHOD = MODEL | {'monitoring', 'diagnosis', 'baselines', 'plant'}
-FACES = METHOD | {'logs', 'report', 'interface'}
+FACES = METHOD | {'logs', 'report', 'interface', 'page'}
 ALLOWED: dict[str, set[str]] = {
     '': {'interface'},
     'errors': set(),
@@ -38,7 +38,8 @@ ALLOWED: dict[str, set[str]] = {
     'plant': BASE,
     'logs': {'errors', 'records'},
     'report': METHOD,
-    'interface': FACES,
+    'page': METHOD | {'report'},
+    'interface': METHOD | {'logs', 'report'},
     'cli': FACES,
     'ros': FACES,
 }

@@ -25,7 +25,7 @@ KINDS = {
     'sh', 'sh long', 'sh jazzy', 'sh make', 'console', 'console fails', 'yaml', 'text', 'python',
 }  # fmt: skip
 RUN = ('sh', 'console', 'console fails')
-EXECUTABLES = {'monitor', 'replay', 'plant_simulator', 'watch'}
+EXECUTABLES = {'monitor', 'page', 'replay', 'plant_simulator', 'watch'}
 
 
 class Block(NamedTuple):

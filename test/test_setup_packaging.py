@@ -84,7 +84,9 @@ def test_executables_are_those_of_the_contract(arguments):
     scripts = dict(
         re.split(r'\s*=\s*', line) for line in arguments['entry_points']['console_scripts']
     )
-    assert set(scripts) == {'monitor', 'plant_simulator', 'replay', 'watch', 'valveflow'}
+    assert set(scripts) == {
+        'monitor', 'page', 'plant_simulator', 'replay', 'watch', 'valveflow',
+    }  # fmt: skip
     for target in scripts.values():
         assert re.fullmatch(r'valveflow_ros(\.\w+)+:main', target)
         assert (ROOT / (target.split(':')[0].replace('.', '/') + '.py')).is_file()

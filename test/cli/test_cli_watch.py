@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import os
 import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
 
+import pytest
 from monitor_recording import recording
 
 from valveflow_ros.cli import watch as verb
@@ -67,3 +74,70 @@ def test_with_ros_another_process_takes_over(run, monkeypatch):
     assert taken[0][3:] == ['--interval', '1.0', '--once', '--node', '/a/b']
     run('watch', '--ask', 'shelve_alarms')
     assert taken[1][3:] == ['--interval', '1.0', '--ask', 'shelve_alarms']
+
+
+def test_a_recording_on_a_page(tmp_path):
+    """The page of a finished recording, as a process, until it is asked to end."""
+    pytest.importorskip('dash', reason='the page is an extra')
+    with socket.create_server(('127.0.0.1', 0)) as free:
+        port = free.getsockname()[1]
+    words = ['watch', '--page', '--port', str(port), str(recording(tmp_path / 'r'))]
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'valveflow_ros.cli', *words], stderr=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stderr.readline() == f'The page is at http://127.0.0.1:{port}/\n'
+        deadline_s = time.monotonic() + 30.0
+        while 'valveflow_curve_pieces{unit="U1"} 2.0' not in _metrics(port):
+            assert time.monotonic() < deadline_s
+            time.sleep(0.05)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20) in (0, 130)
+        assert 'Traceback' not in process.stderr.read()
+    finally:
+        process.kill()
+        process.wait()
+        process.stderr.close()
+
+
+def _metrics(port: int) -> str:
+    with urllib.request.urlopen(f'http://127.0.0.1:{port}/metrics', timeout=10) as answer:
+        return answer.read().decode()
+
+
+@pytest.mark.parametrize(
+    ('words', 'told'),
+    [
+        (['--page', '--once'], '--page does not go with --once'),
+        (['--page', '--ask', 'refit'], '--page does not go with'),
+        (['--page', '--token-file', 'x', 'LOG'], '--token-file is for a running monitor'),
+        (['--webhook', 'http://a/'], 'go with --page'),
+        (['--name', 'plant'], 'go with --page'),
+        (['--page', '--port', '0'], '--port must be a port from 1 to 65535'),
+    ],
+)
+def test_options_of_the_page_that_do_not_go_together(run, words, told):
+    assert told in run('watch', *words).err
+
+
+def test_without_its_libraries_the_page_is_told_of(run, monkeypatch, tmp_path):
+    monkeypatch.setattr('valveflow_ros.page.server.find_spec', lambda name: None)
+    sentence = run('watch', '--page', recording(tmp_path / 'r')).refused()
+    assert 'pip install dash prometheus_client waitress' in sentence
+
+
+def test_the_page_of_a_running_monitor_is_another_process(run, monkeypatch):
+    taken = []
+    monkeypatch.setattr(verb, 'find_spec', lambda name: name)
+    monkeypatch.setattr(verb, 'check_installed', lambda: None)
+    monkeypatch.setattr(os, 'execv', lambda path, words: taken.append(words) or _end())
+
+    def _end():
+        raise KeyboardInterrupt
+
+    run('watch', '--page', '--node', '/a/b', '--webhook', 'http://a/', '--name', 'plant')
+    assert taken[0][1:3] == ['-m', 'valveflow_ros.ros.page_main']
+    assert taken[0][3:] == [
+        '--host', '127.0.0.1', '--port', '8350', '--name', 'plant', '--node', '/a/b',
+        '--webhook', 'http://a/',
+    ]  # fmt: skip

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from chromium import BROWSERS, Chromium, installed
 from curves import curve
 
 from valveflow_ros.curve.characteristic import (
@@ -119,14 +118,3 @@ def make() -> Make:
 def identified(make: Make) -> Identified:
     """Return a day at ten seconds."""
     return make()
-
-
-@pytest.fixture(scope='session')
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
-    """Return a browser without a head; one for all tests."""
-    found = installed()
-    if found is None:
-        pytest.skip(f'none of {", ".join(BROWSERS)} is installed')
-    opened = Chromium(found, tmp_path_factory.mktemp('browser'))
-    yield opened
-    opened.close()

@@ -18,8 +18,9 @@ from valveflow_msgs.msg import Alarm, Diagnosis, DiagnosisCause, FlowCharacteris
 
 from valveflow_ros.report.terminal.screen import screen
 from valveflow_ros.ros import watch_main
+from valveflow_ros.ros.listening import fields_of
 from valveflow_ros.ros.node.diagnostics import Item, Level, diagnostics_message
-from valveflow_ros.ros.watch_main import WatchNode, fields_of
+from valveflow_ros.ros.watch_main import WatchNode
 
 pytestmark = pytest.mark.ros
 

@@ -13,9 +13,12 @@ from typing import NoReturn
 
 from valveflow_ros.cli.command import Console, VerbResult
 from valveflow_ros.errors import DataError, UsageError
+from valveflow_ros.page.server import check_installed, page_arguments
 from valveflow_ros.report.terminal.text import number
 
-_MODULE = 'valveflow_ros.ros.watch_main'
+_MODULE, _PAGE_MODULE = 'valveflow_ros.ros.watch_main', 'valveflow_ros.ros.page_main'
+# A day at a sample a second: what the page shows at most.
+_DAY = 86_400
 _TABLES = ('.csv', '.tsv', '.txt', '.parquet', '.pq', '.xlsx')
 
 _DESCRIPTION = """\
@@ -31,7 +34,9 @@ and over ROS 2, in a shell that has it:
   valveflow watch
   valveflow watch --ask acknowledge_alarms
 
-Where the output is no terminal, each change is a line instead."""
+Where the output is no terminal, each change is a line instead. With --page it is shown on a page
+in the browser instead, with metrics for Prometheus; that needs pip install dash
+prometheus-client waitress."""
 
 
 def arguments(parser: ArgumentParser) -> None:
@@ -58,10 +63,15 @@ def arguments(parser: ArgumentParser) -> None:
         help='have the monitor do something: acknowledge_alarms, shelve_alarms, unshelve_alarms, '
         'set_reference, refit or diagnose; print its answer, then stop',
     )  # fmt: skip
+    parser.add_argument(
+        '--page', action='store_true', help='show it on a page in the browser; options for it:'
+    )
+    page_arguments(parser)
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
     """Watch until there is nothing more to see."""
+    _check_together(options)
     if options.log is None:
         _watch_ros(options)
     if options.node is not None:
@@ -73,7 +83,63 @@ def run(options: Namespace, console: Console) -> VerbResult:
             f'{options.log} is a table, which does not grow: look into it with '
             f'"valveflow info {options.log}".'
         )
-    return _watch_log(options, console)
+    return _page_of_log(options, console) if options.page else _watch_log(options, console)
+
+
+def _check_together(options: Namespace) -> None:
+    """Refuse options that do not go together; raises `UsageError`."""
+    if options.page:
+        if options.once or options.json or options.ask is not None:
+            raise UsageError('--page does not go with --once, --json or --ask.')
+        if options.log is not None and options.token_file is not None:
+            raise UsageError('--token-file is for a running monitor and does not go with a LOG.')
+        check_installed()
+        return
+    given = (options.on_alarm, options.webhook, options.token_file)
+    if any(option is not None for option in given) or options.name:
+        raise UsageError('--on-alarm, --webhook, --token-file and --name go with --page.')
+
+
+def _page_of_log(options: Namespace, console: Console) -> VerbResult:
+    """Follow a recording on a page; Ctrl-C is the usual end."""
+    from valveflow_ros.interface.recording_view import LogWatch
+    from valveflow_ros.page.notices import Notices
+    from valveflow_ros.page.server import PageServer
+    from valveflow_ros.page.unit import Shown, Unit
+    from valveflow_ros.report.terminal.screen import ending
+
+    unit = Unit(str(options.log))
+    watch = LogWatch(options.log, unit, _DAY)
+    shown = Shown()
+    shown.put((), 'Reading what was recorded so far.')
+    notices = Notices(options.on_alarm, options.webhook, console.warn)
+    server: PageServer | None = None
+    try:
+        with ending():
+            server = PageServer(
+                shown,
+                options.host,
+                options.port,
+                options.name,
+                counters=notices.counters,
+                complain=console.warn,
+            )
+            console.say(f'The page is at {server.address}')
+            while True:
+                for _ in watch.read():
+                    percent = f'{100.0 * watch.share:.0f} %'
+                    if not shown.units:
+                        shown.put((), f'Reading what was recorded so far: {percent}.')
+                shown.put((unit.snapshot(watch.frame()),))
+                notices.tell(unit.changes())
+                time.sleep(options.interval)
+    except KeyboardInterrupt:
+        # How one stops looking.
+        return VerbResult('', {})
+    finally:
+        if server is not None:
+            server.close()
+        notices.close()
 
 
 def _watch_log(options: Namespace, console: Console) -> VerbResult:
@@ -118,11 +184,28 @@ def _watch_ros(options: Namespace) -> NoReturn:
             'Source its setup first, or name the recording to follow: '
             'valveflow watch valveflow_recordings.'
         )
+    if options.page:
+        _become(_PAGE_MODULE, _page_words(options))
     words = ['--interval', str(options.interval)]
     words += ['--once'] if options.once else []
     words += ['--json'] if options.json else []
     words += ['--node', options.node] if options.node else []
     words += ['--ask', options.ask] if options.ask else []
+    _become(_MODULE, words)
+
+
+def _page_words(options: Namespace) -> list[str]:
+    words = ['--host', options.host, '--port', str(options.port)]
+    for name in options.name:
+        words += ['--name', name]
+    for option in ('node', 'token_file', 'on_alarm', 'webhook'):
+        given = getattr(options, option)
+        words += [] if given is None else [f'--{option.replace("_", "-")}', str(given)]
+    return words
+
+
+def _become(module: str, words: list[str]) -> NoReturn:
+    """Become the process of another module."""
     sys.stdout.flush()
     sys.stderr.flush()
-    os.execv(sys.executable, [sys.executable, '-m', _MODULE, *words])
+    os.execv(sys.executable, [sys.executable, '-m', module, *words])

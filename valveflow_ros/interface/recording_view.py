@@ -118,7 +118,7 @@ class InputWatch:
 
 _PARAMETERS = 'parameters.json'
 _MANY = 1 << 30
-_WANTED = {PREDICTION: KEPT, CURVE: 1, DIAGNOSIS: 1, ALARM: _MANY}
+_WANTED = {CURVE: 1, DIAGNOSIS: 1, ALARM: _MANY}
 _STILL_S = 10.0
 
 
@@ -129,6 +129,10 @@ class LogWatch:
     ----------
     path : Path
         An ``.mcap`` file, an ``.mcap.part``, a recording's folder, or a folder of those.
+    board : Board, optional
+        What keeps the state; one of its own by default.
+    kept : int
+        How many of the newest predictions are told to the board, at the start and later.
 
     Raises
     ------
@@ -141,20 +145,26 @@ class LogWatch:
         How much of the present file has been read, 0 to 1.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, board: Board | None = None, kept: int = KEPT) -> None:
         place = recording_in(path)
         self._follower = Follower(place)
         self._name = place.name or str(place)
         self._picker = Picker()
-        self._board = Board()
+        self._board = Board() if board is None else board
+        self._wanted = {**_WANTED, PREDICTION: kept}
         self._inputs = InputWatch()
         self._parameters = b''
         # Most of those of a long recording are never looked at.
-        self._predictions: deque[Raw] = deque(maxlen=KEPT)
+        self._predictions: deque[Raw] = deque(maxlen=kept)
         self._newest_ns = 0
         self._grown_s = time.monotonic()
         self._heard = False
         self.share = 0.0
+
+    @property
+    def name(self) -> str:
+        """Return the name of the recording."""
+        return self._name
 
     @property
     def finished(self) -> bool:
@@ -182,7 +192,7 @@ class LogWatch:
         if attached != self._parameters:
             self._parameters = attached
             self._inputs.parameters(attached)
-        for raw in self._picker.last(batch, _WANTED):
+        for raw in self._picker.last(batch, self._wanted):
             self._heard = True
             if raw.type == PREDICTION:
                 self._predictions.append(raw)

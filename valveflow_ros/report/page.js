@@ -5,58 +5,17 @@
   const paperWidth = 685;
   let printing = false;
 
-  function colours() {
-    const style = getComputedStyle(document.documentElement);
-    return (name) => style.getPropertyValue('--' + name).trim() || '#888888';
-  }
-
-  // Colours stand in the pictures by name; give each its value in the page's present look.
-  function painted(value, colour) {
-    if (typeof value === 'string') {
-      return value.startsWith('token:') ? colour(value.slice(6)) : value;
-    }
-    if (Array.isArray(value)) {
-      const last = value[value.length - 1];
-      return typeof last === 'number' ? value : value.map((v) => painted(v, colour));
-    }
-    if (value !== null && typeof value === 'object') {
-      const out = {};
-      for (const key of Object.keys(value)) out[key] = painted(value[key], colour);
-      return out;
-    }
-    return value;
-  }
-
-  // A long title would run out of a narrow picture.
-  function titled(given, narrow) {
-    const title = Object.assign({ standoff: 8 }, given.title);
-    if (narrow && title.short) title.text = title.short;
-    delete title.short;
-    return title;
-  }
-
-  function axis(given, colour, narrow) {
-    return Object.assign({
-      gridcolor: colour('grid'), linecolor: colour('rule'), tickcolor: colour('rule'),
-      zeroline: false, ticks: 'outside', automargin: true, hoverformat: given.hoverformat,
-    }, given, { title: titled(given, narrow) });
-  }
-
   function layout(figure, colour, narrow) {
     const given = figure.layout;
     const named = figure.data.filter((t) => t.name && t.showlegend !== false).length;
     const out = painted(given, colour);
-    const base = {
-      paper_bgcolor: colour('paper'), plot_bgcolor: colour('paper'),
-      font: { family: getComputedStyle(document.body).fontFamily, size: 14, color: colour('ink') },
-      margin: { l: 60, r: 12, t: narrow || printing ? 34 : 46, b: 50 }, hovermode: 'closest', dragmode: narrow ? false : 'zoom',
-      legend: { orientation: 'h', x: 0, y: 1.02, xanchor: 'left', yanchor: 'bottom', itemsizing: 'constant', font: { size: 14 } },
-      hoverlabel: { bgcolor: colour('panel'), bordercolor: colour('rule'), font: { color: colour('ink') } },
-    };
+    const base = Object.assign(baseLayout(colour), {
+      margin: { l: 60, r: 12, t: narrow || printing ? 34 : 46, b: 50 }, dragmode: narrow ? false : 'zoom',
+    });
     // There the entries of a legend stand one below the other, and need their own room.
     if (narrow) out.height += 22 * Math.max(0, named - 1);
     for (const key of Object.keys(out)) {
-      base[key] = /^[xy]axis/.test(key) ? axis(out[key], colour, narrow) : out[key];
+      base[key] = /^[xy]axis/.test(key) ? styledAxis(out[key], colour, narrow) : out[key];
     }
     return base;
   }

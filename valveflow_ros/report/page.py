@@ -168,7 +168,8 @@ class Page:
             f'<style>{read_text("style.css")}</style></head>\n<body><main>'
             f'<header><h1>{title}</h1>{self.lead}</header>{body}<footer>{self.foot}</footer>'
             f'</main>\n<script id="figures" type="application/json">{{{drawn}}}</script>\n'
-            f'{library}\n<script>{read_text("page.js")}</script></body></html>\n'
+            f'{library}\n<script>{read_text("colours.js")}{read_text("page.js")}</script>'
+            '</body></html>\n'
         )
 
 

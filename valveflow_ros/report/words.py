@@ -212,7 +212,8 @@ def input_axis(value: float) -> dict[str, str]:
     """Return the title of an axis of u, and a short one for narrow pictures, as HTML."""
     if value == 0.0:
         return {'text': 'u = V, valve opening (%)', 'short': 'u = V (%)'}
-    long = f'integrated input u = V p<sup>{exponent(value)}</sup> ({input_unit(value)})'
+    m = exponent(value) if math.isfinite(value) else 'm'
+    long = f'integrated input u = V p<sup>{m}</sup> ({input_unit(value)})'
     return {'text': long, 'short': f'u ({input_unit(value)})'}
 
 

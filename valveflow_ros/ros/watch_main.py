@@ -8,40 +8,25 @@ import json
 import math
 import sys
 import time
-from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
 from std_srvs.srv import Trigger
-from valveflow_msgs.msg import Alarm, Diagnosis, FlowCharacteristic, Prediction
 
 from valveflow_ros.errors import ValveflowError
-from valveflow_ros.report.terminal.board import (
-    ALARM,
-    CURVE,
-    DIAGNOSIS,
-    HEALTH,
-    KEPT,
-    PREDICTION,
-    Board,
-)
+from valveflow_ros.report.terminal.board import CURVE, HEALTH, Board
 from valveflow_ros.report.terminal.frame import Frame
 from valveflow_ros.report.terminal.screen import Screen
 from valveflow_ros.report.terminal.text import number
 from valveflow_ros.ros.domain import start_ros
+from valveflow_ros.ros.listening import Listener, full_name, hear_health, monitors, waiting_for
 from valveflow_ros.ros.outputs import SERVICES
 from valveflow_ros.ros.process import Parser, complain, with_place
 
-_LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# A sample that is lost here is lost to the eye only.
-_STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
-_CURVE_TOPIC = '/characteristic'
 _LOOK_S = 0.5
 # For one picture: how long a monitor may take to be found, and then to say how it is.
 _FIND_S, _HEAR_S = 5.0, 3.0
@@ -59,79 +44,41 @@ class WatchNode(Node):
 
     def __init__(self, monitor: str = '') -> None:
         super().__init__('valveflow_watch', enable_rosout=False)
-        self._wanted = '/' + monitor.strip('/') if monitor else ''
-        self.monitor = ''
+        self._wanted = full_name(monitor)
         self.several: tuple[str, ...] = ()
-        self._board = Board()
-        self._predictions: deque[Prediction] = deque(maxlen=KEPT)
-        self.heard: set[str] = set()
+        self._heard: dict[str, Listener] = {}
+        hear_health(self, self._heard)
+
+    @property
+    def monitor(self) -> str:
+        """Return the full name of the monitor's node, empty until it is found."""
+        return next(iter(self._heard), '')
+
+    @property
+    def heard(self) -> set[str]:
+        """Return the types of the messages that have come."""
+        return set().union(*(listener.heard for listener in self._heard.values()))
 
     def look(self) -> None:
         """Look for the monitor as long as it is not found."""
-        if self.monitor:
+        if self._heard:
             return
-        found = sorted(
-            topic.removesuffix(_CURVE_TOPIC)
-            for topic, kinds in self.get_topic_names_and_types()
-            if CURVE in kinds and topic.endswith(_CURVE_TOPIC) and self.count_publishers(topic)
-        )
+        found = monitors(self)
         self.several = tuple(found) if len(found) > 1 and not self._wanted else ()
         if self._wanted in found or (len(found) == 1 and not self._wanted):
-            self._listen(self._wanted or found[0])
+            name = self._wanted or found[0]
+            self._heard[name] = Listener(self, name, Board())
 
     def frame(self) -> Frame:
         """Return what is known now."""
-        while self._predictions:
-            self._board.take(PREDICTION, fields_of(self._predictions.popleft()))
-        return self._board.frame(self.monitor or 'ROS 2', self._note())
-
-    def _note(self) -> str:
+        listener = self._heard.get(self.monitor)
+        if listener is not None:
+            listener.tell()
+            return listener.board.frame(self.monitor, listener.note)
         if self.several:
-            return f'Several monitors run: {", ".join(self.several)}. Choose with --node NAME.'
-        if not self.monitor:
-            what = self._wanted or 'a monitor'
-            return (
-                f'Waiting for {what}. If one runs, compare ROS_DOMAIN_ID and '
-                'ROS_AUTOMATIC_DISCOVERY_RANGE here and there: they must be the same.'
-            )
-        if not self.count_publishers(self.monitor + _CURVE_TOPIC):
-            return 'The monitor has gone; this is what it said last.'
-        return '' if self.heard else 'The monitor was found; nothing has come from it yet.'
-
-    def _listen(self, monitor: str) -> None:
-        self.monitor = monitor
-        for name, kind, type_name in (
-            ('characteristic', FlowCharacteristic, CURVE),
-            ('alarms', Alarm, ALARM),
-            ('diagnosis', Diagnosis, DIAGNOSIS),
-        ):
-            self._subscribe(f'{monitor}/{name}', kind, type_name, _LATCHED)
-        self._subscribe('/diagnostics', DiagnosticArray, HEALTH, QoSProfile(depth=10))
-        self.create_subscription(Prediction, f'{monitor}/prediction', self._on_prediction, _STREAM)
-
-    def _subscribe(self, topic: str, kind: type, type_name: str, qos: QoSProfile) -> None:
-        def take(message: Any) -> None:
-            self.heard.add(type_name)
-            self._board.take(type_name, fields_of(message))
-
-        self.create_subscription(kind, topic, take, qos)
-
-    def _on_prediction(self, message: Prediction) -> None:
-        self.heard.add(PREDICTION)
-        self._predictions.append(message)
-
-
-def fields_of(message: Any) -> Mapping[str, Any]:
-    """Return a message as a mapping, messages within as mappings too."""
-    return {name: _plain(getattr(message, name)) for name in message.get_fields_and_field_types()}
-
-
-def _plain(value: Any) -> Any:
-    if hasattr(value, 'get_fields_and_field_types'):
-        return fields_of(value)
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value
+            note = f'Several monitors run: {", ".join(self.several)}. Choose with --node NAME.'
+            return Frame(source='ROS 2', note=note)
+        return Frame(source='ROS 2', note=waiting_for(self._wanted))
 
 
 def parser() -> argparse.ArgumentParser:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from valveflow_ros.records import NS_PER_S
@@ -27,7 +28,18 @@ AGE = 'Age of the curve (s)'
 # A quarter of an hour at one sample a second: more than fits on any terminal.
 KEPT = 900
 
+# More alarms than a monitor has, and more items of health.
+_MOST_ALARMS, _MOST_ITEMS = 64, 64
+
 Fields = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class ItemView:
+    """An item of the health with the numbers behind it, as text; units stand in their keys."""
+
+    health: HealthView
+    values: Mapping[str, str]
 
 
 class Board:
@@ -41,11 +53,14 @@ class Board:
         Set by whoever knows better than `/diagnostics`.
     recorder : HealthView or None
         The same.
+    items : tuple of ItemView
+        All that `/diagnostics` tells of this monitor.
     """
 
     def __init__(self) -> None:
         self.inputs: tuple[HealthView, ...] = ()
         self.recorder: HealthView | None = None
+        self.items: tuple[ItemView, ...] = ()
         self._unit = ''
         # The tag of what the monitor publishes, and of the health that was taken; None: no word.
         self._tag: str | None = None
@@ -66,6 +81,7 @@ class Board:
             if self._health_tag not in (None, self._tag):
                 # It came before it was known which monitor of several this is.
                 self.inputs, self.recorder, self._health_tag = (), None, None
+                self.items = ()
             self._unit = self._tag or self._unit
             if isinstance(view, SampleView):
                 if time_ns < self._now_ns and self._samples:
@@ -78,7 +94,8 @@ class Board:
                 self._curve = view
                 self.at(view.window[1])
             elif isinstance(view, AlarmView):
-                self._alarms[view.name] = view
+                if view.name in self._alarms or len(self._alarms) < _MOST_ALARMS:
+                    self._alarms[view.name] = view
                 self.at(time_ns)
             else:
                 self._diagnosis = view
@@ -103,7 +120,11 @@ class Board:
             ours = [s for s in ours if str(s['hardware_id']) == self._tag]
         if ours:
             self._health_tag = str(ours[0]['hardware_id'])
-        items = [_item(status) for status in ours]
+        items = [_item(status) for status in ours[:_MOST_ITEMS]]
+        if items:
+            self.items = tuple(
+                ItemView(item, _values(status)) for item, status in zip(items, ours, strict=False)
+            )
         inputs = [item for item in items if item.name.startswith('input ')]
         if inputs:
             self.inputs = tuple(
@@ -167,11 +188,14 @@ def _floats(values: Iterable[Any]) -> tuple[float, ...]:
     return tuple(float(value) for value in values)
 
 
+def _values(status: Fields) -> dict[str, str]:
+    return {str(pair['key']): str(pair['value']) for pair in status.get('values', ())}
+
+
 def _age_ns(fit: Fields) -> int:
     """Return the age of the curve that the health tells, 0 where it tells none."""
-    told = {str(pair['key']): str(pair['value']) for pair in fit.get('values', ())}
     try:
-        return round(float(told[AGE]) * NS_PER_S)
+        return round(float(_values(fit)[AGE]) * NS_PER_S)
     except (KeyError, ValueError, OverflowError):
         return 0
 

@@ -244,16 +244,18 @@ def inputs_words(frame: Frame) -> list[Said]:
         if item.level != OK:
             groups.setdefault((item.level, item.sentence), []).append(item.name)
     wrong = [
-        (f'{", ".join(map(_short, names))}: {sentence}', _TONES.get(level, 'bad'))
+        (f'{", ".join(map(short_name, names))}: {sentence}', _TONES.get(level, 'bad'))
         for (level, sentence), names in groups.items()
     ]
-    fine = [f'{_short(i.name)} {i.sentence.rstrip(".")}' for i in frame.inputs if i.level == OK]
+    fine = [
+        f'{short_name(i.name)} {i.sentence.rstrip(".")}' for i in frame.inputs if i.level == OK
+    ]
     return [*wrong, *([(', '.join(fine), '')] if fine else [])]
 
 
 def health_words(item: HealthView) -> Said:
     """Say how one thing is."""
-    return f'{_short(item.name)}: {item.sentence}', _TONES.get(item.level, 'bad')
+    return f'{short_name(item.name)}: {item.sentence}', _TONES.get(item.level, 'bad')
 
 
 def recorder_words(frame: Frame) -> Said:
@@ -275,6 +277,6 @@ def diagnosis_words(diagnosis: DiagnosisView | None) -> Said:
     return text, 'warn' if diagnosis.verdict in (2, 3) else ''
 
 
-def _short(name: str) -> str:
+def short_name(name: str) -> str:
     """Return a signal's name as it is said in a narrow place."""
     return _SHORT.get(name, name)

@@ -7,7 +7,7 @@ import os
 import shutil
 import signal
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from itertools import pairwise
 from types import FrameType, TracebackType
 from typing import TextIO
@@ -304,9 +304,7 @@ class Screen:
 
     def __enter__(self) -> Screen:
         """Take the terminal; a request to end comes as `KeyboardInterrupt` from now on."""
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            with suppress(ValueError):  # not in the main thread
-                self._handlers[number] = signal.signal(number, _interrupt)
+        self._handlers = _handled()
         if self.in_place:
             self._out.write(_ENTER)
             self._entered = True
@@ -323,8 +321,7 @@ class Screen:
             with suppress(OSError):
                 self._out.write(_LEAVE)
                 self._out.flush()
-        for number, handler in self._handlers.items():
-            signal.signal(number, handler)  # type: ignore[arg-type]
+        _put_back(self._handlers)
 
     def show(self, frame: Frame) -> None:
         """Show a frame, or what has changed since the last one."""
@@ -347,6 +344,30 @@ class Screen:
     def _rows(self, frame: Frame) -> list[str]:
         size = shutil.get_terminal_size(_USUAL)
         return screen(frame, size.columns, size.lines, colour=self._colour, unicode=self._unicode)
+
+
+def _handled() -> dict[signal.Signals, object]:
+    """Let requests to end come as `KeyboardInterrupt`; return what handled them before."""
+    before: dict[signal.Signals, object] = {}
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        with suppress(ValueError):  # not in the main thread
+            before[number] = signal.signal(number, _interrupt)
+    return before
+
+
+def _put_back(handlers: Mapping[signal.Signals, object]) -> None:
+    for number, handler in handlers.items():
+        signal.signal(number, handler)  # type: ignore[arg-type]
+
+
+@contextmanager
+def ending() -> Iterator[None]:
+    """Let a request to end come as `KeyboardInterrupt` inside."""
+    before = _handled()
+    try:
+        yield
+    finally:
+        _put_back(before)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

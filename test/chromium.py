@@ -150,9 +150,13 @@ class Chromium:
 
     def open(self, path: Path) -> None:
         """Open a file and wait until the page says that everything is drawn."""
+        self.visit(path.resolve().as_uri())
+
+    def visit(self, url: str) -> None:
+        """Open an address and wait until the page says that everything is drawn."""
         self.said.clear()
         self.asked.clear()
-        self.call('Page.navigate', url=path.resolve().as_uri())
+        self.call('Page.navigate', url=url)
         until = time.monotonic() + _LONGEST_S
         while self.ask('document.documentElement?.dataset.drawn') != 'yes':
             if time.monotonic() > until:

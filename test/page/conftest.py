@@ -1,0 +1,33 @@
+"""The page's server, where its libraries are installed."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from valveflow_ros.page.unit import Shown
+
+EXTRA = ('dash', 'prometheus_client', 'waitress')
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[..., Any]]:
+    """Give a function that starts a server on any free port; skip where the extra is absent."""
+    missing = [name for name in EXTRA if importlib.util.find_spec(name) is None]
+    if missing:
+        pytest.skip(f'{", ".join(missing)} not installed; the page is an extra')
+    from valveflow_ros.page.server import PageServer
+
+    made = []
+
+    def start(shown: Shown, port: int = 0, **more: Any) -> PageServer:
+        server = PageServer(shown, port=port, **more)
+        made.append(server)
+        return server
+
+    yield start
+    for server in made:
+        server.close()

@@ -1,0 +1,328 @@
+"""The page's server: what it answers, what it refuses, and what hostile or slow peers can do."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import socket
+import time
+from contextlib import ExitStack
+
+import pytest
+from page_units import alarm, shown_now, told
+
+from valveflow_ros.errors import DataError, InputError, RecordingError, ValveflowError
+from valveflow_ros.page import server as module
+from valveflow_ros.page.server import MOST_CONNECTIONS, check_installed, read_token
+from valveflow_ros.page.unit import Shown
+
+
+def asked(server, path='/', method='GET', body=None, **head):
+    """Return status, headers and text of an answer."""
+    connection = http.client.HTTPConnection('127.0.0.1', server.port, timeout=20)
+    names = {k.replace('_', '-'): v for k, v in head.items()}
+    connection.request(method, path, body=body, headers=names)
+    answer = connection.getresponse()
+    text = answer.read().decode()
+    connection.close()
+    return answer.status, dict(answer.getheaders()), text
+
+
+def tick(server, seen=None, **head):
+    """Ask for what a browser asks for each tick; return status and the parts that came."""
+    ids = [{'unit': 0, 'part': 'pictures'}]
+    names = ('head', 'alarms', 'curve_words', 'now', 'diagnosis', 'health')
+    outputs = [
+        *([{'id': {'unit': 0, 'part': name}, 'property': 'children'}] for name in names),
+        [{'id': {'unit': 0, 'part': 'pictures'}, 'property': 'data'}],
+        {'id': 'note', 'property': 'children'}, {'id': 'note', 'property': 'className'},
+        {'id': 'seen', 'property': 'data'},
+    ]  # fmt: skip
+    _, _, described = asked(server, '/_dash-dependencies')
+    output = next(d['output'] for d in json.loads(described) if 'seen.data' in d['output'])
+    content = {
+        'output': output, 'outputs': outputs, 'changedPropIds': ['tick.n_intervals'],
+        'inputs': [{'id': 'tick', 'property': 'n_intervals', 'value': 1}],
+        'state': [{'id': 'seen', 'property': 'data', 'value': seen},
+                  [{'id': i, 'property': 'id', 'value': i} for i in ids]],
+    }  # fmt: skip
+    status, _, text = asked(
+        server, '/_dash-update-component', 'POST', json.dumps(content),
+        **{'Content_Type': 'application/json', **head},
+    )  # fmt: skip
+    return status, json.loads(text)['response'] if status == 200 else text
+
+
+def test_the_page_and_its_metrics_are_served_from_here_alone(serve):
+    server = serve(shown_now(told()))
+    assert server.address == f'http://127.0.0.1:{server.port}/'
+    status, head, text = asked(server)
+    assert status == 200
+    assert 'react-entry-point' in text
+    assert "default-src 'self'" in head['Content-Security-Policy']
+    assert "'unsafe-eval'" not in head['Content-Security-Policy']
+    assert 'http://' not in text.replace('http://www.w3.org', '')
+    assert 'https://' not in text
+    status, head, text = asked(server, '/metrics')
+    assert (status, head['Content-Type'].split(';')[0]) == (200, 'text/plain')
+    assert 'valveflow_monitor_up{unit="U1"} 1.0' in text
+    status, _, text = asked(server, '/_dash-layout')
+    assert status == 200
+    assert 'The valve sticks.' in text
+    assert 'Lubricate' in text
+
+
+def test_a_browser_is_sent_what_has_changed_and_no_more(serve):
+    unit = told()
+    shown = shown_now(unit)
+    server = serve(shown)
+    status, first = tick(server, {})
+    # A page that was loaded from another server, or for other units, is only told to load again.
+    assert (status, set(first)) == (200, {'note', 'seen'})
+    generation = {'generation': first['seen']['data']['generation']}
+    _, whole = tick(server, generation)
+    pictures = whole['{"part":"pictures","unit":0}']['data']
+    assert set(pictures) == {'curve', 'recent', 'day'}
+    assert whole['{"part":"head","unit":0}']['children']
+    _, nothing = tick(server, whole['seen']['data'])
+    assert set(nothing) == {'note', 'seen'}
+    alarm(unit, 1, second=199)
+    shown.put([unit.snapshot(unit.frame('m'))], 'Look.')
+    _, changed = tick(server, nothing['seen']['data'])
+    assert changed['note']['children'] == 'Look.'
+    # Not only the alarm: one word at the head of the unit sums it up.
+    assert set(changed) == {
+        'note', 'seen', '{"part":"alarms","unit":0}', '{"part":"head","unit":0}'
+    }  # fmt: skip
+
+
+REFUSED = {
+    'a name that was made to point here': ('/', 'GET', {'Host': 'evil.example'}, 403),
+    'the same with a port': ('/metrics', 'GET', {'Host': 'evil.example:8350'}, 403),
+    'no name': ('/', 'GET', {'Host': ''}, 403),
+    'a broken name': ('/', 'GET', {'Host': '[::1'}, 403),
+    'another origin': ('/metrics', 'GET', {'Origin': 'http://evil.example'}, 403),
+    'an origin that is a secret': ('/', 'GET', {'Origin': 'null'}, 403),
+    'another port': ('/', 'GET', {'Origin': 'http://127.0.0.1:1'}, 403),
+    'a picture in another page': ('/metrics', 'GET', {'Sec_Fetch_Site': 'cross-site'}, 403),
+    'a form in another page': (
+        '/_dash-update-component', 'POST', {'Origin': 'http://evil.example'}, 403
+    ),
+    'no such page': ('/etc/passwd', 'GET', {}, 404),
+    'a way out': ('/_dash-component-suites/../../etc/passwd', 'GET', {}, 400),
+    'a file the library does not offer': ('/_dash-component-suites/dash/dash.py', 'GET', {}, 400),
+    'a method': ('/', 'POST', {}, 405),
+    'another method': ('/metrics', 'DELETE', {}, 405),
+    'a head that is too large': ('/', 'GET', {'X': 'y' * 20000}, 431),
+    'nothing to update': ('/_dash-update-component', 'POST', {}, 415),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('case', REFUSED)
+def test_what_is_refused(serve, case, capfd):
+    path, method, head, status = REFUSED[case]
+    server = serve(shown_now(told(seconds=3)))
+    found, _, text = asked(server, path, method, **head)
+    assert found == status, text
+    assert len(text) < 200
+    assert 'Traceback' not in text + capfd.readouterr().err
+    assert asked(server)[0] == 200
+
+
+@pytest.mark.parametrize(
+    'body',
+    ['', '{', '[]', 'null', '"x"', '{"output": 7}', '{"output":"a.b","inputs":[7]}', 'é' * 9],
+)
+def test_garbage_where_a_browser_asks(serve, body, capfd):
+    server = serve(shown_now(told(seconds=3)))
+    status, _, text = asked(
+        server, '/_dash-update-component', 'POST', body.encode(), Content_Type='application/json'
+    )
+    assert status == 400
+    assert 'Traceback' not in text + capfd.readouterr().err
+    assert asked(server)[0] == 200
+
+
+@pytest.mark.parametrize(
+    'seen', [None, 7, [], {'0': 7}, {'generation': {}}, {'generation': None, '0': {'head': []}}]
+)
+def test_garbage_for_what_was_seen(serve, seen):
+    server = serve(shown_now(told(seconds=3)))
+    status, _ = tick(server, seen)
+    assert status == 200
+
+
+@pytest.mark.parametrize(
+    'sent', [b'\0' * 100, b'GET / HTTP/9\r\n\r\n', b'\x16\x03\x01\x02\0\x01', b'GET\r\n\r\n' * 50]
+)
+def test_what_is_not_http(serve, sent, capfd):
+    server = serve(shown_now(told(seconds=3)))
+    with socket.create_connection(('127.0.0.1', server.port), timeout=20) as peer:
+        peer.sendall(sent)
+        peer.shutdown(socket.SHUT_WR)
+        answer = peer.recv(65536)
+    assert answer == b'' or b' 40' in answer.split(b'\r\n')[0]
+    assert 'Traceback' not in capfd.readouterr().err
+    assert asked(server)[0] == 200
+
+
+def test_a_body_without_end_is_refused(serve):
+    server = serve(shown_now(told(seconds=3)))
+    with socket.create_connection(('127.0.0.1', server.port), timeout=20) as peer:
+        peer.sendall(
+            b'POST /_dash-update-component HTTP/1.1\r\nHost: localhost\r\n'
+            b'Content-Length: 1000000000\r\n\r\n'
+        )
+        assert b'413' in peer.recv(65536)
+
+
+@pytest.mark.parametrize('name', ['localhost', '127.0.0.1', '[::1]', '10.1.2.3', 'plant.example'])
+def test_our_own_names(serve, name):
+    server = serve(shown_now(told(seconds=3)), names=['Plant.Example'])
+    host = f'{name}:{server.port}'
+    assert asked(server, Host=host, Origin=f'http://{host}')[0] == 200
+
+
+def test_a_port_that_is_taken_is_told(serve):
+    first = serve(shown_now(told(seconds=3)))
+    with pytest.raises(ValveflowError, match=rf'Port {first.port} of 127\.0\.0\.1 is in use'):
+        serve(Shown(), port=first.port)
+
+
+@pytest.mark.parametrize('host', ['no.such.name.invalid', '203.0.113.7', 'ä' * 100])
+def test_an_address_that_is_not_ours_is_told(serve, host):
+    with pytest.raises(ValveflowError) as refused:
+        serve(Shown(), host=host)
+    assert host in str(refused.value)
+
+
+def test_two_hundred_connections_and_then_too_many(serve):
+    server = serve(shown_now(told(seconds=3)))
+    with ExitStack() as stack:
+
+        def more(count):
+            for _ in range(count):
+                peer = socket.create_connection(('127.0.0.1', server.port), timeout=20)
+                stack.enter_context(peer).sendall(b'GET / HT')
+
+        more(200)
+        assert asked(server)[0] == 200
+        assert tick(server, {})[0] == 200
+        more(MOST_CONNECTIONS - 195)
+        status, head, text = asked(server)
+        assert (status, head.get('Retry-After')) == (503, '10')
+        assert text == 'Too many connections; try again.\n'
+    deadline_s = time.monotonic() + 20
+    while asked(server)[0] != 200:
+        assert time.monotonic() < deadline_s
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize('kind', ['idle', 'half a request', 'drips', 'does not read'])
+def test_slow_peers_are_left(serve, monkeypatch, kind):
+    monkeypatch.setattr(module, 'IDLE_S', 1)
+    monkeypatch.setattr(module, '_SWEEP_S', 0.2)
+    server = serve(shown_now(told(seconds=3)))
+    files = asked(server, '/_dash-layout')[2]
+    assert files
+    with socket.socket() as peer:
+        peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        peer.settimeout(20)
+        peer.connect(('127.0.0.1', server.port))
+        line = b'GET / HTTP/1.1\r\nHost: localhost\r\n'
+        if kind == 'does not read':
+            peer.sendall((line + b'\r\n') * 400)
+        elif kind != 'idle':
+            peer.sendall(line)
+        assert asked(server)[0] == 200
+        deadline_s = time.monotonic() + 20
+        while server.connections():
+            assert time.monotonic() < deadline_s, 'it is still connected'
+            if kind == 'drips':
+                try:
+                    peer.sendall(b'X')
+                except OSError:
+                    pass
+            time.sleep(0.1)
+    assert asked(server)[0] == 200
+
+
+def test_a_unit_of_which_little_is_known_is_shown(serve):
+    from valveflow_ros.page.unit import Unit
+    from valveflow_ros.report.terminal.board import CURVE
+
+    unit, nan, never = Unit('/m'), float('nan'), {'sec': 0, 'nanosec': 0}
+    unit.take(CURVE, {
+        'header': {'stamp': never, 'frame_id': 'U1'}, 'breakpoints': [], 'values': [], 'status': 0,
+        'cause': 'No curve yet.', 'model_id': '', 'samples': 0, 'window_start': never,
+        'window_end': never, 'rmse_mw': nan, 'pressure_exponent': nan,
+    })  # fmt: skip
+    said = []
+    server = serve(shown_now(Unit('/n'), unit), complain=said.append)
+    status, _, text = asked(server, '/_dash-layout')
+    assert status == 200
+    assert 'No curve yet.' in text
+    assert said == []
+
+
+def test_an_error_of_the_page_is_told_once(serve):
+    said = []
+    server = serve(Shown(), complain=said.append)
+    server.guard._metrics = lambda: {}['nothing']
+    for _ in range(3):
+        assert asked(server, '/metrics')[0] == 400
+    assert said == ["A request of /metrics was not answered (KeyError: 'nothing')."]
+
+
+def test_without_a_token_nothing_can_be_asked(serve):
+    server = serve(shown_now(told(seconds=3)))
+    assert 'Acknowledge' not in asked(server, '/_dash-layout')[2]
+    assert 'answer' not in asked(server, '/_dash-dependencies')[2]
+
+
+def test_a_token_and_few_wrong_ones():
+    pytest.importorskip('dash', reason='the page is an extra')
+    from valveflow_ros.page.view import Asking
+
+    done = []
+
+    def ask(unit, service):
+        done.append((unit, service))
+        return True, 'Acknowledged.'
+
+    asking = Asking('the right one', ask)
+    assert asking('/m', 'acknowledge_alarms', 'the right one') == (True, 'Acknowledged.')
+    assert asking('/m', 'set_reference', 'the right one')[0] is False
+    assert asking('/m', 'shelve_alarms', '')[0] is False
+    for _ in range(5):
+        asking('/m', 'shelve_alarms', 'the wrong one\udcff')
+    # The right one has to wait as well, or guessing would be told from not guessing.
+    assert 'wait' in asking('/m', 'shelve_alarms', 'the right one')[1]
+    assert done == [('/m', 'acknowledge_alarms')]
+
+
+@pytest.mark.parametrize(
+    ('content', 'token'),
+    [
+        (b' eight signs \nmore\n', 'eight signs'),
+        (b'short\n', None),
+        (b'', None),
+        (b'\xff' * 9, None),
+    ],
+)
+def test_the_file_of_the_token(tmp_path, content, token):
+    path = tmp_path / 'token'
+    path.write_bytes(content)
+    if token is None:
+        with pytest.raises((InputError, RecordingError), match='token'):
+            read_token(path)
+    else:
+        assert read_token(path) == token
+
+
+def test_without_its_libraries_it_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(module, 'find_spec', lambda name: None if name == 'dash' else name)
+    with pytest.raises(
+        DataError, match='The page needs dash, not installed here: pip install dash'
+    ):
+        check_installed()

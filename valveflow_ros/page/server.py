@@ -1,0 +1,439 @@
+"""The web server of the page: what it listens to, whom it answers, and its limits."""
+
+from __future__ import annotations
+
+import errno
+import gzip
+import io
+import ipaddress
+import logging
+import socket
+import threading
+import time
+from argparse import ArgumentParser, ArgumentTypeError
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from valveflow_ros.errors import DataError, InputError, RecordingError, UsageError, ValveflowError
+
+if TYPE_CHECKING:
+    # A verb that only names the options need not load it.
+    from valveflow_ros.page.unit import Shown
+
+PORT = 8350
+# Open connections beyond which the answer is 503, and beyond which none is accepted.
+MOST_CONNECTIONS, _MOST_ACCEPTED = 256, 320
+# How long a connection may be idle, or stuck in a request or an answer; how long an answer may
+# take in all.
+IDLE_S, _LONGEST_S = 20, 120.0
+_SWEEP_S = 5.0
+_MOST_HEAD, _MOST_BODY = 16384, 65536
+_THREADS = 4
+_MOST_FILES = 64
+_TELL_S = 60.0
+_STATIC = '/_dash-component-suites/'
+_PATHS = {'/': 'GET', '/_dash-layout': 'GET', '/_dash-dependencies': 'GET', '/metrics': 'GET',
+          '/_dash-update-component': 'POST'}  # fmt: skip
+_NEEDS = {'dash': 'dash', 'prometheus_client': 'prometheus_client', 'waitress': 'waitress'}
+_MOST_TOKEN = 1024
+_LEAST_TOKEN = 8
+
+Start = Callable[..., Any]
+Wsgi = Callable[[dict[str, Any], Start], Iterable[bytes]]
+
+
+def check_installed() -> None:
+    """Return if everything is there that only the page needs; raises `DataError`."""
+    missing = [name for module, name in _NEEDS.items() if find_spec(module) is None]
+    if missing:
+        raise DataError(
+            f'The page needs {" and ".join(missing)}, not installed here: '
+            f'pip install {" ".join(missing)}.'
+        )
+
+
+def page_arguments(parser: ArgumentParser) -> None:
+    """Add the options that say where the page is and whom it tells."""
+    parser.add_argument(
+        '--host', metavar='ADDRESS', default='127.0.0.1',
+        help='address to listen on (default 127.0.0.1: this machine only)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--port', metavar='N', type=_port, default=PORT, help=f'port (default {PORT})'
+    )
+    parser.add_argument(
+        '--name', metavar='NAME', action='append', default=[],
+        help='a further name by which browsers and Prometheus reach this machine',
+    )  # fmt: skip
+    parser.add_argument(
+        '--token-file', metavar='FILE', type=Path,
+        help='let a browser that knows the token in this file acknowledge and shelve alarms',
+    )  # fmt: skip
+    parser.add_argument(
+        '--on-alarm', metavar='COMMAND',
+        help='run this for each change of an alarm, with the change as JSON on its input',
+    )  # fmt: skip
+    parser.add_argument(
+        '--webhook', metavar='URL', help='send each change of an alarm there, as JSON by POST'
+    )
+
+
+def _port(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= 65535:
+        raise ArgumentTypeError(f"must be a port from 1 to 65535, such as {PORT}; '{text}' is not")
+    return int(text)
+
+
+def read_token(path: Path) -> str:
+    """Return the token in a file: its first line.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be read.
+    InputError
+        The token is too short to be one.
+    """
+    try:
+        with path.open(encoding='utf-8') as file:
+            token = file.readline(_MOST_TOKEN).strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecordingError(path, f'cannot be read ({getattr(error, "strerror", "")})') from None
+    if len(token) < _LEAST_TOKEN:
+        raise InputError(f'{path}: a token has at least {_LEAST_TOKEN} characters.')
+    return token
+
+
+# Whom it answers.
+
+
+class Guard:
+    """Answers browsers of the page itself and Prometheus, and refuses everything else.
+
+    A page of another site may be open in the same browser, also under a name that its owner lets
+    point to this machine: so the name asked for must be ours, and a request that says where it
+    comes from must come from here.
+
+    Parameters
+    ----------
+    application : WSGI application
+    policy : str
+        The content security policy of the page.
+    metrics : callable
+        Returns the metrics as text.
+    names : sequence of str
+        Names of this machine beside its addresses and its host name.
+    connections : callable
+        Returns how many connections are open.
+    complain : callable
+        Takes a sentence where a request could not be answered, at most once a minute.
+    """
+
+    def __init__(
+        self,
+        application: Wsgi,
+        policy: str,
+        metrics: Callable[[], bytes],
+        names: Sequence[str] = (),
+        connections: Callable[[], int] = lambda: 0,
+        complain: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self._application = application
+        self._metrics = metrics
+        host = socket.gethostname().lower()
+        self._names = {'localhost', host, *(name.lower() for name in names)}
+        self._connections = connections
+        self._complain = complain
+        self._told_s = -_TELL_S
+        self._static: dict[str, tuple[list[tuple[str, str]], bytes]] = {}
+        self._head = [
+            ('Content-Security-Policy', policy), ('X-Content-Type-Options', 'nosniff'),
+            ('X-Frame-Options', 'DENY'), ('Referrer-Policy', 'no-referrer'),
+            ('Cross-Origin-Resource-Policy', 'same-origin'),
+            ('Cross-Origin-Opener-Policy', 'same-origin'),
+        ]  # fmt: skip
+        self.refused = 0
+
+    def __call__(self, environ: dict[str, Any], start: Start) -> Iterable[bytes]:
+        """Answer a request."""
+        refusal = self._refusal(environ)
+        if refusal is not None:
+            self.refused += 1
+            return self._say(start, *refusal)
+
+        def begin(status: str, head: list[tuple[str, str]], *more: Any) -> Any:
+            kept = [(k, v) for k, v in head if k.lower() != 'server']
+            return start(status, kept + self._head, *more)
+
+        path = str(environ.get('PATH_INFO', ''))
+        try:
+            if path == '/metrics':
+                text = self._metrics()
+                begin('200 OK', [
+                    ('Content-Type', 'text/plain; version=0.0.4; charset=utf-8'),
+                    ('Content-Length', str(len(text))),
+                ])  # fmt: skip
+                return [text]
+            if path.startswith(_STATIC):
+                return self._file(path, environ, begin, start)
+            return self._asked(environ, begin, start)
+        except Exception as error:  # noqa: BLE001 - whatever a strange request brings about
+            self.refused += 1
+            if time.monotonic() - self._told_s >= _TELL_S:
+                self._told_s = time.monotonic()
+                what = f'{type(error).__name__}: {str(error)[:200]}'
+                self._complain(f'A request of {path[:80]} was not answered ({what}).')
+            return self._say(start, '400 Bad Request', 'This request cannot be answered.')
+
+    def _refusal(self, environ: dict[str, Any]) -> tuple[str, str] | None:
+        """Return status and sentence for a request that is not answered."""
+        host = str(environ.get('HTTP_HOST', ''))
+        path = str(environ.get('PATH_INFO', ''))
+        wanted = 'GET' if path.startswith(_STATIC) else _PATHS.get(path)
+        method = environ.get('REQUEST_METHOD')
+        origin = environ.get('HTTP_ORIGIN')
+        if self._connections() > MOST_CONNECTIONS:
+            return '503 Service Unavailable', 'Too many connections; try again.'
+        if not self._ours(host):
+            return '403 Forbidden', 'The page has no such name; --name adds one.'
+        site = environ.get('HTTP_SEC_FETCH_SITE', 'none')
+        if (origin is not None and urlsplit(str(origin)).netloc.lower() != host.lower()) or (
+            path != '/' and site not in ('none', 'same-origin')
+        ):
+            return '403 Forbidden', 'Only the page itself may ask.'
+        if wanted is None:
+            return '404 Not Found', 'There is nothing of this name.'
+        if method != wanted and not (method == 'HEAD' and wanted == 'GET'):
+            return '405 Method Not Allowed', f'Only {wanted} is answered here.'
+        return None
+
+    def _ours(self, host: str) -> bool:
+        try:
+            name = urlsplit(f'//{host}').hostname or ''
+        except ValueError:
+            return False
+        if name in self._names:
+            return True
+        # An address cannot be made to point elsewhere.
+        with suppress(ValueError):
+            return bool(ipaddress.ip_address(name))
+        return False
+
+    def _say(self, start: Start, status: str, sentence: str) -> list[bytes]:
+        body = f'{sentence}\n'.encode()
+        head = [('Content-Type', 'text/plain; charset=utf-8'), ('Content-Length', str(len(body)))]
+        if status.startswith('503'):
+            head.append(('Retry-After', '10'))
+        start(status, head)
+        return [body]
+
+    def _asked(self, environ: dict[str, Any], begin: Start, start: Start) -> Iterable[bytes]:
+        """Return the library's answer; where it is an error, its number and a sentence."""
+        status, head, body = _whole(self._application, environ)
+        if status[0] in '45':
+            self.refused += 1
+            return self._say(start, status, 'This request cannot be answered.')
+        begin(status, head)
+        return [body]
+
+    def _file(
+        self, path: str, environ: dict[str, Any], begin: Start, start: Start
+    ) -> Iterable[bytes]:
+        """Return a file of the library; each is kept once, whoever reads it and however slowly."""
+        if 'gzip' not in str(environ.get('HTTP_ACCEPT_ENCODING', '')):
+            return self._asked(environ, begin, start)
+        if path not in self._static:
+            whole = {**environ, 'REQUEST_METHOD': 'GET'}
+            status, head, body = _whole(self._application, whole)
+            if not status.startswith('200') or len(self._static) > _MOST_FILES:
+                return self._asked(environ, begin, start)
+            packed = gzip.compress(body, 6, mtime=0)
+            kept = [(k, v) for k, v in head if k.lower() not in ('content-length', 'server')]
+            more = [('Content-Encoding', 'gzip'), ('Content-Length', str(len(packed)))]
+            self._static[path] = (kept + more, packed)
+        head, packed = self._static[path]
+        begin('200 OK', head)
+        return environ['wsgi.file_wrapper'](io.BytesIO(packed))  # type: ignore[no-any-return]
+
+
+def _whole(application: Wsgi, environ: dict[str, Any]) -> tuple[str, Any, bytes]:
+    """Return an answer as status, head and body."""
+    kept: list[Any] = []
+
+    def start(status: str, head: list[tuple[str, str]], *_: Any) -> None:
+        kept[:] = [status, head]
+
+    answer = application(environ, start)
+    try:
+        body = b''.join(answer)
+    finally:
+        close = getattr(answer, 'close', None)
+        if close is not None:
+            close()
+    return str(kept[0]), kept[1], body
+
+
+# The server.
+
+
+class PageServer:
+    """Serves the page and the metrics in threads of its own.
+
+    Parameters
+    ----------
+    shown : Shown
+    host : str
+        Address to listen on.
+    port : int
+        0: any that is free.
+    names : sequence of str
+        Further names of this machine.
+    asking : Asking, optional
+        For whoever may ask a monitor for something.
+    counters : callable, optional
+        Further counters for the metrics.
+    complain : callable
+        Takes a sentence where a request could not be answered.
+
+    Raises
+    ------
+    ValveflowError
+        The address cannot be listened on.
+    """
+
+    def __init__(
+        self,
+        shown: Shown,
+        host: str = '127.0.0.1',
+        port: int = PORT,
+        names: Sequence[str] = (),
+        asking: Any = None,
+        counters: Callable[[], dict[str, tuple[str, float]]] = dict,
+        complain: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        # Whoever else holds the port is told of before the libraries are loaded.
+        listener = _listener(host, port)
+        try:
+            from waitress.server import create_server
+
+            from valveflow_ros.page.metrics import Metrics
+            from valveflow_ros.page.view import make_app
+
+            _quiet()
+            app, policy = make_app(shown, asking)
+            self._sockets: dict[int, Any] = {}
+            metrics = Metrics(shown, lambda: {**counters(), **self._counters()})
+            # An error is told by the guard in a sentence.
+            app.server.config['PROPAGATE_EXCEPTIONS'] = True
+            self.guard = Guard(
+                app.server, policy, metrics.text, names, self.connections, complain
+            )  # fmt: skip
+            self._server = create_server(
+                self.guard, map=self._sockets, sockets=[listener], threads=_THREADS,
+                connection_limit=_MOST_ACCEPTED, channel_timeout=IDLE_S,
+                cleanup_interval=max(1, round(_SWEEP_S)),
+                max_request_header_size=_MOST_HEAD, max_request_body_size=_MOST_BODY,
+                asyncore_use_poll=True, ident=None, log_socket_errors=False, backlog=128,
+                clear_untrusted_proxy_headers=True,
+            )  # fmt: skip
+        except BaseException:
+            listener.close()
+            raise
+        self.host, self.port = host, listener.getsockname()[1]
+        self._ended = threading.Event()
+        self._threads = [
+            threading.Thread(target=self._run, name='page', daemon=True),
+            threading.Thread(target=self._sweep, name='page sweep', daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def address(self) -> str:
+        """Return what is typed into a browser on this machine."""
+        host = {'0.0.0.0': '127.0.0.1', '::': '::1'}.get(self.host, self.host.strip('[]'))
+        return f'http://{f"[{host}]" if ":" in host else host}:{self.port}/'
+
+    def connections(self) -> int:
+        """Return how many connections are open."""
+        return sum(1 for channel in list(self._sockets.values()) if hasattr(channel, 'requests'))
+
+    def close(self) -> None:
+        """End; open connections are closed."""
+        self._ended.set()
+        # In the thread that waits for the sockets, so that it need not be waited for.
+        with suppress(OSError):
+            self._server.trigger.pull_trigger(self._close_all)
+        for thread in self._threads:
+            thread.join(timeout=2.0)
+
+    def _close_all(self) -> None:
+        self._server.task_dispatcher.shutdown(cancel_pending=True, timeout=1)
+        for channel in list(self._sockets.values()):
+            channel.close()
+        self._sockets.clear()
+
+    def _counters(self) -> dict[str, tuple[str, float]]:
+        return {'valveflow_page_requests_refused': ('Requests refused.', self.guard.refused)}
+
+    def _run(self) -> None:
+        # At the end its sockets are closed under it.
+        with suppress(OSError, ValueError):
+            self._server.run()
+
+    def _sweep(self) -> None:
+        """End connections that hold a request or an answer for too long."""
+        since: dict[int, tuple[object, float]] = {}
+        while not self._ended.wait(_SWEEP_S):
+            now_s, still = time.monotonic(), {}
+            for channel in list(self._sockets.values()):
+                stuck = getattr(channel, 'request', None)
+                slow = getattr(channel, 'total_outbufs_len', 0) > 0
+                if stuck is None and not slow:
+                    continue
+                what, begun_s = since.get(id(channel), (None, now_s))
+                begun_s = begun_s if what is (stuck or channel) else now_s
+                still[id(channel)] = (stuck or channel, begun_s)
+                idle = time.time() - channel.last_activity > IDLE_S
+                limit_s = _LONGEST_S if slow else float(IDLE_S)
+                if now_s - begun_s > limit_s or (slow and idle):
+                    # The server's own thread sees the end and cleans up.
+                    with suppress(OSError):
+                        channel.socket.shutdown(socket.SHUT_RDWR)
+            since = still
+
+
+def _listener(host: str, port: int) -> socket.socket:
+    """Return a socket that is bound; raises `ValveflowError`."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host.strip('[]'), port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+    except (OSError, UnicodeError):
+        raise UsageError(f"--host must be an address of this machine; '{host}' is none.") from None
+    made = socket.socket(family, kind, protocol)
+    try:
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        made.bind(address)
+        # Two that listen on one port are told apart only when both do.
+        made.listen(128)
+    except OSError as error:
+        made.close()
+        if error.errno == errno.EADDRINUSE:
+            raise ValveflowError(
+                f'Port {port} of {host} is in use, perhaps by another page; '
+                'choose one with --port.'
+            ) from None
+        said = error.strerror or str(error)
+        raise ValveflowError(f'{host}, port {port}: cannot be listened on ({said}).') from None
+    return made
+
+
+def _quiet() -> None:
+    """Keep the libraries' own lines off the terminal; what matters is counted and told by us."""
+    for name in ('waitress', 'waitress.queue', 'werkzeug', 'valveflow_page', 'dash'):
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)

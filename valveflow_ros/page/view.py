@@ -1,0 +1,569 @@
+"""The page itself: words and pictures of each unit, made with Dash, brought up to date each tick.
+
+The server keeps nothing of a browser. Each tick a browser says which version it has of every part,
+and is sent the parts that differ; their text is made once for all browsers.
+"""
+
+from __future__ import annotations
+
+import hmac
+import math
+import re
+import secrets
+import threading
+import time
+from base64 import b64encode
+from collections.abc import Callable, Mapping, Sequence
+from hashlib import sha256
+from importlib import resources
+from itertools import chain, pairwise
+from typing import Any, NamedTuple
+
+from dash import ALL, MATCH, Dash, Input, Output, State, ctx, dcc, html, no_update
+
+from valveflow_ros import __version__
+from valveflow_ros.page.unit import MINUTE_NS, MOST_UNITS, Shown, Snapshot
+from valveflow_ros.records import NS_PER_S
+from valveflow_ros.report.figure import Spec, axis, line, points, rounded, token
+from valveflow_ros.report.page import read_text
+from valveflow_ros.report.terminal.frame import (
+    ACKNOWLEDGED,
+    BAD_DATA,
+    ERROR,
+    OK,
+    STALE,
+    UNACKNOWLEDGED,
+    WARN,
+    Frame,
+    HealthView,
+    Said,
+    alarms_words,
+    curve_words,
+    diagnosis_words,
+    recorder_words,
+    sample_words,
+    short_name,
+)
+from valveflow_ros.report.terminal.text import clean
+from valveflow_ros.report.words import input_axis, moment
+
+TICK_MS = 2000
+# The newest samples as they are; what is older is shown a point a minute.
+RECENT_S = 900
+_MOST_RECENT = 300
+_LEVELS = {OK: ('ok', 'good'), WARN: ('look', 'warn'), ERROR: ('fault', 'bad'),
+           STALE: ('silent', 'bad')}  # fmt: skip
+PARTS = ('head', 'alarms', 'curve_words', 'now', 'diagnosis', 'health')
+PICTURES = {'curve': 300, 'recent': 250, 'day': 340}
+# What may be asked of a monitor from the page.
+ASKED = {'acknowledge_alarms': 'Acknowledge', 'shelve_alarms': 'Shelve'}
+_TRIES, _WAIT_S = 5, 30.0
+# With it the sentence of a diagnosis goes on, once for each cause.
+_TO_DO = 'What to do:'
+Ask = Callable[[str, str], tuple[bool, str]]
+
+
+# Words.
+
+
+def _said(said: Said) -> Any:
+    text, tone = clean(said[0]), said[1]
+    first, point, rest = text.partition('. ')
+    if tone == 'bad' and rest:
+        # What it is stands out from why.
+        return html.P([html.B(first + point), rest], className=tone)
+    return html.P(text, className=tone or 'plain')
+
+
+def summary(frame: Frame, present: bool) -> Said:
+    """Return one word on how a unit is, and its tone."""
+    if not present:
+        return 'no monitor', 'bad'
+    states = {alarm.state for alarm in frame.alarms if alarm.standing}
+    if UNACKNOWLEDGED in states:
+        return 'alarm', 'bad'
+    if ACKNOWLEDGED in states:
+        return 'alarm, acknowledged', 'bad'
+    if frame.last is not None and frame.last.state == BAD_DATA:
+        return 'bad data', 'bad'
+    levels = [item.level for item in frame.inputs]
+    if any(level in (ERROR, STALE) for level in levels):
+        return 'input fault', 'bad'
+    if states:
+        return 'alarm to be looked at', 'warn'
+    if frame.curve is None or not frame.curve.breakpoints:
+        return 'no curve yet', 'dim'
+    return 'no alarm', 'good'
+
+
+def _head(unit: Snapshot) -> list[Any]:
+    frame = unit.frame
+    word, tone = summary(frame, unit.present)
+    when = moment(frame.now_ns) if frame.now_ns else 'no data yet'
+    made = [
+        html.H2([clean(unit.title), ' ', html.Span(word, className=f'pill {tone}')]),
+        html.P(f'{when}, {clean(unit.key)}', className='where'),
+    ]
+    return [*made, html.P(clean(frame.note), className='notice')] if frame.note else made
+
+
+def _code(text: str) -> list[Any]:
+    """Return a paragraph whose `code` stands in backquotes."""
+    parts = re.split(r'`([^`]*)`', ' '.join(text.split()))
+    return [html.Code(part) if k % 2 else part for k, part in enumerate(parts)]
+
+
+def _diagnosis(frame: Frame) -> list[Any]:
+    text, tone = diagnosis_words(frame.diagnosis)
+    said, *to_do = clean(text).split(_TO_DO)
+    return [
+        _said((said.strip(), tone)),
+        *(html.P([html.B(_TO_DO), ' ', *_code(paragraph)]) for paragraph in to_do),
+    ]
+
+
+def _row(item: HealthView) -> Any:
+    word, tone = _LEVELS.get(item.level, (f'level {item.level}', 'bad'))
+    return html.Tr([
+        html.Th(short_name(item.name), scope='row'),
+        html.Td(html.Span(word, className=f'pill {tone}')),
+        html.Td(clean(item.sentence), className='words'),
+    ])  # fmt: skip
+
+
+def _health(frame: Frame) -> list[Any]:
+    text, tone = recorder_words(frame)
+    if not frame.inputs:
+        return [html.P('Nothing has come from any input yet.', className='dim')]
+    rows = [_row(item) for item in frame.inputs]
+    if frame.recorder is not None:
+        rows.append(_row(frame.recorder))
+    else:
+        rows.append(html.Tr([html.Th('recorder'), html.Td(), html.Td(text, className=tone)]))
+    return [html.Div(html.Table(html.Tbody(rows)), className='scroll')]
+
+
+def words(unit: Snapshot) -> dict[str, list[Any]]:
+    """Return the content of each of `PARTS` as Dash components."""
+    frame = unit.frame
+    return {
+        'head': _head(unit),
+        'alarms': [_said(said) for said in alarms_words(frame)],
+        'curve_words': [_said(curve_words(frame.curve, _whole_minute(frame)))],
+        'now': [_said(sample_words(frame.last))],
+        'diagnosis': _diagnosis(frame),
+        'health': _health(frame),
+    }
+
+
+def _whole_minute(frame: Frame) -> int:
+    """Return the time with which an age need not be told anew each second."""
+    end_ns = 0 if frame.curve is None else frame.curve.window[1]
+    return max(end_ns, frame.now_ns - frame.now_ns % (60 * NS_PER_S))
+
+
+# Pictures, as `report.figure` makes them: colours by name.
+
+
+def curve_picture(frame: Frame) -> Spec:
+    """Return the curve with the last quarter of an hour and today's operating point."""
+    curve, last = frame.curve, frame.last
+    traces = []
+    e = math.nan
+    if curve is not None:
+        e = curve.exponent
+        traces.append(
+            line(rounded(curve.breakpoints), rounded(curve.values), 'curve', 'curve',
+                 'curve: %{y:.1f} at u = %{x:.0f}<extra></extra>', mode='lines+markers')
+        )  # fmt: skip
+    recent = _recent(frame)
+    if recent:
+        traces.append(
+            points(rounded([s.u for s in recent]), rounded([s.measured_mw for s in recent]),
+                   'last 15 min', 'data-soft', size=4)
+        )  # fmt: skip
+    if last is not None and math.isfinite(last.u) and math.isfinite(last.measured_mw):
+        mark = {'size': 13, 'symbol': 'diamond', 'line': {'color': token('paper'), 'width': 2}}
+        traces.append(
+            points(rounded([last.u]), rounded([last.measured_mw]), 'now', 'steady',
+                   'now: %{y:.1f} at u = %{x:.0f}<extra></extra>', marker=mark)
+        )  # fmt: skip
+    layout = {'xaxis': axis(input_axis(e)), 'yaxis': axis('power (MW)')}
+    return {'data': traces, 'layout': layout}
+
+
+def _recent(frame: Frame) -> list[Any]:
+    """Return the samples of the last quarter of an hour, thinned to what a picture shows."""
+    begin_ns = frame.now_ns - RECENT_S * NS_PER_S
+    found = [s for s in frame.samples if s.time_ns >= begin_ns]
+    step = -(-len(found) // _MOST_RECENT) or 1
+    # Counted from the end, so that the newest is always there.
+    return found[::-1][::step][::-1]
+
+
+def _ms(time_ns: int) -> float:
+    return time_ns // 1_000_000
+
+
+def recent_picture(frame: Frame) -> Spec:
+    """Return prediction and its limits against measurement over the last quarter of an hour."""
+    found = _recent(frame)
+    predicted = [s.measured_mw - s.residual_mw for s in found]
+    columns = (
+        [s.measured_mw for s in found], predicted,
+        [p + s.low_mw for p, s in zip(predicted, found, strict=True)],
+        [p + s.high_mw for p, s in zip(predicted, found, strict=True)],
+    )  # fmt: skip
+    if not found:
+        return _empty('No sample has come yet.')
+    t = [_ms(s.time_ns) for s in found]
+    return _against(t, columns, '95 % limits')
+
+
+def day_picture(unit: Snapshot) -> Spec:
+    """Return means of a minute over the last 24 hours, with a strip below to scroll in."""
+    day = unit.day
+    if len(day) < 2:
+        return _empty('A point comes each minute.')
+    t: list[float] = []
+    columns: tuple[list[float], ...] = ([], [], [], [])
+    late = (b.start_ns - a.start_ns > 90 * NS_PER_S for a, b in pairwise(day))
+    for gap, m in zip(chain([False], late), day, strict=False):
+        if gap:
+            t.append(_ms(m.start_ns) - 1)
+            for column in columns:
+                column.append(math.nan)
+        t.append(_ms(m.start_ns + MINUTE_NS // 2))
+        values = (m.measured_mw, m.predicted_mw, m.low_mw, m.high_mw)
+        for column, value in zip(columns, values, strict=True):
+            column.append(value)
+    made = _against(t, columns, 'least to largest')
+    made['layout']['xaxis']['rangeslider'] = {
+        'thickness': 0.16, 'bgcolor': token('panel'), 'borderwidth': 1,
+        'bordercolor': token('rule'),
+    }  # fmt: skip
+    return made
+
+
+def _against(t: Sequence[float], columns: Sequence[Sequence[float]], band: str) -> Spec:
+    """Return a picture over time; columns: measured, predicted, and the edges of a band."""
+    measured, predicted, low, high = map(rounded, columns)
+    edge: Any = {'line': {'width': 0}, 'showlegend': False}
+    traces = [
+        line(t, low, '', 'band', **edge),
+        line(t, high, band, 'band', line={'width': 0}, fill='tonexty', fillcolor=token('band')),
+        line(t, predicted, 'predicted', 'curve', '%{y:.1f} MW predicted<extra></extra>'),
+        line(t, measured, 'measured', 'steady', '%{y:.1f} MW measured<extra></extra>', width=1.5),
+    ]
+    # No range: one that changes would take away what was scrolled to by hand.
+    across = axis('', type='date', tickangle=0, nticks=6)
+    return {
+        'data': traces,
+        'layout': {'xaxis': across, 'yaxis': axis('power (MW)')},
+    }
+
+
+def _empty(sentence: str) -> Spec:
+    """Return a picture that says why it is empty."""
+    told = {'text': sentence, 'showarrow': False, 'xref': 'paper', 'yref': 'paper', 'x': 0.5,
+            'y': 0.5, 'font': {'color': token('muted')}}  # fmt: skip
+    hidden = axis('', visible=False)
+    return {'data': [], 'layout': {'xaxis': hidden, 'yaxis': hidden, 'annotations': [told]}}
+
+
+# What is sent.
+
+
+class Made(NamedTuple):
+    """A part of the page, and a version that differs where the content does."""
+
+    version: str
+    content: Any
+
+
+class Maker:
+    """Makes words and pictures of units, each once for all browsers.
+
+    Parameters
+    ----------
+    shown : Shown
+    """
+
+    def __init__(self, shown: Shown) -> None:
+        self.shown = shown
+        self._kept: dict[tuple[str, str], tuple[object, Made]] = {}
+        self._boot = secrets.token_hex(4)
+
+    @property
+    def generation(self) -> str:
+        """Return what changes when a browser has to load the page anew: units, or this process."""
+        return _digest(self._boot, *(unit.key for unit in self.shown.units))
+
+    def parts(self, unit: Snapshot) -> dict[str, Made]:
+        """Return every part of a unit by its name."""
+        frame, day = unit.frame, unit.day
+        live = (frame.now_ns, frame.last, frame.curve)
+        told = self._once(unit, 'words', (frame, unit.present), lambda: _versions(words(unit)))
+        return dict(told.content) | {
+            'curve': self._once(unit, 'curve', live, lambda: curve_picture(frame)),
+            'recent': self._once(unit, 'recent', live[:2], lambda: recent_picture(frame)),
+            'day': self._once(unit, 'day', day[:1] + day[-1:], lambda: day_picture(unit)),
+        }
+
+    def _once(self, unit: Snapshot, what: str, of: object, make: Callable[[], Any]) -> Made:
+        """Return what was made of the same; two threads may both make it, and make the same."""
+        before = self._kept.get((unit.key, what))
+        if before is not None and before[0] == of:
+            return before[1]
+        content = make()
+        version = '' if what == 'words' else _digest(content)
+        found = Made(version, content)
+        if len(self._kept) > _MOST_KEPT:
+            self._kept.clear()
+        self._kept[unit.key, what] = (of, found)
+        return found
+
+
+_MOST_KEPT = 8 * MOST_UNITS
+
+
+def _digest(*parts: object) -> str:
+    return sha256(repr(parts).encode()).hexdigest()[:12]
+
+
+def _versions(told: Mapping[str, Any]) -> dict[str, Made]:
+    return {name: Made(_digest(content), content) for name, content in told.items()}
+
+
+# The page.
+
+_CONFIG: Any = {
+    'displaylogo': False, 'displayModeBar': 'hover', 'responsive': True,
+    'plotlyServerURL': '', 'showSendToCloud': False,
+    # A list of our own: the usual one has a button that sends the data to a server.
+    'modeBarButtons': [['toImage'], ['zoom2d', 'pan2d'], ['resetScale2d']],
+    'toImageButtonOptions': {'format': 'svg'},
+}  # fmt: skip
+_CAPTIONS = {
+    'curve': "Flow characteristic and today's operating point",
+    'recent': 'Prediction against measurement, last 15 minutes',
+    'day': 'The last 24 hours; drag the ends of the strip, or the picture, to scroll',
+}
+
+
+def _part(number: int, name: str, content: Any = None, kind: str = '') -> Any:
+    return html.Div(content, id={'unit': number, 'part': name}, className=f'{name} {kind}'.strip())
+
+
+def _picture(number: int, name: str) -> Any:
+    graph = dcc.Graph(
+        id={'unit': number, 'part': name}, config=_CONFIG,
+        style={'height': f'{PICTURES[name]}px'},
+    )  # fmt: skip
+    return html.Figure([html.Figcaption(_CAPTIONS[name]), graph], className=name)
+
+
+def _block(number: int, told: Mapping[str, Made], may_ask: bool) -> Any:
+    buttons = [
+        html.Button(label, id={'unit': number, 'ask': service}, n_clicks=0)
+        for service, label in ASKED.items()
+    ]
+    ask = [html.Div([*buttons, _part(number, 'answer')], className='ask')] if may_ask else []
+
+    def part(name: str, title: str = '') -> list[Any]:
+        return [*([html.H3(title)] if title else []), _part(number, name, told[name].content)]
+
+    return html.Section(html.Div([
+        html.Div(part('head'), className='title'),
+                html.Div(part('alarms', 'Alarms') + ask, className='top'),
+        html.Div(
+            [_picture(number, 'curve'), *part('curve_words'), _picture(number, 'recent'),
+             *part('now')], className='pictures',
+        ),
+        html.Div(part('diagnosis', 'Diagnosis') + part('health', 'Inputs and recorder'),
+                 className='words'),
+        html.Div([_picture(number, 'day')], className='history'),
+        dcc.Store(id={'unit': number, 'part': 'pictures'}),
+    ], className='grid'), className='unit')  # fmt: skip
+
+
+def _page(maker: Maker, may_ask: bool) -> Any:
+    units = maker.shown.units
+    blocks = [_block(k, maker.parts(unit), may_ask) for k, unit in enumerate(units)]
+    blocks = blocks or [_nowhere()]
+    token_field = [
+        html.Label(['Token for the buttons: ', dcc.Input(id='token', type='password', value='')],
+                   className='token'),
+    ] if may_ask and units else []  # fmt: skip
+    many = ' many' if len(units) > 1 else ''
+    return html.Main([
+        html.Header([html.H1('valveflow'), html.Div(id='lost', role='alert'), *token_field]),
+        html.Div(maker.shown.note, id='note', className='notice' if maker.shown.note else ''),
+        html.Div(blocks, className=f'units{many}'),
+        html.Footer(f'Made by valveflow {__version__}. Times are UTC.'),
+        dcc.Interval(id='tick', interval=TICK_MS), dcc.Interval(id='pulse', interval=1000),
+        dcc.Store(id='seen', data={'generation': maker.generation}),
+    ], id='page')  # fmt: skip
+
+
+def _nowhere() -> Any:
+    """Return the parts of a unit that is not there: without any, Dash would not tick at all."""
+    parts = [_part(-1, name) for name in PARTS]
+    return html.Div([*parts, dcc.Store(id={'unit': -1, 'part': 'pictures'})], hidden=True)
+
+
+class Asking:
+    """Lets a browser with the token ask a monitor for something.
+
+    Parameters
+    ----------
+    token : str
+        What a browser has to know; not empty.
+    ask : callable
+        Takes the key of a unit and the name of a service; returns success and a sentence.
+    """
+
+    def __init__(self, token: str, ask: Ask) -> None:
+        self._token = _bytes(token)
+        self._ask = ask
+        self._lock = threading.Lock()
+        self._wrong = 0
+        self._until_s = 0.0
+
+    def __call__(self, unit: str, service: str, token: str) -> tuple[bool, str]:
+        """Return success and a sentence; one request at a time, and few wrong tokens."""
+        if service not in ASKED:
+            return False, 'That cannot be asked from here.'
+        if not self._lock.acquire(blocking=False):
+            return False, 'Another request is being answered; try again.'
+        try:
+            if time.monotonic() < self._until_s:
+                return False, f'Too many wrong tokens; wait {_WAIT_S:.0f} s.'
+            if not hmac.compare_digest(_bytes(token), self._token):
+                self._wrong += 1
+                if self._wrong >= _TRIES:
+                    self._wrong, self._until_s = 0, time.monotonic() + _WAIT_S
+                return False, 'The token is not the right one.'
+            self._wrong = 0
+            return self._ask(unit, service)
+        finally:
+            self._lock.release()
+
+
+def _bytes(token: str) -> bytes:
+    # A browser may send what is no text.
+    return token.encode(errors='backslashreplace')
+
+
+def make_app(shown: Shown, asking: Asking | None = None) -> tuple[Dash, str]:
+    """Return the page as a Dash application, and its content security policy.
+
+    Parameters
+    ----------
+    shown : Shown
+        What is shown; replaced by another thread.
+    asking : Asking, optional
+        For whoever may ask a monitor for something; without it the page has no buttons.
+    """
+    maker = Maker(shown)
+    script = read_text('colours.js') + _file('page.js')
+    app = Dash(
+        'valveflow_page', title='valveflow', update_title='', assets_folder='no_assets',
+        suppress_callback_exceptions=True, index_string=_index(script), compress=False,
+        meta_tags=[
+            {'name': 'viewport', 'content': 'width=device-width, initial-scale=1'},
+            {'name': 'color-scheme', 'content': 'light dark'},
+        ],
+    )  # fmt: skip
+    app.layout = lambda: _page(maker, asking is not None)
+    _update(app, maker)
+    if asking is not None:
+        _answer(app, shown, asking)
+    inline = [*app.csp_hashes(), _hash(script)]
+    return app, (
+        f"default-src 'self'; script-src 'self' {' '.join(inline)}; "
+        "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
+        "frame-ancestors 'none'; base-uri 'none'; form-action 'none'; object-src 'none'"
+    )
+
+
+def _file(name: str) -> str:
+    return resources.files('valveflow_ros.page').joinpath(name).read_text(encoding='utf-8')
+
+
+def _hash(script: str) -> str:
+    return f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'"
+
+
+def _index(script: str) -> str:
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head>{%metas%}<title>{%title%}</title>'
+        '<link rel="icon" href="data:,">{%css%}'
+        f'<style>{read_text("style.css")}{_file("page.css")}</style></head>'
+        f'<body>{{%app_entry%}}{{%config%}}{{%scripts%}}<script>{script}</script>{{%renderer%}}'
+        '</body></html>'
+    )
+
+
+def _update(app: Dash, maker: Maker) -> None:
+    """Bring what a browser shows up to date, tick by tick."""
+    everything = (*PARTS, 'pictures')
+
+    @app.callback(  # type: ignore[untyped-decorator]
+        *(Output({'unit': ALL, 'part': name}, 'children') for name in PARTS),
+        Output({'unit': ALL, 'part': 'pictures'}, 'data'),
+        Output('note', 'children'), Output('note', 'className'), Output('seen', 'data'),
+        Input('tick', 'n_intervals'), State('seen', 'data'),
+        State({'unit': ALL, 'part': 'pictures'}, 'id'),
+    )  # fmt: skip
+    def tick(number: Any, seen: Any, ids: Any) -> Any:
+        units, note, generation = maker.shown.units, maker.shown.note, maker.generation
+        told = seen if isinstance(seen, dict) else {}
+        versions: dict[str, Any] = {'generation': generation, 'tick': number}
+        out: dict[str, list[Any]] = {name: [no_update] * len(ids) for name in everything}
+        known = told.get('generation') == generation and len(ids) == len(units)
+        for k, unit in enumerate(units if known else ()):
+            before = told.get(str(k))
+            before = before if isinstance(before, dict) else {}
+            made = maker.parts(unit)
+            new = {name for name, part in made.items() if before.get(name) != part.version}
+            for name in new.intersection(PARTS):
+                out[name][k] = made[name].content
+            drawn = {name: made[name].content for name in new.intersection(PICTURES)}
+            if drawn:
+                out['pictures'][k] = drawn
+            versions[str(k)] = {name: part.version for name, part in made.items()}
+        return (
+            *(out[name] for name in everything), note, 'notice' if note else '', versions,
+        )  # fmt: skip
+
+    for name in PICTURES:
+        app.clientside_callback(  # type: ignore[no-untyped-call]
+            f"function(made) {{ return valveflow.picture(made, '{name}'); }}",
+            Output({'unit': MATCH, 'part': name}, 'figure'),
+            Input({'unit': MATCH, 'part': 'pictures'}, 'data'),
+        )
+    app.clientside_callback(  # type: ignore[no-untyped-call]
+        'function(pulse, seen) { return valveflow.pulse(seen); }',
+        Output('lost', 'children'), Input('pulse', 'n_intervals'), Input('seen', 'data'),
+    )  # fmt: skip
+
+
+def _answer(app: Dash, shown: Shown, asking: Asking) -> None:
+    """Hand what was asked on, and show the answer beside the button."""
+
+    @app.callback(  # type: ignore[untyped-decorator]
+        Output({'unit': ALL, 'part': 'answer'}, 'children'),
+        Input({'unit': ALL, 'ask': ALL}, 'n_clicks'), State('token', 'value'),
+        State({'unit': ALL, 'part': 'answer'}, 'id'),
+        prevent_initial_call=True,
+    )  # fmt: skip
+    def answer(_: Any, token: Any, ids: Any) -> Any:
+        chosen, units = ctx.triggered_id, shown.units
+        out: list[Any] = [no_update] * len(ids)
+        pressed = any(entry.get('value') for entry in ctx.triggered)
+        number = chosen.get('unit') if isinstance(chosen, dict) else None
+        if pressed and isinstance(number, int) and 0 <= number < min(len(units), len(out)):
+            done, text = asking(units[number].key, str(chosen.get('ask')), str(token or ''))
+            out[number] = html.P(clean(text), className='good' if done else 'bad')
+        return out

@@ -1,0 +1,186 @@
+"""The executable `page`: running monitors on a page in the browser, and metrics for Prometheus."""
+
+from __future__ import annotations
+
+import argparse
+import queue
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as NoAnswer
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.utilities import remove_ros_args
+from std_srvs.srv import Trigger
+
+from valveflow_ros.errors import ValveflowError
+from valveflow_ros.page.notices import Notices
+from valveflow_ros.page.server import PageServer, check_installed, page_arguments, read_token
+from valveflow_ros.page.unit import MOST_UNITS, AlarmChange, Shown, Snapshot, Unit
+from valveflow_ros.ros.domain import start_ros
+from valveflow_ros.ros.listening import Listener, full_name, hear_health, monitors, waiting_for
+from valveflow_ros.ros.process import Parser, StopFlag, complain, with_place
+
+# How often what has come is shown; and how often monitors are looked for.
+_SHOW_S, _LOOK_S = 0.5, 2.0
+_ANSWER_S = 10.0
+
+
+class PageNode(Node):
+    """Listens to all monitors there are, or to those that were named.
+
+    Parameters
+    ----------
+    wanted : sequence of str
+        Names of monitors' nodes; empty: every one that is found, at most `MOST_UNITS`.
+    """
+
+    def __init__(self, wanted: Sequence[str] = ()) -> None:
+        super().__init__('valveflow_page', enable_rosout=False)
+        self._wanted = tuple(dict.fromkeys(map(full_name, wanted)))
+        self._units: dict[str, Unit] = {}
+        self._listeners: dict[str, Listener] = {}
+        self._asked: queue.Queue[tuple[str, str, Future[tuple[bool, str]]]] = queue.Queue(8)
+        self._left_out = 0
+        hear_health(self, self._listeners)
+
+    def look(self) -> None:
+        """Look for monitors; one that was found is kept, for it may come back."""
+        found = [name for name in monitors(self) if not self._wanted or name in self._wanted]
+        for name in found:
+            if name not in self._listeners and len(self._listeners) < MOST_UNITS:
+                self._units[name] = Unit(name)
+                self._listeners[name] = Listener(self, name, self._units[name])
+        self._left_out = sum(name not in self._listeners for name in found)
+
+    def show(self, shown: Shown) -> list[AlarmChange]:
+        """Hand over what is known now; return the changes of alarms since the last call."""
+        units: list[Snapshot] = []
+        changes: list[AlarmChange] = []
+        for name in sorted(self._listeners):
+            listener, unit = self._listeners[name], self._units[name]
+            listener.tell()
+            frame = unit.frame(name, listener.note)
+            units.append(unit.snapshot(frame, listener.present))
+            changes += unit.changes()
+        shown.put(units, self._note())
+        return changes
+
+    def ask(self, monitor: str, service: str) -> tuple[bool, str]:
+        """Ask a monitor for something, from any thread; return success and a sentence."""
+        answer: Future[tuple[bool, str]] = Future()
+        try:
+            self._asked.put_nowait((monitor, service, answer))
+            return answer.result(timeout=_ANSWER_S)
+        except (queue.Full, NoAnswer):
+            return False, f'{monitor} does not answer; nothing is known to be done.'
+
+    def pass_on(self) -> None:
+        """Send the monitors what was asked of them; the answers come while the node spins."""
+        while not self._asked.empty():
+            monitor, service, answer = self._asked.get_nowait()
+            client = self.create_client(Trigger, f'{monitor}/{service}')
+            if not client.service_is_ready():
+                client.wait_for_service(timeout_sec=0.5)
+
+            def done(future: rclpy.Future, answer=answer, client=client) -> None:
+                response = future.result()
+                answer.set_result((response.success, response.message))
+                self.destroy_client(client)
+
+            client.call_async(Trigger.Request()).add_done_callback(done)
+
+    def _note(self) -> str:
+        missing = [name for name in self._wanted if name not in self._listeners]
+        if missing or not self._listeners:
+            return waiting_for(' and '.join(missing))
+        if self._left_out:
+            return (
+                f'{self._left_out} further monitors run; a page shows {MOST_UNITS} at most. '
+                'Choose with --node NAME.'
+            )
+        return ''
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the description of the command line."""
+    made = Parser(
+        prog='page',
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description='Show running monitors on a page in the browser: curve, prediction against '
+        'measurement,\nalarms, diagnosis, inputs, the last 24 hours. /metrics has the same for '
+        'Prometheus.\n\nexamples:\n  ros2 run valveflow_ros page\n'
+        '  ros2 run valveflow_ros page --node /unit1/valveflow_monitor --port 8351',
+        epilog='ROS arguments follow --ros-args.',
+    )
+    made.add_argument(
+        '--node', metavar='NAME', action='append', default=[],
+        help='a monitor to show; may be given several times (default: every one that runs)',
+    )  # fmt: skip
+    page_arguments(made)
+    return made
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Serve the page until it is asked to end; return the exit status."""
+    arguments = list(sys.argv if args is None else ['page', *args])
+    options = parser().parse_args(remove_ros_args(arguments)[1:])
+    stop = StopFlag().install()
+    try:
+        check_installed()
+        start_ros(arguments)
+        return _run(options, stop)
+    except ValveflowError as error:
+        return complain('page', str(error))
+    except Exception as error:  # noqa: BLE001 - a person gets a sentence, not a trace
+        return complain('page', f'failed unexpectedly: {with_place(error)}')
+    finally:
+        rclpy.try_shutdown()
+
+
+def _say(sentence: str) -> None:
+    print(sentence, file=sys.stderr, flush=True)
+
+
+def _run(options: argparse.Namespace, stop: StopFlag) -> int:
+    shown = Shown()
+    shown.put((), waiting_for(' and '.join(map(full_name, options.node))))
+    notices = Notices(options.on_alarm, options.webhook, _say)
+    node = PageNode(options.node)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    server: PageServer | None = None
+    try:
+        asking = None
+        if options.token_file is not None:
+            from valveflow_ros.page.view import Asking
+
+            asking = Asking(read_token(options.token_file), node.ask)
+        server = PageServer(
+            shown, options.host, options.port, options.name, asking, notices.counters, _say
+        )
+        _say(f'The page is at {server.address}')
+        looked_s = -_LOOK_S
+        while not stop:
+            if time.monotonic() - looked_s >= _LOOK_S:
+                node.look()
+                looked_s = time.monotonic()
+            end_s = time.monotonic() + _SHOW_S
+            while not stop and (left_s := end_s - time.monotonic()) > 0.0:
+                executor.spin_once(timeout_sec=min(left_s, 0.1))
+                node.pass_on()
+            notices.tell(node.show(shown))
+    finally:
+        if server is not None:
+            server.close()
+        notices.close()
+        executor.shutdown(timeout_sec=0.5)
+        node.destroy_node()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
