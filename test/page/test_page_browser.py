@@ -161,7 +161,7 @@ def test_a_button_asks_the_monitor_for_those_who_know_the_token(serve, browser, 
     browser.ask('document.getElementById("token").blur()')
     browser.ask(f'{button}.click()')
     has(browser, 'Acknowledged: residual.')
-    assert asked == [('/valveflow_monitor', 'acknowledge_alarms')]
+    assert asked == [('/valveflow_monitor', 'acknowledge residual')]
     assert 'the right one' not in browser.ask(_TEXT)
 
 

@@ -6,7 +6,7 @@ import http.client
 import json
 import socket
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 
 import pytest
 from page_units import alarm, shown_now, told
@@ -239,10 +239,8 @@ def test_slow_peers_are_left(serve, monkeypatch, kind):
         while server.connections():
             assert time.monotonic() < deadline_s, 'it is still connected'
             if kind == 'drips':
-                try:
+                with suppress(OSError):
                     peer.sendall(b'X')
-                except OSError:
-                    pass
             time.sleep(0.1)
     assert asked(server)[0] == 200
 
@@ -291,14 +289,14 @@ def test_a_token_and_few_wrong_ones():
         return True, 'Acknowledged.'
 
     asking = Asking('the right one', ask)
-    assert asking('/m', 'acknowledge_alarms', 'the right one') == (True, 'Acknowledged.')
+    assert asking('/m', 'acknowledge residual', 'the right one') == (True, 'Acknowledged.')
     assert asking('/m', 'set_reference', 'the right one')[0] is False
-    assert asking('/m', 'shelve_alarms', '')[0] is False
+    assert asking('/m', 'shelve residual', '')[0] is False
     for _ in range(5):
-        asking('/m', 'shelve_alarms', 'the wrong one\udcff')
+        asking('/m', 'shelve residual', 'the wrong one\udcff')
     # The right one has to wait as well, or guessing would be told from not guessing.
-    assert 'wait' in asking('/m', 'shelve_alarms', 'the right one')[1]
-    assert done == [('/m', 'acknowledge_alarms')]
+    assert 'wait' in asking('/m', 'shelve residual', 'the right one')[1]
+    assert done == [('/m', 'acknowledge residual')]
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 import pytest
 from rclpy.executors import SingleThreadedExecutor
 from ros_helpers import wait_until
-from std_srvs.srv import Trigger
 from test_ros_watch import Speaker
+from valveflow_msgs.srv import OperateAlarm
 
 EXTRA = ('dash', 'prometheus_client', 'waitress')
 pytestmark = [
@@ -96,16 +96,16 @@ def test_every_monitor_is_shown_asked_and_told_of(context, speaker, processes, p
 
     asked = []
 
-    def answer(_request, response):
-        asked.append(response)
+    def answer(request, response):
+        asked.append((request.action, request.name))
         response.success, response.message = True, 'Acknowledged.'
         return response
 
-    speaker.create_service(Trigger, '~/acknowledge_alarms', answer)
+    speaker.create_service(OperateAlarm, '~/operate_alarm', answer)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(speaker)
     ids = [{'unit': k, 'part': 'answer'} for k in (0, 1)]
-    pressed = {'unit': 1, 'ask': 'acknowledge_alarms'}
+    pressed = {'unit': 1, 'ask': 'shelve curve_shift'}
     output = next(
         d['output']
         for d in json.loads(_get(port, '/_dash-dependencies'))
@@ -113,7 +113,7 @@ def test_every_monitor_is_shown_asked_and_told_of(context, speaker, processes, p
     )
     content = {
         'output': output, 'outputs': [{'id': i, 'property': 'children'} for i in ids],
-        'changedPropIds': ['{"ask":"acknowledge_alarms","unit":1}.n_clicks'],
+        'changedPropIds': ['{"ask":"shelve curve_shift","unit":1}.n_clicks'],
         'inputs': [[{'id': pressed, 'property': 'n_clicks', 'value': 1}]],
         'state': [{'id': 'token', 'property': 'value', 'value': 'the right one'},
                   [{'id': i, 'property': 'id', 'value': i} for i in ids]],
@@ -140,7 +140,7 @@ def test_every_monitor_is_shown_asked_and_told_of(context, speaker, processes, p
     wait_until(answered, 'the answer', 30.0)
     thread.join()
     executor.shutdown()
-    assert len(asked) == 1
+    assert asked == [('shelve', 'curve_shift')]
     assert 'Acknowledged.' in answers[0]
     other.destroy_node()
 

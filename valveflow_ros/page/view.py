@@ -56,7 +56,10 @@ _LEVELS = {OK: ('ok', 'good'), WARN: ('look', 'warn'), ERROR: ('fault', 'bad'),
 PARTS = ('head', 'alarms', 'curve_words', 'now', 'diagnosis', 'health')
 PICTURES = {'curve': 300, 'recent': 250, 'day': 340}
 # What may be asked of a monitor from the page.
-ASKED = {'acknowledge_alarms': 'Acknowledge', 'shelve_alarms': 'Shelve'}
+ASKED = {
+    f'{action} {name}': f'{action.capitalize()} {name}'
+    for name in ('residual', 'curve_shift') for action in ('acknowledge', 'shelve')
+}  # fmt: skip
 _TRIES, _WAIT_S = 5, 30.0
 # With it the sentence of a diagnosis goes on, once for each cause.
 _TO_DO = 'What to do:'
@@ -365,8 +368,8 @@ def _picture(number: int, name: str) -> Any:
 
 def _block(number: int, told: Mapping[str, Made], may_ask: bool) -> Any:
     buttons = [
-        html.Button(label, id={'unit': number, 'ask': service}, n_clicks=0)
-        for service, label in ASKED.items()
+        html.Button(label, id={'unit': number, 'ask': asked}, n_clicks=0)
+        for asked, label in ASKED.items()
     ]
     ask = [html.Div([*buttons, _part(number, 'answer')], className='ask')] if may_ask else []
 
@@ -420,7 +423,7 @@ class Asking:
     token : str
         What a browser has to know; not empty.
     ask : callable
-        Takes the key of a unit and the name of a service; returns success and a sentence.
+        Takes the key of a unit and one of `ASKED`; returns success and a sentence.
     """
 
     def __init__(self, token: str, ask: Ask) -> None:
@@ -430,9 +433,9 @@ class Asking:
         self._wrong = 0
         self._until_s = 0.0
 
-    def __call__(self, unit: str, service: str, token: str) -> tuple[bool, str]:
+    def __call__(self, unit: str, asked: str, token: str) -> tuple[bool, str]:
         """Return success and a sentence; one request at a time, and few wrong tokens."""
-        if service not in ASKED:
+        if asked not in ASKED:
             return False, 'That cannot be asked from here.'
         if not self._lock.acquire(blocking=False):
             return False, 'Another request is being answered; try again.'
@@ -445,7 +448,7 @@ class Asking:
                     self._wrong, self._until_s = 0, time.monotonic() + _WAIT_S
                 return False, 'The token is not the right one.'
             self._wrong = 0
-            return self._ask(unit, service)
+            return self._ask(unit, asked)
         finally:
             self._lock.release()
 

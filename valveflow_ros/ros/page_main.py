@@ -14,7 +14,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
-from std_srvs.srv import Trigger
+from valveflow_msgs.srv import OperateAlarm
 
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.page.notices import Notices
@@ -69,11 +69,18 @@ class PageNode(Node):
         shown.put(units, self._note())
         return changes
 
-    def ask(self, monitor: str, service: str) -> tuple[bool, str]:
-        """Ask a monitor for something, from any thread; return success and a sentence."""
+    def ask(self, monitor: str, asked: str) -> tuple[bool, str]:
+        """Have a monitor do something to an alarm; return success and a sentence.
+
+        Parameters
+        ----------
+        monitor : str
+        asked : str
+            Action and alarm, such as 'shelve residual'. Any thread may ask.
+        """
         answer: Future[tuple[bool, str]] = Future()
         try:
-            self._asked.put_nowait((monitor, service, answer))
+            self._asked.put_nowait((monitor, asked, answer))
             return answer.result(timeout=_ANSWER_S)
         except (queue.Full, NoAnswer):
             return False, f'{monitor} does not answer; nothing is known to be done.'
@@ -81,8 +88,9 @@ class PageNode(Node):
     def pass_on(self) -> None:
         """Send the monitors what was asked of them; the answers come while the node spins."""
         while not self._asked.empty():
-            monitor, service, answer = self._asked.get_nowait()
-            client = self.create_client(Trigger, f'{monitor}/{service}')
+            monitor, asked, answer = self._asked.get_nowait()
+            action, _, name = asked.partition(' ')
+            client = self.create_client(OperateAlarm, f'{monitor}/operate_alarm')
             if not client.service_is_ready():
                 client.wait_for_service(timeout_sec=0.5)
 
@@ -91,7 +99,8 @@ class PageNode(Node):
                 answer.set_result((response.success, response.message))
                 self.destroy_client(client)
 
-            client.call_async(Trigger.Request()).add_done_callback(done)
+            request = OperateAlarm.Request(name=name, action=action)
+            client.call_async(request).add_done_callback(done)
 
     def _note(self) -> str:
         missing = [name for name in self._wanted if name not in self._listeners]
