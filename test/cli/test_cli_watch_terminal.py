@@ -105,7 +105,7 @@ def test_lines_to_a_pipe_come_as_it_happens(tmp_path):
     monitor.say('diagnosis', diagnosis(monitor.now_ns, 1, 'All is well.'))
     monitor.seconds(1)
     line = process.stdout.readline()
-    assert 'diagnosis: nothing is wrong' in line
+    assert 'diagnosis: no cause found' in line
     assert 'All is well.' in line
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=30) == 0

@@ -102,7 +102,7 @@ def _text(found: DiagnosisResult) -> str:
     from valveflow_ros.report.words import level
 
     verdicts = {
-        NAMED: 'cause found', NOTHING: 'nothing is wrong', UNEXPLAINED: 'something is unexplained',
+        NAMED: 'cause found', NOTHING: 'no cause found', UNEXPLAINED: 'something is unexplained',
     }  # fmt: skip
     d = found.diagnosis
     rows = [

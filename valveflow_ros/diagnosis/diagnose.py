@@ -37,7 +37,7 @@ from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.diagnosis.search import Found, Progress, search, simplified
 from valveflow_ros.diagnosis.slow import Drift, drift
 from valveflow_ros.diagnosis.structure import Period, Structure, Wander, period, structure, wander
-from valveflow_ros.errors import DataError
+from valveflow_ros.errors import DataError, listed
 from valveflow_ros.records import BoolArray, FloatArray, IntArray, SampleTable
 from valveflow_ros.signals.compression import Compression
 from valveflow_ros.signals.static_form import StaticForm
@@ -515,10 +515,13 @@ def _sentence(d: Diagnosis) -> str:
         drifts = d.disturbance is not None and d.disturbance.drift_mw is not None
         return ' '.join(c.sentence for c in d.causes) + (wander if drifts else '')
     if d.verdict == NOTHING:
-        blind = sum('cannot be judged' in reason for _, reason in d.rejected)
-        but = f' {blind} causes could not be judged in this record.' if blind > 1 else ''
+        blind = [name for name, reason in d.rejected if 'cannot be judged' in reason]
+        but = f' Not judged, for want of what this record lacks: {listed(blind)}.' if blind else ''
         slow = '' if d.disturbance is None else 'a slow disturbance and '
-        return f'The model explains the unit down to {slow}its noise.{but}{wander}'
+        return (
+            f'Of the {len(catalogue()) - len(blind)} causes that could be judged none was found: '
+            f'the model explains the unit down to {slow}its noise.{but}{wander}'
+        )
     near = f'; nearest: {", ".join(d.not_told_apart)}' if d.not_told_apart else ''
     besides = ''.join(f' Found besides: {c.sentence}' for c in d.causes)
     return (

@@ -27,7 +27,7 @@ ALARM_STATES = (
     'cannot be judged now',
     'out of service',
 )
-VERDICTS = ('not diagnosed yet', 'nothing is wrong', 'cause named', 'unexplained')
+VERDICTS = ('not diagnosed yet', 'no cause found', 'cause named', 'unexplained')
 NORMAL, UNACKNOWLEDGED, ACKNOWLEDGED = 0, 1, 2
 OUTSIDE, BAD_DATA = 4, 5
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
