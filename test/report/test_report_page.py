@@ -330,3 +330,9 @@ def test_the_hour_that_comes_twice_is_told_by_the_name_of_the_clock():
     zone = zoneinfo.ZoneInfo('Europe/Berlin')
     both = 'from 2024-10-27 00:30 UTC to 2024-10-27 01:30 UTC'
     assert in_zone(both, zone) == 'from 2024-10-27 02:30 CEST to 2024-10-27 02:30 CET'
+
+
+def test_what_is_told_in_a_zone_already_stays():
+    once = in_zone('2024-01-02 00:30 UTC', timezone(timedelta(hours=1)))
+    assert once == '2024-01-02 01:30 UTC+01:00'
+    assert in_zone(once, timezone(timedelta(hours=5))) == once

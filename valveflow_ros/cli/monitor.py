@@ -32,7 +32,7 @@ example:
   valveflow monitor plant.mcap -o result
 
 and quicker, without the diagnoses:
-  valveflow monitor plant.mcap -o result --no-diagnosis -p alarm_floor:=2.0"""
+  valveflow monitor plant.mcap -o result --no-diagnosis --set alarm_floor=2.0"""
 
 
 def arguments(parser: ArgumentParser) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import actuator
-from valveflow_ros.diagnosis.cause import Active, Estimate, SentenceValues
+from valveflow_ros.diagnosis.cause import DAY_S, Active, Estimate, SentenceValues
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.evidence import (
     Certainty,
@@ -164,7 +165,6 @@ _OWN_MISFIT = 0.004  # of the power's range
 _LAST_STEPS = 10  # knots go slowly beside a bump
 _FULL_LOAD = 0.9  # quantile of the power
 _ACTS = 0.05  # share of the largest change below which there is none
-_PARTS = 8  # of the record, for its beginning and its end
 
 
 def _quiet(_share: float, _what: str) -> None:
@@ -413,25 +413,48 @@ def _final(found: Found) -> tuple[Task, Extended]:
 def _meaning(task: Task, model: Extended, cause: Active) -> str:
     """Say what a cause is worth at full load, against the model without it.
 
-    Of a change in time that is the difference between the end of the record and its beginning.
+    Causes that change with time are counted from their mean over the record: of a step it is the
+    difference between after and before, of a drift that between the end and the beginning, of
+    intervals that between in effect and not.
     """
-    grids = task.grids
-    moved = (answer(grids, model) - answer(grids, model.without(cause.name)))[grids.whole]
-    power = grids.power[grids.whole]
+    grids, whole = task.grids, task.grids.whole
+    without = answer(grids, model.without(cause.name))
+    moved, power = (answer(grids, model) - without)[whole], without[whole]
     full = float(np.quantile(power, _FULL_LOAD))
-    at_full = moved[power >= full]
-    part = -(-len(at_full) // _PARTS)
-    lasts = cause.cause.slow and not cause.extra and cause.name != 'diurnal'
-    level = float(np.mean(at_full[-part:]) - np.mean(at_full[:part])) if lasts else 0.0
-    if not lasts and np.ptp(np.sign(at_full)) == 0.0:
-        level = float(np.mean(at_full))
-    size, most = (float(np.quantile(np.abs(m), 0.95)) for m in (at_full, moved))
-    where = f'At full load (from {full:.0f} MW on)'
-    if not size > _ACTS * most:
+    where, high = f'At full load (from {full:.0f} MW on)', power >= full
+    day = grids.means(grids.time_s)[whole] / DAY_S
+    onset = next((cause.named()[u.name] for u in cause.cause.unknowns if u.dated), None)
+    days = grids.reference.span_s / DAY_S
+    level, reach = _worth(cause, moved[high], day[high], onset, days)
+    if not np.isfinite(level):
+        return ''
+    most = float(np.ptp(np.quantile(moved, (0.01, 0.99))))
+    if not max(abs(level), reach) > _ACTS * most:
         return f'{where} it changes nothing, at other loads up to {most:.2g} MW.'
     if not level:
-        return f'{where} it moves the power by up to {size:.2g} MW.'
+        return f'{where} it moves the power by up to {reach:.2g} MW.'
     return f'{where} it is {abs(level):.2g} MW {"more" if level > 0.0 else "less"}.'
+
+
+def _worth(
+    cause: Active, moved: FloatArray, day: FloatArray, onset: float | None, days: float
+) -> tuple[float, float]:
+    """Return the signed MW of a cause, 0 where it goes to both sides, and how far it goes."""
+    reach = float(np.quantile(np.abs(moved), 0.95))
+    if onset is not None:
+        after = day >= onset
+        if after.all() or not after.any():
+            return math.nan, reach
+        return float(moved[after].mean() - moved[~after].mean()), reach
+    if cause.extra:
+        low, high = np.quantile(moved, (0.01, 0.99)).tolist()
+        return math.copysign(high - low, next(iter(cause.values))), reach
+    if cause.cause.slow and cause.name != 'diurnal':
+        if np.ptp(day) < 0.5:
+            return math.nan, reach
+        return float(np.polyfit(day, moved, 1)[0]) * days, reach
+    one_sided = np.ptp(np.sign(moved)) == 0.0
+    return float(moved.mean()) if one_sided else 0.0, reach
 
 
 def _conclude(

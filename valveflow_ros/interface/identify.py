@@ -44,6 +44,7 @@ from valveflow_ros.records import (
 from valveflow_ros.report.identification import identification_page
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import Page
+from valveflow_ros.signals.units import in_unit
 
 STEP_TEST_ADVICE = (
     'This looks like a manual step test (few openings, each held): --step-test identifies it '
@@ -213,7 +214,7 @@ def _identified(
     mixture = mixture_sentence(characteristic, observed.segments)
     told += [mixture] if mixture else []
     for sentence in told:
-        progress.warn(sentence)
+        progress.warn(in_unit(sentence, settings.output_unit))
     found = Identified(
         source=log.name, characteristic=characteristic, table=observed.table,
         segments=observed.segments, counts=observed.counts, settings=settings,

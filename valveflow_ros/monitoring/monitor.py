@@ -69,6 +69,7 @@ class Monitor(Memory):
     REMEMBERED = (
         '_correction', '_segmenter', '_window', 'alarm', '_force', '_refits', 'reference',
         'diagnosing', '_rows', '_last_ns', '_went_back', 'judged', '_chart_due',
+        '_chart_not_ns',
     )  # fmt: skip
 
     def __init__(self, settings: Settings, corrector: Corrector | None = None) -> None:
@@ -82,6 +83,7 @@ class Monitor(Memory):
         self._last_ns = 0
         self._went_back = False
         self._chart_due = False  # the parameters of the residual's chart have changed
+        self._chart_not_ns: int | None = None  # a request from before that
         self.judged = Judged(0, math.nan, math.nan)
         self._refits = Refits()
         self.reference = ReferenceCurve(settings)
@@ -160,8 +162,10 @@ class Monitor(Memory):
         self._alarms.configure(settings)
         self._force.configure(settings)
         if changed.keys() & _OF_CHART:
-            # The next fit brings another chart, and is not to wait for new segments.
+            # The next fit brings another chart, and is not to wait for new segments; one that
+            # runs already has the old parameters.
             self._chart_due = True
+            self._chart_not_ns = self._refits.pending_ns
             self._refits.count_as_new(self.segments)
         text = json.dumps(changed, sort_keys=True)
         return [self._journal(JournalKind.SETTINGS, 0, '', text)]
@@ -199,7 +203,8 @@ class Monitor(Memory):
             return [*begun, *self.refuse(request_ns, MIXED)]
         self._refits.settle(request_ns)
         self._force.adopt(characteristic, self._provisional())
-        self._take_chart(characteristic)
+        if request_ns != self._chart_not_ns:
+            self._take_chart(characteristic)
         segments = self._window.special_segments()
         shift, changes = self.reference.judge(
             characteristic, segments, self._last_ns, self.settings
@@ -462,7 +467,7 @@ class Monitor(Memory):
         chart = curve.residuals.chart
         if self._chart_due and chart is not None and self.reference.fault_ns is None:
             self._chart_due = False
-            self.reference.take_chart(chart)
+            self.reference.take_chart(chart, curve.residuals.wander_mw)
             if self.reference.curve is not None:
                 self._predict()
 
@@ -506,6 +511,8 @@ class Monitor(Memory):
         told = f'Since the state was saved {listed(names)} changed.' if names else ''
         if 'window' in lost:
             told += ' The window of rows begins anew.'
+        elif 'window_days' in names:
+            told += f' The window has {counted(len(self._window), "row")} now.'
         elif 'segmenter' in lost:
             told += f' Segments were found anew in {counted(len(self._window), "row")}.'
         if gone := [words for key, words in _PARTS.items() if key in lost]:
@@ -550,7 +557,11 @@ class Monitor(Memory):
 
     def restore(self, saved: State) -> None:
         """Go on from a state; raises `DataError` if it does not fit."""
-        super().restore({'chart_due': False, **saved})  # which earlier versions do not know
+        # Earlier versions know neither these nor weather, for which their charts have no room.
+        super().restore({'chart_due': False, 'chart_not_ns': None, **saved})
+        curve = self.reference.curve
+        if curve is not None and math.isnan(curve.residuals.wander_mw):
+            self._chart_due = True
 
     def _journal(
         self, kind: JournalKind, request_ns: int, model_id: str, text: str

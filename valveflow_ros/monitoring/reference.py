@@ -227,11 +227,11 @@ class ReferenceCurve:
                 worn = float(np.average(found.residual_mw, weights=found.weights))
                 self._worn = [*self._worn[1 - _KEPT :], (at_ns, worn)]
 
-    def take_chart(self, chart: ChartDesign) -> None:
+    def take_chart(self, chart: ChartDesign, wander_mw: float) -> None:
         """Watch the residual of the reference by another chart; the curve stays what it was."""
         since_ns, candidate = self._candidate or (0, None)
         self.curve, self.first, candidate = (
-            c and replace(c, residuals=replace(c.residuals, chart=chart))
+            c and replace(c, residuals=replace(c.residuals, chart=chart, wander_mw=wander_mw))
             for c in (self.curve, self.first, candidate)
         )
         self._candidate = None if candidate is None else (since_ns, candidate)

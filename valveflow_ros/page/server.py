@@ -160,7 +160,10 @@ class Guard:
 
     def __call__(self, environ: dict[str, Any], start: Start) -> Iterable[bytes]:
         """Answer a request."""
-        refusal = self._refusal(environ)
+        try:
+            refusal = self._refusal(environ)
+        except ValueError:  # an address that is none
+            refusal = ('403 Forbidden', 'This request does not come from the page.')
         if refusal is not None:
             self.refused += 1
             return self._say(start, *refusal)

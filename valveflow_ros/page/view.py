@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import hmac
 import math
-import re
 import secrets
 import threading
 import time
 from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from hashlib import sha256
 from importlib import resources
 from itertools import chain, pairwise
@@ -61,8 +61,6 @@ ASKED = {
     for name in ('residual', 'curve_shift') for action in ('acknowledge', 'shelve')
 }  # fmt: skip
 _TRIES, _WAIT_S = 5, 30.0
-# With it the sentence of a diagnosis goes on, once for each cause.
-_TO_DO = 'What to do:'
 Ask = Callable[[str, str], tuple[bool, str]]
 
 
@@ -110,19 +108,11 @@ def _head(unit: Snapshot) -> list[Any]:
     return [*made, html.P(clean(frame.note), className='notice')] if frame.note else made
 
 
-def _code(text: str) -> list[Any]:
-    """Return a paragraph whose `code` stands in backquotes."""
-    parts = re.split(r'`([^`]*)`', ' '.join(text.split()))
-    return [html.Code(part) if k % 2 else part for k, part in enumerate(parts)]
-
-
 def _diagnosis(frame: Frame) -> list[Any]:
-    text, tone = diagnosis_words(frame.diagnosis)
-    said, *to_do = clean(text).split(_TO_DO)
-    return [
-        _said((said.strip(), tone)),
-        *(html.P([html.B(_TO_DO), ' ', *_code(paragraph)]) for paragraph in to_do),
-    ]
+    found = frame.diagnosis
+    said = diagnosis_words(None if found is None else replace(found, advice=()))
+    advice = () if found is None else found.advice
+    return [_said(said), *(html.P(clean(paragraph)) for paragraph in advice)]
 
 
 def _row(item: HealthView) -> Any:

@@ -137,6 +137,8 @@ def _moved(mark: Spec, dates: Sequence[str], zone: tzinfo) -> Spec:
             for key in (letter, f'{letter}0', f'{letter}1'):
                 if isinstance(new.get(key), int | float):
                     new[key] = _local_ms(new[key], zone)
+    if 'text' in new:
+        new['text'] = str(new['text']).replace('(UTC)', f'({zone})')
     return new
 
 

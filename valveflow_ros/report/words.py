@@ -160,7 +160,7 @@ def moment(time_ns: int) -> str:
     return f'{at:%Y-%m-%d %H:%M:%S} UTC'
 
 
-_UTC_MOMENT = re.compile(r'(\d{4}-\d\d-\d\d \d\d:\d\d(?::\d\d)?) UTC\b')
+_UTC_MOMENT = re.compile(r'(\d{4}-\d\d-\d\d \d\d:\d\d(?::\d\d)?) UTC(?![\w+-])')
 
 
 def in_zone(said: str, zone: tzinfo | None) -> str:

@@ -177,6 +177,8 @@ _WORDS = (
 
 def tell_in(message: Any, unit: str, zone: tzinfo | None = None) -> None:
     """Put the unit of the output and the time zone into what a message says to people."""
+    if isinstance(message, JournalEntry):
+        zone = None  # a replay reads its text
     for name in _WORDS if unit != 'MW' or zone is not None else ():
         said = getattr(message, name, None)
         if isinstance(said, str):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import queue
 import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NoAnswer
+from typing import Any
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -44,6 +46,7 @@ class PageNode(Node):
         self._units: dict[str, Unit] = {}
         self._listeners: dict[str, Listener] = {}
         self._asked: queue.Queue[tuple[str, str, Future[tuple[bool, str]]]] = queue.Queue(8)
+        self._clients: dict[str, Any] = {}
         self._left_out = 0
         hear_health(self, self._listeners)
 
@@ -90,14 +93,18 @@ class PageNode(Node):
         while not self._asked.empty():
             monitor, asked, answer = self._asked.get_nowait()
             action, _, name = asked.partition(' ')
-            client = self.create_client(OperateAlarm, f'{monitor}/operate_alarm')
-            if not client.service_is_ready():
-                client.wait_for_service(timeout_sec=0.5)
+            client = self._clients.get(monitor)
+            if client is None:
+                client = self.create_client(OperateAlarm, f'{monitor}/operate_alarm')
+                self._clients[monitor] = client
+            if not client.service_is_ready() and not client.wait_for_service(timeout_sec=0.5):
+                answer.set_result((False, f'{monitor} is not there to be asked.'))
+                continue
 
-            def done(future: rclpy.Future, answer=answer, client=client) -> None:
-                response = future.result()
-                answer.set_result((response.success, response.message))
-                self.destroy_client(client)
+            def done(future: rclpy.Future, answer=answer) -> None:
+                with contextlib.suppress(Exception):  # the asker may have gone, or the monitor
+                    response = future.result()
+                    answer.set_result((response.success, response.message))
 
             request = OperateAlarm.Request(name=name, action=action)
             client.call_async(request).add_done_callback(done)

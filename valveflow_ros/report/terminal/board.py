@@ -164,12 +164,13 @@ def decoded(
         )  # fmt: skip
     if type_name == DIAGNOSIS:
         causes = tuple(str(cause['name']) for cause in fields['causes'])
-        parts = [str(fields['sentence']).strip()]
-        for cause in fields['causes']:  # recordings of earlier versions do not have these
-            parts.append(str(cause.get('meaning', '')))
-            parts.append(f'What to do: {cause["to_do"]}' if cause.get('to_do') else '')
-        said = ' '.join(p for p in parts if p)
-        return time_ns, DiagnosisView(int(fields['verdict']), said, causes, time_ns)
+        said = str(fields['sentence']).strip()
+        advice = tuple(
+            f'{cause["name"]}: {cause["meaning"]} What to do: {cause["to_do"]}'.replace('  ', ' ')
+            for cause in fields['causes']
+            if cause.get('to_do')  # recordings of earlier versions do not have it
+        )
+        return time_ns, DiagnosisView(int(fields['verdict']), said, causes, time_ns, advice)
     return time_ns, CurveView(
         _floats(fields['breakpoints']), _floats(fields['values']), int(fields['status']),
         str(fields['cause']).strip(), str(fields['model_id']),

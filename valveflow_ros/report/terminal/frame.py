@@ -121,12 +121,26 @@ class HealthView:
 
 @dataclass(frozen=True, slots=True)
 class DiagnosisView:
-    """The last diagnosis: its place in `VERDICTS`, its sentence, names of causes, its end."""
+    """The last diagnosis.
+
+    Attributes
+    ----------
+    verdict : int
+        Its place in `VERDICTS`.
+    sentence : str
+    causes : tuple of str
+        Their names.
+    until_ns : int
+        End of the data.
+    advice : tuple of str
+        What each cause means in MW and what to do about it, where that is known.
+    """
 
     verdict: int
     sentence: str
     causes: tuple[str, ...]
     until_ns: int
+    advice: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,6 +288,7 @@ def diagnosis_words(diagnosis: DiagnosisView | None) -> Said:
     names = f' ({", ".join(diagnosis.causes)})' if diagnosis.causes else ''
     until = f' in the data until {moment(diagnosis.until_ns)[:16]}' if diagnosis.until_ns else ''
     text = f'{_word(VERDICTS, diagnosis.verdict)}{names}{until}. {diagnosis.sentence}'
+    text = ' '.join([text, *diagnosis.advice])
     return text, 'warn' if diagnosis.verdict in (2, 3) else ''
 
 

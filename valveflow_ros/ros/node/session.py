@@ -194,6 +194,11 @@ class Session:
         follows = written and self.recording.whole and self._store.saved_s is not None
         if follows or not self._store.on:
             return written or not self.recording.on
+        if self._store.busy:
+            # An older state is being written; this one could only follow.
+            self._store.finish()
+        if self._store.busy:
+            return False
         self._save_state()
         self._store.finish()
         return not (self._store.busy or self._store.problem)

@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import json
 import os
+import shutil
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -157,8 +158,9 @@ class StateFolder:
         with contextlib.suppress(OSError):
             if not self.aside.exists() or self.aside.lstat().st_size < self.path.lstat().st_size:
                 if of_use:
-                    self.aside.unlink(missing_ok=True)
-                    os.link(self.path, self.aside)
+                    between = self.folder / f'.{STATE}.tmp'
+                    shutil.copyfile(self.path, between)
+                    between.replace(self.aside)
                 else:
                     self.path.replace(self.aside)
                 return True
@@ -454,6 +456,9 @@ class StateStore:
             return
         names = _changed(self.saved, settings, Depends.ROWS)
         if not names:
+            if _changed(self.saved, settings, Depends.NOTHING):
+                # A shorter window, say, lets rows go.
+                folder.set_aside(of_use=True)
             return
         # Whoever corrects a mistyped parameter gets back what was there before.
         with contextlib.suppress(ValveflowError, KeyError, TypeError):
