@@ -170,8 +170,9 @@ def test_what_a_service_confirmed_survives_a_kill_that_follows_at_once(
     # The parameters of the alarms and those of the segments may be other ones.
     second = start_monitor(processes, tmp_path, **given, alarm_floor=2.0, steady_min=150.0)
     plant.until(lambda: goes_on(processes, second), 'the sentence', 240.0)
+    before = 'from before, alarm residual, acknowledged'
+    plant.until(lambda: before in processes.output(second), 'the alarm of before')
     told = processes.output(second)
-    assert 'from before, alarm residual, acknowledged' in told
     assert 'Since the state was saved steady_min changed. Segments were found anew in ' in told
     late: list[Alarm] = []
     plant.node.create_subscription(Alarm, f'{MONITOR}/alarms', late.append, LATCHED)
