@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import START_NS, blocks_of, cuts, examples
 
+from valveflow_ros.curve.characteristic import level_error_mw
 from valveflow_ros.fit.residual_chart import (
     ChartDesign,
     ResidualChart,
@@ -17,6 +18,7 @@ from valveflow_ros.fit.residual_chart import (
     design_chart,
     limit_for,
     normal_limit,
+    slow_wander,
 )
 from valveflow_ros.records import NS_PER_S
 
@@ -257,3 +259,78 @@ def test_a_chart_that_follows_one_of_other_limits_keeps_the_shares():
     slow = ResidualChart(replace(DESIGN, block_s=120.0), 1.0)
     slow.follow(first)
     assert np.isnan(slow.feed(time_ns[-1:] + NS_PER_S, residual[-1:])[0]).all()
+
+
+MINUTE_S = 60.0
+DAY_ROWS = 1440
+
+
+def weather(seed, sd, days=10, hold_days=1.0):
+    """Draw noise of 1 MW upon a level that forgets in about a day, minute by minute."""
+    rng = np.random.default_rng(seed)
+    rows = days * DAY_ROWS
+    keep = math.exp(-1.0 / (hold_days * DAY_ROWS))
+    level = np.empty(rows)
+    level[0] = sd * rng.standard_normal()
+    step = sd * math.sqrt(1.0 - keep * keep) * rng.standard_normal(rows)
+    for t in range(1, rows):
+        level[t] = keep * level[t - 1] + step[t]
+    return level + rng.standard_normal(rows)
+
+
+def wander_of(residual, floor=1.0):
+    return slow_wander(residual, np.ones(len(residual), dtype=np.uint8), MINUTE_S, floor)
+
+
+@pytest.mark.parametrize('sd', [1.0, 3.0])
+def test_the_wander_of_days_is_told_from_a_window_of_them(sd):
+    found = [wander_of(weather(seed, sd)) for seed in range(20)]
+    assert 0.7 * sd < np.median(found) < 1.6 * sd
+    assert 0.4 * sd < min(found) <= max(found) < 2.5 * sd
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_fault_in_the_window_is_no_weather(seed):
+    residual = weather(seed, 0.5)
+    usual = wander_of(residual)
+    row = np.arange(len(residual))
+    for fault in (-10.0 * (row > 7.5 * DAY_ROWS), 20.0 * ((row > 5000) & (row < 5720))):
+        assert usual <= wander_of(residual + fault) < usual + 0.7
+
+
+@given(st.floats(0.01, 100.0))
+def test_the_wander_is_in_the_unit_of_the_residual(factor):
+    residual = weather(1, 1.0, days=2)
+    assert wander_of(factor * residual, factor) == pytest.approx(factor * wander_of(residual))
+
+
+def test_before_six_hours_half_of_what_need_not_be_found_is_taken_for_it():
+    assert wander_of(np.zeros(100), 2.0) == wander_of(np.zeros(300), 2.0) > 0.0
+    assert wander_of(np.zeros(100), 0.0) == 0.0
+    assert wander_of(np.zeros(10 * DAY_ROWS), 2.0) < 0.5 * wander_of(np.zeros(100), 2.0)
+
+
+def test_a_mean_of_more_days_is_nearer_to_that_of_many():
+    day_ns = 86_400 * NS_PER_S
+    errors = [level_error_mw(1.5, 0, days * day_ns) for days in (0, 1, 4, 10, 100)]
+    assert errors[0] == 1.5
+    assert errors == sorted(errors, reverse=True)
+    # Of independent spells of two days.
+    assert errors[-1] == pytest.approx(1.5 * math.sqrt(2.0 / 100.0), rel=0.02)
+    assert level_error_mw(math.nan, 0, day_ns) == 0.0
+
+
+def test_what_weather_does_raises_no_alarm_and_twice_of_what_may_pass_does():
+    residual = weather(5, 1.0)
+    weight = np.ones(len(residual), dtype=np.uint8)
+    wander = wander_of(residual)
+    design = design_chart(
+        residual, weight, MINUTE_S, block_s=60.0, run_length_days=30.0, floor_mw=1.0,
+        curve_error_mw=0.1, wander_mw=wander,
+    )  # fmt: skip
+    time_ns = START_NS + np.arange(len(residual), dtype=np.int64) * 60 * NS_PER_S
+    passes = 4.0 * wander
+    for shift, raised in ((0.0, False), (0.5 * passes, False), (2.0 * passes, True)):
+        chart = ResidualChart(design, MINUTE_S)
+        evidence, _ = chart.feed(time_ns, weather(6, 1.0) + shift)
+        assert bool(np.nanmax(evidence) > 1.0) == raised
