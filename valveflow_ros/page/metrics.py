@@ -8,14 +8,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
+from valveflow_ros.page.notices import STATES
 from valveflow_ros.page.unit import Shown, Snapshot
 from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.terminal.board import AGE
 from valveflow_ros.report.terminal.frame import OK, SampleView
 
 _W = 1e6
-_ALARM_STATES = ('normal', 'unacknowledged', 'acknowledged', 'returned_unacknowledged', 'shelved',
-                 'suppressed', 'out_of_service')  # fmt: skip
 # Keys of the health's values that become counters: of inputs, and of the recorder.
 _INPUT_COUNTS = {
     'valveflow_input_messages': ('Messages received', 'Messages of an input that were received.'),
@@ -129,7 +128,7 @@ def _alarms(units: Named) -> Metric:
     )  # fmt: skip
     for name, unit in units:
         for alarm in unit.frame.alarms:
-            for k, word in enumerate(_ALARM_STATES):
+            for k, word in enumerate(STATES):
                 found.add_metric([name, alarm.name, word], float(k == alarm.state))
     return found
 

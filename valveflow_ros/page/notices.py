@@ -27,7 +27,7 @@ MOST_WAITING = 64
 LIMIT_S = 10.0
 PAUSES_S = (2.0, 10.0, 60.0)
 _LAST_S = 1.0
-_STATES = ('normal', 'unacknowledged', 'acknowledged', 'returned_unacknowledged', 'shelved',
+STATES = ('normal', 'unacknowledged', 'acknowledged', 'returned_unacknowledged', 'shelved',
            'suppressed', 'out_of_service')  # fmt: skip
 
 
@@ -56,7 +56,7 @@ def notice(change: AlarmChange) -> bytes:
 
 
 def _state(number: int) -> str:
-    return _STATES[number] if 0 <= number < len(_STATES) else f'state_{number}'
+    return STATES[number] if 0 <= number < len(STATES) else f'state_{number}'
 
 
 def _time(time_ns: int) -> str | None:

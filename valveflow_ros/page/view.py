@@ -393,7 +393,7 @@ def _page(maker: Maker, may_ask: bool) -> Any:
         html.Header([html.H1('valveflow'), html.Div(id='lost', role='alert'), *token_field]),
         html.Div(maker.shown.note, id='note', className='notice' if maker.shown.note else ''),
         html.Div(blocks, className=f'units{many}'),
-        html.Footer(f'Made by valveflow {__version__}. Times are UTC.'),
+        html.Footer(f'Made by valveflow {__version__}. Clock and pictures are in UTC.'),
         dcc.Interval(id='tick', interval=TICK_MS), dcc.Interval(id='pulse', interval=1000),
         dcc.Store(id='seen', data={'generation': maker.generation}),
     ], id='page')  # fmt: skip

@@ -232,7 +232,7 @@ def sample_words(sample: SampleView | None) -> Said:
 
 def alarm_words(alarm: AlarmView) -> Said:
     """Say how an alarm stands."""
-    raised = f', raised {moment(alarm.raised_ns)[11:16]}'
+    raised = f', raised {moment(alarm.raised_ns)[5:16]} UTC'
     if not (alarm.standing and alarm.raised_ns):
         raised = ''
     tone = {UNACKNOWLEDGED: 'bad', ACKNOWLEDGED: 'bad'}.get(alarm.state, 'warn')
@@ -286,7 +286,9 @@ def diagnosis_words(diagnosis: DiagnosisView | None) -> Said:
     if not diagnosis.verdict and diagnosis.sentence:
         return diagnosis.sentence, 'dim'
     names = f' ({", ".join(diagnosis.causes)})' if diagnosis.causes else ''
-    until = f' in the data until {moment(diagnosis.until_ns)[:16]}' if diagnosis.until_ns else ''
+    until = ''
+    if diagnosis.until_ns:
+        until = f' in the data until {moment(diagnosis.until_ns)[:16]} UTC'
     text = f'{_word(VERDICTS, diagnosis.verdict)}{names}{until}. {diagnosis.sentence}'
     text = ' '.join([text, *diagnosis.advice])
     return text, 'warn' if diagnosis.verdict in (2, 3) else ''
