@@ -45,7 +45,7 @@ def told(key: str = NODE, tag: str = 'U1', seconds: int = 200) -> Unit:
     unit.take(DIAGNOSIS, {
         'header': head(START_NS, tag), 'verdict': 2, 'sentence': 'The valve sticks.',
         'causes': [
-            {'name': 'stiction', 'meaning': 'Friction.', 'to_do': 'Lubricate, `retighten`.'},
+            {'name': 'stiction', 'meaning': 'Friction.', 'to_do': 'Lubricate, retighten.'},
         ],
     })  # fmt: skip
     for k in range(seconds):

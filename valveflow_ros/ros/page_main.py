@@ -46,7 +46,7 @@ class PageNode(Node):
         self._units: dict[str, Unit] = {}
         self._listeners: dict[str, Listener] = {}
         self._asked: queue.Queue[tuple[str, str, Future[tuple[bool, str]]]] = queue.Queue(8)
-        self._clients: dict[str, Any] = {}
+        self._by_monitor: dict[str, Any] = {}
         self._left_out = 0
         hear_health(self, self._listeners)
 
@@ -93,10 +93,10 @@ class PageNode(Node):
         while not self._asked.empty():
             monitor, asked, answer = self._asked.get_nowait()
             action, _, name = asked.partition(' ')
-            client = self._clients.get(monitor)
+            client = self._by_monitor.get(monitor)
             if client is None:
                 client = self.create_client(OperateAlarm, f'{monitor}/operate_alarm')
-                self._clients[monitor] = client
+                self._by_monitor[monitor] = client
             if not client.service_is_ready() and not client.wait_for_service(timeout_sec=0.5):
                 answer.set_result((False, f'{monitor} is not there to be asked.'))
                 continue
