@@ -118,6 +118,8 @@ def _alarm() -> list[tuple[str, str, str]]:
 
 _MONITOR = {
     'monitor_healthy_431_438': 'the monitor on healthy units, 20 days each, means over a minute',
+    'monitor_all_times_3_431_431': 'the same with an effect of three times its default from day '
+    '10 on, one unit an effect; alarms since then',
 }
 
 
