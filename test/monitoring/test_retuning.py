@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import lzma
+import math
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.alarms import AlarmState
 from valveflow_ros.monitoring.events import FitRequested, JournalKind, ReferenceSet
 from valveflow_ros.monitoring.monitor import Monitor
-from valveflow_ros.monitoring.offline import CLOCK_BACK, feed_rows
+from valveflow_ros.monitoring.offline import CLOCK_BACK, feed_rows, outcome_of
 from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.parameters import TABLE, Depends, Settings
 from valveflow_ros.records import NS_PER_S
@@ -349,6 +350,29 @@ def test_the_next_fit_brings_the_reference_a_chart_of_other_parameters(changes):
     # The curve itself is what it was.
     assert monitor.reference.curve.model_id == before.model_id
     assert monitor.reference.curve.pieces == before.pieces
+
+
+def test_a_fit_under_way_brings_no_chart_of_parameters_that_changed_meanwhile():
+    monitor, before = watched()
+    (asked,) = [e for e in monitor.request_fit() if isinstance(e, FitRequested)]
+    monitor.reconfigure(monitor.settings.changed({'alarm_floor': 20.0}))
+    outcome_of(monitor, asked.task)
+    assert charts(monitor) == [before.residuals.chart] * 2
+    feed_rows(monitor, plant_table(4, 300, start_ns=int(monitor.last_ns) + NS_PER_S))
+    assert charts(monitor)[0].innovation_mw > before.residuals.chart.innovation_mw
+
+
+def test_a_reference_of_before_weather_was_known_learns_it_from_the_next_fit():
+    monitor, before = watched()
+    saved = from_bytes(to_bytes(monitor.snapshot()))
+    for part in ('curve', 'first'):
+        del saved['reference'][part]['residuals']['wander_mw']
+    other = Monitor(WATCHED)
+    other.restore(saved)
+    assert math.isnan(other.reference.curve.residuals.wander_mw)
+    feed_rows(other, plant_table(4, 300, start_ns=int(monitor.last_ns) + NS_PER_S))
+    assert other.reference.curve.residuals.wander_mw > 0.0
+    assert other.reference.curve.model_id == before.model_id
 
 
 def test_no_later_reference_brings_the_old_chart_back():

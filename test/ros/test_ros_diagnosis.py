@@ -17,6 +17,7 @@ from rclpy.serialization import deserialize_message
 from ros_helpers import Processes, wait_until
 from test_ros_live import SlowWorker, rows_of
 from valveflow_msgs.msg import Diagnosis
+from valveflow_msgs.msg import JournalEntry as JournalMessage
 
 from valveflow_ros.errors import DataError
 from valveflow_ros.monitoring.events import (
@@ -121,6 +122,12 @@ def test_no_result_is_unknown_and_says_why() -> None:
     before = deserialize_message(first.data, Diagnosis)
     assert (before.verdict, before.model_id) == (Diagnosis.UNKNOWN, '')
     assert before.sentence == encoding.NOT_YET
+
+
+def test_what_a_replay_reads_of_the_journal_is_not_told_in_a_zone() -> None:
+    entry = JournalEntry(0, JournalKind.RESET, 0, 1, '', 'since 2024-01-02 00:30 UTC')
+    (told,) = Outputs('u', zone=zone_of('+05:00')).of([entry])
+    assert deserialize_message(told.data, JournalMessage).text == entry.text
 
 
 @pytest.fixture(scope='module')

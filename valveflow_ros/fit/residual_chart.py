@@ -190,13 +190,13 @@ _YOUNG_DAYS = 0.4
 _HIGHEST = 400.0
 _LEAST_LIMIT = 4.5  # more than one clipped block can add
 # Weather, cooling water and fouling move the output by megawatts over days, and a window of days
-# shows little of that. It shows how far the residual goes in six hours; on units 421 to 424 of
-# `plant/thermal_unit.py`, twenty days each, the level spread by 1.1 to 1.5 times that.
+# shows little of that. It shows how far the residual goes in six hours, from which the level goes
+# on; how often healthy units alarm with this factor is counted by `benchmarks.monitor_study`.
 _WANDER_S = 21_600.0
 _TO_DAYS = 1.5
 # Until six hours have passed some times, half of what need not be found is taken for it.
 _PRIOR_BLOCKS = 4.0
-_LARGEST_MOVE = 2.5
+_LARGEST_MOVE = 2.5  # usual ones; beyond lies a fault
 # A unit may be so many spreads of its days away from the curve, and nothing is wrong.
 _WANDERS = 4.0
 
