@@ -130,6 +130,7 @@ class Parameter:
         return int(value) if whole else float(value)
 
 
+NOT_NOW = 'cannot be changed while the monitor runs; set it at the start, or after a clean-up'
 # YAML takes a bare % for the beginning of a directive.
 _OPENING_UNITS = ('percent', '%', 'fraction')
 # Two names of one value: a state does not depend on which was given.
@@ -454,7 +455,7 @@ class Settings(Mapping[str, Value]):
         changed = wanted.changes(self)
         for name in changed:
             if not parameter(name).live:
-                raise ParameterError(name, 'cannot be changed while the monitor runs')
+                raise ParameterError(name, NOT_NOW)
         return changed
 
     @classmethod

@@ -36,6 +36,20 @@ def node(context: Any) -> Any:
     made.destroy_node()
 
 
+class Running:
+    """A session that a parameter may reach."""
+
+    def reconfigure(self, settings: Settings) -> None:
+        self.settings = settings
+
+
+@pytest.fixture
+def running(node: MonitorNode) -> MonitorNode:
+    """The node as it is between configure and clean-up, for its parameters."""
+    node.session = Running()  # type: ignore[assignment]
+    return node
+
+
 def bad_values(row: Parameter) -> list[object]:
     """Values that do not fit a row, of every kind that ROS can send."""
     values: list[object] = ['', [1.0, 2.0], [b'\x01'], None]
@@ -56,13 +70,21 @@ def good_values(row: Parameter) -> list[object]:
     return [row.low, row.high, float(row.default)]
 
 
+def means_the_default(row: Parameter, value: object) -> bool:
+    try:
+        return row.check(value) == row.default
+    except ParameterError:
+        return False
+
+
 def test_every_row_is_declared_with_its_default_and_described(node: MonitorNode) -> None:
     for row in TABLE:
         assert node.get_parameter(row.name).value == row.default
         found = node.describe_parameter(row.name)
         assert row.sentence in found.description
         assert not row.unit or row.unit in found.description
-        assert found.read_only != row.live
+        assert not found.read_only
+        assert ('unconfigured' in found.additional_constraints) != row.live
         for choice in row.choices:
             assert choice in found.additional_constraints
         spans = [*found.integer_range, *found.floating_point_range]
@@ -73,7 +95,8 @@ def test_every_row_is_declared_with_its_default_and_described(node: MonitorNode)
     assert node.settings == Settings()
 
 
-def test_live_parameters_take_good_values_and_refuse_bad_ones(node: MonitorNode) -> None:
+def test_live_parameters_take_good_values_and_refuse_bad_ones(running: MonitorNode) -> None:
+    node = running
     for row in LIVE:
         for value in good_values(row):
             result = node.set_parameters_atomically([ros(row.name, value)])
@@ -90,15 +113,52 @@ def test_live_parameters_take_good_values_and_refuse_bad_ones(node: MonitorNode)
         assert node.settings is before
 
 
-def test_fixed_parameters_stay_as_they_are(node: MonitorNode) -> None:
+def test_fixed_parameters_stay_as_they_are_while_it_runs(running: MonitorNode) -> None:
     for row in FIXED:
         for value in [*good_values(row), *bad_values(row)]:
+            result = running.set_parameters_atomically([ros(row.name, value)])
+            assert result.successful == means_the_default(row, value), (row.name, value)
+            assert result.successful or row.name in result.reason
+        assert running.get_parameter(row.name).value == row.default
+    assert running.settings == Settings()
+
+
+def test_unconfigured_every_parameter_may_be_changed(node: MonitorNode) -> None:
+    for row in FIXED:
+        for value in good_values(row):
             result = node.set_parameters_atomically([ros(row.name, value)])
-            assert not result.successful
-            assert row.name in result.reason
-            assert result.reason.endswith('.')
-        assert node.get_parameter(row.name).value == row.default
-    assert node.settings == Settings()
+            try:
+                alone = Settings({row.name: value})
+            except ParameterError as error:  # at odds with another
+                assert result.reason == str(error)
+            else:
+                assert result.successful
+                assert node.settings == alone
+        assert node.set_parameters_atomically([ros(row.name, row.default)]).successful
+    assert node.set_parameters_atomically([ros('use_sim_time', True)]).successful
+    assert node.set_parameters_atomically([ros('unit_tag', 'HV7')]).successful
+    assert node.settings.text('unit_tag') == 'HV7'
+
+
+def test_values_have_the_type_of_the_table(context: Any) -> None:
+    given = [ros('hold_limit', 20), ros('record_queue', 2000.0)]
+    node = MonitorNode(context=context, parameter_overrides=given)
+    assert type(node.get_parameter('hold_limit').value) is float
+    assert type(node.get_parameter('record_queue').value) is int
+    assert node.set_parameters_atomically([ros('alarm_flood', 7.0)]).successful
+    (set_one,) = node.set_parameters([ros('alarm_dead_band', 0)])
+    assert set_one.successful
+    assert type(node.get_parameter('alarm_flood').value) is int
+    assert type(node.get_parameter('alarm_dead_band').value) is float
+    node.destroy_node()
+
+
+def test_what_was_dumped_can_be_loaded_while_it_runs(running: MonitorNode) -> None:
+    declared = [running.get_parameter(name) for name in running._parameters]
+    declared += [ros(row.name, row.default) for row in TABLE]
+    for one in declared:
+        assert running.set_parameters_atomically([one]).successful, one.name
+    assert running.set_parameters_atomically(declared).successful
 
 
 def test_setting_one_after_the_other_is_judged_too(node: MonitorNode) -> None:
@@ -154,14 +214,17 @@ def test_misspelt_parameters_are_named(context: Any) -> None:
 
 
 def test_changes_leave_foreign_parameters_to_ros() -> None:
-    assert changed(Settings(), [ros('start_type_description_service', True)]) == Settings()
+    foreign = [ros('start_type_description_service', True)]
+    assert changed(Settings(), foreign, running=True) == Settings()
 
 
-def test_the_clock_cannot_be_taken_over_while_it_runs(node: MonitorNode) -> None:
+def test_the_clock_cannot_be_taken_over_while_it_runs(running: MonitorNode) -> None:
+    node = running
     result = node.set_parameters_atomically([ros('use_sim_time', True)])
     assert not result.successful
     assert result.reason == (
-        "Parameter 'use_sim_time' cannot be changed while the monitor runs; set it at the start."
+        "Parameter 'use_sim_time' cannot be changed while the monitor runs; set it at the start, "
+        'or after a clean-up.'
     )
     assert node.get_parameter('use_sim_time').value is False
 
@@ -173,7 +236,10 @@ def test_the_description_holds_no_default_beyond_its_range() -> None:
             assert span.from_value <= row.default <= span.to_value
 
 
-def test_from_afar_bad_values_come_back_with_the_sentence(context: Any, node: MonitorNode) -> None:
+def test_from_afar_bad_values_come_back_with_the_sentence(
+    context: Any, running: MonitorNode
+) -> None:
+    node = running
     asking = Node('asking', context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
@@ -218,21 +284,24 @@ def hostile_wishes() -> list[RosParameter]:
     wishes = [ros(name, value) for name in STRANGE_NAMES for value in (1.0, 'a', None)]
     wishes += [ros('use_sim_time', value) for value in (True, 1, 'yes', None)]
     for row in TABLE:
-        values = [*HOSTILE, *bad_values(row), *([] if row.live else [row.default])]
+        values = [*HOSTILE, *bad_values(row)]
         for value in values:
             try:
                 row.check(value)
             except ParameterError:
                 pass
             else:
-                if row.live:
+                if row.live or means_the_default(row, value):
                     continue
             wishes.append(ros(row.name, value))
     return wishes
 
 
 @pytest.mark.parametrize('kind', [SetParameters, SetParametersAtomically])
-def test_from_afar_nothing_hostile_gets_in(context: Any, node: MonitorNode, kind: Any) -> None:
+def test_from_afar_nothing_hostile_gets_in(
+    context: Any, running: MonitorNode, kind: Any
+) -> None:
+    node = running
     asking = Node('asking', context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)

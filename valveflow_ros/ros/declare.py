@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Mapping
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -9,13 +10,20 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from valveflow_ros.errors import ParameterError
-from valveflow_ros.parameters import PARAMETERS, TABLE, Parameter, Settings, Value, parameter
+from valveflow_ros.parameters import (
+    NOT_NOW,
+    PARAMETERS,
+    TABLE,
+    Parameter,
+    Settings,
+    Value,
+    parameter,
+)
 
 # What ROS itself puts among the parameters of every node.
 _SIM_TIME = 'use_sim_time'
 _FOREIGN = (_SIM_TIME, 'start_type_description_service')
 _FOREIGN_PREFIX = 'qos_overrides.'
-_AT_THE_START = 'cannot be changed while the monitor runs; set it at the start'
 
 
 def descriptor(row: Parameter) -> ParameterDescriptor:
@@ -23,12 +31,12 @@ def descriptor(row: Parameter) -> ParameterDescriptor:
     found = ParameterDescriptor(
         name=row.name,
         description=f'{row.sentence} Unit: {row.unit}.' if row.unit else row.sentence,
-        read_only=not row.live,
-        # 30 is to be as good as 30.0; the table knows what is meant.
+        # 30 is to be as good as 30.0; `in_type` knows what is meant.
         dynamic_typing=True,
     )
-    if row.choices:
-        found.additional_constraints = f'One of {", ".join(row.choices)}.'
+    limits = [f'One of {", ".join(row.choices)}.'] if row.choices else []
+    limits += [] if row.live else ['To be changed while the node is unconfigured.']
+    found.additional_constraints = ' '.join(limits)
     if row.low is None or row.high is None:
         return found
     if isinstance(row.default, int):
@@ -52,11 +60,29 @@ def declare(node: Node, table: Iterable[Parameter] = TABLE) -> dict[str, object]
     for row in table:
         # The table judges first, with its own sentence; then ROS learns the range too.
         loose = ParameterDescriptor(dynamic_typing=True)
-        values[row.name] = _checked(
-            row, node.declare_parameter(row.name, row.default, loose).value
-        )
+        value = _checked(row, node.declare_parameter(row.name, row.default, loose).value)
+        node.set_parameters([RosParameter(row.name, value=value)])
         node.set_descriptor(row.name, descriptor(row))
+        values[row.name] = value
     return values
+
+
+def in_type(wanted: Iterable[RosParameter]) -> list[RosParameter]:
+    """Return parameters with the types of the table; what does not fit stays as it is."""
+    found = []
+    for item in wanted:
+        with contextlib.suppress(ParameterError):
+            item = RosParameter(item.name, value=parameter(item.name).check(item.value))
+        found.append(item)
+    return found
+
+
+def stands(node: Node, wanted: RosParameter) -> bool:
+    """Return True if a parameter has this value, as most of a loaded file have."""
+    if not node.has_parameter(wanted.name):
+        return False
+    now = node.get_parameter(wanted.name)
+    return (now.type_, now.value) == (wanted.type_, wanted.value)
 
 
 def _checked(row: Parameter, value: object) -> Value:
@@ -81,8 +107,15 @@ def unknown_overrides(node: Node, known: Iterable[str] = PARAMETERS) -> list[str
     return sentences
 
 
-def changed(settings: Settings, wanted: Iterable[RosParameter]) -> Settings:
+def changed(settings: Settings, wanted: Iterable[RosParameter], *, running: bool) -> Settings:
     """Return settings with some parameters changed.
+
+    Parameters
+    ----------
+    settings : Settings
+    wanted : iterable of Parameter
+    running : bool
+        Whether only live parameters may change.
 
     Raises
     ------
@@ -91,14 +124,12 @@ def changed(settings: Settings, wanted: Iterable[RosParameter]) -> Settings:
     """
     values = {}
     for item in wanted:
-        if item.name == _SIM_TIME:
+        if item.name == _SIM_TIME and running:
             # Setting it would replace the node's clock.
-            raise ParameterError(item.name, _AT_THE_START)
-        if item.name in _FOREIGN:
-            continue
-        row = parameter(item.name)
-        value = row.check(item.value)
-        if not row.live:
-            raise ParameterError(row.name, _AT_THE_START)
-        values[row.name] = value
-    return settings.changed(values)
+            raise ParameterError(item.name, NOT_NOW)
+        if item.name not in _FOREIGN and not item.name.startswith(_FOREIGN_PREFIX):
+            values[item.name] = parameter(item.name).check(item.value)
+    new = settings.changed(values)
+    if running:
+        settings.live_changes(new)
+    return new

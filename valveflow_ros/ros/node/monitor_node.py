@@ -235,6 +235,7 @@ class MonitorNode(LifecycleNode):
         self._look_around_s, self._same_name = 0.0, 1
         self.settings = Settings(declare.declare(self))
         self._ignored = declare.unknown_overrides(self)
+        self.add_pre_set_parameters_callback(declare.in_type)
         self.add_on_set_parameters_callback(self._check)
         self.add_post_set_parameters_callback(self._apply)
         self._health = self.create_publisher(DiagnosticArray, DIAGNOSTICS, 10)
@@ -252,18 +253,19 @@ class MonitorNode(LifecycleNode):
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set parameters; refuse with the table's own sentence."""
-        result = self._check(parameter_list)
-        return super().set_parameters_atomically(parameter_list) if result.successful else result
+        wanted = [p for p in declare.in_type(parameter_list) if not declare.stands(self, p)]
+        result = self._check(wanted)
+        return super().set_parameters_atomically(wanted) if wanted and result.successful else result
 
     def _check(self, wanted: list[Parameter]) -> SetParametersResult:
         try:
-            declare.changed(self.settings, wanted)
+            declare.changed(self.settings, wanted, running=self.session is not None)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _apply(self, wanted: list[Parameter]) -> None:
-        self.settings = declare.changed(self.settings, wanted)
+        self.settings = declare.changed(self.settings, wanted, running=self.session is not None)
         if self.session is not None:
             self.session.reconfigure(self.settings)
 
