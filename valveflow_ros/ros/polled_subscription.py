@@ -1,8 +1,9 @@
-"""Subscriptions that are polled without the executor; the one place that uses rclpy's inside.
+"""Subscriptions and services polled without the executor; the one place that uses rclpy's inside.
 
 An executor spends far more time on choosing callbacks than the messages are worth. Here the loop
 polls each subscription for raw bytes with the stamps and the sequence number that the middleware
-delivers. Where this rclpy does not offer that, the executor calls back instead.
+delivers, and each service for a request. Where this rclpy does not offer that, the executor calls
+back instead.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.service import Service
 from rclpy.subscription import Subscription
 
 DEPTH = 1000
@@ -144,6 +146,17 @@ class PolledSubscription:
 
     def _call_back(self, data: bytes, info: dict[str, Any]) -> None:
         self._waiting.append(_raw_message(data, info))
+
+
+def answer_request(service: Service) -> bool:
+    """Answer the oldest request of a service; return False if there is none."""
+    take = getattr(service.handle, 'service_take_request', None)
+    request, header = (None, None) if take is None else take(service.srv_type.Request)
+    if header is None:
+        return False
+    response = service.callback(request, service.srv_type.Response())
+    service.send_response(response, header)
+    return True
 
 
 def _raw_message(data: bytes, info: dict[str, Any]) -> RawMessage:

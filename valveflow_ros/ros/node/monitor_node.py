@@ -20,6 +20,7 @@ from rclpy.executors import (
     TimeoutException,
 )
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
@@ -37,6 +38,7 @@ from valveflow_ros.ros.node.diagnostics import Changes, Item, Level, diagnostics
 from valveflow_ros.ros.node.recording import check_record_directory
 from valveflow_ros.ros.node.session import DIAGNOSTICS, Session
 from valveflow_ros.ros.outputs import SERVICES
+from valveflow_ros.ros.polled_subscription import answer_request
 from valveflow_ros.ros.process import StopFlag, with_place
 
 _SUCCESS = TransitionCallbackReturn.SUCCESS
@@ -47,10 +49,12 @@ _NOT_ON_DISK = 'It is not on disk yet; see recorder and state in /diagnostics.'
 # as from a replay, the next look follows at once.
 _PERIOD_S = 0.02
 _MUCH = 50
-# Services may wait that long; a look of the executor costs as much as forty messages.
-_SPIN_EVERY_S = 0.1
+# Requests are looked for more often, as that costs a hundredth of a millisecond.
+_REQUESTS_EVERY_S = 0.005
 # Of each look; a storm of requests must not keep samples waiting.
-_SPIN_S = 0.05
+_REQUESTS_S = 0.05
+# The executor has the rest, events of the middleware and /clock, and costs several times as much.
+_SPIN_EVERY_S = 0.1
 # The default of ten loses the eleventh request of a burst without a word.
 _REQUESTS = QoSProfile(depth=1000)
 # The compiler works when a configuration runs for the first time, and an activation may feed what
@@ -255,7 +259,9 @@ class MonitorNode(LifecycleNode):
         """Set parameters; refuse with the table's own sentence."""
         wanted = [p for p in declare.in_type(parameter_list) if not declare.stands(self, p)]
         result = self._check(wanted)
-        return super().set_parameters_atomically(wanted) if wanted and result.successful else result
+        if not wanted or not result.successful:
+            return result
+        return super().set_parameters_atomically(wanted)
 
     def _check(self, wanted: list[Parameter]) -> SetParametersResult:
         try:
@@ -463,18 +469,26 @@ class MonitorNode(LifecycleNode):
         return f'Curve {curve.model_id} is the reference that later ones are judged against.'
 
 
-def serve_requests(executor: Executor, longest_s: float) -> None:
-    """Serve what is ready, requests of services and parameters; after that time the rest waits."""
-    until_s, served = time.monotonic() + longest_s, True
-    while served:
-        # The executor takes one request of each service, then says that its time is over.
-        served = False
-        with contextlib.suppress(TimeoutException, ShutdownException):
-            while time.monotonic() < until_s:
-                handler, _, _ = executor.wait_for_ready_callbacks(timeout_sec=0)
-                served = True
-                handler()
-                handler.result()
+def serve_requests(node: Node, longest_s: float) -> None:
+    """Answer the requests that wait, of services and parameters; after that time the rest wait."""
+    until_s, answered = time.monotonic() + longest_s, True
+    while answered:
+        # One of each service in turn, so that none waits for a storm at another.
+        answered = False
+        for service in tuple(node.services):
+            if time.monotonic() > until_s:
+                return
+            answered |= answer_request(service)
+
+
+def _spin(executor: Executor, longest_s: float) -> None:
+    """Serve what else is ready; after that time the rest waits."""
+    until_s = time.monotonic() + longest_s
+    with contextlib.suppress(TimeoutException, ShutdownException):
+        while time.monotonic() < until_s:
+            handler, _, _ = executor.wait_for_ready_callbacks(timeout_sec=0)
+            handler()
+            handler.result()
 
 
 def run(stop: StopFlag, presence: Presence) -> int:
@@ -501,13 +515,15 @@ def run(stop: StopFlag, presence: Presence) -> int:
         while not stop and not node.finalized and node.context.ok():
             begun_s = time.monotonic()
             found = node.step()
+            serve_requests(node, _REQUESTS_S)
             if begun_s >= spin_s:
                 spin_s = begun_s + _SPIN_EVERY_S
-                serve_requests(executor, _SPIN_S)
+                _spin(executor, _REQUESTS_S)
             # Taken, fed, handed to the recorder: only a whole cycle counts.
             watchdog.completed(node.recorder_status)
-            if found < _MUCH:
-                time.sleep(max(0.0, begun_s + _PERIOD_S - time.monotonic()))
+            while found < _MUCH and (left_s := begun_s + _PERIOD_S - time.monotonic()) > 0.0:
+                time.sleep(min(left_s, _REQUESTS_EVERY_S))
+                serve_requests(node, _REQUESTS_S)
         return 0
     finally:
         watchdog.stopping('Finishing the recording.')
