@@ -49,8 +49,8 @@ _NOT_ON_DISK = 'It is not on disk yet; see recorder and state in /diagnostics.'
 # as from a replay, the next look follows at once.
 _PERIOD_S = 0.02
 _MUCH = 50
-# Requests are looked for more often, as that costs a hundredth of a millisecond.
-_REQUESTS_EVERY_S = 0.005
+# Requests are looked for twice as often: who asks has an answer within that time.
+_REQUESTS_EVERY_S = 0.01
 # Of each look; a storm of requests must not keep samples waiting.
 _REQUESTS_S = 0.05
 # The executor has the rest, events of the middleware and /clock, and costs several times as much.
