@@ -38,7 +38,7 @@ class Signal(enum.IntEnum):
 
 
 class Quality(enum.IntEnum):
-    """How far a value can be trusted; the same numbers stand in the messages."""
+    """How far a value can be trusted; `logs.names.qualities` knows the codes of messages."""
 
     GOOD = 0
     UNCERTAIN = 1

@@ -25,7 +25,7 @@ from mcap.writer import CompressionType, Writer
 
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.logs import Message, RecordingWriter, open_log
-from valveflow_ros.records import SIGNALS, Signal
+from valveflow_ros.records import SIGNALS, Quality, Signal
 
 NUMBERS = st.floats(width=64)
 TIMES = st.integers(0, 2**62)
@@ -69,9 +69,10 @@ def naive_readings(messages):
             place += -place % 8
             value, quality = struct.unpack_from(f'{order}dB', data, 4 + place)
             place += 9
-            if info.required or np.isfinite(value):
+            if info.required or (np.isfinite(value) and quality):
                 time_ns = sec * 10**9 + nanosec
-                found.append(Reading(log_ns, time_ns, int(info.signal), value, min(quality, 2)))
+                code = {1: Quality.GOOD, 2: Quality.UNCERTAIN}.get(quality, Quality.BAD)
+                found.append(Reading(log_ns, time_ns, int(info.signal), value, int(code)))
     return found
 
 
@@ -240,7 +241,7 @@ def test_a_name_of_an_input_with_another_type(tmp_path):
 
 
 def test_messages_that_do_not_fit_their_type_are_counted(tmp_path):
-    good = plant_sample(START_NS, [1.0] * 5, [0] * 5)
+    good = plant_sample(START_NS, [1.0] * 5, [1] * 5)
     bad = [good[:-1], good[:20], b'', b'\0\7\0\0' + good[4:], good[:12] + b'\xff' * 4 + good[16:]]
     messages = [Message('/plant_sample', data, START_NS, START_NS) for data in [good, *bad]]
     messages += [
@@ -264,13 +265,29 @@ def test_the_layout_of_samples_is_taken_from_the_file(tmp_path):
     parts = [text, f'MSG: std_msgs/Header\n{header[0]}', header[1]]
     body = struct.pack('<hxxiII3s', 7, 5, 6, 3, b'ab\0')
     for number in range(5):
-        body += struct.pack('<B', 1)
+        body += struct.pack('<B', 2)
         body += b'\0' * (-len(body) % 8) + struct.pack('<d', 10.0 + number)
     with RecordingWriter(tmp_path / 'log', definitions=STOCK) as writer:
         writer.add_topic('/plant_sample', SAMPLE, definition=f'\n{"=" * 80}\n'.join(parts))
         writer.write('/plant_sample', b'\0\1\0\0' + body, 9, 9)
     found = read_back(open_log(tmp_path / 'log'))
     assert found == [Reading(9, 5 * 10**9 + 6, k, 14.0 - k, 1) for k in range(5)]
+
+
+def test_qualities_of_recordings_before_there_was_one_for_unknown(tmp_path):
+    codes = {1: [1, 2, 3, 0, 1], 2: [0, 1, 2, 2, 0]}  # what 0 to 2 meant then, by those of now
+    now = STOCK.text(SAMPLE)
+    then = now.replace('uint8 QUALITY_UNKNOWN=0', '')
+    for k, name in enumerate(('GOOD', 'UNCERTAIN', 'BAD')):
+        then = then.replace(f'QUALITY_{name}={k + 1}', f'QUALITY_{name}={k}')
+    found = []
+    for text, sent in ((now, codes[1]), (then, codes[2])):
+        folder = tmp_path / str(len(found))
+        with RecordingWriter(folder, definitions=STOCK) as writer:
+            writer.add_topic('/plant_sample', SAMPLE, definition=text)
+            writer.write('/plant_sample', plant_sample(START_NS, [1.0] * 5, sent), 9, 9)
+        found.append(open_log(folder).readings.quality.tolist())
+    assert found[0] == found[1] == [Quality.GOOD, Quality.UNCERTAIN, Quality.BAD, Quality.BAD, 0]
 
 
 def test_samples_without_a_signal_are_refused(tmp_path):

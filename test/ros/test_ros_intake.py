@@ -50,10 +50,14 @@ def intake_of(names: list[str], clock: Queue | None = None, **values: object
 
 
 def sample(time_ns: int, **values: float) -> PlantSample:
-    message = PlantSample(valve_command=math.nan)
+    message = PlantSample()
     message.header.stamp = to_time(time_ns)
+    for info in SIGNALS:
+        if info.required:
+            setattr(message, f'{info.topic}_quality', PlantSample.QUALITY_GOOD)
     for name, value in values.items():
         setattr(message, name, value)
+        setattr(message, f'{name}_quality', PlantSample.QUALITY_GOOD)
     return message
 
 
@@ -312,7 +316,7 @@ def test_both_byte_orders_are_read() -> None:
 def test_a_sample_gives_a_reading_a_signal_the_optional_one_first() -> None:
     decoder = Decoder(Settings())
     message = sample(T0, valve_opening=50.0, generated_power=math.nan, valve_command=51.0)
-    message.main_steam_pressure_quality = Quality.UNCERTAIN.value
+    message.main_steam_pressure_quality = PlantSample.QUALITY_UNCERTAIN
     message.main_steam_temperature_quality = 200
     rows = decoder.rows(PLANT_SAMPLE, encode(message), T0)
     assert rows[0][1] == Signal.VALVE_COMMAND
@@ -327,6 +331,14 @@ def test_a_sample_gives_a_reading_a_signal_the_optional_one_first() -> None:
 def test_a_command_that_is_not_sent_is_no_reading() -> None:
     rows = Decoder(Settings()).rows(PLANT_SAMPLE, encode(sample(T0, valve_opening=1.0)), T0)
     assert Signal.VALVE_COMMAND not in {row[1] for row in rows}
+
+
+def test_a_value_whose_quality_was_not_set_is_not_used() -> None:
+    message = PlantSample(valve_opening=50.0, main_steam_pressure=13.0, valve_command=50.0)
+    rows = Decoder(Settings()).rows(PLANT_SAMPLE, encode(message), T0)
+    assert {row[1]: row[3] for row in rows} == {
+        info.signal: Quality.BAD for info in SIGNALS if info.required
+    }
 
 
 def test_what_came_first_is_known_only_as_long_as_it_is_kept() -> None:

@@ -24,6 +24,7 @@ from valveflow_msgs.msg import (
 )
 from valveflow_msgs.msg import JournalEntry as JournalMessage
 
+from valveflow_ros.logs.names import qualities
 from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState, Priority
 from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.events import JournalEntry, JournalKind
@@ -32,7 +33,7 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, Quality, SegmentKind
 from valveflow_ros.records import SpecialSegment as SegmentRecord
 from valveflow_ros.ros import encoding
-from valveflow_ros.ros.decoding import from_time, journal_entry
+from valveflow_ros.ros.decoding import from_time, journal_entry, with_todays_codes
 from valveflow_ros.ros.encoding import clock_bytes, encode, float64_bytes, prediction_bytes
 from valveflow_ros.ros.node.engine import example_curve
 
@@ -84,8 +85,22 @@ def test_the_engine_and_the_messages_mean_the_same_by_a_number(numbers: Any, mes
 
 
 def test_quality_codes_are_the_messages() -> None:
+    of_code = qualities()
     for quality in Quality:
-        assert getattr(PlantSample, f'QUALITY_{quality.name}') == quality.value
+        assert of_code[getattr(PlantSample, f'QUALITY_{quality.name}')] == quality
+    assert of_code[PlantSample.QUALITY_UNKNOWN] == Quality.BAD
+    assert set(of_code[4:]) == {Quality.BAD}
+
+
+def test_a_sample_of_before_the_code_for_unknown_is_sent_with_the_codes_of_now() -> None:
+    then = PlantSample(valve_opening=50.0, generated_power=200.0)
+    then.generated_power_quality, then.valve_command_quality = 1, 2
+    now = deserialize_message(with_todays_codes(encode(then)), PlantSample)
+    assert (now.valve_opening, now.valve_opening_quality) == (50.0, PlantSample.QUALITY_GOOD)
+    assert now.generated_power_quality == PlantSample.QUALITY_UNCERTAIN
+    assert now.valve_command_quality == PlantSample.QUALITY_BAD
+    with pytest.raises(ValueError, match='no valveflow_msgs/PlantSample'):
+        with_todays_codes(b'none')
 
 
 def test_every_field_of_a_segment_is_carried_over() -> None:

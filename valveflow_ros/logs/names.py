@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 
+import numpy as np
+
 from valveflow_ros.errors import InputError, RecordingError
-from valveflow_ros.records import SIGNALS, Signal
+from valveflow_ros.records import SIGNALS, ByteArray, Quality, Signal
 
 FLOAT64 = 'std_msgs/msg/Float64'
 PLANT_SAMPLE = 'valveflow_msgs/msg/PlantSample'
 PLANT_SAMPLE_TOPIC = 'plant_sample'
+# Its codes of quality, from 0, which stands where the sender did not set one.
+_CODES = (Quality.BAD, Quality.GOOD, Quality.UNCERTAIN, Quality.BAD)
+# Of recordings made before there was a code for that.
+_EARLIER = (Quality.GOOD, Quality.UNCERTAIN, Quality.BAD)
+_EARLIER_GOOD = re.compile(r'QUALITY_GOOD\s*=\s*0\b')
 
 _BY_NAME = {info.topic: info.signal for info in SIGNALS} | {
     info.column: info.signal for info in SIGNALS
@@ -40,6 +48,26 @@ def signals_of(names: Iterable[str]) -> set[Signal]:
 def last_part(topic: str) -> str:
     """Return the part of a topic behind its last slash."""
     return topic.rsplit('/', 1)[-1]
+
+
+def has_earlier_codes(definition: str) -> bool:
+    """Return True for the ros2msg text of a PlantSample in which 0 meant a good value."""
+    return _EARLIER_GOOD.search(definition) is not None
+
+
+def qualities(definition: str = '') -> ByteArray:
+    """Return the `Quality` of each code in a PlantSample, shape (256,).
+
+    Parameters
+    ----------
+    definition : str
+        The ros2msg text that a recording has of it; empty for that of now.
+    """
+    # A code that is not known says at least that all is not well.
+    found = np.full(256, int(Quality.BAD), dtype=np.uint8)
+    codes = _EARLIER if has_earlier_codes(definition) else _CODES
+    found[: len(codes)] = codes
+    return found
 
 
 class TopicChoice:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from builtin_interfaces.msg import Time
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Float64
 from valveflow_msgs.msg import JournalEntry as JournalMessage
 from valveflow_msgs.msg import PlantSample
 
+from valveflow_ros.logs.names import qualities
 from valveflow_ros.monitoring.events import JournalEntry, JournalKind
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
@@ -99,10 +100,14 @@ class Decoder:
     ----------
     settings : Settings
         The unit in which each plain topic is sent.
+    definition : str
+        The ros2msg text of a recorded PlantSample; empty for that of now.
     """
 
-    def __init__(self, settings: Settings) -> None:
-        self._read: dict[str, Callable[[bytes, int], list[Row]]] = {PLANT_SAMPLE: _sample_rows}
+    def __init__(self, settings: Settings, definition: str = '') -> None:
+        self._read: dict[str, Callable[[bytes, int], list[Row]]] = {
+            PLANT_SAMPLE: _sample_reader(qualities(definition).tolist())
+        }
         for info in SIGNALS:
             unit = unit_of(info.signal, settings.text(f'{info.topic}_unit'))
             self._read[info.topic] = _float_reader(info.signal, unit)
@@ -146,19 +151,43 @@ def _float_reader(signal: Signal, unit: Unit) -> Callable[[bytes, int], list[Row
     return read
 
 
-def _sample_rows(data: bytes, time_ns: int) -> list[Row]:
+def _sample(data: bytes) -> PlantSample:
     try:
-        sample = deserialize_message(data, PlantSample)
+        return deserialize_message(data, PlantSample)
     except Exception as error:
         # rclpy raises whatever the middleware's C++ gave it.
         raise ValueError('no valveflow_msgs/PlantSample') from error
-    rows: list[Row] = []
+
+
+def _sample_reader(quality: Sequence[int]) -> Callable[[bytes, int], list[Row]]:
+    unset = None if quality[0] == Quality.GOOD else PlantSample.QUALITY_UNKNOWN
+
+    def read(data: bytes, time_ns: int) -> list[Row]:
+        sample = _sample(data)
+        rows: list[Row] = []
+        for info in _IN_ORDER:
+            value = float(getattr(sample, info.topic))
+            code = int(getattr(sample, f'{info.topic}_quality'))
+            if info.required or (math.isfinite(value) and code != unset):
+                rows.append((time_ns, int(info.signal), value, quality[code]))
+        return rows
+
+    return read
+
+
+def with_todays_codes(data: bytes) -> bytes:
+    """Return a PlantSample in whose codes of quality 0 was good, with those of now.
+
+    Raises
+    ------
+    ValueError
+        The bytes are no PlantSample.
+    """
+    sample = _sample(data)
     for info in _IN_ORDER:
-        value = float(getattr(sample, info.topic))
-        if info.required or math.isfinite(value):
-            quality = min(int(getattr(sample, f'{info.topic}_quality')), int(Quality.BAD))
-            rows.append((time_ns, int(info.signal), value, quality))
-    return rows
+        name = f'{info.topic}_quality'
+        setattr(sample, name, min(getattr(sample, name) + 1, PlantSample.QUALITY_BAD))
+    return serialize_message(sample)
 
 
 def plausible_units(signal: Signal, settings: Settings, sent: float) -> list[str]:

@@ -16,10 +16,16 @@ from rclpy.utilities import remove_ros_args
 
 from valveflow_ros.errors import DataError, ValveflowError, counted
 from valveflow_ros.logs import LogContents, open_log
+from valveflow_ros.logs.names import has_earlier_codes
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.terminal.progress import Progress
 from valveflow_ros.report.terminal.text import number
-from valveflow_ros.ros.decoding import INPUT_BY_NAME, PLANT_SAMPLE, header_time_ns
+from valveflow_ros.ros.decoding import (
+    INPUT_BY_NAME,
+    PLANT_SAMPLE,
+    header_time_ns,
+    with_todays_codes,
+)
 from valveflow_ros.ros.domain import start_ros
 from valveflow_ros.ros.encoding import float64_bytes
 from valveflow_ros.ros.node.recording import TOPICS
@@ -120,11 +126,14 @@ def steps_of(log: LogContents) -> tuple[list[str], Iterator[Step]]:
 def _recorded_messages(
     log: LogContents, topics: dict[str, str]
 ) -> Iterator[tuple[int, str, bytes]]:
+    earlier = {t for t in topics if has_earlier_codes(log.topics[t].definition)}
     for message in log.iter_messages(list(topics)):
-        name, time_ns = topics[message.topic], message.publish_time_ns
+        name, time_ns, data = topics[message.topic], message.publish_time_ns, message.data
         if name == PLANT_SAMPLE:
-            time_ns = header_time_ns(message.data)
-        yield time_ns, name, message.data
+            time_ns = header_time_ns(data)
+            if message.topic in earlier:
+                data = with_todays_codes(data)
+        yield time_ns, name, data
 
 
 def _table_messages(log: LogContents) -> Iterator[tuple[int, str, bytes]]:

@@ -112,10 +112,11 @@ def stamped_steps(parts: Iterable[SampleTable], command: bool, tag: str) -> Iter
     """Yield a step with one stamped sample for each row."""
     topics = [info.topic for info in SIGNALS]
     for table in parts:
-        values, quality = table.values.copy(), table.quality.copy()
+        # The table's codes begin with good, those of the message with unknown.
+        values, quality = table.values.copy(), table.quality + PlantSample.QUALITY_GOOD
         if not command:
             values[:, Signal.VALVE_COMMAND] = float('nan')
-            quality[:, Signal.VALVE_COMMAND] = PlantSample.QUALITY_BAD
+            quality[:, Signal.VALVE_COMMAND] = PlantSample.QUALITY_UNKNOWN
         rows = zip(table.time_ns.tolist(), values.tolist(), quality.tolist(), strict=True)
         for time_ns, row, codes in rows:
             sample = PlantSample(header=header(time_ns, tag))

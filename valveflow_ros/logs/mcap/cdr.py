@@ -23,7 +23,7 @@ from valveflow_ros.logs.mcap.definitions import (
     parse_all,
 )
 from valveflow_ros.logs.mcap.records import HEAD_SIZE, LayoutError, MessageTable, rows
-from valveflow_ros.logs.names import PLANT_SAMPLE
+from valveflow_ros.logs.names import PLANT_SAMPLE, qualities
 from valveflow_ros.records import (
     N_SIGNALS,
     NS_PER_S,
@@ -187,6 +187,7 @@ class PlantSampleReader:
 
     def __init__(self, definition: str) -> None:
         types = parse_all(PLANT_SAMPLE, definition)
+        self._qualities = qualities(definition)
         self._steps: list[tuple[str, str]] = []
         self._flatten(types, PLANT_SAMPLE, '', 0)
         have = dict(self._steps)
@@ -270,7 +271,9 @@ class PlantSampleReader:
         seconds = found[_SEC][alive].astype(np.int64)
         samples.time_ns[good] = seconds * NS_PER_S + found[_NANOSEC][alive].astype(np.int64)
         for info in SIGNALS:
-            samples.values[good, info.signal] = found[info.topic][alive]
-            quality = found[f'{info.topic}_quality'][alive]
-            # A code that is not known says at least that all is not well.
-            samples.quality[good, info.signal] = np.minimum(quality, int(Quality.BAD))
+            values, codes = found[info.topic][alive], found[f'{info.topic}_quality'][alive]
+            if not info.required and self._qualities[0] == Quality.BAD:
+                # The sender left it alone; that is no bad value.
+                values = np.where(codes == 0, np.nan, values)
+            samples.values[good, info.signal] = values
+            samples.quality[good, info.signal] = self._qualities[codes]
