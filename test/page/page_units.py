@@ -56,8 +56,8 @@ def told(key: str = NODE, tag: str = 'U1', seconds: int = 200) -> Unit:
         'fit': (0, 'A curve.', {'Age of the curve (s)': '431.5', 'Samples taken': '200'}),
         'recorder': (0, 'Recording.', {'Messages dropped': 'unknown'}),
     }
-    unit.take(HEALTH, {'status': [
-        {'name': f'valveflow: {tag} {name}', 'hardware_id': tag, 'level': level, 'message': text,
+    unit.take(HEALTH, {'header': head(START_NS, tag), 'status': [
+        {'name': f'valveflow_monitor: {name}', 'hardware_id': tag, 'level': level, 'message': text,
          'values': [{'key': k, 'value': v} for k, v in values.items()]}
         for name, (level, text, values) in items.items()
     ]})  # fmt: skip

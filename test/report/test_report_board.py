@@ -23,12 +23,15 @@ def test_memory_is_bounded():
 
 @pytest.mark.parametrize('early', [False, True])
 @pytest.mark.parametrize('tag', ['U1', ''])
-def test_the_health_of_another_unit_is_not_taken_for_this_ones(tag, early):
+# The second is that of earlier versions.
+@pytest.mark.parametrize('prefix', ['unit_1/valveflow_monitor: ', 'valveflow: {} '])
+def test_the_health_of_another_unit_is_not_taken_for_this_ones(tag, early, prefix):
     def health(of, level, sentence):
+        befores = [prefix.format(of)]
         items = [('input valve_opening', level, sentence), ('recorder', level, sentence)]
-        board.take(HEALTH, {'status': [
-            {'name': f'valveflow: {of} {name}', 'hardware_id': of, 'level': level, 'message': told}
-            for name, level, told in items
+        board.take(HEALTH, {'header': {'frame_id': of}, 'status': [
+            {'name': f'{before}{name}', 'hardware_id': of, 'level': level, 'message': told}
+            for before in befores for name, level, told in items
         ]})  # fmt: skip
 
     def speak():
@@ -52,6 +55,16 @@ def test_the_health_of_another_unit_is_not_taken_for_this_ones(tag, early):
     assert frame.recorder.sentence == 'fine'
 
 
+def test_what_others_say_of_the_same_device_is_left_alone():
+    board = Board()
+    said = {'hardware_id': 'U1', 'level': 2, 'message': 'Too hot.'}
+    names = ('pump_node: temperature', 'pump_node: recorders', 'recorder of the pump')
+    status = [{**said, 'name': name} for name in names]
+    board.take(HEALTH, {'header': {'frame_id': 'U1'}, 'status': status})
+    assert board.items == ()
+    assert board.frame('x').recorder is None
+
+
 @pytest.mark.parametrize(('age', 'later_s'), [('431.5', 431.5), ('unknown', 0.0), ('nan', 0.0)])
 def test_without_a_sample_the_health_tells_how_old_the_curve_is(age, later_s):
     board = Board()
@@ -60,8 +73,8 @@ def test_without_a_sample_the_health_tells_how_old_the_curve_is(age, later_s):
         'values': [1.0, 2.0], 'status': 1, 'cause': '', 'model_id': 'a', 'samples': 9,
         'window_start': stamp(START_NS - 9), 'window_end': stamp(START_NS), 'rmse_mw': 0.1,
     })  # fmt: skip
-    board.take(HEALTH, {'status': [{
-        'name': 'valveflow: U1 fit', 'hardware_id': 'U1', 'level': 0, 'message': '',
+    board.take(HEALTH, {'header': {'frame_id': 'U1'}, 'status': [{
+        'name': 'valveflow_monitor: fit', 'hardware_id': 'U1', 'level': 0, 'message': '',
         'values': [{'key': AGE, 'value': age}],
     }]})  # fmt: skip
     assert board.frame('x').now_ns == START_NS + round(later_s * SECOND)

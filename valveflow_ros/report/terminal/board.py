@@ -28,6 +28,10 @@ AGE = 'Age of the curve (s)'
 # A quarter of an hour at one sample a second: more than fits on any terminal.
 KEPT = 900
 
+# What a monitor tells on `/diagnostics` besides its inputs.
+_ITEMS = frozenset({
+    'fit', 'alarm', 'reference', 'model', 'diagnosis', 'recorder', 'state', 'parameters', 'name',
+})  # fmt: skip
 # More alarms than a monitor has, and more items of health.
 _MOST_ALARMS, _MOST_ITEMS = 64, 64
 
@@ -114,10 +118,9 @@ class Board:
         self._now_ns = max(self._now_ns, time_ns)
 
     def _health(self, fields: Fields) -> None:
-        ours = [s for s in fields['status'] if str(s['name']).startswith('valveflow: ')]
-        if self._tag is not None:
-            # `/diagnostics` is one topic for every monitor there is.
-            ours = [s for s in ours if str(s['hardware_id']) == self._tag]
+        # `/diagnostics` is one topic for every node there is; a monitor sends its tag along.
+        tag = str(fields['header']['frame_id']) if self._tag is None else self._tag
+        ours = [s for s in fields['status'] if str(s['hardware_id']) == tag and _is_item(s)]
         if ours:
             self._health_tag = str(ours[0]['hardware_id'])
         items = [_item(status) for status in ours[:_MOST_ITEMS]]
@@ -131,7 +134,7 @@ class Board:
                 HealthView(i.name.removeprefix('input '), i.level, i.sentence) for i in inputs
             )
         self.recorder = next((i for i in items if i.name == 'recorder'), self.recorder)
-        fit = next((status for status in ours if str(status['name']).endswith(' fit')), None)
+        fit = next((status for status in ours if _item_name(status) == 'fit'), None)
         if fit is not None and self._curve is not None and not self._samples:
             # Without a sample the age of the curve is what tells the plant's time.
             self.at(self._curve.window[1] + _age_ns(fit))
@@ -202,12 +205,18 @@ def _age_ns(fit: Fields) -> int:
 
 
 def _item(status: Fields) -> HealthView:
-    """Return a line of the health without the monitor's name and the unit's tag before it."""
-    tag = f'valveflow: {status["hardware_id"]} '
+    """Return a line of the health without the monitor's name before it."""
     level = status['level']
     number = level[0] if isinstance(level, bytes) else int(level)
-    name = str(status['name'])
-    return HealthView(
-        name.removeprefix(tag) if name.startswith(tag) else name.removeprefix('valveflow: '),
-        number, str(status['message']),
-    )  # fmt: skip
+    return HealthView(_item_name(status), number, str(status['message']))
+
+
+def _item_name(status: Fields) -> str:
+    name = str(status['name']).rpartition(': ')[2]
+    # Recordings of earlier versions have the unit's tag before the item.
+    return name.removeprefix(f'{status["hardware_id"]} ')
+
+
+def _is_item(status: Fields) -> bool:
+    name = _item_name(status)
+    return name in _ITEMS or name.startswith('input ')

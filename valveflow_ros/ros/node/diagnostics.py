@@ -45,12 +45,14 @@ class Item:
     values: dict[str, object] = field(default_factory=dict)
 
 
-def diagnostics_message(items: Iterable[Item], tag: str, now_ns: int) -> DiagnosticArray:
-    """Return all items as a message."""
+def diagnostics_message(
+    items: Iterable[Item], node: str, tag: str, now_ns: int
+) -> DiagnosticArray:
+    """Return all items as a message, each under the name of the node and its own."""
     status = [
         DiagnosticStatus(
             level=bytes([item.level]),
-            name=f'valveflow: {tag} {item.name}',
+            name=f'{node}: {item.name}',
             message=item.sentence,
             hardware_id=tag,
             values=[KeyValue(key=key, value=_text(value)) for key, value in item.values.items()],
