@@ -339,7 +339,7 @@ def test_rotation_by_size_and_by_age(tmp_path):
 
 def test_latched_messages_head_every_later_split(tmp_path):
     recorder = recorder_of(tmp_path / 'log')
-    recorder.add_topic('/curve', FLOAT64, qos=LATCHED, latched=True)
+    recorder.add_topic('/curve', FLOAT64, qos=(LATCHED,), latched=True)
     record(recorder, 0, 2, '/curve')
     for part in range(3):
         record(recorder, 10 + 10 * part, 2)

@@ -282,7 +282,7 @@ def test_a_latched_message_is_a_repetition_only_once_it_is_on_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage = Stage(tmp_path, monkeypatch)
-    stage.loop.put(NewTopic('/curve', FLOAT64, Qos(), 'hash', 'float64 data', True))
+    stage.loop.put(NewTopic('/curve', FLOAT64, (Qos(),), 'hash', 'float64 data', True))
     stage.put(2)
     stage.put(2, '/curve')
     stage.writer.bad = {'flush'}
@@ -294,7 +294,7 @@ def test_a_latched_message_is_a_repetition_only_once_it_is_on_disk(
     assert [m.topic for m in stage.loop.latched()] == ['/curve']
     topic, _, more = stage.writer.took[0]
     assert (topic, more['type_hash'], more['definition']) == ('/curve', 'hash', 'float64 data')
-    assert more['qos'] == Qos()
+    assert more['qos'] == (Qos(),)
 
 
 @pytest.mark.parametrize('bad', ['', 'note', 'close'])

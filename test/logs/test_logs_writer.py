@@ -53,7 +53,7 @@ def samples(tmp_path):
     folder = tmp_path / 'samples'
     rows = [(START_NS + k * 10**9, [k + 0.5, 12.0, 538.0, 600.0 + k, 41.0]) for k in range(50)]
     messages = [
-        Message('/unit1/plant_sample', plant_sample(t, v, [0, 1, 0, 2, 0]), t + 5, t)
+        Message('/unit1/plant_sample', plant_sample(t, v, [1, 2, 1, 3, 1]), t + 5, t)
         for t, v in rows
     ]
     write_messages(folder, {'/unit1/plant_sample': SAMPLE}, messages)
@@ -85,7 +85,7 @@ def test_own_messages_are_read_by_both(samples):
     for found in (by_rosbags(folder), by_mcap(folder / 'samples_0.mcap')):
         assert [m[-1].main_steam_pressure for m in found] == [v[1] for _, v in rows]
         assert [m[-1].generated_power for m in found] == [v[3] for _, v in rows]
-        assert {m[-1].generated_power_quality for m in found} == {2}
+        assert {m[-1].generated_power_quality for m in found} == {3}
         assert {m[-1].header.frame_id for m in found} == {'HV101'}
 
 
@@ -172,7 +172,7 @@ def test_splits_begin_with_the_latched_messages_which_are_read_once(tmp_path):
     folder = tmp_path / 'log'
     curve = Message('/curve', float64(7.0), START_NS, START_NS)
     with RecordingWriter(folder, definitions=STOCK, head_messages=lambda: [curve]) as writer:
-        writer.add_topic('/curve', FLOAT64, qos=LATCHED)
+        writer.add_topic('/curve', FLOAT64, qos=(LATCHED,))
         writer.add_topic('/valve_opening', FLOAT64)
         writer.write(*curve)
         for step in range(1, 4):

@@ -3,28 +3,32 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 import rclpy
+import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_helpers import wait_until
-from std_msgs.msg import Float32
+from std_msgs.msg import Float32, Float64
 from std_srvs.srv import Trigger
 
-from valveflow_ros.errors import RecordingError
+from valveflow_ros.errors import ParameterError, RecordingError
 from valveflow_ros.logs import open_log
 from valveflow_ros.parameters import TABLE, Settings
 from valveflow_ros.ros import demo, replay_main, simulator_main, watch_main
 from valveflow_ros.ros.node import monitor_node
 from valveflow_ros.ros.node.monitor_node import MonitorNode
 from valveflow_ros.ros.node.recording import check_record_directory
+from valveflow_ros.ros.outputs import OUTPUTS
 
 pytestmark = pytest.mark.ros
 _MODULES = ('monitor_main', 'simulator_main', 'replay_main', 'watch_main', 'demo')
@@ -107,6 +111,79 @@ def test_the_whole_life(context: Any, tmp_path: Path) -> None:
             )
         assert monitor.trigger_shutdown() == DONE
         assert monitor.finalized
+    finally:
+        stage.close()
+
+
+def test_the_quality_of_service_is_set_from_outside_and_recorded_as_offered(
+    context: Any, tmp_path: Path
+) -> None:
+    override = {
+        'qos_overrides./valveflow_monitor/diagnosis.publisher.depth': 7,
+        'qos_overrides./valve_opening.subscription.reliability': 'reliable',
+        'qos_overrides./valve_openin.subscription.depth': 5,
+    }
+    stage = Stage(context, tmp_path, **override)
+    try:
+        best_effort = QoSProfile(depth=3, reliability=ReliabilityPolicy.BEST_EFFORT)
+        pressure = stage.other.create_publisher(Float64, '/main_steam_pressure', best_effort)
+        stage.monitor.trigger_configure()
+        stage.monitor.trigger_activate()
+        (seen,) = stage.other.get_subscriptions_info_by_topic('/valve_opening')
+        assert seen.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+        assert "'qos_overrides./valve_openin.subscription.depth' is for no topic" in (
+            stage.sentence('parameters')
+        )
+        wait_until(lambda: pressure.get_subscription_count(), 'the subscription', 20.0)
+        pressure.publish(Float64(data=12.0))
+        wait_until(lambda: stage.monitor.step(), 'the message', 20.0)
+        assert stage.monitor.trigger_deactivate() == DONE
+    finally:
+        stage.close()
+    (folder,) = tmp_path.glob('valveflow_*')
+    told = yaml.safe_load((folder / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
+    offered = {
+        t['topic_metadata']['name']: t['topic_metadata']['offered_qos_profiles']
+        for t in told['topics_with_message_count']
+    }
+    assert [p['reliability'] for p in offered['/main_steam_pressure']] == ['best_effort']
+    (diagnosis,) = offered['/valveflow_monitor/diagnosis']
+    assert (diagnosis['depth'], diagnosis['durability']) == (7, 'transient_local')
+    assert offered['/valveflow_monitor/alarms'][0]['depth'] == OUTPUTS['alarms'].kept
+
+
+@pytest.mark.parametrize(
+    ('policy', 'value', 'words'),
+    [
+        ('reliability', 'sure', "must be reliable or best_effort, not 'sure'"),
+        ('history', 3, 'must be keep_last or keep_all, not 3'),
+        ('depth', 0, 'must be a whole number from 1 to 1000000, not 0'),
+    ],
+)
+def test_a_quality_of_service_that_there_is_not_is_refused_at_the_start(
+    context: Any, tmp_path: Path, policy: str, value: object, words: str
+) -> None:
+    name = f'qos_overrides./valve_opening.subscription.{policy}'
+    with pytest.raises(ParameterError, match=words):
+        Stage(context, tmp_path, **{name: value})
+
+
+def test_requests_that_wait_are_all_answered_in_one_turn(context: Any, tmp_path: Path) -> None:
+    stage = Stage(context, tmp_path)
+    try:
+        stage.executor.remove_node(stage.monitor)
+        names = ('refit', 'acknowledge_alarms')
+        clients = [stage.other.create_client(Trigger, f'/valveflow_monitor/{n}') for n in names]
+        wait_until(lambda: all(c.service_is_ready() for c in clients), 'the services', 20.0)
+        asked = [client.call_async(Trigger.Request()) for client in clients * 5]
+        time.sleep(0.5)  # until all have arrived; nothing takes them meanwhile
+        monitor_node.serve_requests(stage.monitor, 10.0)
+        for answer in asked:
+            wait_until(
+                lambda a=answer: stage.executor.spin_once(timeout_sec=0.01) or a.done(),
+                'the answer', 20.0,
+            )  # fmt: skip
+        assert not any(a.result().success for a in asked)
     finally:
         stage.close()
 

@@ -9,7 +9,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from valveflow_ros.errors import ParameterError
+from valveflow_ros.errors import ParameterError, listed
 from valveflow_ros.parameters import (
     NOT_NOW,
     PARAMETERS,
@@ -24,6 +24,7 @@ from valveflow_ros.parameters import (
 _SIM_TIME = 'use_sim_time'
 _FOREIGN = (_SIM_TIME, 'start_type_description_service')
 _FOREIGN_PREFIX = 'qos_overrides.'
+_DEEPEST = 1_000_000
 
 
 def descriptor(row: Parameter) -> ParameterDescriptor:
@@ -104,6 +105,44 @@ def unknown_overrides(node: Node, known: Iterable[str] = PARAMETERS) -> list[str
             parameter(name)
         except ParameterError as error:
             sentences.append(str(error))
+    return sentences
+
+
+_POLICIES = {'history': ('keep_last', 'keep_all'), 'reliability': ('reliable', 'best_effort')}
+
+
+def check_qos_overrides(node: Node, topics: Mapping[str, Iterable[str]]) -> list[str]:
+    """Return a sentence for each override of a quality of service that is for none of our topics.
+
+    Parameters
+    ----------
+    node : Node
+    topics : mapping of str to iterable of str
+        Full names by 'publisher' and 'subscription'.
+
+    Raises
+    ------
+    ParameterError
+        One has a value that cannot be used.
+    """
+    given: Mapping[str, RosParameter] = getattr(node, '_parameter_overrides', {})
+    known = {
+        f'{_FOREIGN_PREFIX}{topic}.{entity}.{policy}'
+        for entity, names in topics.items() for topic in names for policy in (*_POLICIES, 'depth')
+    }  # fmt: skip
+    sentences = []
+    for name, item in given.items():
+        words, value = _POLICIES.get(name.rpartition('.')[2]), item.value
+        if not name.startswith(_FOREIGN_PREFIX):
+            continue
+        if name not in known:
+            sentences.append(f"Parameter '{name}' is for no topic and policy of the monitor.")
+        elif words and value not in words:
+            raise ParameterError(name, f'must be {listed(words, "or")}, not {value!r}')
+        elif not words and not (type(value) is int and 0 < value <= _DEEPEST):
+            raise ParameterError(
+                name, f'must be a whole number from 1 to {_DEEPEST}, not {value!r}'
+            )
     return sentences
 
 

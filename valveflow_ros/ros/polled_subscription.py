@@ -16,10 +16,13 @@ from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 
 DEPTH = 1000
+# What a user may set from outside as qos_overrides.TOPIC.publisher.depth and the like.
+QOS_OVERRIDES = QoSOverridingOptions.with_default_policies()
 
 
 class RawMessage(NamedTuple):
@@ -130,6 +133,7 @@ class PolledSubscription:
         on_mismatch: Callable[[str], None],
         group: CallbackGroup | None,
     ) -> None:
+        overrides = None if topic == '/clock' else QOS_OVERRIDES
         reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
         self._subscription = self._node.create_subscription(
             self._type,
@@ -138,6 +142,7 @@ class PolledSubscription:
             QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=DEPTH, reliability=reliability),
             raw=True,
             callback_group=group or MutuallyExclusiveCallbackGroup(),
+            qos_overriding_options=overrides,
             # Each event costs the executor time at every look; the rest says nothing of use.
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=lambda _: on_mismatch(self.topic), use_default_callbacks=False

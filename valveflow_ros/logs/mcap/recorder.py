@@ -8,7 +8,7 @@ import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -235,7 +235,7 @@ class NewTopic(NamedTuple):
 
     topic: str
     type_name: str
-    qos: Qos
+    qos: Sequence[Qos]
     type_hash: str
     definition: str
     latched: bool
@@ -523,7 +523,7 @@ class Recorder:
         topic: str,
         type_name: str,
         *,
-        qos: Qos | None = None,
+        qos: Sequence[Qos] = (Qos(),),
         type_hash: str | None = None,
         definition: str | None = None,
         latched: bool = False,
@@ -534,8 +534,8 @@ class Recorder:
         ----------
         topic, type_name : str
             Its full name and ``package/msg/Type``.
-        qos : Qos, optional
-            What its publisher offers.
+        qos : sequence of Qos
+            What each of its publishers offers.
         type_hash, definition : str, optional
             If the caller knows them better than `Definitions`.
         latched : bool
@@ -560,7 +560,7 @@ class Recorder:
             except LayoutError as error:
                 raise RecordingError(f"message type '{type_name}'", str(error)) from None
         self._topics[topic] = type_name
-        self._loop.put(NewTopic(topic, type_name, qos or Qos(), type_hash, text, latched))
+        self._loop.put(NewTopic(topic, type_name, qos, type_hash, text, latched))
 
     def record(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int) -> bool:
         """Hand in a message of raw CDR bytes.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -52,7 +52,7 @@ class Qos:
     depth: int = 10
 
     def text(self) -> str:
-        """Return the YAML list of one profile that stands in a channel's metadata."""
+        """Return this profile as an item of the YAML list in a channel's metadata."""
         lines = [
             f'- history: {self.history}',
             f'  depth: {self.depth}',
@@ -84,7 +84,7 @@ class TopicBook:
         self,
         topic: str,
         type_name: str,
-        qos: Qos | None = None,
+        qos: Sequence[Qos] = (Qos(),),
         hash_text: str | None = None,
         definition: str | None = None,
     ) -> int:
@@ -113,7 +113,8 @@ class TopicBook:
             self.table.schemas[schema.id] = schema
         if hash_text is None:
             hash_text = self._hash(type_name, definition)
-        metadata = {'offered_qos_profiles': (qos or Qos()).text(), 'topic_type_hash': hash_text}
+        offered = '\n'.join(profile.text() for profile in qos)
+        metadata = {'offered_qos_profiles': offered, 'topic_type_hash': hash_text}
         number = len(self.ids) + 1
         channel = Channel(
             id=number,
@@ -261,7 +262,7 @@ class RecordingWriter:
         topic: str,
         type_name: str,
         *,
-        qos: Qos | None = None,
+        qos: Sequence[Qos] = (Qos(),),
         type_hash: str | None = None,
         definition: str | None = None,
     ) -> None:

@@ -32,12 +32,13 @@ from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.parameters import Settings
 from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.ros import declare
+from valveflow_ros.ros.decoding import INPUTS
 from valveflow_ros.ros.domain import Presence
 from valveflow_ros.ros.encoding import encode
 from valveflow_ros.ros.node.diagnostics import Changes, Item, Level, diagnostics_message
 from valveflow_ros.ros.node.recording import check_record_directory
 from valveflow_ros.ros.node.session import DIAGNOSTICS, Session
-from valveflow_ros.ros.outputs import SERVICES
+from valveflow_ros.ros.outputs import OUTPUTS, SERVICES
 from valveflow_ros.ros.polled_subscription import answer_request
 from valveflow_ros.ros.process import StopFlag, with_place
 
@@ -238,7 +239,10 @@ class MonitorNode(LifecycleNode):
         self._changes = Changes()
         self._look_around_s, self._same_name = 0.0, 1
         self.settings = Settings(declare.declare(self))
-        self._ignored = declare.unknown_overrides(self)
+        self._ignored = declare.unknown_overrides(self) + declare.check_qos_overrides(self, {
+            'publisher': [self.resolve_topic_name(f'~/{name}') for name in OUTPUTS],
+            'subscription': [self.resolve_topic_name(topic.name) for topic in INPUTS],
+        })  # fmt: skip
         self.add_pre_set_parameters_callback(declare.in_type)
         self.add_on_set_parameters_callback(self._check)
         self.add_post_set_parameters_callback(self._apply)
@@ -367,8 +371,9 @@ class MonitorNode(LifecycleNode):
             items = [Item('fit', Level.STALE, 'The monitor is not configured.')]
         else:
             items = [*session.items(), *self.unknown_parameters(), *self.same_name(now_s)]
-        now_ns = time.time_ns()
-        data = encode(diagnostics_message(items, self.settings.text('unit_tag'), now_ns))
+        now_ns = self.get_clock().now().nanoseconds
+        name = self.get_fully_qualified_name().lstrip('/')
+        data = encode(diagnostics_message(items, name, self.settings.text('unit_tag'), now_ns))
         self._health.publish(data)
         if session is not None:
             session.record(DIAGNOSTICS, data, now_ns)

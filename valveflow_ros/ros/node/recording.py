@@ -8,9 +8,11 @@ import queue
 import re
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from rclpy.qos import QoSProfile
 
 from valveflow_ros.errors import RecordingError, ValveflowError, counted
 from valveflow_ros.logs import (
@@ -87,6 +89,14 @@ def check_record_directory(settings: Settings) -> None:
         )
 
 
+def recorded_qos(profile: QoSProfile) -> Qos:
+    """Return a quality of service in the words of a recording."""
+    return Qos(
+        reliability=profile.reliability.name.lower(), durability=profile.durability.name.lower(),
+        history=profile.history.name.lower(), depth=profile.depth,
+    )  # fmt: skip
+
+
 class Recording:
     """Records inputs and outputs; a failure is reported and never stops the monitor.
 
@@ -123,7 +133,7 @@ class Recording:
         self.problem = ''
         self.folder: Path | None = None
         self._recorder: Recorder | None = None
-        self._offered: dict[str, tuple[str, Qos, bool]] = {}
+        self._offered: dict[str, tuple[str, Callable[[], Sequence[Qos]], bool]] = {}
         self.began = dict(settings if began is None else began)
         if not settings.flag('record'):
             self.problem = 'Recording is switched off (parameter record).'
@@ -158,13 +168,24 @@ class Recording:
             return False
         return not (status.lost or any(status.dropped.values()))
 
-    def offer(self, topic: str, type_name: str, *, reliable: bool, latched: bool) -> None:
-        """Describe a topic; it stands in the file from its first message on."""
-        qos = Qos(
-            reliability='reliable' if reliable else 'best_effort',
-            durability='transient_local' if latched else 'volatile',
-            depth=1 if latched else 10,
-        )
+    def offer(
+        self,
+        topic: str,
+        type_name: str,
+        qos: Callable[[], Sequence[Qos]],
+        *,
+        latched: bool = False,
+    ) -> None:
+        """Describe a topic; it stands in the file from its first message on.
+
+        Parameters
+        ----------
+        topic, type_name : str
+        qos : callable
+            Returns what each publisher offers; called with the first message.
+        latched : bool
+            Its last message is repeated in later files.
+        """
         self._offered[topic] = (type_name, qos, latched)
 
     def write(self, topic: str, data: bytes, log_ns: int, time_ns: int) -> None:
@@ -174,7 +195,7 @@ class Recording:
         try:
             if topic in self._offered:
                 type_name, qos, latched = self._offered.pop(topic)
-                self._recorder.add_topic(topic, type_name, qos=qos, latched=latched)
+                self._recorder.add_topic(topic, type_name, qos=qos(), latched=latched)
             self._recorder.record(topic, data, log_ns, time_ns)
         except ValveflowError as error:
             self._give_up(str(error))

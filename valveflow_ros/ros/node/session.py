@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -13,7 +14,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
-from valveflow_ros.logs import RecorderStatus
+from valveflow_ros.logs import Qos, RecorderStatus
 from valveflow_ros.monitoring.events import Event
 from valveflow_ros.parameters import Settings
 from valveflow_ros.report.words import in_zone
@@ -22,11 +23,11 @@ from valveflow_ros.ros.node import health, parameter_files
 from valveflow_ros.ros.node.diagnostics import Item, Level, line_of
 from valveflow_ros.ros.node.engine import LiveEngine, warm_up
 from valveflow_ros.ros.node.intake import Intake, LogClock
-from valveflow_ros.ros.node.recording import BackgroundRecovery, Recording, tag_of
+from valveflow_ros.ros.node.recording import BackgroundRecovery, Recording, recorded_qos, tag_of
 from valveflow_ros.ros.node.restart import Restart
 from valveflow_ros.ros.node.state_store import StateStore
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs, OutputTopic
-from valveflow_ros.ros.polled_subscription import PolledSubscription
+from valveflow_ros.ros.polled_subscription import QOS_OVERRIDES, PolledSubscription
 from valveflow_ros.ros.worker import DiagnosisWorker, FitWorker
 from valveflow_ros.signals.units import in_unit
 from valveflow_ros.state import State
@@ -78,14 +79,21 @@ class Session:
         self._fit_worker = FitWorker(settings.real('refit_timeout'))
         self._fit_worker.start()
         self._diagnosis_worker = DiagnosisWorker(settings.real('diagnosis_timeout'))
-        self._messages = Outputs(settings.text('unit_tag'), settings.output_unit, settings.zone)
+        self._messages = Outputs(
+            settings.text('unit_tag'), settings.output_unit, settings.zone,
+            node.get_clock().now().nanoseconds,
+        )  # fmt: skip
         self._recovery: BackgroundRecovery | None = None
         try:
             # Each event costs the executor time at every look, and nobody listens to these.
             silent = PublisherEventCallbacks(use_default_callbacks=False)
             self._publishers: dict[str, Publisher] = {
                 name: node.create_publisher(
-                    topic.message_type, f'~/{name}', _qos(topic), event_callbacks=silent
+                    topic.message_type,
+                    f'~/{name}',
+                    _qos(topic),
+                    event_callbacks=silent,
+                    qos_overriding_options=QOS_OVERRIDES,
                 )
                 for name, topic in OUTPUTS.items()
             }
@@ -311,17 +319,18 @@ class Session:
         attachments = parameter_files.model_attachment(self._model)
         folder, began = self._restart.folder, self._restart.began
         recording = Recording(self._settings, topics, time.time(), attachments, folder, began)
-        reliable = self._settings.text('input_reliability') == 'reliable'
         for topic in INPUTS:
+            full_name, kind = self.inputs[topic.name], topic.type_name
             recording.offer(
-                self.inputs[topic.name], topic.type_name, reliable=reliable, latched=False
+                full_name, kind, functools.partial(health.offered, self._node, full_name, kind)
             )
         for name, output in OUTPUTS.items():
+            profile = recorded_qos(self._publishers[name].qos_profile)
             recording.offer(
-                self.outputs[name], output.type_name, reliable=True, latched=output.latched
-            )
-        health_type = 'diagnostic_msgs/msg/DiagnosticArray'
-        recording.offer(DIAGNOSTICS, health_type, reliable=True, latched=False)
+                self.outputs[name], output.type_name, lambda p=profile: (p,),
+                latched=output.latched,
+            )  # fmt: skip
+        recording.offer(DIAGNOSTICS, 'diagnostic_msgs/msg/DiagnosticArray', lambda: (Qos(),))
         return recording
 
 
