@@ -117,8 +117,7 @@ def test_no_result_is_unknown_and_says_why() -> None:
     assert (message.model_id, message.header.frame_id) == (TASK.curve.model_id, 'unit 1')
     assert math.isnan(message.rmse_simulation)
     assert len(message.causes) == 0
-    (*_, first) = Outputs('u').latched()
-    assert first.name == 'diagnosis'
+    first = next(o for o in Outputs('u').latched() if o.name == 'diagnosis')
     before = deserialize_message(first.data, Diagnosis)
     assert (before.verdict, before.model_id) == (Diagnosis.UNKNOWN, '')
     assert before.sentence == encoding.NOT_YET

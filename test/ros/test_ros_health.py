@@ -110,20 +110,28 @@ def test_stamps_ahead_of_the_machines_clock_are_told_once_for_each_look(off_s: f
         (10.0, '1 Hz.'),
         (0.0, '1 Hz.'),
         (-10.0, '1 Hz.'),
-        (-3600.0, "1 Hz; stamps are 1 h behind this machine's clock."),
+        (-100.0, "1 Hz; stamps are 1 min 40 s behind this machine's clock."),
     ],
 )
-def test_stamps_of_a_recording_or_a_little_off_are_well(off_s: float, words: str) -> None:
+def test_stamps_that_are_a_little_off_are_well(off_s: float, words: str) -> None:
     scene = Scene()
     scene.health.note('valve_opening', reading_at(off_s))
     scene.says(Level.OK, words)
 
 
-def test_where_there_is_a_clock_the_machines_own_says_nothing() -> None:
+@pytest.mark.parametrize('off_s', [-130.0, -3600.0, -1e8])
+def test_stamps_minutes_behind_are_told(off_s: float) -> None:
+    scene = Scene()
+    scene.health.note('valve_opening', reading_at(off_s))
+    scene.says(Level.WARN, "behind this machine's clock; set both by one server")
+
+
+@pytest.mark.parametrize('off_s', [1e6, -1e6])
+def test_where_there_is_a_clock_the_machines_own_says_nothing(off_s: float) -> None:
     health = InputHealth(Settings(), TOPICS, by_host=False)
     scene = Scene()
     scene.health = health
-    health.note('valve_opening', reading_at(1e6))
+    health.note('valve_opening', reading_at(off_s))
     scene.says(Level.OK, '1 Hz.')
 
 
@@ -297,10 +305,10 @@ def test_the_message_follows_rep_107() -> None:
         Item('input valve_opening', Level.OK, 'Fine.', {'Rate (Hz)': 1.0, 'Age (s)': None}),
         Item('recorder', Level.ERROR, 'Broken.', {'On': False}),
     ]
-    message = diagnostics_message(items, 'HV101', 5 * 10**9)
+    message = diagnostics_message(items, 'unit_1/monitor', 'HV101', 5 * 10**9)
     assert message.header.stamp.sec == 5
     first, second = message.status
-    assert first.name == 'valveflow: HV101 input valve_opening'
+    assert first.name == 'unit_1/monitor: input valve_opening'
     assert (first.hardware_id, first.message, first.level) == (
         'HV101',
         'Fine.',

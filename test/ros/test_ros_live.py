@@ -18,7 +18,7 @@ from valveflow_ros.monitoring.offline import JournalReplayer
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.records import NS_PER_S, Readings, table_to_readings
-from valveflow_ros.ros.decoding import Row
+from valveflow_ros.ros.decoding import Row, from_time
 from valveflow_ros.ros.node.engine import LiveEngine
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
 from valveflow_ros.ros.simulator_main import effects_of
@@ -102,6 +102,33 @@ def test_it_does_what_it_is_for(live: tuple[LiveEngine, list[list[Event]]]) -> N
     assert engine.last_fit_s == 0.5
     names = {output.name for output in said(calls)}
     assert names == set(OUTPUTS)
+
+
+@pytest.mark.parametrize('begun_ns', [DEFAULT_START_NS - NS_PER_S, 0])
+def test_who_comes_late_finds_everything_with_a_time(
+    live: tuple[LiveEngine, list[list[Event]]], begun_ns: int
+) -> None:
+    _, calls = live
+    outputs = Outputs('u', begun_ns=begun_ns)
+    first = list(outputs.latched())
+    later = [output for events in calls for output in outputs.of(events)]
+    if not begun_ns:
+        # No time yet; they come again with the first row.
+        assert {output.time_ns for output in first} == {0}
+        again, later = later[: len(first)], later[len(first) :]
+        assert [output.name for output in again] == [output.name for output in first]
+        first = again
+    assert {output.time_ns for output in first} == {begun_ns or later[0].time_ns}
+    assert {output.name for output in first} == {n for n, o in OUTPUTS.items() if o.latched}
+    for output in first:
+        message = deserialize_message(output.data, OUTPUTS[output.name].message_type)
+        if output.name not in ('breakpoints', 'slopes'):
+            assert from_time(message.header.stamp) == output.time_ns
+    told = [deserialize_message(o.data, Alarm) for o in first if o.name == 'alarms']
+    assert {alarm.name for alarm in told} == {'residual', 'curve_shift'}
+    assert {(a.state, a.previous_state, a.occurrence) for a in told} == {
+        (Alarm.NORMAL,) * 2 + (0,)
+    }
 
 
 def test_replaying_the_journal_says_the_same_byte_for_byte(

@@ -298,9 +298,7 @@ def hostile_wishes() -> list[RosParameter]:
 
 
 @pytest.mark.parametrize('kind', [SetParameters, SetParametersAtomically])
-def test_from_afar_nothing_hostile_gets_in(
-    context: Any, running: MonitorNode, kind: Any
-) -> None:
+def test_from_afar_nothing_hostile_gets_in(context: Any, running: MonitorNode, kind: Any) -> None:
     node = running
     asking = Node('asking', context=context)
     executor = SingleThreadedExecutor(context=context)

@@ -6,8 +6,9 @@ The node publishes and records them; a verification compares them with those of 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import tzinfo
 from typing import Any, NamedTuple
 
@@ -24,8 +25,13 @@ from valveflow_msgs.msg import (
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.shift import Shift
 from valveflow_ros.monitoring import events as engine
-from valveflow_ros.monitoring.alarm_state import BURIED
-from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState
+from valveflow_ros.monitoring.alarm_state import BURIED, Priority
+from valveflow_ros.monitoring.alarms import (
+    AlarmChange,
+    AlarmState,
+    ResidualAlarm,
+    ShiftAlarm,
+)
 from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.events import JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
@@ -34,6 +40,7 @@ from valveflow_ros.ros import encoding
 from valveflow_ros.signals.static_form import OPENING
 from valveflow_ros.signals.units import in_unit
 
+ALARMS = (ResidualAlarm.NAME, ShiftAlarm.NAME)
 NO_CURVE_YET = 'No curve yet: not enough special segments.'
 
 
@@ -75,6 +82,15 @@ SERVICES: tuple[str, ...] = (
 )
 
 
+def _never(name: str, time_ns: int) -> AlarmChange:
+    """Return what there is to say of an alarm that has not come yet."""
+    normal = AlarmState.NORMAL
+    return AlarmChange(
+        time_ns, name, normal, normal, Priority.MEDIUM, math.nan, math.nan, '',
+        'It has not come since the start.', 0, 0, '',
+    )  # fmt: skip
+
+
 class Output(NamedTuple):
     """A message to be sent: the topic's name in `OUTPUTS`, its bytes, the time it speaks of."""
 
@@ -94,6 +110,9 @@ class Outputs:
         What stands in sentences in place of MW.
     zone : tzinfo, optional
         In which sentences tell times.
+    begun_ns : int
+        When the run began, the time of what is told before there are data; 0: not known, it is
+        told again with the first row.
 
     Notes
     -----
@@ -101,8 +120,11 @@ class Outputs:
     messages depend on nothing but their order.
     """
 
-    def __init__(self, tag: str, output_unit: str = 'MW', zone: tzinfo | None = None) -> None:
+    def __init__(
+        self, tag: str, output_unit: str = 'MW', zone: tzinfo | None = None, begun_ns: int = 0
+    ) -> None:
         self._tag, self._unit, self._zone = tag, output_unit, zone
+        self._begun_ns = begun_ns
         self.curve: Characteristic | None = None
         self.status = CurveStatus.UNKNOWN
         self.cause = NO_CURVE_YET
@@ -131,6 +153,10 @@ class Outputs:
                 yield from self._single(event)
 
     def _rows(self, block: PredictionBlock, changes: list[AlarmChange]) -> Iterator[Output]:
+        if not self._begun_ns:
+            # At the start /clock told no time yet.
+            self._begun_ns = int(block.time_ns[0])
+            yield from self.latched()
         left = iter(changes)
         change = next(left, None)
         for time_ns, data in encoding.prediction_bytes(block, self._tag):
@@ -163,10 +189,9 @@ class Outputs:
             if event.kind == JournalKind.RESUMED:
                 # A subscriber to the restarted process must find everything there.
                 self.shift = None
-                yield from self.latched()
-                yield from self._standing()
+                yield from self._current(event.time_ns)
             elif self._note(event):
-                yield from self._curve_messages()
+                yield from self._curve_messages(event.time_ns)
 
     def restore(self, monitor: Monitor) -> None:
         """Continue from what a restored monitor knows."""
@@ -179,24 +204,25 @@ class Outputs:
 
     def latched(self) -> Iterator[Output]:
         """Yield the current messages of the latched topics."""
-        yield from self._curve_messages()
-        yield self._diagnosis()
+        return self._current(self._begun_ns)
 
-    def _standing(self) -> Iterator[Output]:
-        """Yield the last message of each standing alarm again, unchanged."""
-        told = sorted(self._alarms.values(), key=lambda change: (change.time_ns, change.name))
-        for change in told:
-            if change.state != AlarmState.NORMAL:
-                yield self._output(
-                    'alarms', encoding.alarm_message(change, self._tag), change.time_ns
-                )
+    def _current(self, time_ns: int) -> Iterator[Output]:
+        """Yield what is known; what is not known yet has the given time."""
+        yield from self._curve_messages(time_ns)
+        yield self._diagnosis(time_ns)
+        # Who comes late can tell an alarm that never came from a monitor that is not there.
+        told = {name: _never(name, time_ns) for name in ALARMS} | self._alarms
+        for change in sorted(told.values(), key=lambda a: (a.time_ns, a.name)):
+            if change.state == AlarmState.NORMAL:
+                change = replace(change, previous=change.state)  # nothing new
+            yield self._output('alarms', encoding.alarm_message(change, self._tag), change.time_ns)
 
-    def _diagnosis(self) -> Output:
+    def _diagnosis(self, time_ns: int = 0) -> Output:
         event, tag = self._diagnosed, self._tag
         if event is None:
-            return self._output(
-                'diagnosis', encoding.no_diagnosis_message(encoding.NOT_YET, tag), 0
-            )
+            message = encoding.no_diagnosis_message(encoding.NOT_YET, tag)
+            message.header.stamp = encoding.to_time(time_ns)
+            return self._output('diagnosis', message, time_ns)
         task = event.task
         if event.content:
             message = encoding.diagnosis_message(json.loads(event.content), task, tag)
@@ -215,12 +241,15 @@ class Outputs:
         self.cause = entry.text
         return True
 
-    def _curve_messages(self) -> Iterator[Output]:
+    def _curve_messages(self, time_ns: int = 0) -> Iterator[Output]:
         curve = self.curve
-        time_ns = 0 if curve is None else curve.source.window_end_ns
         message = encoding.curve_message(
             curve, self.status, self.cause, self._tag, self.reference_id, self.shift
         )
+        if curve is None:
+            message.header.stamp = encoding.to_time(time_ns)
+        else:
+            time_ns = curve.source.window_end_ns
         yield self._output('characteristic', message, time_ns)
         knots = [] if curve is None else curve.breakpoints
         slopes = [] if curve is None else [p.slope for p in curve.pieces]

@@ -10,6 +10,7 @@ from itertools import islice
 from pathlib import Path
 
 from rclpy.serialization import deserialize_message
+from valveflow_msgs.msg import FlowCharacteristic
 
 from valveflow_ros.diagnosis import result
 from valveflow_ros.errors import DataError, RecordingError, ValveflowError, counted
@@ -20,7 +21,7 @@ from valveflow_ros.monitoring.offline import JournalReplayer
 from valveflow_ros.monitoring.rows import Corrector
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import Readings
-from valveflow_ros.ros.decoding import Decoder, journal_entry
+from valveflow_ros.ros.decoding import PLANT_SAMPLE, Decoder, from_time, journal_entry
 from valveflow_ros.ros.node import parameter_files
 from valveflow_ros.ros.node.recording import PARAMETERS, TOPICS
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
@@ -175,11 +176,13 @@ class _Replay:
             if first is None or first.log_time_ns > messages[0].log_time_ns:
                 problem = 'goes on from an earlier recording and cannot be verified without it'
                 raise RecordingError(self._log.path, problem)
-        outputs = Outputs(settings.text('unit_tag'), settings.output_unit, settings.zone)
+        outputs = Outputs(
+            settings.text('unit_tag'), settings.output_unit, settings.zone, self._begun_ns()
+        )
         yield from outputs.latched()
         monitor = Monitor(settings, corrector_of_run(self._log, settings))
         replayer = JournalReplayer(monitor, journal, diagnose_in_process)
-        aligner, decoder = Aligner(settings), Decoder(settings)
+        aligner, decoder = Aligner(settings), Decoder(settings, self._definition())
         inputs = self._messages(self._inputs)
         topics = self._log.topics
         total = sum(topics[topic].count for topic in self._inputs if topic in topics)
@@ -199,6 +202,24 @@ class _Replay:
             yield from outputs.of(events)
             found.rows = monitor.rows
             self._progress(found.inputs / max(1, total))
+
+    def _definition(self) -> str:
+        """Return the text of the recorded PlantSample, empty if there is none."""
+        stamped = [topic for topic, name in self._inputs.items() if name == PLANT_SAMPLE]
+        found = [self._log.topics[topic] for topic in stamped if topic in self._log.topics]
+        return found[0].definition if found else ''
+
+    def _begun_ns(self) -> int:
+        """Return the time of what was told before there were data."""
+        curves = [topic for topic, name in self._outputs.items() if name == 'characteristic']
+        first = next(self._messages(curves), None)
+        if first is None:
+            return 0
+        try:
+            stamp = deserialize_message(first.data, FlowCharacteristic).header.stamp
+        except Exception:  # noqa: BLE001 - the comparison says what is wrong with it
+            return 0
+        return from_time(stamp)
 
     def _messages(self, topics: Iterable[str]) -> Iterator[LoggedMessage]:
         there = [topic for topic in topics if topic in self._log.topics]

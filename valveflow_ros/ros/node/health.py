@@ -12,7 +12,7 @@ from rclpy.node import Node
 
 from valveflow_ros.errors import counted
 from valveflow_ros.fit.result import weaknesses
-from valveflow_ros.logs import RecorderState
+from valveflow_ros.logs import Qos, RecorderState
 from valveflow_ros.monitoring.alarm_state import Alarm, AlarmState
 from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.monitor import Monitor
@@ -23,12 +23,13 @@ from valveflow_ros.ros.decoding import PLANT_SAMPLE, Row, plausible_range, plaus
 from valveflow_ros.ros.encoding import NOT_YET
 from valveflow_ros.ros.node.diagnostics import Item, Level
 from valveflow_ros.ros.node.intake import TopicStatistics
-from valveflow_ros.ros.node.recording import Recording
+from valveflow_ros.ros.node.recording import Recording, recorded_qos
 from valveflow_ros.ros.worker import DiagnosisWorker, FitWorker
 from valveflow_ros.signals.align import REASONS
 from valveflow_ros.signals.units import unit_of
 
 _NO_LEAD = -(2**63)
+_FAR_BEHIND_NS = 120 * NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +54,12 @@ def publishers(node: Node, topic: str, type_name: str) -> Publishers:
     right = [info for info in found if info.topic_type == type_name]
     wrong = sorted({info.topic_type for info in found} - {type_name})
     return Publishers(len(right), tuple(wrong))
+
+
+def offered(node: Node, topic: str, type_name: str) -> tuple[Qos, ...]:
+    """Look up in the ROS graph what each publisher of a topic offers."""
+    found = node.get_publishers_info_by_topic(topic)
+    return tuple(recorded_qos(i.qos_profile) for i in found if i.topic_type == type_name)
 
 
 _REJECTED = tuple(reason for reason in REASONS if reason not in ('accepted', 'late'))
@@ -245,6 +252,11 @@ class InputHealth:
                 if off_ns > 0:
                     return f'The last stamp is {off} ahead of the newest one used.'
                 return f'The last stamp is {off} behind the newest one used.'
+            if self._new(info.topic, 'bad_quality', counts['bad_quality']):
+                return (
+                    f'The sender calls them bad, or does not set {info.topic}_quality, which is '
+                    'then 0, unknown; 1 is good.'
+                )
             reasons = [f'{r.replace("_", " ")} {counts[r]}' for r in _REJECTED if counts[r]]
             return f'So far: {", ".join(reasons)}.'
         name, value = found
@@ -264,15 +276,21 @@ class InputHealth:
     def _stamps(self, number: int) -> tuple[str, str]:
         """Return what is wrong with the stamps since the last look, and what is only odd.
 
-        A stamp that is behind may be that of a recording which is played; none can be ahead.
+        A little behind is a slow gateway; none can be ahead.
         """
         lead_ns, self._lead_ns[number] = self._lead_ns[number], _NO_LEAD
         if not self._by_host or lead_ns == _NO_LEAD or abs(lead_ns) <= self._jump_ns:
             return '', ''
         off = duration(abs(lead_ns) / NS_PER_S)
-        if lead_ns < 0:
-            return '', f"stamps are {off} behind this machine's clock"
-        return f"Stamps are up to {off} ahead of this machine's clock; set both by one server.", ''
+        if lead_ns > 0:
+            ahead = (
+                f"Stamps are up to {off} ahead of this machine's clock; set both by one server."
+            )
+            return ahead, ''
+        behind = f"tamps are {off} behind this machine's clock"
+        if lead_ns < -_FAR_BEHIND_NS:
+            return f'S{behind}; set both by one server, or play a recording with a /clock.', ''
+        return '', f's{behind}'
 
     def _new(self, topic: str, what: str, count: int) -> int:
         """Return by how much a count has grown since the last look."""
