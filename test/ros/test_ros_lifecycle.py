@@ -20,12 +20,15 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_helpers import wait_until
 from std_msgs.msg import Float32, Float64
 from std_srvs.srv import Trigger
+from valveflow_msgs.msg import FlowCharacteristic
 
 from valveflow_ros.errors import ParameterError, RecordingError
 from valveflow_ros.logs import open_log
+from valveflow_ros.monitoring.events import CurveAdopted, JournalEntry, JournalKind
 from valveflow_ros.parameters import TABLE, Settings
 from valveflow_ros.ros import demo, replay_main, simulator_main, watch_main
 from valveflow_ros.ros.node import monitor_node
+from valveflow_ros.ros.node.engine import example_curve
 from valveflow_ros.ros.node.monitor_node import MonitorNode
 from valveflow_ros.ros.node.recording import check_record_directory
 from valveflow_ros.ros.outputs import OUTPUTS
@@ -166,6 +169,47 @@ def test_a_quality_of_service_that_there_is_not_is_refused_at_the_start(
     name = f'qos_overrides./valve_opening.subscription.{policy}'
     with pytest.raises(ParameterError, match=words):
         Stage(context, tmp_path, **{name: value})
+
+
+def test_a_curve_is_on_disk_before_anybody_is_told(
+    context: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = Stage(context, tmp_path, record_flush=60.0)
+    told: list[int] = []
+    stage.other.create_subscription(
+        FlowCharacteristic, '/valveflow_monitor/characteristic',
+        lambda message: told.append(message.status), 10,
+    )  # fmt: skip
+    try:
+        stage.monitor.trigger_configure()
+        stage.monitor.trigger_activate()
+        session = stage.monitor.session
+        assert session is not None
+        curve = example_curve(stage.monitor.settings)
+        entry = JournalEntry(5, JournalKind.FIT_ADOPTED, 1, 1, curve.model_id, '')
+        publisher = session._publishers['journal']
+        on_disk: list[bytes] = []
+
+        class Publisher:
+            """Looks what a kill at this moment would leave."""
+
+            def publish(self, data: bytes) -> None:
+                (part,) = tmp_path.glob('valveflow_*/*.part')
+                on_disk.append(part.read_bytes())
+
+        monkeypatch.setitem(session._publishers, 'journal', Publisher())
+        session.publish([entry, CurveAdopted(curve)])
+        monkeypatch.setitem(session._publishers, 'journal', publisher)
+        wait_until(lambda: stage.turn() or len(told) > 1, 'the curve', 20.0)
+        (left,) = on_disk
+        copy = tmp_path / 'copy' / 'copy_0.mcap'
+        copy.parent.mkdir()
+        copy.write_bytes(left)
+        topics = [m.topic for m in open_log(copy).iter_messages()]
+        assert topics.count('/valveflow_monitor/journal') == 1
+        assert topics.count('/valveflow_monitor/characteristic') == 2
+    finally:
+        stage.close()
 
 
 def test_requests_that_wait_are_all_answered_in_one_turn(context: Any, tmp_path: Path) -> None:

@@ -77,6 +77,14 @@ class Restart:
         saved = self._store.saved
         return None if self.folder is None or saved is None else saved['began']
 
+    @property
+    def adopted(self) -> bool:
+        """Return True if the earlier run recorded a curve that its state does not hold yet."""
+        try:
+            return any(entry.kind == JournalKind.FIT_ADOPTED for entry in self._journal())
+        except DataError:
+            return False
+
     def engine(self, make: Callable[[Settings], LiveEngine]) -> LiveEngine:
         """Return the engine, where it was left if there is a state that can be used."""
         saved, self._make = self._store.saved, make

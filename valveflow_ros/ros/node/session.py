@@ -15,7 +15,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from valveflow_ros.logs import Qos, RecorderStatus
-from valveflow_ros.monitoring.events import Event
+from valveflow_ros.monitoring.events import CurveAdopted, Event
 from valveflow_ros.parameters import Settings
 from valveflow_ros.report.words import in_zone
 from valveflow_ros.ros.decoding import INPUTS, Decoder
@@ -99,8 +99,9 @@ class Session:
             }
             self.engine = self._restart.engine(self._make_engine)
             if self._restart.continues:
-                # The curve of the earlier run is there at once.
                 self._messages.restore(self.engine.monitor)
+            if self._restart.continues and not self._restart.adopted:
+                # The curve of the earlier run is there at once.
                 for output in self._messages.latched():
                     self._publishers[output.name].publish(output.data)
             warm_up(settings, self._fit_worker, stop, wait=not self._restart.continues)
@@ -190,7 +191,15 @@ class Session:
             if line is not None:
                 self._log(*line)
         self._store.note(events)
-        self._send(self._messages.of(events))
+        outputs = list(self._messages.of(events))
+        if not any(isinstance(event, CurveAdopted) for event in events):
+            self._send(outputs)
+            return
+        # Whoever was told of a curve finds it again after a kill: first it is on disk.
+        self._record(outputs)
+        self.confirm()
+        for output in outputs:
+            self._publishers[output.name].publish(output.data)
 
     def confirm(self) -> bool:
         """Have what has happened on disk, and return whether it is there.
@@ -312,6 +321,10 @@ class Session:
     def _send(self, outputs: Iterable[Output]) -> None:
         for output in outputs:
             self._publishers[output.name].publish(output.data)
+            self._record([output])
+
+    def _record(self, outputs: Iterable[Output]) -> None:
+        for output in outputs:
             self.record(self.outputs[output.name], output.data, output.time_ns)
 
     def _open_recording(self) -> Recording:
