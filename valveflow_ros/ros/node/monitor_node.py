@@ -275,9 +275,13 @@ class MonitorNode(LifecycleNode):
         return SetParametersResult(successful=True)
 
     def _apply(self, wanted: list[Parameter]) -> None:
-        self.settings = declare.changed(self.settings, wanted, running=self.session is not None)
+        settings = declare.changed(self.settings, wanted, running=self.session is not None)
+        # A new topic declares its quality of service; the session may not have begun then.
+        if settings == self.settings:
+            return
+        self.settings = settings
         if self.session is not None:
-            self.session.reconfigure(self.settings)
+            self.session.reconfigure(settings)
 
     # Lifecycle
 

@@ -101,9 +101,10 @@ class Session:
             if self._restart.continues:
                 self._messages.restore(self.engine.monitor)
             if self._restart.continues and not self._restart.adopted:
-                # The curve of the earlier run is there at once.
+                # The curve of the earlier run is there at once; its alarms may have changed since.
                 for output in self._messages.latched():
-                    self._publishers[output.name].publish(output.data)
+                    if output.name != 'alarms':
+                        self._publishers[output.name].publish(output.data)
             warm_up(settings, self._fit_worker, stop, wait=not self._restart.continues)
             self._log_clock = LogClock(self._restart.log_ns)
             self.recording = self._open_recording()
