@@ -154,7 +154,7 @@ def run() -> tuple[Readings, list[list[Event]], LiveEngine, DiagnosisWorker]:
 
 
 def said(calls: list[list[Event]]) -> list[Output]:
-    outputs = Outputs('u')
+    outputs = Outputs('u', begun_ns=1)
     return [*outputs.latched(), *(output for events in calls for output in outputs.of(events))]
 
 

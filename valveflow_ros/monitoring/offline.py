@@ -100,6 +100,8 @@ class JournalReplayer:
         be repeated.
     curves : callable, optional
         Returns the curve of a name, where there is a quicker way than to compute it again.
+    compute : callable
+        Computes a fit where there is none.
     left : list of str, optional
         Takes why an entry cannot be repeated; without it the first such entry is an error.
     """
@@ -111,9 +113,10 @@ class JournalReplayer:
         diagnose: Callable[[DiagnosisTask], str] | None = None,
         curves: Callable[[str], Characteristic] | None = None,
         left: list[str] | None = None,
+        compute: Callable[[FitTask], Characteristic] = fit,
     ) -> None:
         self._monitor = monitor
-        self._curves = curves
+        self._curves, self._compute = curves, compute
         self._left = left
         self._due = [entry for entry in journal if _from_outside(entry)]
         self._tasks: dict[int, FitTask] = {}
@@ -220,7 +223,7 @@ class JournalReplayer:
                 f'The journal adopts curve {entry.model_id} for a request that never came: '
                 'the readings before it are not complete.'
             )
-        found = fit(task)
+        found = self._compute(task)
         if entry.model_id and found.model_id != entry.model_id:
             raise DataError(
                 f'The fit gives curve {found.model_id} where the journal has {entry.model_id}: '

@@ -12,8 +12,10 @@ from pathlib import Path
 from rclpy.serialization import deserialize_message
 from valveflow_msgs.msg import FlowCharacteristic
 
+from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.diagnosis import result
 from valveflow_ros.errors import DataError, RecordingError, ValveflowError, counted
+from valveflow_ros.fit.task import FitTask
 from valveflow_ros.logs import LogContents, LoggedMessage, open_log
 from valveflow_ros.monitoring.events import DiagnosisContent, DiagnosisTask, JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
@@ -25,12 +27,13 @@ from valveflow_ros.ros.decoding import PLANT_SAMPLE, Decoder, from_time, journal
 from valveflow_ros.ros.node import parameter_files
 from valveflow_ros.ros.node.recording import PARAMETERS, TOPICS
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
-from valveflow_ros.ros.worker import DiagnosisWorker
+from valveflow_ros.ros.worker import DiagnosisWorker, FitWorker, Task, Worker
 from valveflow_ros.signals.align import Aligner
 
 # Small, so that outputs before a decision that cannot be repeated are compared first.
 _BLOCK = 500
 _LOOK_S = 0.05
+_PATIENCE = 10.0
 
 
 @dataclass(slots=True)
@@ -113,16 +116,20 @@ def diagnose_in_process(task: DiagnosisTask) -> str:
         It gave no result.
     """
     worker = DiagnosisWorker(task.settings.real('diagnosis_timeout'))
-    worker.submit(task)
     try:
-        while not (outcomes := worker.poll()):
-            time.sleep(_LOOK_S)
+        content = _result(worker, task)
     finally:
         worker.close()
-    content = outcomes[0].result
     if not isinstance(content, DiagnosisContent):
         raise DataError(f'A diagnosis cannot be repeated. {content}')
     return content.text
+
+
+def _result(worker: Worker, task: Task) -> object:
+    worker.submit(task)
+    while not (outcomes := worker.poll()):
+        time.sleep(_LOOK_S)
+    return outcomes[0].result
 
 
 class _Replay:
@@ -131,6 +138,7 @@ class _Replay:
     def __init__(self, log: LogContents, progress: Callable[[float], None]) -> None:
         self._log = log
         self._progress = progress
+        self._fits: FitWorker | None = None
         self._found = Verification(warnings=log.warnings)
         try:
             self._settings = Settings(json.loads(log.attachments[PARAMETERS]))
@@ -159,6 +167,9 @@ class _Replay:
                 raise _DifferenceError(f'The recording goes on with {name} where the replay ends.')
         except _DifferenceError as error:
             self._found.difference = str(error)
+        finally:
+            if self._fits is not None:
+                self._fits.close()
         return self._found
 
     def _outputs_now(self) -> Iterator[Output]:
@@ -181,7 +192,7 @@ class _Replay:
         )
         yield from outputs.latched()
         monitor = Monitor(settings, corrector_of_run(self._log, settings))
-        replayer = JournalReplayer(monitor, journal, diagnose_in_process)
+        replayer = JournalReplayer(monitor, journal, diagnose_in_process, compute=self._fit)
         aligner, decoder = Aligner(settings), Decoder(settings, self._definition())
         inputs = self._messages(self._inputs)
         topics = self._log.topics
@@ -202,6 +213,16 @@ class _Replay:
             yield from outputs.of(events)
             found.rows = monitor.rows
             self._progress(found.inputs / max(1, total))
+
+    def _fit(self, task: FitTask) -> Characteristic:
+        """Compute a fit as the run did: with several threads its last bits may be others."""
+        if self._fits is None:
+            # This machine may be the slower one.
+            self._fits = FitWorker(_PATIENCE * task.settings.real('refit_timeout'))
+        found = _result(self._fits, task)
+        if not isinstance(found, Characteristic):
+            raise DataError(f'A fit cannot be repeated. {found}')
+        return found
 
     def _definition(self) -> str:
         """Return the text of the recorded PlantSample, empty if there is none."""
