@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from valveflow_msgs.msg import Alarm, Diagnosis, DiagnosisCause, FlowCharacteristic
 
-from valveflow_ros.ros.demo import Story, moment
+from valveflow_ros.ros.demo import Story, moment, told_in_the_end
 from valveflow_ros.ros.encoding import header, to_time
 
 HOUR = 3600 * 10**9
@@ -95,3 +95,21 @@ def test_an_alarm_before_the_fault_is_not_its_alarm(capsys: pytest.CaptureFixtur
     story.on_alarm(alarm(FAULT + HOUR, 2))
     assert story.outcome().endswith('the first alarm came 1.0 h later.')
     assert len(lines(capsys)) == 3
+
+
+def test_an_alarm_that_never_came_is_nothing_to_tell(capsys: pytest.CaptureFixture[str]) -> None:
+    story = Story(FAULT)
+    story.on_alarm(alarm(T0, 0, Alarm.NORMAL))
+    assert lines(capsys) == []
+
+
+@pytest.mark.parametrize(
+    ('missing', 'days', 'words'),
+    [
+        ([], 3.0, 'All came out, and the replay was identical to the recording, byte for byte.'),
+        (['diagnose failed'], 3.0, 'Not all came out: diagnose failed.'),
+        (['a', 'b'], 0.5, 'Not all came out: a; b. 3 days (--days) are enough for that.'),
+    ],
+)
+def test_the_last_line_tells_what_is_missing(missing: list[str], days: float, words: str) -> None:
+    assert told_in_the_end(missing, days) == words

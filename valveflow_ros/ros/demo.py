@@ -38,6 +38,7 @@ _HOUR_NS = 3600 * 10**9
 _FAULT, _FAULT_MW = 'curve_step', -12.0
 _FAULT_FROM = 0.5  # share of the run after which the fault begins
 _MONITOR = '/valveflow_monitor'
+_DAYS = 3.0
 _LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _BEFORE_ACKNOWLEDGING_S = 0.2
 _PATIENCE_S = 10.0
@@ -63,7 +64,7 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument('--output', type=Path, required=True, metavar='DIR', help='for all results')
     made.add_argument(
-        '--days', metavar='D', default=3.0, help='of plant (default: 3)',
+        '--days', metavar='D', default=_DAYS, help=f'of plant (default: {_DAYS:g})',
         type=number('a number of days', 0, 400, '--days 3', above=True),
     )  # fmt: skip
     made.add_argument(
@@ -327,7 +328,7 @@ def run(options: argparse.Namespace, stop: StopFlag) -> int:
         )
         if status != 0:
             raise ValveflowError(f'The monitor ended with status {status}: {monitor.last_line()}')
-        return _conclude(watch, story, folder, fault_ns)
+        return _conclude(watch, story, folder, fault_ns, options.days)
     finally:
         for process in processes:
             process.end()
@@ -403,15 +404,18 @@ def _follow(
             quiet = 0
 
 
-def _conclude(watch: Watch, story: Story, folder: Path, fault_ns: int) -> int:
+def _conclude(watch: Watch, story: Story, folder: Path, fault_ns: int, days: float) -> int:
     recording = max((folder / 'recordings').glob('valveflow_*'), key=lambda p: p.stat().st_mtime)
     result = folder / 'result'
-    ok = _run('replay --verify', 'ros.replay_main', str(recording), '--verify')
+    missing = []
+    if not _run('replay --verify', 'ros.replay_main', str(recording), '--verify'):
+        missing.append('the replay differs from the recording')
     for verb in ('identify', 'diagnose'):
-        ok &= _run(f'valveflow {verb}', 'cli', verb, str(recording), '-o', str(result / verb))
+        if not _run(f'valveflow {verb}', 'cli', verb, str(recording), '-o', str(result / verb)):
+            missing.append(f'{verb} failed')
     clean = [c for c in story.curves if from_time(c.window_end) <= fault_ns]
     if not clean:
-        tell('No curve was found before the fault.')
+        tell(told_in_the_end(['no curve was found before the fault', *missing], days))
         return 1
     _compare(clean[-1])
     tell(story.outcome())
@@ -438,10 +442,20 @@ def _conclude(watch: Watch, story: Story, folder: Path, fault_ns: int) -> int:
         '  python -m valveflow_ros.ros.monitor_main --ros-args -p use_sim_time:=true',
     ):
         tell(line)
-    if ok and story.alarms_of_fault and watch.acknowledged and found == [_FAULT]:
-        return 0
-    tell('Not all of it came out: a run of three days (the default) is enough for that.')
-    return 1
+    if not story.alarms_of_fault or not watch.acknowledged:
+        missing.append('no alarm on the fault was raised and acknowledged')
+    if found != [_FAULT]:
+        missing.append('the diagnosis did not name the fault alone')
+    tell(told_in_the_end(missing, days))
+    return 1 if missing else 0
+
+
+def told_in_the_end(missing: Sequence[str], days: float) -> str:
+    """Return the last line: all is there and the replay agreed, or what is missing."""
+    if not missing:
+        return 'All came out, and the replay was identical to the recording, byte for byte.'
+    enough = f' {_DAYS:g} days (--days) are enough for that.' if days < _DAYS else ''
+    return f'Not all came out: {"; ".join(missing)}.{enough}'
 
 
 def _run(what: str, module: str, *arguments: str) -> bool:
