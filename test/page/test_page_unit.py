@@ -77,10 +77,11 @@ def test_later_each_change_is_told_once_with_the_state_before():
     predict(unit, 0)
     for _ in range(4):
         assert unit.changes() == []
-    for state in (1, 1, 2, 0):
+    # A monitor that starts tells of each alarm that it is normal, which is no change.
+    for state in (0, 1, 1, 2, 0):
         alarm(unit, state, second=7)
     found = unit.changes()
-    assert [(c.previous, c.alarm.state) for c in found] == [(None, 1), (1, 2), (2, 0)]
+    assert [(c.previous, c.alarm.state) for c in found] == [(0, 1), (1, 2), (2, 0)]
     assert found[0].time_ns % 10**10 == 7 * 10**9
     alarm(unit, 0, second=9)
     assert unit.changes() == []

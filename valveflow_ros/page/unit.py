@@ -206,6 +206,9 @@ class Unit(Board):
         if alarm is None or alarm.state == before:
             return
         self._states[name] = alarm.state
+        if before is None and alarm.state == NORMAL:
+            # A monitor that starts says so of each alarm; that is nothing to be called for.
+            return
         time_ns = int(stamp['sec']) * NS_PER_S + int(stamp['nanosec'])
         self._changes.append(
             AlarmChange(self._unit, self.key, alarm, before if self._settled else None, time_ns)
