@@ -1,6 +1,8 @@
 # make setup   .venv and install/, from pinned wheels; quick when nothing changed
 # make demo    set-up, then a simulated plant, the monitor, an alarm and a recording
 # make test    set-up, then every test on all cores (PYTEST_ARGS='-k partition' for some, PARALLEL= for one by one)
+# make test-versions   every test with Python 3.12 and the libraries of Ubuntu 24.04, and with Python 3.10
+#                 and the newest, each in a copy under build/ (PYTHONS='python3.10 /path/to/python3.12')
 # make test-slow   set-up, then the tests marked slow, and those with drawn examples on fresh ones
 # make lint    set-up, then ruff and mypy           (make format rewrites the layout)
 # make bench   set-up, then what is fast, measured
@@ -19,7 +21,7 @@
 
 SHELL := bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow lint format bench bench-gate mutation repeat torture study study-diagnosis certify-partition lock clean
+.PHONY: help setup demo test test-versions test-slow lint format bench bench-gate mutation repeat torture study study-diagnosis certify-partition lock clean
 
 export PYTHON
 ENV := source ./env.sh &&
@@ -27,6 +29,7 @@ VALVEFLOW_DEMO ?= bash -c 'source env.sh && python -m valveflow_ros.ros.demo --o
 PYTEST_ARGS ?=
 # A file's tests stay together, for they share what is dear to make; the long files come first.
 PARALLEL ?= -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+PYTHONS ?= python3.10 python3.12
 # Checked as strictly as mypy can; ros/ is not, because rclpy carries no annotations.
 STRICT := $(wildcard $(addprefix valveflow_ros/,*.py signals segments partition curve fit \
   monitoring diagnosis baselines plant logs report interface page cli) tools)
@@ -45,6 +48,11 @@ demo: setup
 
 test: setup
 	@$(ENV) VALVEFLOW_REQUIRE_ROS=1 python -m pytest $(PARALLEL) $(PYTEST_ARGS)
+
+test-versions: setup
+	@failed=; for python in $(PYTHONS); do tree=$$(.venv/bin/python tools/versions.py $$python) && \
+	  $(MAKE) -C $$tree test PYTHON=$$python || failed="$$failed $$python"; done; \
+	  [ -z "$$failed" ] || { echo "test-versions: failed with$$failed" >&2; exit 1; }
 
 test-slow: setup
 	@$(ENV) VALVEFLOW_REQUIRE_ROS=1 VALVEFLOW_SLOW=1 python -m pytest -m 'slow or hypothesis' \
