@@ -1,5 +1,6 @@
 """The ament_python package valveflow_ros; its metadata stand in package.xml, once."""
 
+import os
 import sys
 from glob import glob
 from pathlib import Path
@@ -17,11 +18,8 @@ README = Path(__file__).resolve().with_name('README.md')
 
 COMMAND = ['valveflow = valveflow_ros.cli.main:main']
 NODES = [
-    'monitor = valveflow_ros.ros.monitor_main:main',
-    'page = valveflow_ros.ros.page_main:main',
-    'plant_simulator = valveflow_ros.ros.simulator_main:main',
-    'replay = valveflow_ros.ros.replay_main:main',
-    'watch = valveflow_ros.ros.watch_main:main',
+    f'{name} = valveflow_ros.ros:{name}'
+    for name in ('monitor', 'page', 'plant_simulator', 'replay', 'watch')
 ]
 # pip would put the nodes beside the command, under names as plain as `monitor`, also
 # where there is no ROS. ros2 looks for them in lib/valveflow_ros, where colcon puts them.
@@ -32,6 +30,26 @@ def files(pattern: str) -> list[str]:
     """Return the files that match, none if the folder is empty or absent."""
     return sorted(name for name in glob(pattern) if Path(name).is_file())
 
+
+def warn_without_messages() -> None:
+    """Say while colcon builds that valveflow_msgs is not there: without it no node can run.
+
+    colcon does not look for packages below another one, and so not into msg/.
+    """
+    marker = Path('share/ament_index/resource_index/packages/valveflow_msgs')
+    prefixes = filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
+    if not any((prefix / marker).is_file() for prefix in map(Path, prefixes)):
+        print(
+            'WARNING: the message package valveflow_msgs is not built, so no node of '
+            'valveflow_ros can run. In the workspace: colcon build --base-paths src '
+            'src/valveflow_ros/msg',
+            file=sys.stderr,
+        )
+
+
+# What colcon calls, with and without --symlink-install.
+if not BY_PIP and {'develop', 'install'}.intersection(sys.argv):
+    warn_without_messages()
 
 setup(
     name=PACKAGE,
@@ -61,24 +79,27 @@ setup(
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={'': ['py.typed', '*.css', '*.html', '*.js', '*.yaml']},
     zip_safe=False,
+    # The oldest versions are those of Ubuntu 24.04 (`make test-versions`).
     install_requires=[
         'argcomplete',
         'lz4',
         'mcap>=1.5',
-        'numba',
-        'numpy',
-        'pandas',
+        'numba>=0.59',
+        'numpy>=1.26',
+        'pandas>=2.1',
         'plotly',
         'pyyaml',
-        'scipy',
+        'scipy>=1.11',
         'zstandard',
     ],
-    # What only some need: reading .xlsx, pictures as files, the page in the browser.
+    # What only some need: reading .xlsx, pictures as files, the page in the browser. By `test`
+    # colcon knows that pytest runs the tests.
     extras_require={
         'excel': ['python-calamine'],
         'figures': ['matplotlib'],
         'page': ['dash>=3', 'prometheus-client', 'waitress>=3'],
         'parquet': ['pyarrow'],
+        'test': ['hypothesis', 'psutil', 'pytest'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),

@@ -1,1 +1,32 @@
 """The only folder that knows ROS: node, replay, simulated plant, conversions."""
+
+import sys
+from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
+
+from valveflow_ros.errors import ValveflowError
+
+# `colcon build` without it finds no msg/ and succeeds; the nodes cannot run then.
+_NOT_BUILT = (
+    'The message package valveflow_msgs is not found. In the workspace: colcon build --base-paths '
+    'src src/valveflow_ros/msg, then source install/setup.bash.'
+)
+
+
+def _start(executable: str, module: str) -> int:
+    """Run an executable of ``ros2 run``; return the exit status."""
+    try:
+        if find_spec('valveflow_msgs') is None:
+            raise ValveflowError(_NOT_BUILT)
+        return int(import_module(f'{__name__}.{module}').main())
+    except ValveflowError as error:
+        print(f'valveflow {executable}: {error}', file=sys.stderr)
+        return 1
+
+
+monitor = partial(_start, 'monitor', 'monitor_main')
+page = partial(_start, 'page', 'page_main')
+plant_simulator = partial(_start, 'plant_simulator', 'simulator_main')
+replay = partial(_start, 'replay', 'replay_main')
+watch = partial(_start, 'watch', 'watch_main')
