@@ -62,7 +62,6 @@ setup(
         'Environment :: Console',
         'Intended Audience :: Manufacturing',
         'Intended Audience :: Science/Research',
-        'License :: OSI Approved :: Apache Software License',
         'Operating System :: POSIX :: Linux',
         'Programming Language :: Python :: 3',
         'Programming Language :: Python :: 3.10',

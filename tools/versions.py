@@ -15,8 +15,8 @@ from pathlib import Path
 
 from tree import BUILD, ROOT, VENV, SetupError, clean_environment, reason, say
 
-# What Ubuntu 24.04, the platform of Jazzy, has beside its Python. Another Python gets the newest of
-# each. pyarrow 26 refuses NumPy 1.
+# What Ubuntu 24.04, the platform of Jazzy, has beside its Python 3.12; any other Python gets the
+# newest of each. pyarrow 26 refuses NumPy 1.
 UBUNTU = {
     '3.12': ('numpy==1.26.4', 'scipy==1.11.4', 'pandas==2.1.4', 'numba==0.59.1', 'pyarrow<26'),
 }
