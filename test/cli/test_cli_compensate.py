@@ -7,11 +7,12 @@ import json
 from functools import partial
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from curves import curve
 
 from valveflow_ros.curve.characteristic_json import to_json
+
+pq = pytest.importorskip('pyarrow.parquet')
 
 # From 150 MW on.
 KNOTS = [1060.0, 1250.0, 1600.0, 1900.0, 2280.0]

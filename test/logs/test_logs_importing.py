@@ -5,12 +5,13 @@ import pytest
 import yaml
 from log_files import STOCK, same_readings, wander, write_chunks
 from mcap.reader import make_reader
-from rosbags.highlevel import AnyReader
 
 from valveflow_ros.errors import DataError, RecordingError
 from valveflow_ros.logs import open_log, write_samples
 from valveflow_ros.logs.tables.words import of_gauge, spelling
 from valveflow_ros.records import SIGNALS, SampleTable, table_to_readings
+
+AnyReader = pytest.importorskip('rosbags.highlevel').AnyReader
 
 
 @pytest.mark.parametrize('command', [False, True])

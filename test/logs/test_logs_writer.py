@@ -22,11 +22,12 @@ from log_files import (
     write_messages,
 )
 from mcap.reader import NonSeekingReader, make_reader
-from mcap_ros2.decoder import DecoderFactory
-from rosbags.highlevel import AnyReader
 
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.logs import LATCHED, Message, RecordingWriter, open_log
+
+AnyReader = pytest.importorskip('rosbags.highlevel').AnyReader
+DecoderFactory = pytest.importorskip('mcap_ros2.decoder').DecoderFactory
 
 READ_IN_NODE = Path(__file__).with_name('read_mcap.mjs')
 

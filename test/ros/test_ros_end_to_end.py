@@ -17,8 +17,6 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
 from ros_helpers import Processes
-from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
 from std_msgs.msg import Float64MultiArray
 from valveflow_msgs.msg import Alarm, Diagnosis, FlowCharacteristic, JournalEntry, Prediction
 
@@ -32,6 +30,9 @@ from valveflow_ros.ros.decoding import from_time
 from valveflow_ros.ros.encoding import float64_bytes
 from valveflow_ros.ros.simulator_main import effects_of
 from valveflow_ros.ros.verify import verify
+
+AnyReader = pytest.importorskip('rosbags.highlevel').AnyReader
+typesys = pytest.importorskip('rosbags.typesys')
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 DAYS, SEED = 0.3, 7
@@ -201,7 +202,8 @@ def the_files_own_words(log: LogContents) -> None:
 def others_read_it(folder: Path) -> None:
     """A reader that is not ours finds the same values."""
     table = sent_table()
-    with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+    with AnyReader([folder], default_typestore=store) as reader:
         by_topic = {connection.topic: connection for connection in reader.connections}
         for signal_ in SENT:
             connection = by_topic[f'/{SIGNALS[signal_].topic}']
