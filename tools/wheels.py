@@ -72,8 +72,8 @@ def install_wheels(log: Path) -> None:
 def repair_cmake() -> int:
     """Point the wheels' exported CMake targets at this Python; return how many files.
 
-    They carry the include paths of the machine that built the wheels, and CMake
-    refuses a path that does not exist. A file is replaced, never written in place:
+    They carry the include paths of the machine that built the wheels, beside NumPy 2,
+    and CMake refuses a path that does not exist. A file is replaced, never written in place:
     it may be a hard link into the installer's cache. A second run finds nothing
     to do, and nothing outside .venv is looked at.
     """
@@ -81,6 +81,9 @@ def repair_cmake() -> int:
     version = f'python{sys.version_info.major}.{sys.version_info.minor}'
     include = str(sysconfig.get_config_var('INCLUDEPY'))
     site = str(VENV / 'lib' / version / 'site-packages')
+    # NumPy 2 has renamed it.
+    headers = f'{site}/numpy/_core/include'
+    there = headers if Path(headers).is_dir() else f'{site}/numpy/core/include'
     repaired = 0
     for path in sorted(VENV.glob('share/*/cmake/*.cmake')):
         text = path.read_text(encoding='utf-8')
@@ -88,6 +91,7 @@ def repair_cmake() -> int:
         right = re.sub(
             builder + r'/lib/python3\.\d+/site-packages(?=[;"/])', lambda _: site, right
         )
+        right = right.replace(headers, there)
         if right != text:
             fresh = path.with_suffix('.new')
             fresh.write_text(right, encoding='utf-8')
