@@ -110,9 +110,13 @@ def test_children_do_not_see_another_ros(monkeypatch):
     assert env['PATH'].startswith(f'{tree.VENV}/bin:')
 
 
-def test_cmake_files_are_repaired_once_and_never_in_place(monkeypatch, tmp_path):
+@pytest.mark.parametrize('core', ['_core', 'core'])
+def test_cmake_files_are_repaired_once_and_never_in_place(monkeypatch, tmp_path, core):
     """The installer's cache, which shares the file, keeps its own content."""
     monkeypatch.setattr(wheels, 'VENV', tmp_path / 'venv')
+    version = 'python{}.{}'.format(*sys.version_info[:2])
+    headers = tmp_path / 'venv' / 'lib' / version / 'site-packages' / 'numpy' / core / 'include'
+    headers.mkdir(parents=True)
     folder = tmp_path / 'venv' / 'share' / 'any_msgs' / 'cmake'
     folder.mkdir(parents=True)
     cache = tmp_path / 'cached.cmake'
@@ -131,7 +135,7 @@ def test_cmake_files_are_repaired_once_and_never_in_place(monkeypatch, tmp_path)
     assert '/opt/python' not in text
     include, numpy = text.split('"')[1].split(';')
     assert Path(include, 'Python.h').is_file()
-    assert numpy.startswith(str(tmp_path / 'venv' / 'lib'))
+    assert Path(numpy) == headers
     assert 'OTHER "/opt/ros/jazzy/include"' in text
     assert cache.read_text() == before
 

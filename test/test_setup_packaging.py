@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.metadata
 import os
 import re
@@ -18,6 +19,11 @@ import pytest
 import valveflow_ros
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / 'tools'))
+
+import headers  # noqa: E402
+import versions  # noqa: E402
+
 LOCK = (ROOT / 'requirements.lock').read_text(encoding='utf-8')
 NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
 
@@ -70,6 +76,7 @@ def test_manifests(folder):
     assert root.findtext('license') == 'Apache-2.0'
     assert re.fullmatch(r'[\w.]+@[\w.]+\.\w+', root.find('maintainer').get('email'))
     assert root.findtext('maintainer')
+    assert root.findtext('url').startswith('https://')
     assert root.findtext('description')
 
 
@@ -88,8 +95,8 @@ def test_executables_are_those_of_the_contract(arguments):
         'monitor', 'page', 'plant_simulator', 'replay', 'watch', 'valveflow',
     }  # fmt: skip
     for target in scripts.values():
-        assert re.fullmatch(r'valveflow_ros(\.\w+)+:main', target)
-        assert (ROOT / (target.split(':')[0].replace('.', '/') + '.py')).is_file()
+        module, _, name = target.partition(':')
+        assert callable(getattr(importlib.import_module(module), name))
 
 
 def test_every_package_is_shipped(arguments):
@@ -107,6 +114,183 @@ def test_data_files_exist(arguments):
     assert len(targets['share/valveflow_ros/msg']) == len(list((ROOT / 'msg').glob('*.msg')))
     for files in targets.values():
         assert all((ROOT / name).is_file() for name in files)
+
+
+# As rosdep resolves them on Ubuntu 24.04: by apt. Those resolved by pip are refused there.
+NATIVE = {
+    'ament_cmake', 'ament_index_python', 'builtin_interfaces', 'diagnostic_msgs', 'launch',
+    'launch_ros', 'lifecycle_msgs', 'rcl_interfaces', 'rclpy', 'rosgraph_msgs',
+    'rosidl_default_generators', 'rosidl_default_runtime', 'std_msgs', 'std_srvs',
+    'python3-argcomplete', 'python3-hypothesis', 'python3-numba', 'python3-numpy',
+    'python3-pandas', 'python3-psutil', 'python3-pytest', 'python3-scipy', 'python3-yaml',
+}  # fmt: skip
+
+
+def keys(folder):
+    """The names of all dependencies of a package."""
+    return {e.text for e in manifest(folder).iter() if e.tag.endswith('depend')}
+
+
+@pytest.mark.parametrize('folder', ['.', 'msg'])
+def test_rosdep_needs_no_pip(folder):
+    assert keys(folder) - {'valveflow_msgs'} <= NATIVE
+
+
+def imports(path, everywhere):
+    """The packages that a file imports, or only those that it cannot be loaded without."""
+    parsed = ast.parse(path.read_text(encoding='utf-8'))
+    for node in ast.walk(parsed) if everywhere else parsed.body:
+        if isinstance(node, ast.Import):
+            yield from (alias.name.partition('.')[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield node.module.partition('.')[0]
+
+
+def test_every_ros_package_that_is_imported_is_a_dependency():
+    files = [*(ROOT / 'valveflow_ros').rglob('*.py'), *(ROOT / 'launch').glob('*.py')]
+    found = {name for path in files for name in imports(path, everywhere=True)}
+    ros = re.compile(r'rclpy|launch(_ros)?|ament_\w+|\w+_(msgs|srvs|interfaces)')
+    assert {name for name in found if ros.fullmatch(name)} <= keys('.')
+
+
+def test_what_apt_does_not_bring_is_said_with_the_command(arguments):
+    """What is always needed, and what reads Parquet beside the NumPy of Ubuntu 24.04."""
+    needed = {NAME.match(need)[0] for need in arguments['install_requires']}
+    by_apt = {key.removeprefix('python3-').replace('yaml', 'pyyaml') for key in keys('.')}
+    by_mcap = {'lz4', 'zstandard'}
+    readme = (ROOT / 'README.md').read_text(encoding='utf-8')
+    line = re.search(r'pip install --break-system-packages (.*)', readme)[1]
+    assert set(line.split()) == needed - by_apt - by_mcap | {"'pyarrow<26'"}
+    assert 'rosdep install --from-paths src src/valveflow_ros/msg ' in readme
+
+
+def test_the_tests_load_without_what_apt_does_not_bring():
+    """`colcon test` skips what needs such a library, instead of failing to load the file."""
+    extras = {
+        'dash', 'matplotlib', 'mcap_ros2', 'openpyxl', 'plotly', 'prometheus_client', 'pyarrow',
+        'python_calamine', 'rosbags', 'waitress',
+    }  # fmt: skip
+    for path in (ROOT / 'test').rglob('*.py'):
+        body = path.read_text(encoding='utf-8')
+        found = extras.intersection(imports(path, everywhere=False))
+        assert all(f"pytest.importorskip('{name}'" in body for name in found), path
+
+
+def run_setup(prefix, *words):
+    """Run setup.py as colcon does, beside a prefix; return what it says."""
+    done = subprocess.run(
+        [sys.executable, 'setup.py', '--dry-run', *words],
+        cwd=ROOT, env=os.environ | {'AMENT_PREFIX_PATH': f'/nowhere:{prefix}'},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    return done.stderr
+
+
+@pytest.mark.parametrize('word', ['install', 'develop'])
+def test_a_build_without_the_messages_says_so(tmp_path, word):
+    # Help is asked for, so nothing is installed.
+    said = run_setup(tmp_path, word, '--help')
+    assert 'WARNING: the message package valveflow_msgs is not built' in said
+    assert 'colcon build --base-paths src src/valveflow_ros/msg' in said
+    marker = tmp_path / 'share/ament_index/resource_index/packages/valveflow_msgs'
+    marker.parent.mkdir(parents=True)
+    marker.touch()
+    assert 'valveflow_msgs' not in run_setup(tmp_path, word, '--help')
+
+
+def test_a_wheel_is_built_without_a_word_about_messages(tmp_path):
+    assert 'valveflow_msgs' not in run_setup(tmp_path, 'bdist_wheel', '--help')
+
+
+def without(module, code):
+    """Run code where a module is not installed."""
+    return subprocess.run(
+        [sys.executable, '-c', f'import sys; sys.modules[{module!r}] = None\n{code}'],
+        env=os.environ | {'PYTHONPATH': f'{ROOT}:{os.environ.get("PYTHONPATH", "")}'},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize('name', ['monitor', 'page', 'plant_simulator', 'replay', 'watch'])
+def test_a_node_without_the_messages_names_the_command(name):
+    code = f'import valveflow_ros.ros\nsys.exit(valveflow_ros.ros.{name}())'
+    done = without('valveflow_msgs', code)
+    assert done.returncode == 1
+    assert done.stderr == (
+        f'valveflow {name}: The message package valveflow_msgs is not found. In the workspace: '
+        'colcon build --base-paths src src/valveflow_ros/msg, then source install/setup.bash.\n'
+    )
+
+
+def test_without_mcap_a_log_is_refused_in_words():
+    """No rosdep key brings it."""
+    code = "from valveflow_ros.cli.main import main\nsys.exit(main(['info', 'README.md']))"
+    done = without('mcap', code)
+    assert done.returncode == 1
+    assert done.stderr.endswith('which is not installed: pip install mcap.\n')
+    assert done.stderr.count('\n') == 1
+
+
+def test_colcon_runs_the_tests_by_pytest(arguments):
+    """It asks the extra `test`; without pytest in it, it would run unittest and find nothing."""
+    assert 'pytest' in arguments['extras_require']['test']
+
+
+def test_no_linter_is_configured_that_is_not_run():
+    text = (ROOT / 'setup.cfg').read_text(encoding='utf-8')
+    assert set(re.findall(r'^\[(.*)\]', text, re.M)) == {'develop', 'install'}
+
+
+def test_the_tree_of_other_versions(monkeypatch, tmp_path):
+    """It is the files of the checkout, without those deleted there; its set-up is kept."""
+    root, copy = tmp_path / 'root', tmp_path / 'copy'
+    (root / 'a').mkdir(parents=True)
+    for name in ('a/kept.py', 'gone.py'):
+        (root / name).write_text(name)
+    monkeypatch.setattr(versions, 'ROOT', root)
+    subprocess.run(['git', 'init', '-q'], cwd=root, check=True)
+    subprocess.run(['git', 'add', '.'], cwd=root, check=True)
+    versions.copy_tree(copy)
+    assert (copy / 'gone.py').is_file()
+    (root / 'gone.py').unlink()
+    (root / 'new.py').write_text('not committed')
+    (copy / '.venv').mkdir()
+    versions.copy_tree(copy)
+    assert {p.name for p in copy.iterdir()} == {'.venv', 'a', 'new.py'}
+    assert (copy / 'a' / 'kept.py').read_text() == 'a/kept.py'
+
+
+def test_headers_are_added_once(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(headers, 'ROOT', tmp_path)
+    files = {
+        'setup.py': '"""About."""\n', 'env.sh': '# About.\n', 'msg/CMakeLists.txt': 'project(x)\n',
+        'tools/run.sh': '#!/bin/sh\necho\n', 'test/empty.py': '', 'test/data.txt': 'x\n',
+    }  # fmt: skip
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert headers.main() == 0
+    assert capsys.readouterr().out == '4 files changed\n'
+    for name, text in files.items():
+        first, rest = headers.parts(tmp_path / name)
+        if name.startswith('test/'):
+            assert rest == text
+        else:
+            assert first + rest.removeprefix(headers.HEADER).lstrip('\n') == text
+            assert rest.startswith(headers.HEADER)
+    assert headers.main() == 0
+    assert capsys.readouterr().out == '0 files changed\n'
+
+
+def test_a_python_that_is_not_there_is_named(capsys):
+    assert versions.main('/nowhere/python3.12') == 1
+    assert capsys.readouterr().err == 'setup: /nowhere/python3.12: No such file or directory\n'
+
+
+def test_the_oldest_libraries_are_those_that_are_tested(arguments):
+    oldest = dict(re.findall(r'^(\w+)==(\d+\.\d+)', '\n'.join(versions.UBUNTU['3.12']), re.M))
+    for name, version in oldest.items():
+        assert f'{name}>={version}' in arguments['install_requires']
 
 
 def test_what_pip_installs_is_in_the_lock(arguments):
