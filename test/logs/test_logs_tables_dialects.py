@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+import os
 import subprocess
 import sys
 import zoneinfo
@@ -127,6 +128,7 @@ def test_the_size_of_the_blocks_changes_nothing(tmp_path, monkeypatch, block):
 
 def test_a_workbook_and_a_parquet_file_give_the_same_values(tmp_path):
     openpyxl = pytest.importorskip('openpyxl')
+    pytest.importorskip('pyarrow')
     book = openpyxl.Workbook()
     sheet = book.active
     sheet.append(['Export of unit 3'])
@@ -165,16 +167,32 @@ def test_without_the_library_of_a_format_it_says_what_to_install(tmp_path, monke
     assert not (tmp_path / 'y.parquet').exists()
 
 
+def test_a_pyarrow_that_refuses_this_numpy_is_told(tmp_path, monkeypatch):
+    """As 26 does beside the NumPy 1.26 of Ubuntu 24.04."""
+    (tmp_path / 'pyarrow.py').write_text('raise ImportError("pyarrow requires NumPy 2.0")\n')
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, 'pyarrow', raising=False)
+    (tmp_path / 'x.parquet').write_bytes(b'PAR1')
+    with pytest.raises(RecordingError, match=r'requires NumPy 2\.0.*pip install "pyarrow<26"'):
+        read_table(tmp_path / 'x.parquet')
+
+
 def test_csv_needs_neither_library(tmp_path):
     """In a process of its own, because pandas looks for pyarrow when it is loaded."""
     path = tmp_path / 'x.csv'
     write_table(wander(50, seed=1), path)
+    # Files, because compiled modules of pandas take a None in sys.modules for the library.
+    for library in ('pyarrow', 'python_calamine'):
+        (tmp_path / f'{library}.py').write_text('raise ModuleNotFoundError(__name__)')
     code = (
-        'import sys; sys.modules.update(pyarrow=None, python_calamine=None)\n'
         'from valveflow_ros.logs import read_table\n'
         f'raw = read_table({str(path)!r}); print(repr([c.tolist() for c in raw.columns.values()]))'
     )
-    done = subprocess.run([sys.executable, '-c', code], check=True, capture_output=True, text=True)
+    places = os.pathsep.join([str(tmp_path), os.environ.get('PYTHONPATH', '')])
+    done = subprocess.run(
+        [sys.executable, '-c', code], env=os.environ | {'PYTHONPATH': places}, check=True,
+        capture_output=True, text=True,
+    )  # fmt: skip
     assert done.stdout.strip() == repr([c.tolist() for c in read_table(path).columns.values()])
 
 

@@ -51,15 +51,21 @@ def check_parquet(path: Path) -> None:
     Raises
     ------
     RecordingError
-        If pyarrow, an extra of this package, is not installed.
+        If pyarrow, an extra of this package, is not installed, or refuses the NumPy beside it.
     """
     try:
         import pyarrow  # noqa: F401
-    except ImportError:
+    except ModuleNotFoundError:
         raise RecordingError(
             path,
             "is a Parquet file, and pyarrow that reads and writes those is not installed; 'pip "
             "install pyarrow', or use CSV",
+        ) from None
+    except ImportError as error:
+        raise RecordingError(
+            path,
+            f'is a Parquet file, and the installed pyarrow cannot be loaded ({error}); beside '
+            'NumPy 1 \'pip install "pyarrow<26"\', or use CSV',
         ) from None
 
 
