@@ -121,8 +121,9 @@ NATIVE = {
     'ament_cmake', 'ament_index_python', 'builtin_interfaces', 'diagnostic_msgs', 'launch',
     'launch_ros', 'lifecycle_msgs', 'rcl_interfaces', 'rclpy', 'rosgraph_msgs',
     'rosidl_default_generators', 'rosidl_default_runtime', 'std_msgs', 'std_srvs',
-    'python3-argcomplete', 'python3-hypothesis', 'python3-numba', 'python3-numpy',
-    'python3-pandas', 'python3-psutil', 'python3-pytest', 'python3-scipy', 'python3-yaml',
+    'python3-argcomplete', 'python3-hypothesis', 'python3-matplotlib', 'python3-numba',
+    'python3-numpy', 'python3-openpyxl', 'python3-pandas', 'python3-psutil', 'python3-pytest',
+    'python3-scipy', 'python3-yaml',
 }  # fmt: skip
 
 

@@ -129,6 +129,7 @@ def test_the_size_of_the_blocks_changes_nothing(tmp_path, monkeypatch, block):
 def test_a_workbook_and_a_parquet_file_give_the_same_values(tmp_path):
     openpyxl = pytest.importorskip('openpyxl')
     pytest.importorskip('pyarrow')
+    pytest.importorskip('python_calamine')
     book = openpyxl.Workbook()
     sheet = book.active
     sheet.append(['Export of unit 3'])

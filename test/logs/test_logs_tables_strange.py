@@ -32,6 +32,7 @@ def text_of(path, head=HEAD, rows=ROWS):
 
 def book_of(path):
     openpyxl = pytest.importorskip('openpyxl')
+    pytest.importorskip('python_calamine')
     book = openpyxl.Workbook()
     for line in (HEAD, *ROWS):
         book.active.append(line.split(','))
@@ -193,6 +194,7 @@ _TEXT_CELLS = ''.join(
 
 def _workbook(path: Path, rows: str, texts: str = '') -> Path:
     """Write the parts of a workbook as they are given."""
+    pytest.importorskip('python_calamine')
     sheet = f'<worksheet xmlns="{_SPREADSHEET}"><sheetData>{rows}</sheetData></worksheet>'
     parts = {
         '[Content_Types].xml': f'<Types xmlns="{_PACKAGE}/content-types">'
