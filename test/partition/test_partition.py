@@ -125,7 +125,7 @@ def test_a_piece_is_the_least_squares_line_with_its_errors():
     found = partition(u, y, 3)
     for (a, b), piece in zip(itertools.pairwise(found.breaks(3)), found.pieces(3), strict=True):
         table = np.column_stack([found.u[a:b], np.ones(b - a)])
-        (slope, intercept), rest, *_ = np.linalg.lstsq(table, found.y[a:b])
+        (slope, intercept), rest, *_ = np.linalg.lstsq(table, found.y[a:b], rcond=None)
         variance = rest[0] / (b - a - 2) * np.linalg.inv(table.T @ table)
         assert piece.slope == pytest.approx(slope)
         assert piece.intercept == pytest.approx(intercept)

@@ -143,7 +143,9 @@ def _settled(points: Points, line: BrokenLine) -> BrokenLine:
     def rest(knots: FloatArray) -> FloatArray:
         at = np.concatenate([[first], knots, [last]])
         hats = _hats(points.u, at)
-        return np.asarray(hats @ np.linalg.lstsq(hats, points.power_mw)[0] - points.power_mw)
+        # The default of NumPy 1 is another one than that of NumPy 2.
+        heights = np.linalg.lstsq(hats, points.power_mw, rcond=None)[0]
+        return np.asarray(hats @ heights - points.power_mw)
 
     scale = float(last - first)
     found = least_squares(
