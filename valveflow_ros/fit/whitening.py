@@ -44,9 +44,15 @@ def yule_walker(products: FloatArray) -> FloatArray:
     """
     if not np.isfinite(products).all():
         raise np.linalg.LinAlgError('the residual is not finite')
-    lags = np.arange(len(products) - 1)
-    # So few that the solver made for such matrices gains nothing, and takes long to load.
-    return np.asarray(np.linalg.solve(products[np.abs(lags[:, None] - lags)], products[1:]))
+    # By Levinson's recursion: the last bits of a library's solver depend on the number of threads.
+    ar, error = np.zeros(0), float(products[0])
+    for k in range(len(products) - 1):
+        if error == 0.0:
+            raise np.linalg.LinAlgError('the products are those of fewer coefficients')
+        reflection = (products[k + 1] - (ar * products[k:0:-1]).sum()) / error
+        ar = np.append(ar - reflection * ar[::-1], reflection)
+        error *= 1.0 - float(reflection) ** 2
+    return ar
 
 
 def normal_equations(
