@@ -158,3 +158,8 @@ def test_a_block_of_scores_holds_the_rows_of_its_time():
     table = np.ones((12, 1))
     _, scores, _ = normal_equations(table, residual, weight, np.empty(0), 3)
     assert scores[:, 0].tolist() == [0 + 1 + 2 + 3, 4 + 5 + 6 + 7, 8 + 9 + 10 + 11]
+
+
+def test_yule_walker_says_where_there_is_no_one_solution():
+    with pytest.raises(np.linalg.LinAlgError):
+        yule_walker(np.ones(3))
