@@ -261,6 +261,10 @@ def test_the_tree_of_other_versions(monkeypatch, tmp_path):
     assert (copy / 'a' / 'kept.py').read_text() == 'a/kept.py'
 
 
+def test_every_source_file_names_copyright_and_licence():
+    assert headers.lacking() == [], 'run: python tools/headers.py'
+
+
 def test_headers_are_added_once(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(headers, 'ROOT', tmp_path)
     files = {
