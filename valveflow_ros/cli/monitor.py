@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING
 from valveflow_ros.cli.command import (
     Console,
     VerbResult,
-    add_beside,
-    add_mapping,
-    add_parameters,
-    add_results,
+    add_analysis,
+    add_analysis_options,
     checked_parameters,
     columns,
     lines,
@@ -39,9 +37,7 @@ def arguments(parser: ArgumentParser) -> None:
     """Add description, example and options."""
     parser.description = _DESCRIPTION
     parser.usage = 'valveflow monitor LOG -o DIR [options]'
-    parser.add_argument('log', metavar='LOG', type=Path, help='the log to read')
-    add_results(parser)
-    add_parameters(parser)
+    add_analysis(parser)
     parser.add_argument(
         '--model', metavar='FILE', type=Path,
         help='an extended_model.json of diagnose: its causes are taken out of the rows first',
@@ -54,8 +50,7 @@ def arguments(parser: ArgumentParser) -> None:
         '--no-diagnosis', action='store_true',
         help='leave out the diagnoses, each of which takes as long as `valveflow diagnose`',
     )  # fmt: skip
-    add_beside(parser)
-    add_mapping(parser)
+    add_analysis_options(parser)
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
