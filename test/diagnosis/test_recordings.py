@@ -10,10 +10,11 @@ from diagnosis_records import record, table, unit
 from streams import needs_jit
 
 import valveflow_ros as vf
-from valveflow_ros.diagnosis import actuator, record_faults
+from valveflow_ros.diagnosis import record_faults
 from valveflow_ros.diagnosis.cause import Active, Estimate
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.grids import Blur, Grids, blur_of
+from valveflow_ros.diagnosis.loop import actuator
 from valveflow_ros.diagnosis.search import hidden, unseen
 from valveflow_ros.records import SampleTable, Signal
 from valveflow_ros.signals.compression import Compression, Updates
