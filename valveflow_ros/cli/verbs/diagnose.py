@@ -92,13 +92,9 @@ def _covariates(said: list[str]) -> dict[str, str]:
 
 
 def _text(found: DiagnosisResult) -> str:
-    from valveflow_ros.diagnosis.result import NAMED, NOTHING, UNEXPLAINED
     from valveflow_ros.report.diagnosis import cells
-    from valveflow_ros.report.words import level
+    from valveflow_ros.report.words import VERDICT_WORDS, advice, level
 
-    verdicts = {
-        NAMED: 'cause found', NOTHING: 'no cause found', UNEXPLAINED: 'something is unexplained',
-    }  # fmt: skip
     d = found.diagnosis
     rows = [
         [c.name, key, *cells(e, found.form.input_exponent)]
@@ -112,7 +108,8 @@ def _text(found: DiagnosisResult) -> str:
         if why.startswith(blind)
     ]
     return lines(
-        f'{found.data.source}: {verdicts[d.verdict]}. {d.sentence}',
+        f'{found.data.source}: {VERDICT_WORDS[d.verdict]}. {d.sentence}',
+        *(advice(c.name, c.meaning, c.to_do) for c in d.causes),
         columns(rows, ['cause', 'parameter', 'value', '95 % interval']) if rows else '',
         f'Not told apart: {", ".join(d.not_told_apart)}.' if d.not_told_apart else '',
         *(f'What would tell them apart: {e}' for e in d.experiments),

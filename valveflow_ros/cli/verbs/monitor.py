@@ -72,7 +72,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
 
 def _text(found: MonitorResult) -> str:
-    from valveflow_ros.report.words import counted, moment
+    from valveflow_ros.report.words import VERDICT_WORDS, advice, counted, moment
 
     content = found.to_json()
     alarms = [
@@ -85,12 +85,21 @@ def _text(found: MonitorResult) -> str:
         for alarm in content['alarms']
     ]
     reference = content['reference']
+    diagnoses = [
+        [moment(at), VERDICT_WORDS[d['verdict']], ', '.join(c['name'] for c in d['causes']) or '-']
+        for at, d in found.diagnoses
+    ]
+    # What was named several times is told once, as it was found last.
+    named = {c['name']: c for _, d in found.diagnoses for c in d['causes']}
     return lines(
         f'{found.source}: {moment(found.start_ns)} to {moment(found.end_ns)}',
         f'{counted(len(content["curves"]), "curve")}, {counted(len(alarms), "alarm")}, '
         f'{counted(len(content["diagnoses"]), "diagnosis", "diagnoses")}.',
         columns(alarms, ['alarm', 'raised', 'cleared', 'state at the end']) if alarms else '',
         *(a['sentence'] for a in content['alarms'] if a['cleared'] is None),
+        columns(diagnoses, ['diagnosis', 'verdict', 'causes']) if diagnoses else '',
+        *(d['sentence'] for _, d in found.diagnoses[-1:]),
+        *(advice(name, c['meaning'], c['to_do']) for name, c in named.items()),
         'No curve became the reference.' if reference is None
         else f'The reference is curve {reference["model_id"]}, set {moment(reference["set"])}.',
     )  # fmt: skip
