@@ -119,7 +119,7 @@ def test_a_valve_at_its_stop_is_no_dead_transmitter(samples: SampleTable, level)
 @pytest.mark.parametrize('effect', [(), ('backlash:w_percent=1',)])
 def test_means_of_a_minute_name_no_slack_of_another_size(effect: tuple[str, ...]) -> None:
     """A slack is found with an interval that holds the truth, or cannot be judged."""
-    plant = vf.simulate(8, 2, effect, unit='choked_fixed:number=2', recording='minute')
+    plant = vf.simulate(5, 2, effect, unit='choked_fixed:number=2', recording='minute')
     found = vf.diagnose(plant.log).diagnosis
     named = {c.name: c for c in found.causes}
     if 'backlash' in named:
