@@ -221,17 +221,6 @@ class HammersteinModel:
         )  # fmt: skip
         return answer, jacobian, weight
 
-    def step_response(self, seconds: FloatArray) -> FloatArray:
-        """Return how much of a unit step of the flow the power has followed, shape (n,)."""
-        rows = int(np.ceil(seconds.max() / self.step_s)) + self.delay + 2
-        # One row of rest before the step; equilibrium is where `run` begins.
-        flat = replace(self, knots=np.array([0.0, 1.0]), values=np.array([0.0, 1.0]))
-        u = np.ones(rows + 1)
-        u[0] = 0.0
-        usable = np.ones(rows + 1, dtype=np.uint8)
-        answer, _ = flat.run(Samples(u, u, usable, self.step_s, 0.0, 1))
-        return np.asarray(np.interp(seconds, np.arange(rows) * self.step_s, answer[1:]))
-
     def pack(self) -> FloatArray:
         """Return the parameters in the order of the kernel's columns."""
         return np.concatenate([self.values, self.knots[1:-1], self.denominator, self.numerator])
