@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from streams import needs_jit
 
-from valveflow_ros.baselines.hammerstein import HammersteinModel, tangents
-from valveflow_ros.baselines.hammerstein_fit import (
+from valveflow_ros.baselines.hammerstein import (
+    HammersteinModel,
     fit_hammerstein,
     grown,
     knots_to_try,
+    tangents,
 )
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.fit.problem import Samples
