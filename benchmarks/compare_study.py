@@ -20,9 +20,9 @@ import numpy as np
 
 from benchmarks import study
 from valveflow_ros.baselines.comparison import Comparison, compare, finding_of
-from valveflow_ros.baselines.hammerstein import HammersteinModel
-from valveflow_ros.baselines.hammerstein_fit import (
+from valveflow_ros.baselines.hammerstein import (
     OUTPUT_ERROR,
+    HammersteinModel,
     first_order,
     grown,
     move,

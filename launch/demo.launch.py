@@ -19,8 +19,9 @@ PLANT = {
     'rate': ('0.0', 'Plant seconds in a second; 0: as fast as the monitor takes them.'),
     'effects': (
         'curve_step:s_mw=-12,t0_days=2.7',
-        'What is wrong with the plant: name:key=value,...; several with semicolons between '
-        'them; empty: nothing.',
+        'What is wrong with the plant: name:key=value,..., several with semicolons between them, '
+        "quoted for the shell: effects:='curve_step:s_mw=-12,t0_days=2.7;backlash'. Empty: "
+        'nothing.',
     ),
 }
 MONITOR = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -76,12 +77,17 @@ def room(path: Path) -> str:
     return '' if first == '__init__.py' else first.removesuffix('.py')
 
 
-def imported(path: Path) -> Iterator[tuple[int, str]]:
+@functools.cache
+def imported(path: Path) -> tuple[tuple[int, str], ...]:
     """Every import of a file, inside functions and type checks too, as an absolute name.
 
     For ``from a import b`` both ``a`` and ``a.b``: ``b`` may be a module. Names
     handed to ``import_module`` and ``__import__`` as text count as well.
     """
+    return tuple(_imports(path))
+
+
+def _imports(path: Path) -> Iterator[tuple[int, str]]:
     package = ('.'.join((PACKAGE, *path.relative_to(HOUSE).parts))).split('.')[:-2]
     for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'), str(path))):
         if isinstance(node, ast.Import):

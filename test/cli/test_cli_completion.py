@@ -9,8 +9,8 @@ import sys
 
 import pytest
 
-from valveflow_ros.cli.completion import SHELLS
 from valveflow_ros.cli.main import VERBS
+from valveflow_ros.cli.verbs.completion import SHELLS
 from valveflow_ros.parameters import TABLE
 from valveflow_ros.plant.effects import catalogue
 from valveflow_ros.records import SIGNALS

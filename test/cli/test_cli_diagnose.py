@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 
 import pytest
@@ -15,13 +17,24 @@ pytestmark = needs_jit
 
 @pytest.fixture(scope='module')
 def diagnosed(tmp_path_factory):
-    """Diagnose a day with a spiky power record; return folder and words."""
+    """Diagnose a day with a spiky power record; return the folder, with what was printed."""
     folder = tmp_path_factory.mktemp('diagnosed')
     log = str(folder / 'plant.parquet')
     words = ['simulate', '-o', log, '--days', '1.3', '--seed', '2', '--quiet']
     assert main([*words, '--effect', 'spikes:height=60,per_day=60']) == 0
-    assert main(['diagnose', log, '-o', str(folder / 'out'), '--quiet']) == 0
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        assert main(['diagnose', log, '-o', str(folder / 'out'), '--quiet']) == 0
+    (folder / 'printed').write_text(printed.getvalue())
     return folder
+
+
+def test_the_answer_says_what_to_do(diagnosed):
+    content = json.loads((diagnosed / 'out' / 'diagnosis.json').read_text())
+    (cause,) = content['causes']
+    first, second = (diagnosed / 'printed').read_text().splitlines()[:2]
+    assert first == f'plant.parquet: cause found. {content["sentence"]}'
+    assert cause['to_do']
+    assert second == f'spikes: What to do: {cause["to_do"]}'
 
 
 def test_the_json_is_the_contract(diagnosed):

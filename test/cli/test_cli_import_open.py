@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from logged import values
 
-from valveflow_ros.cli import import_table
 from valveflow_ros.cli.command import Console, TableOption
 from valveflow_ros.cli.main import Parser, parser_of
+from valveflow_ros.cli.verbs import import_table
 from valveflow_ros.interface.mapping import LOOKING_ON
 from valveflow_ros.logs import open_log
 from valveflow_ros.logs.tables.refusal import Remedy

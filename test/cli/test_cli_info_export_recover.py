@@ -7,11 +7,11 @@ import pytest
 from logged import rewritten
 from monitor_recording import FLOAT64, Monitor, cdr, diagnosis
 
-from valveflow_ros.interface.alignment import align
 from valveflow_ros.interface.logs import steps_of
 from valveflow_ros.interface.settings import settings_for
 from valveflow_ros.logs import open_log, read_table
 from valveflow_ros.records import NS_PER_S, SIGNALS, Signal
+from valveflow_ros.signals.align import align_whole
 
 
 def test_info_tells_what_is_there(run, logs):
@@ -134,7 +134,7 @@ def test_info_counts_what_the_engine_accepts(run, tmp_path, wrong, reason):
     monitor.writer.close()
     told = run('info', tmp_path / 'r', '--json').json['readings']
     readings = open_log(tmp_path / 'r').readings
-    _, _, counts = align(readings, settings_for(steps_of(readings.by_signal()), 0.0, {})[0])
+    _, _, counts = align_whole(readings, settings_for(steps_of(readings.by_signal()), 0.0, {})[0])
     for topic, by_reason in counts.items():
         for name, n in by_reason.items():
             if name != 'late':

@@ -8,8 +8,8 @@ import sys
 import pytest
 
 from valveflow_ros import __version__
-from valveflow_ros.cli import info
 from valveflow_ros.cli.main import VERBS
+from valveflow_ros.cli.verbs import info
 from valveflow_ros.errors import DataError
 
 NAMES = [name for name, _, _ in VERBS]

@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import json
+import re
+from types import SimpleNamespace
 
 import valveflow_ros as vf
+from valveflow_ros.interface import monitor as interface
+from valveflow_ros.monitoring.events import Diagnosed
+from valveflow_ros.parameters import Settings
+
+HOUR_NS = 3600 * 10**9
 
 
 def test_a_fault_stands_to_the_end_and_files_and_answer_say_the_same(run, tmp_path):
     log, out = tmp_path / 'plant.mcap', tmp_path / 'out'
     fault = 'curve_step:s_mw=-12,t0_days=0.9'
-    assert run('simulate', '-o', log, '--days', '2', '--effect', fault).status == 0
-    ran = run('monitor', log, '-o', out, '--no-diagnosis', '--json')
+    assert run('simulate', '-o', log, '--days', '1.5', '--effect', fault).status == 0
+    ran = run('monitor', log, '-o', out, '--no-diagnosis', '--json', '--set', 'sample_period=10')
     assert ran.status == 0, ran.err
     content = json.loads((out / 'monitor.json').read_text())
     assert (content['format'], content['version']) == ('valveflow/monitor', 1)
     assert content['diagnoses'] == []
     answer = json.loads(ran.out)
     assert {key: answer[key] for key in content} == content
-    assert vf.monitor(log, diagnose=False).to_json() == content
+    slow = {'sample_period': 10.0}
+    assert vf.monitor(log, diagnose=False, parameters=slow).to_json() == content
     residual = [a for a in content['alarms'] if a['name'] == 'residual']
     assert [(a['state'], a['cleared']) for a in residual] == [('unacknowledged', None)]
     raised = residual[0]['raised']
@@ -28,3 +36,36 @@ def test_a_fault_stands_to_the_end_and_files_and_answer_say_the_same(run, tmp_pa
     assert later
     assert all(c['window_from'] > raised - 2 * 3600 * 10**9 for c in later)
     assert (out / 'report.html').exists()
+
+
+def ended(hour, verdict, sentence, **causes):
+    """Return a diagnosis that ended, with the meaning and the to-do of each cause."""
+    named = [{'name': k, 'meaning': m, 'to_do': d} for k, (m, d) in causes.items()]
+    content = {'verdict': verdict, 'sentence': sentence, 'causes': named}
+    task = SimpleNamespace(window_end_ns=hour * HOUR_NS)
+    return Diagnosed(task, json.dumps(content), '')
+
+
+def test_each_diagnosis_is_told_with_its_time_and_each_cause_once(
+    run, logs, tmp_path, monkeypatch
+):
+    events = (
+        ended(1, 'nothing', 'All agrees.'),
+        ended(2, 'named', 'First.', gain_step=('It is 2 MW less.', 'Look at the meter.')),
+        ended(30, 'named', 'Last.', gain_step=('It is 3 MW less.', 'Look at the meter.'),
+              spikes=('', 'Mend the wire.')),
+    )  # fmt: skip
+    made = interface.MonitorResult('plant.csv', events, 0, 31 * HOUR_NS, Settings())
+    monkeypatch.setattr(interface, 'monitor', lambda log, **_: made)
+    told = run('monitor', logs / 'plant.csv', '-o', tmp_path).out.splitlines()
+    first = next(k for k, line in enumerate(told) if 'verdict' in line)
+    assert [re.split(' {2,}', line)[1:] for line in told[first + 1 : first + 4]] == [
+        ['1970-01-01 01:00:00 UTC', 'no cause found', '-'],
+        ['1970-01-01 02:00:00 UTC', 'cause found', 'gain_step'],
+        ['1970-01-02 06:00:00 UTC', 'cause found', 'gain_step, spikes'],
+    ]
+    assert told[first + 4 : first + 7] == [
+        'Last.',
+        'gain_step: It is 3 MW less. What to do: Look at the meter.',
+        'spikes: What to do: Mend the wire.',
+    ]

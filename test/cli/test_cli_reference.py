@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 
 import pytest
+from step_plan import StepPlan, step_test
 from streams import needs_jit
 
 from valveflow_ros.curve.characteristic_json import from_json
 from valveflow_ros.logs import write_samples
-from valveflow_ros.plant.step_test import StepPlan, step_test
 
 pytestmark = needs_jit
 

@@ -14,7 +14,7 @@ import urllib.request
 import pytest
 from monitor_recording import recording
 
-from valveflow_ros.cli import watch as verb
+from valveflow_ros.cli.verbs import watch as verb
 
 
 def test_once_prints_a_picture_that_fits(run, tmp_path, monkeypatch):

@@ -7,10 +7,10 @@ import pytest
 from diagnosis_records import masked, record, table, unit
 from streams import needs_jit
 
-from valveflow_ros.diagnosis import actuator
-from valveflow_ros.diagnosis.actuator import sized
 from valveflow_ros.diagnosis.diagnose import notes
 from valveflow_ros.diagnosis.grids import make_grids
+from valveflow_ros.diagnosis.loop import actuator
+from valveflow_ros.diagnosis.loop.actuator import sized
 from valveflow_ros.records import Signal
 
 pytestmark = needs_jit

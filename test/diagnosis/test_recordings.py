@@ -10,10 +10,11 @@ from diagnosis_records import record, table, unit
 from streams import needs_jit
 
 import valveflow_ros as vf
-from valveflow_ros.diagnosis import actuator, record_faults
+from valveflow_ros.diagnosis import record_faults
 from valveflow_ros.diagnosis.cause import Active, Estimate
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.grids import Blur, Grids, blur_of
+from valveflow_ros.diagnosis.loop import actuator
 from valveflow_ros.diagnosis.search import hidden, unseen
 from valveflow_ros.records import SampleTable, Signal
 from valveflow_ros.signals.compression import Compression, Updates
@@ -118,7 +119,7 @@ def test_a_valve_at_its_stop_is_no_dead_transmitter(samples: SampleTable, level)
 @pytest.mark.parametrize('effect', [(), ('backlash:w_percent=1',)])
 def test_means_of_a_minute_name_no_slack_of_another_size(effect: tuple[str, ...]) -> None:
     """A slack is found with an interval that holds the truth, or cannot be judged."""
-    plant = vf.simulate(8, 2, effect, unit='choked_fixed:number=2', recording='minute')
+    plant = vf.simulate(5, 2, effect, unit='choked_fixed:number=2', recording='minute')
     found = vf.diagnose(plant.log).diagnosis
     named = {c.name: c for c in found.causes}
     if 'backlash' in named:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from step_plan import StepPlan, step_test
 from streams import INTERPRETED, START_NS, examples, grid_ns, table_of
 
 from valveflow_ros.curve.characteristic_json import from_json, to_json
@@ -25,7 +26,6 @@ from valveflow_ros.fit.step_test import (
 )
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
-from valveflow_ros.plant.step_test import StepPlan, step_test
 from valveflow_ros.plant.unit import paper_curve
 from valveflow_ros.records import NS_PER_S, SampleTable, Signal
 

@@ -7,10 +7,10 @@ import pytest
 from streams import needs_jit
 
 from valveflow_ros.errors import DataError
-from valveflow_ros.interface.alignment import align
 from valveflow_ros.interface.observation import cut_in_two, observe
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, Readings, SampleTable, Signal, table_to_readings
+from valveflow_ros.signals.align import align_whole
 
 pytestmark = needs_jit
 
@@ -60,7 +60,7 @@ def test_stamps_of_1970_for_a_minute_cost_that_minute():
     assert 0 < len(lost) <= 80
     assert min(lost) >= true.time_ns[slip][0]
     # What was aligned is found again by its place, as a diagnosis on top of a model needs it.
-    rows, resets, _ = align(wrong, settings)
+    rows, resets, _ = align_whole(wrong, settings)
     assert len(resets) == 1
     assert rows.take(watched.rows).time_ns.tolist() == watched.table.time_ns.tolist()
 

@@ -215,6 +215,8 @@ def test_a_file_without_checksums_that_is_cut_anywhere_keeps_what_stands_before(
     raw = Kind(topics='before', outside=outside, chunk_crc=False).write()
     truth, each = in_file(raw), {Opcode.MESSAGE: 1, Opcode.CHUNK: 4 * len(CHANNELS)}
     ends = [end for op, _, end in records(raw) for _ in range(each.get(op, 0))]
+    # Read at every byte; made whole around the ends of all records, and at some bytes between.
+    borders = {end + off for _, _, end in records(raw) for off in (-1, 0, 1)}
     path, out = tmp_path / 'a.mcap', tmp_path / 'b.mcap'
     for size in range(len(raw)):
         path.write_bytes(raw[:size])
@@ -224,6 +226,8 @@ def test_a_file_without_checksums_that_is_cut_anywhere_keeps_what_stands_before(
                 open_log(path)
             continue
         assert len(read(path)) == whole, size
+        if size not in borders and size % 17:
+            continue
         report = recover(path, out)
         assert (report.messages, report.damaged_chunks) == (whole, 0), size
         assert in_file(out.read_bytes()) == truth[:whole]

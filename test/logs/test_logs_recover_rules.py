@@ -53,6 +53,15 @@ class Once(Faults):
         return super()._fail(*call)
 
 
+@pytest.fixture(scope='module', autouse=True)
+def spared() -> Iterator[None]:
+    """Spare the collector what earlier tests left: it is asked before and after each recovery."""
+    gc.collect()
+    gc.freeze()
+    yield
+    gc.unfreeze()
+
+
 def open_descriptors() -> int:
     # What earlier tests left to the collector may go at any moment.
     gc.collect()

@@ -76,7 +76,7 @@ def unit() -> Unit:
     return made
 
 
-@pytest.mark.parametrize(('width', 'dark'), [(DESKTOP, False), (DESKTOP, True), (PHONE, False)])
+@pytest.mark.parametrize(('width', 'dark'), [(DESKTOP, False), (PHONE, True)])
 def test_everything_is_drawn_and_nothing_is_asked_elsewhere(serve, browser, unit, width, dark):
     server = serve(shown_now(unit, told('/other', tag='U2')))
     browser.look(width, dark=dark)

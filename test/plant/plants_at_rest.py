@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from step_plan import StepPlan, step_test
 
 from valveflow_ros.plant.simulator import SimulatedLog
 from valveflow_ros.plant.spec import EffectSpec
-from valveflow_ros.plant.step_test import StepPlan, step_test
 from valveflow_ros.plant.unit import UnitDescription
 
 DAYS = 0.25

@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 from plants_at_rest import DAYS, at_rest, spec
+from step_plan import StepPlan, step_test
 
 from valveflow_ros.plant.simulator import simulate
-from valveflow_ros.plant.step_test import StepPlan, step_test
 from valveflow_ros.plant.unit import Programme, Region, UnitDescription
 from valveflow_ros.records import Signal
 

@@ -177,7 +177,7 @@ def test_a_lag_without_time_constant_lets_everything_through() -> None:
 
 def test_sampling_twice_as_often_gives_the_same_plant(quiet: UnitDescription) -> None:
     # Noise would differ from rate to rate; a manual step test has none here.
-    from valveflow_ros.plant.step_test import StepPlan, step_test
+    from step_plan import StepPlan, step_test
 
     plan = StepPlan(pressure_wander_mpa=0.0, steps=4, hold_s=600.0)
     regions = (Region(np.inf, 30.0, 4.0),)

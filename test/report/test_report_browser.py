@@ -90,7 +90,7 @@ def met(browser):
 
 
 def looked_at(browser, path, pdf):
-    """Open a page once in each look, and return what was seen."""
+    """Open a page in a light window and on a dark telephone, and return what was seen."""
     seen(browser, path, DESKTOP)
     found = {
         'drawn': json.loads(browser.ask(_DRAWN)),
@@ -100,17 +100,16 @@ def looked_at(browser, path, pdf):
         ),
         'light': browser.ask(_COLOURS), 'met': met(browser),
     }  # fmt: skip
-    seen(browser, path, PHONE)
+    seen(browser, path, PHONE, dark=True)
     found |= {
         'scroll': browser.ask('document.documentElement.scrollWidth'),
         'wide': browser.ask(_WIDE), 'small': browser.ask(_SMALL % LEAST_PX),
         'phone': json.loads(browser.ask(_DRAWN)), 'met_on_phone': met(browser),
     }  # fmt: skip
-    seen(browser, path, DESKTOP, dark=True)
     found['dark'] = browser.ask(_COLOURS)
     browser.ask(_LISTEN)
     pdf.write_bytes(browser.paper())
-    found |= {'printed': browser.ask('window.atPrint'), 'pdf': pdf, 'met_in_dark': met(browser)}
+    found |= {'printed': browser.ask('window.atPrint'), 'pdf': pdf, 'met_on_paper': met(browser)}
     return found
 
 
@@ -143,7 +142,7 @@ def test_every_picture_is_drawn_and_nothing_is_asked_for(page):
     assert [d['name'] for d in found['drawn']] == [f.name for f in content.figures]
     assert all(d['width'] > 600 and d['parts'] for d in found['drawn'])
     assert found['waiting'] == 0
-    assert found['met'] == found['met_on_phone'] == found['met_in_dark'] == []
+    assert found['met'] == found['met_on_phone'] == found['met_on_paper'] == []
 
 
 def test_numbers_in_the_drawn_page_are_those_of_the_pictures(page):
@@ -179,7 +178,7 @@ def test_light_and_dark_differ_and_can_both_be_read(page):
 
 
 def test_paper_gets_every_picture_whole_and_light(page):
-    """Printed from a dark window: as wide as A4, white, opened, each caption there."""
+    """Printed from a dark telephone: as wide as A4, white, opened, each caption there."""
     content, found = page
     at = found['printed']
     assert len(at['widths']) == len(content.figures)

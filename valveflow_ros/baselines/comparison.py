@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from valveflow_ros.baselines.hammerstein_fit import HammersteinFit, fit_hammerstein
+from valveflow_ros.baselines.hammerstein import HammersteinFit, fit_hammerstein
 from valveflow_ros.baselines.judged import (
     Judgement,
     OtherData,

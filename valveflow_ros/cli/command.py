@@ -266,14 +266,26 @@ def mapping_of(options: Namespace) -> LogMapping:
     """Read the options of `add_mapping`; raises `UsageError`."""
     from valveflow_ros.interface.mapping import read_mapping
 
-    said = [c for c in options.column if isinstance(c, TableOption)]
-    table = {one.option.replace('-', '_'): one.value for one in said}
     columns = [c for c in options.column if isinstance(c, str)]
-    return read_mapping(columns, options.constant, **table)
+    return read_mapping(columns, options.constant, **table_words(options.column))
 
 
-def add_parameters(parser: ArgumentParser) -> None:
-    """Add ``--params`` and ``--set``."""
+def table_words(gathered: Sequence[str | TableOption]) -> dict[str, str]:
+    """Return what `add_table` gathered, by the names of `table_options`."""
+    return {o.option.replace('-', '_'): o.value for o in gathered if isinstance(o, TableOption)}
+
+
+def add_analysis(parser: ArgumentParser, log: str = 'the log to read') -> None:
+    """Add the log an analysis is of, and the folder of its results."""
+    parser.add_argument('log', metavar='LOG', type=Path, help=log)
+    parser.add_argument(
+        '-o', '--output', metavar='DIR', type=Path, required=True,
+        help='folder for the results, made if absent; the report of another verb there is kept',
+    )  # fmt: skip
+
+
+def add_analysis_options(parser: ArgumentParser) -> None:
+    """Add what every analysis takes: parameters, files beside the report, how to read the log."""
     parser.add_argument(
         '--params', metavar='FILE', type=Path, help='parameters, a YAML file as the node takes it'
     )
@@ -281,18 +293,6 @@ def add_parameters(parser: ArgumentParser) -> None:
         '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs',
         help='one parameter, such as time_constant=120; stands above the file',
     )  # fmt: skip
-
-
-def add_results(parser: ArgumentParser) -> None:
-    """Add the folder of the results."""
-    parser.add_argument(
-        '-o', '--output', metavar='DIR', type=Path, required=True,
-        help='folder for the results, made if absent; the report of another verb there is kept',
-    )  # fmt: skip
-
-
-def add_beside(parser: ArgumentParser) -> None:
-    """Add ``--figures`` and ``--table``."""
     parser.add_argument(
         '--figures', action='store_true',
         help='also write each picture of the report as PNG and SVG: DIR/figures',
@@ -301,6 +301,7 @@ def add_beside(parser: ArgumentParser) -> None:
         '--table', action='store_true',
         help='also write what each picture shows as CSV: DIR/tables',
     )  # fmt: skip
+    add_mapping(parser)
 
 
 def checked_parameters(options: Namespace) -> dict[str, Any]:

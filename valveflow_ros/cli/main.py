@@ -91,7 +91,7 @@ def load(name: str) -> Verb:
     """
     for verb, module, _ in VERBS:
         if verb == name:
-            return cast(Verb, importlib.import_module(f'valveflow_ros.cli.{module}'))
+            return cast(Verb, importlib.import_module(f'valveflow_ros.cli.verbs.{module}'))
     known = [verb for verb, _, _ in VERBS]
     near = difflib.get_close_matches(name, known, n=1)
     hint = f" Did you mean '{near[0]}'?" if near else f' The verbs are {", ".join(known)}.'
@@ -242,7 +242,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 done, 1 could not be done, 2 wrong usage, 130 stopped by Ctrl-C, 143 by the system.
     """
     if '_ARGCOMPLETE' in os.environ:
-        from valveflow_ros.cli.completion import complete
+        from valveflow_ros.cli.verbs.completion import complete
 
         complete([(name, about) for name, _, about in VERBS], parser_of)
     words = list(sys.argv[1:] if arguments is None else arguments)

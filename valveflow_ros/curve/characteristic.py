@@ -120,6 +120,25 @@ class FittedData:
     temperature_spread_k: float
     temperature_flag: bool
 
+    @classmethod
+    def of(
+        cls, time_ns: IntArray, steady: int, slope_response: int, temperature_degc: FloatArray,
+        spread_limit_k: float,
+    ) -> FittedData:  # fmt: skip
+        """Describe a window by its times, its segments, and the temperature in the rows used.
+
+        The paper's condition is an unchanged temperature; its spread is that of 95 % of the rows.
+        """
+        known = temperature_degc[np.isfinite(temperature_degc)]
+        mean = spread = math.nan
+        if len(known):
+            low, high = np.quantile(known, (0.025, 0.975))
+            mean, spread = float(known.mean()), float(high - low)
+        return cls(
+            int(time_ns[0]), int(time_ns[-1]), steady, slope_response, len(temperature_degc),
+            mean, spread, bool(spread > spread_limit_k),
+        )  # fmt: skip
+
 
 @dataclass(frozen=True, slots=True)
 class FormEvidence:

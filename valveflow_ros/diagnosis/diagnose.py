@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
-from valveflow_ros.diagnosis import actuator
 from valveflow_ros.diagnosis.cause import DAY_S, Active, Estimate, SentenceValues
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.evidence import (
@@ -25,6 +24,7 @@ from valveflow_ros.diagnosis.evidence import (
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import Task, improve, search_levels, search_lines
 from valveflow_ros.diagnosis.grids import ORDER, CovariateRows, Grids, make_grids
+from valveflow_ros.diagnosis.loop import actuator
 from valveflow_ros.diagnosis.record_faults import Fault, faults
 from valveflow_ros.diagnosis.result import (
     NAMED,

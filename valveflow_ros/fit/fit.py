@@ -264,24 +264,12 @@ def _no_intervals(pieces: tuple[Piece, ...]) -> tuple[tuple[float, float], ...]:
 
 
 def _source(task: FitTask, rows: np.ndarray) -> FittedData:
-    """Describe the window, and watch the paper's condition of an unchanged temperature."""
+    """Describe the window."""
     c = task.contents
-    temperature = c.temperature_degc[rows]
-    temperature = temperature[np.isfinite(temperature)]
-    mean = spread = math.nan
-    if len(temperature):
-        low, high = np.quantile(temperature, (0.025, 0.975))
-        mean, spread = float(temperature.mean()), float(high - low)
-    return FittedData(
-        window_start_ns=int(c.time_ns[0]),
-        window_end_ns=int(c.time_ns[-1]),
-        steady=c.count(SegmentKind.STEADY),
-        slope_response=c.count(SegmentKind.SLOPE),
-        samples=len(rows),
-        temperature_mean_degc=mean,
-        temperature_spread_k=spread,
-        temperature_flag=bool(spread > task.settings.real('temperature_spread_limit')),
-    )
+    return FittedData.of(
+        c.time_ns, c.count(SegmentKind.STEADY), c.count(SegmentKind.SLOPE),
+        c.temperature_degc[rows], task.settings.real('temperature_spread_limit'),
+    )  # fmt: skip
 
 
 def _static_residuals(formed: _Formed, pieces: tuple[Piece, ...]) -> ResidualStatistics:

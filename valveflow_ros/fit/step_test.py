@@ -449,17 +449,9 @@ def tested_data(
     table: SampleTable, inside: IntArray, levels: int, settings: Settings
 ) -> FittedData:
     """Describe the rows of a test and the temperature in them."""
-    temperature = table.column(Signal.MAIN_STEAM_TEMPERATURE)[inside]
-    temperature = temperature[np.isfinite(temperature)]
-    mean = spread = math.nan
-    if len(temperature):
-        low, high = np.quantile(temperature, (0.025, 0.975))
-        mean, spread = float(temperature.mean()), float(high - low)
-    return FittedData(
-        window_start_ns=int(table.time_ns[0]), window_end_ns=int(table.time_ns[-1]),
-        steady=levels, slope_response=0, samples=len(inside), temperature_mean_degc=mean,
-        temperature_spread_k=spread,
-        temperature_flag=bool(spread > settings.real('temperature_spread_limit')),
+    return FittedData.of(
+        table.time_ns, levels, 0, table.column(Signal.MAIN_STEAM_TEMPERATURE)[inside],
+        settings.real('temperature_spread_limit'),
     )  # fmt: skip
 
 

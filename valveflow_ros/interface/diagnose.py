@@ -23,17 +23,17 @@ from valveflow_ros.diagnosis.result import Diagnosis, model_to_json, to_json
 from valveflow_ros.diagnosis.signature import views
 from valveflow_ros.errors import DataError, InputError
 from valveflow_ros.interface import SILENT, Progress
-from valveflow_ros.interface.alignment import align
 from valveflow_ros.interface.files import Result, signed
 from valveflow_ros.interface.logs import Log, as_log, read_covariate
 from valveflow_ros.interface.models import Model, check_output, load_model, with_exponent
 from valveflow_ros.interface.monitor import recorded_history
-from valveflow_ros.interface.observation import Observed, observe_log, settings_of
+from valveflow_ros.interface.observation import Observed, corrected, observe_log, settings_of
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SIGNALS, IntArray, SampleTable
 from valveflow_ros.report.diagnosis import Diagnosed, diagnosis_page
 from valveflow_ros.report.page import Page
 from valveflow_ros.report.words import held_words
+from valveflow_ros.signals.align import Aligner, align_whole, aligned_blocks, gathered
 from valveflow_ros.signals.static_form import StaticForm
 
 
@@ -197,7 +197,7 @@ def diagnose(
         covariates=beside,
     )  # fmt: skip
     if earlier is not None:
-        measured = align(log.readings, settings)[0]
+        measured = align_whole(log.readings, settings)[0]
         record = on_top(
             record, earlier, measured if rows.places is None else measured.take(rows.places)
         )
@@ -273,7 +273,8 @@ def _rows(
     except DataError as error:
         step_s = settings.real('sample_period')
         corrector = None if earlier is None else corrector_of(earlier, step_s)
-        table, _, _ = align(log.readings, settings, corrector=corrector)
+        blocks = aligned_blocks(Aligner(settings), log.readings, None, '')
+        table = gathered(corrected(blocks, corrector)).table
         needed = [info.signal for info in SIGNALS if info.required]
         if not len(table) or not all(np.isfinite(table.column(s)).any() for s in needed):
             raise

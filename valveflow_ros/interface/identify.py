@@ -21,7 +21,6 @@ from valveflow_ros.fit.static_test import find_static_test
 from valveflow_ros.fit.step_levels import looks_like_step_test
 from valveflow_ros.fit.step_test import identify_step_test
 from valveflow_ros.interface import SILENT, Progress
-from valveflow_ros.interface.alignment import align
 from valveflow_ros.interface.files import Result, signed
 from valveflow_ros.interface.logs import Log, as_log
 from valveflow_ros.interface.models import (
@@ -44,6 +43,7 @@ from valveflow_ros.records import (
 from valveflow_ros.report.identification import identification_page
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import Page
+from valveflow_ros.signals.align import align_whole
 from valveflow_ros.signals.units import in_unit
 
 STEP_TEST_ADVICE = (
@@ -190,7 +190,7 @@ def _identified(
         observed = replace(observed, task=replace(observed.task, form=form))
         characteristic = observed.fit(progress)
     except DataError as error:
-        table, _, counts = align(log.readings, settings)
+        table, _, counts = align_whole(log.readings, settings)
         read = _rows_as_read(log.readings)
         test = None if model is not None else find_static_test(read, settings)
         if test is not None:
@@ -242,7 +242,7 @@ def _rows_as_read(readings: Readings) -> SampleTable:
 
 def _step_test(log: Log, given: Mapping[str, Any], progress: Progress) -> Identified:
     settings, notes = settings_of(log, given, progress, constants=False)
-    table, resets, counts = align(log.readings, settings, progress)
+    table, resets, counts = align_whole(log.readings, settings, progress)
     if len(resets):
         raise DataError(
             'The clock goes back within the log; a step test must be one stretch of time.'

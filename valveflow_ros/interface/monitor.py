@@ -17,7 +17,6 @@ from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.from_window import diagnose_window
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.interface import SILENT, Progress
-from valveflow_ros.interface.alignment import aligned_blocks
 from valveflow_ros.interface.files import Result
 from valveflow_ros.interface.logs import as_log
 from valveflow_ros.interface.models import load_characteristic, load_extended, with_exponent
@@ -51,7 +50,7 @@ from valveflow_ros.report.history import (
 from valveflow_ros.report.page import Page, Section, paragraph, text
 from valveflow_ros.report.terminal.board import ALARM, CURVE, DIAGNOSIS
 from valveflow_ros.report.words import moment
-from valveflow_ros.signals.align import Aligner
+from valveflow_ros.signals.align import Aligner, aligned_blocks
 
 # Without diagnoses; each takes as long as `diagnose` over the window.
 _NO_DIAGNOSIS = {'diagnosis_on_mismatch': False, 'diagnosis_hour': -1}

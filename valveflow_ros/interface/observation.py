@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +17,6 @@ from valveflow_ros.errors import WORKING_BYTES, DataError, check_address_space, 
 from valveflow_ros.fit.fit import fit, form_contradicted, form_of_data, outline
 from valveflow_ros.fit.task import COARSE_STEP_S, FitTask
 from valveflow_ros.interface import SILENT, Progress
-from valveflow_ros.interface.alignment import Counts, aligned_blocks, corrected
 from valveflow_ros.interface.logs import Log
 from valveflow_ros.interface.settings import settings_for
 from valveflow_ros.monitoring.events import FitRequested
@@ -38,7 +37,7 @@ from valveflow_ros.report.data import REASON_WORDS
 from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.report.words import duration
 from valveflow_ros.segments.kernel import WARM_UP, WINDOW
-from valveflow_ros.signals.align import Aligner
+from valveflow_ros.signals.align import Aligned, Aligner, aligned_blocks
 from valveflow_ros.signals.static_form import StaticForm
 
 _NEEDED = tuple(i for i in SIGNALS if i.required and i.topic != 'main_steam_temperature')
@@ -66,7 +65,7 @@ class Observed:
     table: SampleTable
     rows: IntArray
     segments: tuple[SpecialSegment, ...]
-    counts: Counts
+    counts: dict[str, dict[str, int]]
     task: FitTask
     clock_resets: int
 
@@ -154,6 +153,21 @@ def observe(
     return Observed(table.take(rows), rows, monitor.special_segments(), counts, task, resets)
 
 
+def corrected(blocks: Iterator[Aligned], corrector: Corrector | None) -> Iterator[Aligned]:
+    """Yield blocks whose rows are freed of the causes of a corrector, if there is one."""
+    if corrector is None:
+        yield from blocks
+        return
+    for block in blocks:
+        tables, start = [], 0
+        for reset in block.resets.tolist():
+            tables.append(corrector.correct(block.table.part(start, reset)))
+            corrector.restart()
+            start = reset
+        tables.append(corrector.correct(block.table.part(start, len(block.table))))
+        yield Aligned(SampleTable.concatenate(tables), block.resets)
+
+
 def observe_log(
     log: Log, settings: Settings, progress: Progress, model: ExtendedModel | None = None,
     shown: Callable[[float, str], None] | None = None,
@@ -187,7 +201,7 @@ def cut_in_two(log: Log, block_s: float) -> tuple[Log, Log]:
     return part(r.time_ns < cut), part(r.time_ns >= cut)
 
 
-def check_signals(table: SampleTable, counts: Counts) -> None:
+def check_signals(table: SampleTable, counts: dict[str, dict[str, int]]) -> None:
     """Refuse a log in which a needed signal has no usable value; say which and why.
 
     Raises

@@ -11,7 +11,6 @@ from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.interface import SILENT, Progress
-from valveflow_ros.interface.alignment import aligned_blocks
 from valveflow_ros.interface.logs import Log, as_log
 from valveflow_ros.interface.settings import ONE_FIT, fitting
 from valveflow_ros.monitoring.events import FitRequested
@@ -21,7 +20,7 @@ from valveflow_ros.parameters import PARAMETERS, TABLE, Settings, Value, as_yaml
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.terminal.text import clean
 from valveflow_ros.report.words import duration
-from valveflow_ros.signals.align import Aligner
+from valveflow_ros.signals.align import Aligner, aligned_blocks
 from valveflow_ros.signals.units import DIFFERENCES, unit_of
 
 # A transient cut short spoils segments, one too long only costs some: up in small steps,

@@ -242,3 +242,20 @@ def held_words(held: tuple[HeldCause, ...]) -> str:
         f'Held, and taken out of opening and power before anything else: {names}. {curve}'
         + ' '.join(h.sentence for h in held)
     )
+
+
+VERDICT_WORDS = {
+    'named': 'cause found',
+    'nothing': 'no cause found',
+    'unexplained': 'something is unexplained',
+}
+
+
+def advice(name: str, meaning: str, to_do: str) -> str:
+    """Return what a named cause is worth in MW and what to do about it; empty if neither is known.
+
+    The arguments are those of a cause in ``diagnosis.json``.
+    """
+    known = [meaning, f'What to do: {to_do}' if to_do else '']
+    told = ' '.join(part for part in known if part)
+    return f'{name}: {told}' if told else ''

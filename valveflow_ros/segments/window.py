@@ -179,11 +179,6 @@ class RollingWindow:
         return self._end
 
     @property
-    def rows_seen(self) -> int:
-        """Return the number of rows ever appended; the next row's number."""
-        return self._seen
-
-    @property
     def segments(self) -> int:
         """Return the number of special segments inside the window."""
         return len(self.special_segments())

@@ -13,6 +13,7 @@ Nothing is dropped without a count; see `REASONS`.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -461,3 +462,40 @@ class Aligner:
                 break
         table = tables[0] if len(tables) == 1 else SampleTable.concatenate(tables)
         return Aligned(table, np.array(resets, dtype=np.int64))
+
+
+# A whole log, without the engine, which takes long to load.
+
+_BLOCK = 200_000  # readings between two reports of progress
+
+
+def align_whole(
+    readings: Readings, settings: Settings, progress: Callable[[float, str], None] | None = None
+) -> tuple[SampleTable, IntArray, dict[str, dict[str, int]]]:
+    """Return all rows, the rows before which the clock was set back, and the counts."""
+    aligner = Aligner(settings)
+    rows = gathered(aligned_blocks(aligner, readings, progress, 'putting rows together'))
+    return rows.table, rows.resets, aligner.counts()
+
+
+def aligned_blocks(
+    aligner: Aligner, readings: Readings, progress: Callable[[float, str], None] | None, what: str
+) -> Iterator[Aligned]:
+    """Yield the rows block by block, with those that only the end closes."""
+    for start in range(0, len(readings), _BLOCK):
+        if progress is not None:
+            progress(0.1 + 0.4 * start / len(readings), what)
+        yield aligner.feed(readings.part(start, min(start + _BLOCK, len(readings))))
+    yield aligner.finish()
+
+
+def gathered(blocks: Iterable[Aligned]) -> Aligned:
+    """Return the rows of all blocks as one."""
+    tables: list[SampleTable] = []
+    resets: list[int] = []
+    before = 0
+    for block in blocks:
+        resets += [before + int(k) for k in block.resets]
+        before += len(block.table)
+        tables.append(block.table)
+    return Aligned(SampleTable.concatenate(tables), np.array(resets, dtype=np.int64))

@@ -30,6 +30,12 @@ TEN_DAYS_S = 10.0 * DAY_S
 ONSET = Unknown('t0_days', 'd', 2.0 / 24.0, 0.0, 400.0, Kind.LINE, dated=True)
 
 
+def drift_size(screening: Screening, carrier: int) -> float:
+    """Return the coefficient of one carrier times a ramp in time."""
+    time = ramp(screening.grids, screening.grids.sub_middle_s)
+    return float(screening.modulated([carrier], time[None, :])[1][0])
+
+
 def ramp(grids: Grids, time_s: FloatArray) -> FloatArray:
     """Return a ramp that rises by 1 in ten days and is 0 in the middle of the record.
 
@@ -83,10 +89,7 @@ def apply_gain_drift(values: Values, grids: Grids, extra: Values) -> FloatArray:
 
 def gain_drift_starts(screening: Screening) -> Sequence[Start]:
     """Regress on the power times a ramp in time."""
-    _, found = screening.modulated(
-        [GAIN], ramp(screening.grids, screening.grids.sub_middle_s)[None, :]
-    )
-    return screening.best(GAIN_DRIFT, [(float(found[0]),)])
+    return screening.best(GAIN_DRIFT, [(drift_size(screening, GAIN),)])
 
 
 def gain_drift_sentence(values: dict[str, float]) -> str:
@@ -157,11 +160,8 @@ def apply_input_drift(
 
 def input_drift_starts(screening: Screening) -> Sequence[Start]:
     """Regress on the input's effect times a ramp in time."""
-    _, found = screening.modulated(
-        [INPUT], ramp(screening.grids, screening.grids.sub_middle_s)[None, :]
-    )
-    g = float(found[0])
-    return screening.best(INPUT_DRIFT, [(g,), (0.6 * g,)])
+    size = drift_size(screening, INPUT)
+    return screening.best(INPUT_DRIFT, [(size,), (0.6 * size,)])
 
 
 def input_drift_sentence(values: dict[str, float]) -> str:
@@ -232,10 +232,7 @@ def apply_output_offset_drift(y: FloatArray, values: Values, grids: Grids) -> Fl
 
 def output_offset_drift_starts(screening: Screening) -> Sequence[Start]:
     """Regress on a ramp in time."""
-    _, found = screening.modulated(
-        [OFFSET], ramp(screening.grids, screening.grids.sub_middle_s)[None, :]
-    )
-    return screening.best(OUTPUT_OFFSET_DRIFT, [(float(found[0]),)])
+    return screening.best(OUTPUT_OFFSET_DRIFT, [(drift_size(screening, OFFSET),)])
 
 
 def output_offset_drift_sentence(values: dict[str, float]) -> str:

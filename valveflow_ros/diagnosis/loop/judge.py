@@ -13,8 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from valveflow_ros.diagnosis import actuator
-from valveflow_ros.diagnosis.loop import detectors, plug
+from valveflow_ros.diagnosis.loop import actuator, detectors, plug
 from valveflow_ros.diagnosis.loop.detectors import NO_STICTION, STICTION, Detection
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import BoolArray, FloatArray, IntArray

@@ -35,11 +35,11 @@ def run(options: Namespace, console: Console) -> VerbResult:
     """Align and write."""
     mapping = mapping_of(options)
     from valveflow_ros.errors import DataError
-    from valveflow_ros.interface.alignment import align
     from valveflow_ros.interface.files import TABLES, check_output, write_log
     from valveflow_ros.interface.logs import open_log
     from valveflow_ros.interface.settings import read_parameters, settings_for
     from valveflow_ros.report.words import counted, duration, moment
+    from valveflow_ros.signals.align import align_whole
 
     given = read_parameters(None, options.pairs)
     check_output(options.output, TABLES, source=options.log, overwrite=options.overwrite)
@@ -49,7 +49,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
     settings, notes = settings_for(log.steps(), 0.0, given)
     for sentence in [*told, *notes]:
         console.say(sentence)
-    table, resets, counts = align(log.readings, settings, console)
+    table, resets, counts = align_whole(log.readings, settings, console)
     if not len(table):
         raise DataError('The log holds no usable reading, so there is no row to write.')
     if len(resets):

@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING
 from valveflow_ros.cli.command import (
     Console,
     VerbResult,
-    add_beside,
-    add_mapping,
-    add_parameters,
-    add_results,
+    add_analysis,
+    add_analysis_options,
     checked_parameters,
     columns,
     lines,
@@ -44,8 +42,7 @@ def arguments(parser: ArgumentParser) -> None:
     """Add description, example and options."""
     parser.description = _DESCRIPTION
     parser.usage = 'valveflow diagnose LOG -o DIR [options]'
-    parser.add_argument('log', metavar='LOG', type=Path, help='the log to read')
-    add_results(parser)
+    add_analysis(parser)
     parser.add_argument(
         '--model', metavar='FILE', type=Path,
         help='characteristic.json or extended_model.json of an earlier log, to be held against '
@@ -56,9 +53,7 @@ def arguments(parser: ArgumentParser) -> None:
         help='a column beside the signals that the power may follow, such as '
         'vacuum=condenser_pressure_kpa; may be given several times',
     )  # fmt: skip
-    add_parameters(parser)
-    add_beside(parser)
-    add_mapping(parser)
+    add_analysis_options(parser)
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
@@ -97,13 +92,9 @@ def _covariates(said: list[str]) -> dict[str, str]:
 
 
 def _text(found: DiagnosisResult) -> str:
-    from valveflow_ros.diagnosis.result import NAMED, NOTHING, UNEXPLAINED
     from valveflow_ros.report.diagnosis import cells
-    from valveflow_ros.report.words import level
+    from valveflow_ros.report.words import VERDICT_WORDS, advice, level
 
-    verdicts = {
-        NAMED: 'cause found', NOTHING: 'no cause found', UNEXPLAINED: 'something is unexplained',
-    }  # fmt: skip
     d = found.diagnosis
     rows = [
         [c.name, key, *cells(e, found.form.input_exponent)]
@@ -117,7 +108,8 @@ def _text(found: DiagnosisResult) -> str:
         if why.startswith(blind)
     ]
     return lines(
-        f'{found.data.source}: {verdicts[d.verdict]}. {d.sentence}',
+        f'{found.data.source}: {VERDICT_WORDS[d.verdict]}. {d.sentence}',
+        *(advice(c.name, c.meaning, c.to_do) for c in d.causes),
         columns(rows, ['cause', 'parameter', 'value', '95 % interval']) if rows else '',
         f'Not told apart: {", ".join(d.not_told_apart)}.' if d.not_told_apart else '',
         *(f'What would tell them apart: {e}' for e in d.experiments),

@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING
 from valveflow_ros.cli.command import (
     Console,
     VerbResult,
-    add_beside,
-    add_mapping,
-    add_parameters,
-    add_results,
+    add_analysis,
+    add_analysis_options,
     checked_parameters,
     columns,
     lines,
@@ -39,9 +37,7 @@ def arguments(parser: ArgumentParser) -> None:
     """Add description, example and options."""
     parser.description = _DESCRIPTION
     parser.usage = 'valveflow monitor LOG -o DIR [options]'
-    parser.add_argument('log', metavar='LOG', type=Path, help='the log to read')
-    add_results(parser)
-    add_parameters(parser)
+    add_analysis(parser)
     parser.add_argument(
         '--model', metavar='FILE', type=Path,
         help='an extended_model.json of diagnose: its causes are taken out of the rows first',
@@ -54,8 +50,7 @@ def arguments(parser: ArgumentParser) -> None:
         '--no-diagnosis', action='store_true',
         help='leave out the diagnoses, each of which takes as long as `valveflow diagnose`',
     )  # fmt: skip
-    add_beside(parser)
-    add_mapping(parser)
+    add_analysis_options(parser)
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
@@ -77,7 +72,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
 
 def _text(found: MonitorResult) -> str:
-    from valveflow_ros.report.words import counted, moment
+    from valveflow_ros.report.words import VERDICT_WORDS, advice, counted, moment
 
     content = found.to_json()
     alarms = [
@@ -90,12 +85,21 @@ def _text(found: MonitorResult) -> str:
         for alarm in content['alarms']
     ]
     reference = content['reference']
+    diagnoses = [
+        [moment(at), VERDICT_WORDS[d['verdict']], ', '.join(c['name'] for c in d['causes']) or '-']
+        for at, d in found.diagnoses
+    ]
+    # What was named several times is told once, as it was found last.
+    named = {c['name']: c for _, d in found.diagnoses for c in d['causes']}
     return lines(
         f'{found.source}: {moment(found.start_ns)} to {moment(found.end_ns)}',
         f'{counted(len(content["curves"]), "curve")}, {counted(len(alarms), "alarm")}, '
         f'{counted(len(content["diagnoses"]), "diagnosis", "diagnoses")}.',
         columns(alarms, ['alarm', 'raised', 'cleared', 'state at the end']) if alarms else '',
         *(a['sentence'] for a in content['alarms'] if a['cleared'] is None),
+        columns(diagnoses, ['diagnosis', 'verdict', 'causes']) if diagnoses else '',
+        *(d['sentence'] for _, d in found.diagnoses[-1:]),
+        *(advice(name, c['meaning'], c['to_do']) for name, c in named.items()),
         'No curve became the reference.' if reference is None
         else f'The reference is curve {reference["model_id"]}, set {moment(reference["set"])}.',
     )  # fmt: skip

@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Any
 from valveflow_ros.cli.command import (
     Console,
     VerbResult,
-    add_beside,
-    add_mapping,
-    add_parameters,
-    add_results,
+    add_analysis,
+    add_analysis_options,
     checked_parameters,
     columns,
     lines,
@@ -50,9 +48,7 @@ def arguments(parser: ArgumentParser) -> None:
     """Add description, example and options."""
     parser.description = _DESCRIPTION
     parser.usage = 'valveflow identify LOG -o DIR [options]'
-    parser.add_argument('log', metavar='LOG', type=Path, help='the log to read')
-    add_results(parser)
-    add_parameters(parser)
+    add_analysis(parser)
     parser.add_argument(
         '--model', metavar='FILE', type=Path,
         help='an extended_model.json of diagnose: its causes are held, curve and dynamics found '
@@ -66,8 +62,7 @@ def arguments(parser: ArgumentParser) -> None:
         '--step-test', action='store_true',
         help='the log is a manual test: pressure constant, the opening in steps, each held',
     )  # fmt: skip
-    add_beside(parser)
-    add_mapping(parser)
+    add_analysis_options(parser)
 
 
 def run(options: Namespace, console: Console) -> VerbResult:

@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING
 from valveflow_ros.cli.command import (
     Console,
     VerbResult,
-    add_beside,
-    add_mapping,
-    add_parameters,
-    add_results,
+    add_analysis,
+    add_analysis_options,
     checked_parameters,
     columns,
     lines,
@@ -43,8 +41,7 @@ def arguments(parser: ArgumentParser) -> None:
     """Add description, example and options."""
     parser.description = _DESCRIPTION
     parser.usage = 'valveflow compare LOG -o DIR [options]'
-    parser.add_argument('log', metavar='LOG', type=Path, help='the log to learn from')
-    add_results(parser)
+    add_analysis(parser, 'the log to learn from')
     parser.add_argument(
         '--test', metavar='LOG2', type=Path, help='a log of other days to judge by'
     )
@@ -52,9 +49,7 @@ def arguments(parser: ArgumentParser) -> None:
         '--truth', metavar='FILE', type=Path,
         help='the true curve, as "simulate --truth" writes it; a characteristic.json too',
     )  # fmt: skip
-    add_parameters(parser)
-    add_beside(parser)
-    add_mapping(parser)
+    add_analysis_options(parser)
 
 
 def run(options: Namespace, console: Console) -> VerbResult:

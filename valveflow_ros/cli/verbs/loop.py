@@ -11,6 +11,7 @@ from valveflow_ros.cli.command import (
     add_table,
     columns,
     lines,
+    table_words,
 )
 from valveflow_ros.errors import UsageError
 from valveflow_ros.interface.files import check_folder
@@ -57,11 +58,10 @@ def run(options: Namespace, console: Console) -> VerbResult:
     if options.position and options.process:
         raise UsageError('Give --position or --process, not both.')
     check_folder(options.output)
-    said = {o.option.replace('-', '_'): o.value for o in options.said}
     found = judge_loop(
         options.table, command=options.command, position=options.position,
         process=options.process, set_point=options.set_point, time=options.time,
-        options=table_options(said), progress=console,
+        options=table_options(table_words(options.said)), progress=console,
     )  # fmt: skip
     path = found.write(options.output)
     content = found.to_json()

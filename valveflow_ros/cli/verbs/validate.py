@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING
 from valveflow_ros.cli.command import (
     Console,
     VerbResult,
-    add_beside,
-    add_mapping,
-    add_parameters,
-    add_results,
+    add_analysis,
+    add_analysis_options,
     checked_parameters,
     columns,
     lines,
@@ -38,12 +36,11 @@ def arguments(parser: ArgumentParser) -> None:
     """Add description, example and options."""
     parser.description = _DESCRIPTION
     parser.usage = 'valveflow validate LOG --model FILE -o DIR [options]'
-    parser.add_argument('log', metavar='LOG', type=Path, help='the log to judge by')
+    add_analysis(parser, 'the log to judge by')
     parser.add_argument(
         '--model', metavar='FILE', type=Path, required=True,
         help='a characteristic.json of identify, or an extended_model.json of diagnose',
     )  # fmt: skip
-    add_results(parser)
     parser.add_argument(
         '--against', metavar='FILE', type=Path,
         help='a second characteristic.json, to see which of the two is better',
@@ -53,9 +50,7 @@ def arguments(parser: ArgumentParser) -> None:
         type=number('a power in MW', 0, 10_000, '--tolerance 2', above=True),
         help='a mean difference that does not matter (default: the parameter alarm_floor, 1 MW)',
     )  # fmt: skip
-    add_parameters(parser)
-    add_beside(parser)
-    add_mapping(parser)
+    add_analysis_options(parser)
 
 
 def run(options: Namespace, console: Console) -> VerbResult:

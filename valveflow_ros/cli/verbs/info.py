@@ -189,9 +189,9 @@ def _fates(
             info.topic: {'accepted': len(parts[info.signal]) if info.signal in parts else 0}
             for info in SIGNALS
         }
-    from valveflow_ros.interface.alignment import align
+    from valveflow_ros.signals.align import align_whole
 
-    _, _, counts = align(readings, settings)
+    _, _, counts = align_whole(readings, settings)
     return {
         topic: {reason: n for reason, n in by_reason.items() if reason != 'late'}
         for topic, by_reason in counts.items()

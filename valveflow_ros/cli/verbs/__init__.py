@@ -1,0 +1,1 @@
+"""One module for each verb: `arguments` adds its options, `run` does it."""
