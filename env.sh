@@ -1,3 +1,6 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 # Source this file: `source env.sh` in bash or zsh, `. ./env.sh` in sh (from this folder).
 #
 # It puts the command `valveflow`, the environment in .venv and the ROS packages in

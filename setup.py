@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The ament_python package valveflow_ros; its metadata stand in package.xml, once."""
 
 import os

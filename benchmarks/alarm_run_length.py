@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Days between false residual alarms, and minutes to a true one, under correlated noise.
 
 Run: ``python -m benchmarks.alarm_run_length --records 40``. This asks the chart and the alarm

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The paper's simulation study: three methods, ten days to learn from, other ten to judge by.
 
 Run: ``python -m benchmarks.compare_study --seeds 5 --first 1``. Each seed is one plant that is

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How often the 95 % intervals hold the truth, on plants that differ in everything.
 
 Run: ``python -m benchmarks.coverage_study --seeds 200 --first 9000``. Each seed draws a unit

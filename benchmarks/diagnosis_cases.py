@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Plants to be diagnosed: what is hidden in them is drawn, and so is the plant itself."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a diagnosis could know at best: the causes with their true sizes, the rest fitted."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects that no cause of the catalogue explains, drawn and added to a simulated record.
 
 Each is a function of what was measured (never of the noise), freed of what a curve of u could

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Hide effects in plants, diagnose them, and count.
 
     python -m benchmarks.diagnosis_study --kind hidden --seeds 3 --first 5000 --days 10

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Freeze what the command writes and says, and compare it with what another tree gives.
 
     python -m benchmarks.goldens make DIR [--recordings FOLDER]

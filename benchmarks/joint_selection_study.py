@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The number of pieces in the joint fit of random units, and whether its confidence is right.
 
 Run: ``python -m benchmarks.joint_selection_study --seeds 40 --first 5000``. Each seed draws a

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How rarely the monitor says of a clean plant that its model fits no longer, how soon of others.
 
     python -m benchmarks.mismatch_study --kind clean --seeds 10 --first 400

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Whether a fault stands in the alarms to the end, and how often a healthy unit raises one.
 
 Run: ``python -m benchmarks.monitor_study --seeds 10 --first 431`` for healthy units, and with

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The node under load: what is lost, what it costs, how late it is.
 
     python -m benchmarks.node_load [CASE]... [--full] [--qos best_effort|reliable|both]

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How long the parts of the long verbs take, which is what a progress bar's pace is made of.
 
     python -m benchmarks.pace [DAYS]

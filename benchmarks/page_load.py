@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the page costs, how soon it is there, and what slow clients do to it.
 
     python -m benchmarks.page_load [--seconds S] [--output DIR]

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The paper's simulation study, many times over: how far the curve found is from the true one.
 
 Run: ``python -m benchmarks.paper_study --seeds 20 --first 1000``. Each seed is ten days at 1 s

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How fast the exact partition is, beside a plain dynamic programme and beside other packages.
 
 Run: python -m benchmarks.partition [--kinds valve noise ...] [--sizes 20000 305633 ...]

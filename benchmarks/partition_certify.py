@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The plain dynamic programme, every break for every end, as the judge of the exact partition.
 
 ``python -m benchmarks.partition --certify`` compares all layers at all ends. Nothing is left

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What other packages make of the same samples: time, and cost over the optimum.
 
 Each is run at sizes it can do in seconds; a package that is not installed is left out and

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How fast a ten-day recording is written and read, beside the libraries one would take else.
 
 Run: python -m benchmarks.reading [--days 10] [--peers] [--json] [--keep]

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulated flow, pressure and level loops under PI control, with and without a sticking valve.
 
 They are for fixing and trying thresholds of `valveflow_ros.diagnosis.loop`; nothing in them was

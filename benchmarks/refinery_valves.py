@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Valves of single control loops, judged by `vf.judge_loop`: simulated loops, 31 measured windows.
 
     python -m benchmarks.refinery_valves --data DIR

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run the quick tests of recorder, recovery and state again and again, to find one that wavers.
 
     python -m benchmarks.repeats [--count 200] [--minutes M] [--seed N] [--lanes L]

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The picture of `segment_study`: an excerpt with truth and finding, and the scores."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How well special segments are found: precision and recall against the simulator's truth.
 
 Run: ``python -m benchmarks.segment_study --seeds 4 --first 3000``. What is special in truth

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Which rows of a simulated run are special in truth, known from what drove the unit.
 
 The load programme says when the unit is held and when it is ramped; the pulses of primary

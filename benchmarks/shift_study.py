@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How surely a shift of the curve is seen, and how rarely one is seen that is not there.
 
 Run: ``python -m benchmarks.shift_study --seeds 12 --first 101``. Each seed is twenty days of

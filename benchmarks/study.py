@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What every study does: take options, identify plants, go through seeds, keep the result."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of the studies of the curve and of its alarm, from their results.
 
 Run: ``python -m benchmarks.study_figures``. Each result that is there gets a picture beside it.

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """From ten days of a simulated plant on disk to the report: how long each step takes.
 
     python -m benchmarks.ten_days [--days 10] [--seed 1] [--effect NAME]... [--cold] [--json]

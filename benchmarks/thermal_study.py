@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How right curves and names are on units built from physics instead of the paper's plant.
 
 Run: ``python -m benchmarks.thermal_study --recording minute --seeds 100 --first 101``. Each seed

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How often the residual alarm cries wolf while a unit's curve is young.
 
 Run: ``python -m benchmarks.young_curves --plants 20 --days 3 --first 8000``. Each plant is drawn

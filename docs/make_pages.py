@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The generated parts of the pages: tables and texts that the code already holds.
 
 Run: ``python -m docs.make_pages``; with ``--check`` nothing is written and the exit status

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The pictures of the handbook, drawn from what ``docs.picture_data`` has kept.
 
 Run: ``python -m docs.make_pictures [NAME ...]``. The same data give the same bytes.

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The generated parts of the pages about effects, from the catalogue and from one trial each."""
 
 from __future__ import annotations

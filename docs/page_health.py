@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What /diagnostics holds, read from the code of the node without importing ROS."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Tables for the handbook, made from the code: verbs, topics, parameters, messages."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the pictures of the handbook show: plants that are simulated and diagnosed once.
 
 Run: ``python -m docs.picture_data [NAME ...]`` (about a minute each); ``python -m

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A simulated plant and a monitor; ends when the plant has run."""
 
 from launch.actions import (

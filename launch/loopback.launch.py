@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Keep DDS on this host, for everything that is started afterwards in the same scope."""
 
 from pathlib import Path

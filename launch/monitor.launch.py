@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Start the monitor; the option --show-args of `ros2 launch` explains the arguments."""
 
 import json

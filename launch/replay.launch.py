@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Play a log on the input topics and let a monitor listen to it."""
 
 from launch.actions import (

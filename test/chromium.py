@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A browser without a head, spoken to through a pipe: what a person would see and do."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What every test may ask for: a ROS domain of its own, the real data; how hypothesis runs."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Characteristics and regional models made by hand or drawn: everything in them is known."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """An ``extended_model.json`` for the simulated plant of the tests, as ``diagnose`` writes one."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A recording as a monitor leaves one, made without a monitor: messages encoded field by field."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Slow truths: obvious loops in extended precision that the fast code is compared with."""
 
 from __future__ import annotations

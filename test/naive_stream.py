@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Slow truths of the streaming parts, in obvious loops over lists and dicts.
 
 Nothing here is fast, bounded in memory or clever, and nothing is shared with the

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The traditional manual test: constant pressure, the opening raised in steps and held."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Streams the engine is tested on, ways of cutting them, and a form to compare events in."""
 
 from __future__ import annotations

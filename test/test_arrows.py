@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Who may import whom: between the folders, and between the modules inside each of them."""
 
 from __future__ import annotations

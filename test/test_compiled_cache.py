@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What was compiled before is used again only while nothing that it was made of has changed."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Every command of README and handbook is run here, in a folder of its own, as a reader would."""
 
 from __future__ import annotations

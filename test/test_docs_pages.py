@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The pages keep up with the code: tables, effects, links, pictures and quoted figures."""
 
 from __future__ import annotations

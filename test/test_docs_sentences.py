@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Troubleshooting quotes what the program says, and what the monitor says is quoted there."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The layouts for Foxglove and PlotJuggler name what our messages have, and are installed."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The messages read like documentation, and keep to what the tools can show."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """env.sh in the shells people use: right, quiet, twice harmless, and clear when it cannot."""
 
 from __future__ import annotations

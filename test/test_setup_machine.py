@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The set-up on machines that lack something: one sentence that names it and its cure."""
 
 from __future__ import annotations

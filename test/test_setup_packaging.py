@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The packages' metadata agree with each other, with the contract and with the lock."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Which Python the set-up takes, and what it says when none will do."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The set-up carries real ROS: a message of ours over DDS, in a domain of the test's own."""
 
 from __future__ import annotations

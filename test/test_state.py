@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What an object remembers: a copy both ways, in the kinds it had, or a sentence."""
 
 from __future__ import annotations

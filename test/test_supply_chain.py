@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is installed is what was chosen, and nothing that is read is ever run."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Put the copyright line and the licence at the head of each source file that lacks them.
 
     python tools/headers.py

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Whether this machine can carry the set-up; the first thing it lacks, in a sentence."""
 
 from __future__ import annotations

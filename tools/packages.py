@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The second step: valveflow_msgs and valveflow_ros, built by colcon into install/."""
 
 from __future__ import annotations

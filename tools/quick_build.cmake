@@ -1,3 +1,6 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 # Read by `make setup` alone, when it builds valveflow_msgs: the generated sources of
 # these libraries are compiled as one file each, and nothing is optimised. That takes
 # about half the processor time. (The other generated sources cannot be joined: they

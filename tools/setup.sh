@@ -1,4 +1,7 @@
 #!/bin/sh
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 # Finds a Python that can carry the set-up and hands over to setup_tree.py.
 # A name on the PATH proves nothing (version managers leave shims that do not run),
 # so every candidate is run before it is believed.

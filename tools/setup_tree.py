@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Set up the tree: wheels into .venv, the two packages into install/.
 
 Each step leaves a stamp, a hash of everything it depends on, and is skipped

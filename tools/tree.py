@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the parts of the set-up share: the tree's folders, stamps, running a command.
 
 Only the standard library: this runs on a bare Python, before anything is installed.

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Unpack the tree beside a lock file of its own: the tests with other Pythons and libraries.
 
     python tools/versions.py PYTHON

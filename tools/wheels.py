@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The first step: .venv, filled from requirements.lock and nothing else."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Online identification and monitoring of main steam valve flow characteristics.
 
 The Python interface, ``import valveflow_ros as vf``: `open_log`, `identify`, `diagnose`,

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Everything that can go wrong for a person, each as one sentence.
 
 Every error the project raises on purpose derives from `ValveflowError`, and

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Flags of the compiler, threads, and long sums whose bits do not depend on either."""
 
 from __future__ import annotations

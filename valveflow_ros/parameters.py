@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The one table of parameters: names, defaults, units, ranges, sentences.
 
 The node declares its ROS parameters from this table, ``config/monitor.yaml``

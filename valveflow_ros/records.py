@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The words every part of the house shares: signals, qualities, readings, samples, segments.
 
 Records are frozen and slotted; arrays inside them are never written after the

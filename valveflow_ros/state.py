@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What an object that follows a stream remembers, as plain values.
 
 ``snapshot()`` gives numbers, texts, lists, dicts and arrays that no longer change; ``restore()``

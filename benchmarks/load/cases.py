@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is tried: steady rates, more than that, a stall, refits meanwhile, a flood, and hours."""
 
 from __future__ import annotations

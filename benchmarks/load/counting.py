@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The account of a run: every message that was sent stands in exactly one column."""
 
 from __future__ import annotations

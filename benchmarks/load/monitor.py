@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The monitor as a process, what it says of itself, and a history to fit."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The monitor itself, with a stop-watch on the door of its engine.
 
     python -m benchmarks.load.probed FILE [--ros-args ...]

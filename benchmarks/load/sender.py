@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A process that publishes plain values at a rate, each with a number of its own.
 
     python -m benchmarks.load.sender PLAN

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a long run holds: memory, descriptors, threads, files; at its end as near its beginning."""
 
 from __future__ import annotations

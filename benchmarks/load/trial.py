@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One run: a monitor, senders, something that happens meanwhile, and the account of it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compare the speed of this tree with that of an earlier one, by ratios and not by seconds.
 
     python -m benchmarks.regression [--base COMMIT] [--rounds N] [--only NAME ...] [--output FILE]

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Says from pairs of times whether something has become slower."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is measured: the same small work for whichever tree Python finds first.
 
     python work.py make FOLDER          make the inputs

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Trials that hurt recordings, files and processes on purpose, and count what comes of it."""
 
 import sys

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Hurt recordings, files and processes on purpose, and count what comes of it.
 
     python -m benchmarks.torture [--only NAME ...] [--scale 0.1] [--seed N]

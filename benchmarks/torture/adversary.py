@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Acts put together at random against a running monitor: its claims are held against the truth.
 
 The truth is what the stock reader finds in the files, damaged ones recovered; the claims are the

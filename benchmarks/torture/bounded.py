@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Runs a piece of work in a child process that may take so much time and memory, and no more."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Files cut at every byte, with flipped bits, without their first chunk: no wrong values."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A disk that is really full, by a small file system or a limit, until room returns."""
 
 from __future__ import annotations

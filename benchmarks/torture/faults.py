@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Every call by which the recorder changes the disk fails once in turn, until all have."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Recordings by other programs: what is known is read, the rest is skipped and counted."""
 
 from __future__ import annotations

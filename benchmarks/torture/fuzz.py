@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Mutants of recordings and tables: whatever reads them ends with a result or a sentence."""
 
 from __future__ import annotations

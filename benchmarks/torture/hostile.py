@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Files and names that are meant to hurt: a sentence or intact messages, at a bounded price."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What records until it is killed, and the memory that outlives it and says what was handed in."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Recorders killed at random moments: how much is lost, and whether the next start mends it."""
 
 from __future__ import annotations

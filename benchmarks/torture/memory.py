@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How much memory this process holds and has held."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Changes files in ways that a reader has to be ready for: records, chunks, cells and bytes."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A power cut after each sync, with torn tails: what was synced is there, nothing is invented."""
 
 from __future__ import annotations

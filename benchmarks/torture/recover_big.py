@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """An hour at 4,000 messages a second that nobody finished: what its recovery costs."""
 
 from __future__ import annotations

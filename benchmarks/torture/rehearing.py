@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A monitor is killed and started again beside a gateway of others; it must hear it again."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The running monitor is killed and started again, over and over, and its story must be one."""
 
 from __future__ import annotations

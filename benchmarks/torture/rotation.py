@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A hundred new files under 4,000 messages a second: no message is lost or repeated."""
 
 from __future__ import annotations

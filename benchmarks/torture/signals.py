@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The running monitor is asked to end at random moments: in order, soon, and leaving nothing."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A year of a plant through the engine: what grows."""
 
 from __future__ import annotations

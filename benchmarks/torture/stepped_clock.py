@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Runs the monitor under a host clock that another process steps: a file holds seconds to add.
 
 python -m benchmarks.torture.stepped_clock FILE [--ros-args ...]

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the reader that others use finds in a file, with every checksum verified."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a trial is told, what it brings, and how that is written down."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The comparison as a whole, on data made by hand."""
 
 from __future__ import annotations

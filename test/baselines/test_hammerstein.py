@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The Hammerstein baseline: its kernels against obvious loops, and plants of its own class."""
 
 from __future__ import annotations

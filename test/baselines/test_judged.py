@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Scores of predictions on special segments, and who is better than whom."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Tests of a mean difference: the paper's, and those that count what samples are worth."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The sparse baseline: library, equations, thresholding, simulation and rest."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is true of a plant, and how far a curve is from it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Does a characteristic hold on other data."""
 
 from __future__ import annotations

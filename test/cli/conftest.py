@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Logs to run the command on, and a way to run it in this process."""
 
 from __future__ import annotations

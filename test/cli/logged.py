@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What stands in a log that a verb has written, and tables with one column changed."""
 
 from __future__ import annotations

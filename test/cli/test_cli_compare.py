@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``valveflow compare``: three methods on one log, judged on another."""
 
 from __future__ import annotations

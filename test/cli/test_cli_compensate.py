@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``valveflow compensate``: the table, its checks, and what is refused."""
 
 from __future__ import annotations

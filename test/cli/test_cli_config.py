@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``valveflow config``: a file that the monitor takes, and what is wrong with one."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``valveflow diagnose``: from a log to verdict, extended model and report."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The verbs with an extended model: identify, validate and diagnose on top of it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Flows and pressure differences on the command line."""
 
 from __future__ import annotations

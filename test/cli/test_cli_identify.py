@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``valveflow identify``: from any log to the curve, its files and its words."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a table leaves open is said all together, and the last line is the command that works."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``valveflow import`` sees what can be seen, shows it, and asks for the rest."""
 
 from __future__ import annotations

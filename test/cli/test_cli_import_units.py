@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``valveflow import``: units that fit alike, times without a name, pressures that cannot be."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Ctrl-C at any moment: one sentence, its exit status, nothing half-written."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``valveflow loop`` and ``vf.judge_loop``: tables of every kind, columns, what is refused."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The command as a whole: help, usage, exit status, no traceback."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Under a limit of memory a person gets a sentence, never a process that died of a signal."""
 
 from __future__ import annotations

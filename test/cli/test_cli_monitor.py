@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``valveflow monitor``: what the monitor would have told, as the Python interface says it."""
 
 from __future__ import annotations

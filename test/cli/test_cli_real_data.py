@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Two measured loops: one that carries a curve, one that does not."""
 
 from __future__ import annotations

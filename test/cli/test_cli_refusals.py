@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is typed wrongly, or goes where nothing can be written, is told at once and in words."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``--figures`` and ``--table``: the pictures and their numbers as files of their own."""
 
 from __future__ import annotations

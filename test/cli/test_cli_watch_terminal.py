@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``valveflow watch`` on a terminal and to a pipe, while the recording grows."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One change of a mean: found where obvious loops find it, and rarely where there is none."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The inverse table against the curve it came from, and against obvious loops."""
 
 from __future__ import annotations

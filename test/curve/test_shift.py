@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The judgement of a shift: relations between judgements, and plants made by hand."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Records of the simulated plant to be diagnosed, and a start an identification would give."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Faults between command and position sensor: found where they are, and only there."""
 
 from __future__ import annotations

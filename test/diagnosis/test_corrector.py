@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Rows freed of causes as they come: against the extended model itself, and by relations."""
 
 from __future__ import annotations

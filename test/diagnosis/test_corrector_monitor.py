@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The engine on rows freed of causes: what it says, what it finds, and that cutting is nothing."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """An effect is hidden and must be found; where nothing is hidden, nothing may be."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The parts of the diagnosis, each against an obvious truth."""
 
 from __future__ import annotations

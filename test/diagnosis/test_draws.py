@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A valve that sticks: several draws of the sensor's noise, believed by how they predict."""
 
 from __future__ import annotations

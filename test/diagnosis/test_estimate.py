@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Times as dates: no finer than known, never narrower than the interval, the same everywhere."""
 
 from __future__ import annotations

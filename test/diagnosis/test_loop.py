@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One control loop: relations that the verdict keeps, what cannot be judged, the single tests."""
 
 from __future__ import annotations

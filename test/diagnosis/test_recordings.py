@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a diagnosis makes of how a record was kept: coarse rows, held values, a valve at rest."""
 
 from __future__ import annotations

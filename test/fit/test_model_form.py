@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The form of the static power is found where the pressure tells it, and left open where not.
 
 The units here are drawn in tables of flow: no hinge, no exponent grid and no engine makes them.

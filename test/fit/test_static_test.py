@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A static flow test: steady rows far apart become a curve; rows that move do not."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The manual step test: levels found, means, refusals, and the curve through them."""
 
 from __future__ import annotations

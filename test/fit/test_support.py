@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Which pieces rest on data of their own."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``import valveflow_ros as vf``: the verbs as functions, DataFrames in and out, results."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Columns beside the signals: read, tried as causes, kept with the model; drifts without them."""
 
 from __future__ import annotations

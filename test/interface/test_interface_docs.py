@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The examples of ``docs/python.md`` and the notebook run, one after the other, as shown."""
 
 from __future__ import annotations

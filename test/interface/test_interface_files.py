@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One folder for the results of several verbs: nothing of another verb is lost."""
 
 from __future__ import annotations

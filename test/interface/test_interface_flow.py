@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A flow in place of the power, a pressure difference in place of the pressure, any fluid."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The form of the static power through the verbs: found, given, wrong, and put to use."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Files of curves and models with one thing changed, through every door that reads them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A finished log as the engine sees it, also where its clock goes back."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Values that do not suit their unit, and the unit that would."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``Characteristic.power`` and ``.opening``: each undoes the other, and says what it knows."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a recording of a monitor tells, as frames of the terminal view."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Mapping options, parameters, and the settings that follow from the data."""
 
 from __future__ import annotations

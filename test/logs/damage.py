@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a damaged file should still give, found by an obvious walk over the intact one."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Makes the calls by which one thread changes the disk fail, one after the other."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Small recordings and slow truths for the tests of logs."""
 
 from __future__ import annotations

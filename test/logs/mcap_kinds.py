@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Legal MCAP recordings of all kinds: where topics are told, what is packed, what is left out."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A recording is followed while it grows: every message once, whenever one looks."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Every legal kind of MCAP recording: reader, `info` and `recover` against the library `mcap`."""
 
 from __future__ import annotations

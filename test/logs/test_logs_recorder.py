@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The recorder's account against what is found on the disk, whatever the disk does."""
 
 import errno

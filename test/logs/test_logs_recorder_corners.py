@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Corners of recorder and recovery that a day of recording does not come by."""
 
 from __future__ import annotations

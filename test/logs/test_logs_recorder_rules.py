@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What holds of a recorder's loop, account and chunks at any speed, on a clock moved by hand."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Another program removes or changes what a recorder writes: the account is what a reader finds.
 
 The slow truth is the stock reader, after damaged files were recovered.

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What holds of recovery, part files and small files wherever the disk fails."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The end of a recording, against the slow truth of reading all of it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One plant, exported in every way: the same values must come of it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A quote that is not closed is refused with its line, and every quote that is closed is read."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Tables that say what is easily misread, and files that would fill memory or time."""
 
 from __future__ import annotations

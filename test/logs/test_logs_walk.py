@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The quick walk through a chunk against a loop that takes one record at a time."""
 
 import struct

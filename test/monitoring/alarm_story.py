@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Alarms made, fed and operated; and the life of one in obvious steps, the slow truth of them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The life of an alarm by the relations that ISA-18.2 draws, whatever happens to it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Both alarms: at one desk, where neither hides the other, and through the engine."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A monitor that is taken up where it was left goes on bit for bit as if it had not been."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The curve of health: it comes by itself, follows what is slow, and never learns a fault."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A monitor beside a choked valve: curve, prediction, reference and restart over openings."""
 
 from __future__ import annotations

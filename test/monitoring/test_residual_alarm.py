@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The residual alarm: against the slow truth, by relations, and by the stories it was made for."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A state made with other parameters, or by another version, is used as far as it can be."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Slow wear: followed by the reference, told per month, and beyond its budget a shift."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A unit as the page knows it, told message by message."""
 
 from __future__ import annotations

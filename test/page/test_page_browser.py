@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The page in a real browser without a head: drawn, brought up to date, lost and found again."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The metrics are Prometheus', say what is known, and the board of Grafana asks for no others."""
 
 from __future__ import annotations

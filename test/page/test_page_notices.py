@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Notices of alarms: in order, tried again, bounded, and never waited for."""
 
 from __future__ import annotations

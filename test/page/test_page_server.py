@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The page's server: what it answers, what it refuses, and what hostile or slow peers can do."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the page keeps of a unit: bounded, in the plant's time, each alarm's change told once."""
 
 from __future__ import annotations

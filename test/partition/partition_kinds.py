@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Samples of many kinds to try the partition on: kind, and hard kinds that numerics dislike."""
 
 from __future__ import annotations

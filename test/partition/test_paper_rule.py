@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The paper's rule (24), its guard, and its answer where there is no choice."""
 
 from __future__ import annotations

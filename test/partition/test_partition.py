@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The partition as its users see it: truth, relations, hostile input, the trap."""
 
 from __future__ import annotations

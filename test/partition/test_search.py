@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The search against the plain dynamic programme: every number of pieces, every end."""
 
 from __future__ import annotations

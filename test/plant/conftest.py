@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Units that make one thing visible at a time."""
 
 from __future__ import annotations

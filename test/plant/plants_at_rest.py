@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Plants at rest, and effects from their text."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The operators of the actuator, by their laws."""
 
 from __future__ import annotations

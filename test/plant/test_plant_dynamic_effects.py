@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects of actuator, storage and clock do what their physics says, and nothing else."""
 
 from __future__ import annotations

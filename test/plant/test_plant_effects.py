@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What holds for every effect: nothing is nothing, twice is twice, and several compose."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The slow truth of the closed loop: plain Python, no arrays, no state between parts."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The outside of the plant: what the text of the paper's study asks for, by counting."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Faults of the record: where they are, how large, and that nothing else is touched."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a person may write after --effect, and what is said when it makes no sense."""
 
 from __future__ import annotations

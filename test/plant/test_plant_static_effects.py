@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects on the curve do what their physics says, and nothing else."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The thermal unit as a whole: its truth, its ranges, and what effects do to it alone."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The slow truth of the thermal unit's loop: plain Python, one second after the other."""
 
 from __future__ import annotations

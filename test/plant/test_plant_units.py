@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Units and runs: which are refused, which are plausible."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A monitor's recording and a diagnosis made by hand, for the pages that tell of them."""
 
 from __future__ import annotations

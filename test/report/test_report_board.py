@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The board behind the terminal view keeps what it is told, of one unit, within bounds."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The pages in a real browser without a head, where there is one: drawn, touched, printed."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is drawn of the data: where they are and where they are missing, thinned for the eye."""
 
 from __future__ import annotations

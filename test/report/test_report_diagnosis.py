@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The page of a diagnosis: the answer with its doubts first, then the four steps."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Pictures as PNG and SVG, and what they show as CSV."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What has to be compiled first is known by numba's cache."""
 
 from __future__ import annotations

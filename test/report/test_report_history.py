@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The history of a monitor's recording on the page: what its pictures and its words say."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The page: whole, small, closed to the network, and telling the right numbers."""
 
 from __future__ import annotations

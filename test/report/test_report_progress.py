@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Progress: even, with the time that is left, and quiet where there is no terminal."""
 
 from __future__ import annotations

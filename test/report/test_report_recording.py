@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """From a monitor's recording to the history its page tells, by the recording's own schemas."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The part of the page that judges the curve against a reference."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The drawing of the terminal view: a pure function that always fits the terminal."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The monitor as a process, with places at which a test can hold it up.
 
 A file `hold` in the working folder names the place; `held` is written when it is reached, and

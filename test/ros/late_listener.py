@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A node that comes when everything was said: prints the diagnosis kept for it, and ends."""
 
 from __future__ import annotations

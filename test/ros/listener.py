@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A node that hears a running monitor, and the processes of monitor and plant."""
 
 from __future__ import annotations

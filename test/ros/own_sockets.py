@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Which sockets a process holds, and where they are bound, from /proc.
 
 As a program: make a node, and print them.

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Waiting for events, and processes that are ended."""
 
 from __future__ import annotations

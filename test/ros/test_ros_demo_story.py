@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The demo tells one story: each thing when it first happens, and at the end what it meant."""
 
 from __future__ import annotations

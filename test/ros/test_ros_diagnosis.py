@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The diagnosis in the running node: asked for, computed elsewhere, published, repeated."""
 
 from __future__ import annotations

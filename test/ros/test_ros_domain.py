@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A process is known in the domain before it begins to work, and can be stopped until then."""
 
 from __future__ import annotations

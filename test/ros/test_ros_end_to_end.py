@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A plant and a monitor as two processes, a listener over DDS, and what is on disk afterwards."""
 
 from __future__ import annotations

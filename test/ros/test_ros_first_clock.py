@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Values that come before the first /clock: none is lost, and none stands at 1970."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The launch files: what they declare, and that every argument is explained."""
 
 from __future__ import annotations

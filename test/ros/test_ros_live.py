@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The engine as the node runs it gives what it gives offline, however the data are cut."""
 
 from __future__ import annotations

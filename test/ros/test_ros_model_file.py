@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The extended model in the node: its file, its recording, its replay."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The page beside real monitors: what it shows and asks, kills and starts, and how it ends."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The reference in the node: its file, its service, its messages, its recording."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A monitor that is killed goes on where it was: same curve, same alarms, one recording."""
 
 from __future__ import annotations

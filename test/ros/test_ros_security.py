@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Nobody outside this host is listened to, nobody else may read, and no demand is overheard."""
 
 from __future__ import annotations

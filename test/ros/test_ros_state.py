@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is kept between runs: one owner, whole or not at all, used only where it fits."""
 
 from __future__ import annotations

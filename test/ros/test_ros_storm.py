@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A burst of requests: each is answered, also while parameters change and fits run."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The terminal view over ROS: it finds the monitor and shows what it says."""
 
 from __future__ import annotations

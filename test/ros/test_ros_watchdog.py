@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What systemd is told: that the monitor is ready, alive, ending; and never while it is stuck."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Logs that a historian compressed: detection, holding, and what must not be taken for one."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The form of the static power: what a curve is a function of, and what it is multiplied by."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What judges the project's speed, judged by what must hold of any judge."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The study of single loops: what its result says is what the interface says."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The comparison of Section IV of the paper: three methods on one log, judged on another."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A Hammerstein model, and its identification as its literature does it.
 
 Piecewise-linear input, one linear block for all loads. Knots, values and the block are

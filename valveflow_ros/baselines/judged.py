@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Judge predictions on special segments: squared errors and tests (Table III of the paper)."""
 
 from __future__ import annotations

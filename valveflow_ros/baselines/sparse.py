@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Sparse identification of nonlinear dynamics (SINDy), tuned on data of its own.
 
 The model is ``y' = xi . theta(y, u)`` with theta = [1, y, u, y^2, y u, u^2, y^3, y^2 u, y u^2,

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Does a characteristic hold on other data? Judged on their special segments."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """So that ``python -m valveflow_ros.cli`` is the command."""
 
 import sys

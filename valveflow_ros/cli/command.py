@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the verbs share: options, messages and progress on the terminal, the result."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The command: choose the verb, read its options, run it, turn what happens into a status."""
 
 from __future__ import annotations

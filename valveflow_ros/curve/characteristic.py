@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The result: the flow characteristic, how sure it is, and what it was made from."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The characteristic as JSON: what ``characteristic.json`` holds, and what is believed of one."""
 
 from __future__ import annotations

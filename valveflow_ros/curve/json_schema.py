@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What JSON that somebody else may have written has to look like, as a table; `checked` holds it.
 
 A schema is a dict of its keys, or one of the classes here. Every error names its place.

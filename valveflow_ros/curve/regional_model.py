@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The model that is fitted: a piecewise-linear curve and dynamics by region."""
 
 from __future__ import annotations

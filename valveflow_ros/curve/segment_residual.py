@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """By how much each special segment differs from a curve, from the segments' records alone."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Has the flow characteristic moved away from a reference: which piece, how far, since when."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a cause is: a change of the model with parameters, and a way to look for it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Take the causes of an extended model out of rows as they come.
 
 What the pipeline then sees is a plant without the causes:

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """From a record and a model to a diagnosis."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How much the data speak for a cause, its gain on sealed blocks, and how sure its sizes are."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The extended model: curve, regional dynamics and causes, run on measured inputs."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Fit an extended model by its prediction error: tangents, Gauss-Newton, line searches."""
 
 from __future__ import annotations

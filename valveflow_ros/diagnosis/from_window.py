@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Diagnose what the running monitor holds: a pure function of a snapshot."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A record on the grids the diagnosis works on: fine rows, model rows, scored means, blocks."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The loops of the extended model: an answer by regions, and what a valve does to a position."""
 
 from __future__ import annotations

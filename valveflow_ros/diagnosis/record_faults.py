@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Faults of the record itself: they have a name and are masked, but no model explains them."""
 
 from __future__ import annotations

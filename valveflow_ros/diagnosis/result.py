@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The diagnosis as a record: verdict, causes, proof."""
 
 from __future__ import annotations

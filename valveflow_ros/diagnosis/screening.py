@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Screening: what a model leaves unexplained, and cheap ways to try a cause on it.
 
 All tries are regressions of the whitened residual on whitened columns, freed of what curve,

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Which causes: screening, rivals, full refits, a penalised choice, one after the other."""
 
 from __future__ import annotations

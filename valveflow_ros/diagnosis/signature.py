@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where the simulation is wrong: the residual against what was measured, and after fast moves."""
 
 from __future__ import annotations

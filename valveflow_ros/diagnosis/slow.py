@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The slow part of what a model leaves: a drift of the power over hours and days.
 
 The residual is averaged over sub-blocks of half an hour and taken for the sum of three parts:

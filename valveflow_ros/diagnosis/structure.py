@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Whether there is still something in the residual, and on what it depends.
 
 Means of a minute are sorted into cells by one, two or three variables at a time; the mean of

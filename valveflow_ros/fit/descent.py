@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Damped Gauss-Newton and searches along a line, for any model whose cost is a sum of squares."""
 
 from __future__ import annotations

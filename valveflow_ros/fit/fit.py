@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """From a window of rows to a flow characteristic: a pure function of its input."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Derivatives of curve and regional dynamics, a block of rows at a time.
 
 As in `answer_residual`; what a row adds to each derivative is written down first, and then every

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Which form the static power has: P = F(V p^m), or P = p^m F(V) + c.
 
 Both are fitted to means inside special segments with the same number of knots, and judged on

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The number of pieces, judged in the space where the noise is white.
 
 Eq. (24) of the paper looks at the costs of the static fit alone: it cannot

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Measured rows, what a model makes of them, and how its parameters move."""
 
 from __future__ import annotations

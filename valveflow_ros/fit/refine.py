@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Refine curve, time constants, delays and regions together on all samples.
 
 The special segments give F up to a term that eq. (14) of the paper drops:

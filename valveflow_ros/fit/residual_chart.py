@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A chart that watches the residual for a lasting shift: whitened block means, two-sided CUSUMs.
 
 The residual is averaged over blocks of a minute, which takes the fast noise out; what is left is

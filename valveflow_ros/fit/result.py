@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Bring a refined model into the form of the result, with its uncertainties."""
 
 from __future__ import annotations

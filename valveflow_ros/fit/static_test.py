@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A static flow test: steady rows far apart, one opening each, without anything between them.
 
 Such a table holds no time constant and no stretch in which noise could be learnt. Its rows are the

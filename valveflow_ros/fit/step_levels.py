@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The levels of a manual step test: held openings, and the settled part of each."""
 
 from __future__ import annotations

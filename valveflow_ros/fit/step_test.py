@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The traditional manual test: constant pressure, the opening in steps, a mean at each level.
 
 Section I of the paper names it as what plants do today. Its log is not ordinary operation:

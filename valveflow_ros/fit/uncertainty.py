@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How sure the parameters are, with noise that is correlated and depends on what happens."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """An autoregressive model of the residual, so that its samples may be counted as independent."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The Python interface: what ``import valveflow_ros as vf`` offers, and what the verbs call."""
 
 from __future__ import annotations

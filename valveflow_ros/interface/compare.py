@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``compare`` and ``validate``: curves judged on data that they were not made from."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``diagnose``: what the simulation gets wrong, the cause, the gain."""
 
 from __future__ import annotations

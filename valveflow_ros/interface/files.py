@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Output files, whole or not there, and results: their files, report and main picture."""
 
 from __future__ import annotations

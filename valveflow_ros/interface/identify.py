@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``identify``: the flow characteristic of a log."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A log from a file or a DataFrame: readings in the engine's units, constants filled in."""
 
 from __future__ import annotations

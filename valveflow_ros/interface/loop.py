@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``loop``: the valve of one control loop judged from its command and what follows it."""
 
 from __future__ import annotations

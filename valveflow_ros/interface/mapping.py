@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a person says of a log: names, units, constants, and how a table is written."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Reads ``characteristic.json``, ``extended_model.json`` and the truth of a simulated plant."""
 
 from __future__ import annotations

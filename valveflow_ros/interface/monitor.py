@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``monitor``: what the monitor tells over a log; and what one has told, from its recording."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run the engine over a finished log: align, find special segments, ask for one fit."""
 
 from __future__ import annotations

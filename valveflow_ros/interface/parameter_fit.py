@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Parameters of the monitor that follow from a log of the plant, and the file with them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Values that cannot be what their unit says, and signals that were not logged."""
 
 from __future__ import annotations

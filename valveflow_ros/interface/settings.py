@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Parameters for a log: from its own step, a file, and what a person sets, in this order."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``simulate``: the unit of the paper's study or one built from physics, with effects."""
 
 from __future__ import annotations

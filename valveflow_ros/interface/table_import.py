@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Read a historian's table once, judge it, and give it out in the order of time.
 
 The rows wait on disk meanwhile, so that a table of years needs no more memory than its times.

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Files, without ROS: recordings in MCAP, tables in CSV and Parquet, repair."""
 
 from valveflow_ros.logs.contents import LogContents, LoggedMessage, TopicInfo

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Which topic or column stands for which signal."""
 
 from __future__ import annotations

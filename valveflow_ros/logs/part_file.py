@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A file that is being written: it carries its own name only when it is whole.
 
 It is written as ``NAME.mcap.part``, locked as long as its writer lives, and

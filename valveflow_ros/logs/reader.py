@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Opens any log: a recording, a folder of one, or a historian's table."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Opens a file for reading without being caught by what is not a file."""
 
 from __future__ import annotations

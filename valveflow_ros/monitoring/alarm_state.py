@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """An alarm by ANSI/ISA-18.2: its states, the ways between them, and what is announced."""
 
 from __future__ import annotations

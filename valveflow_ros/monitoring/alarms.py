@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The alarms of the monitor: on the residual, on a shift of the curve, and both in one list."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The curve of the last fit, the one that predicts, and when the next fit is asked for."""
 
 from __future__ import annotations

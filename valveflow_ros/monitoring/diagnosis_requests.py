@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """When the model is said not to fit, when a diagnosis is asked for, and what came of it.
 
 Decisions fall at the first row of each hour of the samples' own time, so that neither a clock nor

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the engine says: events, each with the time of the row at which it happened."""
 
 from __future__ import annotations

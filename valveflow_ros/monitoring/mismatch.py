@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Watch, at little cost, whether the model still fits.
 
 The residual's chart sees that the power is off. What is off only at one load, in one direction,

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The engine: rows in, events out. No clock, no files, no threads, no ROS."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Drive the engine without a plant: fits in place, or where a journal says."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the running curve expects, row by row, and by how much the plant differs."""
 
 from __future__ import annotations

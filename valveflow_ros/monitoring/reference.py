@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the plant is like in health: the reference, what fits may use, and how the valve wears."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What goes into the engine in one call and what comes out of it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What Prometheus is told of each unit, from the same pictures that the page shows."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A command or a webhook for each change of an alarm: bounded, tried again, never waited for."""
 
 from __future__ import annotations

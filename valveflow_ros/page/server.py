@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The web server of the page: what it listens to, whom it answers, and its limits."""
 
 from __future__ import annotations

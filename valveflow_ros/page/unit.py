@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the page keeps of one unit: the picture of `Board`, the last 24 hours, alarm changes."""
 
 from __future__ import annotations

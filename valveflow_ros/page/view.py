@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The page itself: words and pictures of each unit, made with Dash, brought up to date each tick.
 
 The server keeps nothing of a browser. Each tick a browser says which version it has of every part,

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a block of candidate breaks can give at best, whatever lies to its right.
 
 Write ``A(l)`` for the sum of squared residuals of the samples ``A`` about a

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A group of ends that are searched together, and what is known about them so far.
 
 Seen from a break far to the left, the ends of a group differ only in the tail:

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Moments of stretches of samples, without cancellation, and the line through them.
 
 A stretch of weighted samples is known by six sums about an origin ``o``, with

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The number of pieces by the paper's rule, eq. (24), with a guard against chance."""
 
 from __future__ import annotations

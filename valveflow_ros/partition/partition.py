@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The exact partition: the best J straight pieces through samples, for all J in one pass.
 
 Solves eqs. (19)-(23) of the paper. The samples are sorted by u, equal u are

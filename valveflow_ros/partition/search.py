@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One layer of the exact search: the best last break for every end.
 
 Ends are taken a group at a time, from left to right within a run of groups. A

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What an effect is: a name, parameters with units and ranges, and a way to take hold."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a historian keeps of the signals of a plant: every value, means, or exceptions."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The closed loop of valve, turbine and power control, one step after the other."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The whole plant with its instruments, row after row."""
 
 from __future__ import annotations

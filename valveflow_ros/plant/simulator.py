@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulate a unit for some days and return what its instruments would have written."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """An effect with the values of its parameters: what a person asks for."""
 
 from __future__ import annotations

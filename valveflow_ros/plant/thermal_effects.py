@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What can be wrong with a unit of `valveflow_ros.plant.thermal_unit` or with its record.
 
 Effects that mean the same as on the paper's unit are taken from its catalogue. Those that

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The loop of governor, valve, turbine and boiler of a thermal unit, one second after the other.
 
 Lags are discretised exactly for an input that is held (controllers) or straight (steam) between

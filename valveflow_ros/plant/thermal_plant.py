@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulate a unit of `valveflow_ros.plant.thermal_unit` and record it as a historian does.
 
 Schedule and AGC give a set point, primary response adds to it, a governor turns it into an

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is fixed about a unit that is built from physics: its valves, steam, boiler and turbine.
 
 Nothing here comes from the paper. Steam flow is a power of the pressure times an area that

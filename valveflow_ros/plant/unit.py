@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is fixed about a simulated unit: its curve, its dynamics, its noise and its habits.
 
 The defaults are the simulation study of the paper, eqs. (30) (as printed for

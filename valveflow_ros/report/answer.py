@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The answer in words and tables: the curve, its number of pieces, its dynamics."""
 
 from __future__ import annotations

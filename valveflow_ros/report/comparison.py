@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The report of a comparison: what came out first, then the evidence."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The tables of a comparison, for people and as CSV: II, III and IV of the paper."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The curve over the samples it was found in, with its error; what it leaves; its reference."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What became of every reading, and where data are missing."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The report of a diagnosis: what is wrong, why, the extended model, the proof."""
 
 from __future__ import annotations

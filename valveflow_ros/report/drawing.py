@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of the report as PNG and SVG files, drawn by matplotlib from the same data."""
 
 from __future__ import annotations

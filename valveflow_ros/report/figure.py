@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A picture as plain data: what plotly draws, with colours by name.
 
 A colour is written ``token:steady``; the page looks it up in its style sheet

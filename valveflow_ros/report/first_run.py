@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Whether the engine has to be compiled first, which takes about a minute, once."""
 
 from __future__ import annotations

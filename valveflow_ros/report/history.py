@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a monitor published while it recorded: its curves, its alarms, its diagnoses."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the report of an identification is made from, and what it derives once for all parts."""
 
 from __future__ import annotations

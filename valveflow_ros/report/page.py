@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The page: sections of text, tables and pictures in one self-contained file."""
 
 from __future__ import annotations

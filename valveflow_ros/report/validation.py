@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The report of a validation: does the curve hold, and where not."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Numbers, times and units as people read them: rounded by what they are worth."""
 
 from __future__ import annotations

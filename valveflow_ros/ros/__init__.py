@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The only folder that knows ROS: node, replay, simulated plant, conversions."""
 
 import sys

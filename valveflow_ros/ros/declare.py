@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The table of parameters as ROS parameters: declared, described, and checked together."""
 
 from __future__ import annotations

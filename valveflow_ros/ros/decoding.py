@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Messages as the engine's records: readings from input topics, lines of the journal."""
 
 from __future__ import annotations

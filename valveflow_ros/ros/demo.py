@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The demo: a simulated plant and the monitor as two real processes, and what comes of it."""
 
 from __future__ import annotations

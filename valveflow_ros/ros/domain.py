@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Entering the ROS domain: transport, security, and being discovered early.
 
 Fast DDS (2.14) announces a participant before it reads its own sockets. Whoever is on the same

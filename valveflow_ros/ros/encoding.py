@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The engine's records as messages, and messages as bytes that depend on nothing but their fields.
 
 The middleware's own serialiser leaves whatever was in memory in the padding between fields, so two

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Finds running monitors and listens to them: every message goes to a board, decoded there."""
 
 from __future__ import annotations

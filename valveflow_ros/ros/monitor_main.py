@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The executable `monitor`: it handles its signals before anything else is loaded.
 
 Then it enters the ROS domain, and only then loads compiler and libraries: while that takes a

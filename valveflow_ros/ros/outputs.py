@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The output topics, and their messages as a pure function of the engine's events.
 
 The node publishes and records them; a verification compares them with those of a replay.

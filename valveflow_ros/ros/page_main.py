@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The executable `page`: running monitors on a page in the browser, and metrics for Prometheus."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Publish samples in their own time, at any rate, with or without a clock.
 
 What is sent in one go beyond what the middleware's queues hold is lost. The monitor answers each

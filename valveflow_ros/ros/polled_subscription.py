@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Subscriptions and services polled without the executor; the one place that uses rclpy's inside.
 
 An executor spends far more time on choosing callbacks than the messages are worth. Here the loop

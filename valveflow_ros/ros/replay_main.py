@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The executable `replay`: a log on the input topics again, or a comparison with its replay."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The executable `plant_simulator`: the paper's plant on the input topics."""
 
 from __future__ import annotations

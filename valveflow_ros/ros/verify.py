@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Feed a recording again and compare every recorded output with that of the replay."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The executable `watch`: how a running monitor is doing, on a terminal."""
 
 from __future__ import annotations

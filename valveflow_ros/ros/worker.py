@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Fits and diagnoses in a child process, so that no sample waits for one.
 
 The parent's side is `FitWorker` and `DiagnosisWorker`; ``python -m valveflow_ros.ros.worker`` is

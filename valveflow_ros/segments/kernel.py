@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The streaming piecewise linear representation of u and power, row by row.
 
 Rows are averaged over short blocks. A straight line of u grows from the last

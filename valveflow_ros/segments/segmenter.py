@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Find special segments while the data stream by (Section III.B of the paper)."""
 
 from __future__ import annotations

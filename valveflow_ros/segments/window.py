@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The rolling window of rows and special segments, in bounded memory."""
 
 from __future__ import annotations

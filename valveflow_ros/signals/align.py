@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Asynchronous signals become one table on a time grid.
 
 A row stands at each multiple of the sample period. It holds, for each signal,

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Signals that a historian keeps by exception: each value stands until the next one.
 
 Such a historian stores a value when a scan finds it farther than a dead band from the last one

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How static power depends on opening and pressure: P = p^e F(V p^q) + c.
 
 The paper has e = c = 0 and q = m (Eq. 1): the knees stand at fixed integrated input u = V p^m.

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Units at the border: what a gateway or a historian may send, and what the engine works in."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``valveflow compare``: the proposed method beside the two of the literature."""
 
 from __future__ import annotations

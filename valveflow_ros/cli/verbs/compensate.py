@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``valveflow compensate``: the inverse curve as a table for the turbine controller."""
 
 from __future__ import annotations

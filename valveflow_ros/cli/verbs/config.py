@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``valveflow config``: a parameter file for the monitor, fitted to a log, or checked."""
 
 from __future__ import annotations

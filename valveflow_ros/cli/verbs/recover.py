@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``valveflow recover``: make a whole recording of what is left of one."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The catalogue of causes, by family; every `Cause` at the top of a module here is one of them."""
 
 from __future__ import annotations

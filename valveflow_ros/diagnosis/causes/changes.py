@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Causes that are a change in time: drifts, steps, intervals and the daily swing."""
 
 from __future__ import annotations

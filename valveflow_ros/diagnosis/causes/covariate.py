@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the four signals do not hold: columns beside them that the power may follow."""
 
 from __future__ import annotations

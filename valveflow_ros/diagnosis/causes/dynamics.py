@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Causes in the response of the power: another lag at high load, the reheater, another clock."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Causes in the flow through the valve: exponent of the pressure, unchoked flow, temperature."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Causes between the measured and the true position of the valve: slack, friction, servo, stop."""
 
 from __future__ import annotations

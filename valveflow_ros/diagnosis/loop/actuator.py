@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where the commanded opening was logged: faults between command and position sensor.
 
 They need no turbine. Each fault says where the valve goes from where it was measured to be,

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The classical tests for a sticking valve in an oscillating loop, each as it was published.
 
 All of them take the controller's output (the command) and the process variable without missing

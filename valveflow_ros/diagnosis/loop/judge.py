@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Judges the valve of one control loop: sticks, has slack, is sound, or cannot be judged.
 
 First comes which question can be asked of a record, then what the tests answer. With a measured

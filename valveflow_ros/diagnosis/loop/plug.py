@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a plug that sticks or has slack explains of a response, beside what the command does.
 
 The response is predicted one row ahead from its own past and the command's (a linear process with

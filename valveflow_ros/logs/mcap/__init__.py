@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Recordings in MCAP: reading, writing, following and repairing them."""
 
 from importlib.util import find_spec

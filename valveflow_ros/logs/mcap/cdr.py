@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Decodes CDR messages by the definition that stands in the file itself.
 
 For journals, `info` and watching, not for the hot path. Every length is

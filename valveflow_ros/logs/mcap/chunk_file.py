@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Writes an MCAP file chunk by chunk and, at the end, the index that stock readers ask for.
 
 It knows after every failure which chunks are whole on disk, because it counts

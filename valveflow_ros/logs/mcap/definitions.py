@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Finds the definition of a message type, complete with everything it is made of."""
 
 from __future__ import annotations

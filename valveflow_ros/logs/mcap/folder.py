@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A recording's folder: numbered splits and the `metadata.yaml` that rosbag2 asks for."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Follows a recording while it is written: what was added since the last look, and no more.
 
 Nothing is held but the place that was reached, the topics of the file, and small

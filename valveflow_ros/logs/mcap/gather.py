@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Goes through one MCAP file and collects, chunk by chunk, the values that may matter.
 
 Chunks are handled in groups of about a mebibyte, so that a file of many tiny

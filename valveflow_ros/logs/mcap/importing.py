@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Turns a table of samples into a recording, as fast as the disk allows.
 
 Records are laid out for a whole chunk at once: all of them have the same size,

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Reads a recording of one or several MCAP files into `LogContents`."""
 
 from __future__ import annotations

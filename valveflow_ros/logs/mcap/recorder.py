@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Records in a thread of its own; whoever hands messages in never waits for a disk."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The records of an MCAP file: parsed and packed by the library `mcap`, within bounds of our own.
 
 No claim of a file is believed: a length never allocates more than the bytes that are there, and a

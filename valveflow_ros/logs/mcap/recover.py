@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Makes a whole file of what a crash, a full disk or a bad sector left.
 
 Intact chunks are copied as they are and get a new index. A chunk whose

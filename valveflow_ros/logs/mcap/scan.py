@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Finds every intact chunk of an MCAP file, whatever happened to the rest of it.
 
 The file is followed record by record. Where the chain breaks, the next bytes

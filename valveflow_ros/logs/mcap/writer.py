@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Writes a recording: a folder of MCAP splits that ROS 2 tools read with nothing of ours."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Gives the rows of Parquet files and Excel workbooks block by block."""
 
 from __future__ import annotations

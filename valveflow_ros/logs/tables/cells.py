@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Makes numbers of the cells of a table, and counts the words that stand in place of one."""
 
 from __future__ import annotations

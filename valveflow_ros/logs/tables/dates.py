@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Finds out how a table writes its dates, and refuses what could be read in two ways."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Opens a table's file of any kind, finds its heading, and gives its rows block by block."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Reads the columns of one control loop from a table: command, position, process value, set point.
 
 Their names are those of control systems: MV or OP, PV, SP or SV behind a tag, or words. Nothing is

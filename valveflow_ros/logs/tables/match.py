@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Decides which column of a table is which signal, and refuses what it cannot decide."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Understands a table before it is read, and then reads it block by block."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a table leaves open, and the option of the command that would decide it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Reads a historian's table, CSV, Excel or Parquet, and writes samples as one."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The text of a table: encoding, separator and decimal mark, and lines that cannot fill memory."""
 
 from __future__ import annotations

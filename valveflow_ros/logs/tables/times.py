@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Makes nanoseconds of whatever a historian writes as time."""
 
 from __future__ import annotations

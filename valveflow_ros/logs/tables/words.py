@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What plants call the five signals, in English and German, and what only sounds like them.
 
 A name gets marks: a quantity alone ('pressure') one, a quantity of the right

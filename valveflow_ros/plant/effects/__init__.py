@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The effects a plant can have, by family; every `Effect` at the top of a module here is one."""
 
 from __future__ import annotations

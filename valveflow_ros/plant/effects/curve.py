@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects in the curve itself: a bend, and a valve that no longer takes part."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects in the response of the power: another lag at high load, and the reheater."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects of the record alone: another clock, values that stand still, coarse steps, spikes."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects between measured and true position: slack, friction, servo, a stop."""
 
 from __future__ import annotations

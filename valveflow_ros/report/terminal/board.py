@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The messages of a monitor decoded, and what a terminal view keeps of them."""
 
 from __future__ import annotations

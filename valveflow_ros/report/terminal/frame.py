@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the terminal view shows at one moment: plain records, and the sentences for them."""
 
 from __future__ import annotations

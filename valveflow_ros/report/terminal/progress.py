@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Progress of long work: a bar on a terminal, a line now and then anywhere else."""
 
 from __future__ import annotations

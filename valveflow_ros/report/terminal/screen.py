@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The terminal view: a frame drawn as lines, and put on a terminal or told change by change."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Lines of a terminal view: pieces of text with a tone, and what a terminal is sent for them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Health items, the diagnostics message they become (REP 107), and lines of the log."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The engine as the node runs it: readings as they come, fits and diagnoses in other processes."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The health of the inputs, the fit, the alarms, the diagnosis and the recorder: an item each."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The inputs: messages are taken, put in one order, and given the times they belong to."""
 
 from __future__ import annotations

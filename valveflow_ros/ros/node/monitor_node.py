@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The node: lifecycle, parameters and services wired to a session, its loop and its watchdog."""
 
 from __future__ import annotations

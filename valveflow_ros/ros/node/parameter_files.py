@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The files that `model_file` and `reference_file` name: read whole, or refused with a reason."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The recording of a run: where it is, what it holds, and that it never disturbs the run."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Continuing where an earlier run ended: its saved state, and what it recorded after that."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One run of the monitor from configure to clean-up: inputs, engine, outputs, recording."""
 
 from __future__ import annotations

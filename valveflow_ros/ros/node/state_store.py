@@ -1,3 +1,5 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The monitor's saved state: one folder, one owner, written whole, found at the next start."""
 
 from __future__ import annotations
