@@ -142,7 +142,7 @@ Publishes the paper's unit, simulated, as a gateway would; any effect of the cat
 hidden in it."""
 _EXAMPLE = (
     'ros2 run valveflow_ros plant_simulator --ros-args -p stamped:=true -p rate:=100.0 '
-    '-p "effects:=[gain_step:t0_days=0.5]"'
+    '-p effects:=gain_step:t0_days=0.5'
 )
 
 
