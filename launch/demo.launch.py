@@ -14,21 +14,23 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchContext, LaunchDescription
+from valveflow_ros.ros.process import parameter_file
 
 PLANT = {
     'days': ('3.0', 'How many days the plant is simulated.'),
     'seed': ('1', 'Seed of every random number.'),
     'rate': ('0.0', 'Plant seconds in a second; 0: as fast as the monitor takes them.'),
     'effects': (
-        'curve_step:s_mw=-12,t0_days=2.7',
+        'step',
         'What is wrong with the plant: name:key=value,..., several with semicolons between them, '
-        "quoted for the shell: effects:='curve_step:s_mw=-12,t0_days=2.7;backlash'. Empty: "
-        'nothing.',
+        "quoted for the shell: effects:='curve_step:s_mw=-12,t0_days=2.7;backlash'. step: it "
+        'gives 12 MW less after nine tenths of the days; none: nothing.',
     ),
 }
 MONITOR = {
     'namespace': ('', 'Namespace of both nodes.'),
     'unit_tag': ('demo', 'Tag of the unit.'),
+    'use_sim_time': ('true', "Whether the monitor goes by the plant's clock (true, false)."),
     'record': ('true', 'Whether to record inputs and outputs to MCAP (true, false).'),
     'record_directory': ('', 'Folder of the recordings; empty: valveflow_recordings here.'),
     'log_level': ('info', 'debug, info, warn, error or fatal.'),
@@ -43,22 +45,31 @@ def plant(context: LaunchContext) -> list[Node]:
     def given(name: str) -> str:
         return LaunchConfiguration(name).perform(context)
 
+    def number(name: str, kind: type) -> float:
+        try:
+            return kind(given(name))
+        except ValueError:
+            raise RuntimeError(f"{name} must be a number, not '{given(name)}'") from None
+
+    days, effects = number('days', float), given('effects')
+    # A command line of ros2 launch cannot give an empty text.
+    known = {'step': f'curve_step:s_mw=-12,t0_days={0.9 * days:g}', 'none': ''}
+    values = {
+        'days': days,
+        'seed': number('seed', int),
+        'rate': number('rate', float),
+        'effects': known.get(effects, effects),
+        'unit_tag': given('unit_tag'),
+        'stamped': True,
+        'use_clock': True,
+    }
     return [
         Node(
             package='valveflow_ros',
             executable='plant_simulator',
             name='plant_simulator',
             namespace=given('namespace'),
-            parameters=[
-                {
-                    'days': float(given('days')),
-                    'seed': int(given('seed')),
-                    'rate': float(given('rate')),
-                    'effects': given('effects'),
-                    'unit_tag': given('unit_tag'),
-                    'stamped': True,
-                }
-            ],
+            parameters=[parameter_file(values)],
             output='screen',
             on_exit=[Shutdown(reason='the plant has run')],
         )

@@ -2,18 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start the monitor; the option --show-args of `ros2 launch` explains the arguments."""
 
-import json
-from tempfile import NamedTemporaryFile
-
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
-from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
+from launch.actions import (
+    DeclareLaunchArgument,
+    IncludeLaunchDescription,
+    OpaqueFunction,
+    TimerAction,
+)
 from launch.conditions import IfCondition
+from launch.events.process import ProcessExited
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchContext, LaunchDescription
+from valveflow_ros.ros.process import parameter_file
 
 # Arguments that stand above the parameter file where they are given, and the type of each.
 OVERRIDES = {
@@ -43,14 +47,12 @@ def typed(kind: type, text: str) -> object:
     return word in _TRUE
 
 
-def parameter_file(values: dict[str, object]) -> str:
-    """Write a parameter file in which texts stand in quotes.
-
-    launch writes them without, and a tag such as 1E5 would arrive as a number.
-    """
-    with NamedTemporaryFile('w', prefix='valveflow_', suffix='.yaml', delete=False) as file:
-        json.dump({'/**': {'ros__parameters': values}}, file)
-    return file.name
+def start_again(event: ProcessExited, context: LaunchContext) -> list[TimerAction]:
+    """Start the monitor again; one that ended in order, as by its lifecycle, stays down."""
+    if event.returncode == 0 or context.is_shutdown:
+        return []
+    again = OpaqueFunction(function=monitor)
+    return [TimerAction(period=2.0, actions=[again], cancel_on_shutdown=True)]
 
 
 def monitor(context: LaunchContext) -> list[Node]:
@@ -71,8 +73,7 @@ def monitor(context: LaunchContext) -> list[Node]:
             namespace=given('namespace'),
             parameters=[given('params_file'), parameter_file(overrides)],
             arguments=['--ros-args', '--log-level', given('log_level')],
-            respawn=typed(bool, given('use_respawn')),
-            respawn_delay=2.0,
+            on_exit=start_again if typed(bool, given('use_respawn')) else None,
             output='screen',
         )
     ]

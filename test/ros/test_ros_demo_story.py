@@ -99,6 +99,14 @@ def test_an_alarm_before_the_fault_is_not_its_alarm(capsys: pytest.CaptureFixtur
     assert len(lines(capsys)) == 3
 
 
+def test_why_there_is_no_curve_is_told_once(capsys: pytest.CaptureFixture[str]) -> None:
+    story = Story(FAULT)
+    for _ in range(2):
+        story.on_curve(FlowCharacteristic(status=FlowCharacteristic.UNKNOWN, cause='No rows.'))
+    (line,) = lines(capsys)
+    assert line.endswith('No rows.')
+
+
 def test_an_alarm_that_never_came_is_nothing_to_tell(capsys: pytest.CaptureFixture[str]) -> None:
     story = Story(FAULT)
     story.on_alarm(alarm(T0, 0, Alarm.NORMAL))

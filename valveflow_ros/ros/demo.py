@@ -159,7 +159,7 @@ class Story:
     def __init__(self, fault_ns: int) -> None:
         self._fault_ns = fault_ns
         self._fault_told = False
-        self._last_curve = ''
+        self._last_curve = self._cause = ''
         self._occurrences: dict[str, int] = {}
         self._raised_ns: list[int] = []
         self._named: list[str] = []
@@ -175,7 +175,8 @@ class Story:
         """Tell of the first curve, or of one with another number of pieces."""
         time_ns = from_time(message.window_end)
         if message.status != FlowCharacteristic.FRESH:
-            if message.cause and not self.curves:
+            if message.cause not in ('', self._cause) and not self.curves:
+                self._cause = message.cause
                 self._tell(time_ns or DEFAULT_START_NS, message.cause)
             return
         if self.curves and self.curves[-1].model_id == message.model_id:
@@ -361,8 +362,8 @@ def _commands(
     """Return name, module and parameters of both processes."""
     monitor: dict[str, object] = {
         'unit_tag': 'demo', 'record_directory': folder / 'recordings',
-        # Shown anew each time.
-        'keep_state': False,
+        # Shown anew each time, in the plant's time.
+        'keep_state': False, 'use_sim_time': True,
         'refit_period': 14400.0, 'refit_segments': 0,
         # Here a night is over before a diagnosis is.
         'diagnosis_hour': -1,
@@ -372,7 +373,7 @@ def _commands(
     fault = f'{_FAULT}:s_mw={_FAULT_MW:g},t0_days={_FAULT_FROM * options.days:.6g}'
     plant: dict[str, object] = {
         'days': options.days, 'seed': options.seed, 'rate': float(options.rate), 'stamped': True,
-        'unit_tag': 'demo', 'effects': f'"{fault}"', 'wait': 600.0,
+        'use_clock': True, 'unit_tag': 'demo', 'effects': f'"{fault}"', 'wait': 600.0,
     }  # fmt: skip
     return [('monitor', 'monitor_main', monitor), ('plant', 'simulator_main', plant)]
 

@@ -5,13 +5,15 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import re
 import signal
 import sys
 import traceback
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from tempfile import NamedTemporaryFile
 from types import FrameType
 from typing import NoReturn
 
@@ -125,6 +127,17 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Refuse what was typed, in words."""
         super().error(re.sub(r'^argument (\S+): must ', r'\1 must ', message))
+
+
+def parameter_file(values: Mapping[str, object]) -> str:
+    """Write a parameter file for a launched node, and return its name.
+
+    Texts stand in quotes in it. launch itself writes them without: a tag such as 1E5 would arrive
+    as a number, and an empty text not at all.
+    """
+    with NamedTemporaryFile('w', prefix='valveflow_', suffix='.yaml', delete=False) as file:
+        json.dump({'/**': {'ros__parameters': values}}, file)
+    return file.name
 
 
 def usage(about: str, example: str, rows: Iterable[Parameter]) -> str:
