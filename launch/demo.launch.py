@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A simulated plant and a monitor; ends when the plant has run."""
 
+from typing import Any
+
 from launch.actions import (
     DeclareLaunchArgument,
     IncludeLaunchDescription,
@@ -39,37 +41,45 @@ MONITOR = {
 }
 
 
-def plant(context: LaunchContext) -> list[Node]:
-    """Make the plant; everything ends when it has run."""
+def given(context: LaunchContext, name: str, kind: type = str) -> Any:
+    """Return the value of an argument."""
+    text = LaunchConfiguration(name).perform(context)
+    try:
+        return kind(text)
+    except ValueError:
+        raise RuntimeError(f"{name} must be a number, not '{text}'") from None
 
-    def given(name: str) -> str:
-        return LaunchConfiguration(name).perform(context)
 
-    def number(name: str, kind: type) -> float:
-        try:
-            return kind(given(name))
-        except ValueError:
-            raise RuntimeError(f"{name} must be a number, not '{given(name)}'") from None
-
-    days, effects = number('days', float), given('effects')
+def values(context: LaunchContext) -> dict[str, object]:
+    """Return the parameters of the plant."""
+    days, effects = given(context, 'days', float), given(context, 'effects')
     # A command line of ros2 launch cannot give an empty text.
     known = {'step': f'curve_step:s_mw=-12,t0_days={0.9 * days:g}', 'none': ''}
-    values = {
+    return {
         'days': days,
-        'seed': number('seed', int),
-        'rate': number('rate', float),
+        'seed': given(context, 'seed', int),
+        'rate': given(context, 'rate', float),
         'effects': known.get(effects, effects),
-        'unit_tag': given('unit_tag'),
+        'unit_tag': given(context, 'unit_tag'),
         'stamped': True,
         'use_clock': True,
     }
+
+
+def check(context: LaunchContext) -> None:
+    """Refuse an argument before the monitor is started, which would be left running."""
+    values(context)
+
+
+def plant(context: LaunchContext) -> list[Node]:
+    """Make the plant; everything ends when it has run."""
     return [
         Node(
             package='valveflow_ros',
             executable='plant_simulator',
             name='plant_simulator',
-            namespace=given('namespace'),
-            parameters=[parameter_file(values)],
+            namespace=given(context, 'namespace'),
+            parameters=[parameter_file(values(context))],
             output='screen',
             on_exit=[Shutdown(reason='the plant has run')],
         )
@@ -87,6 +97,7 @@ def generate_launch_description() -> LaunchDescription:
                 DeclareLaunchArgument(name, default_value=default, description=about)
                 for name, (default, about) in (PLANT | MONITOR).items()
             ),
+            OpaqueFunction(function=check),
             IncludeLaunchDescription(
                 PythonLaunchDescriptionSource(monitor),
                 launch_arguments=[(name, LaunchConfiguration(name)) for name in MONITOR],

@@ -4,8 +4,11 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -171,3 +174,26 @@ def test_the_readme_quotes_the_studies_as_they_are() -> None:
     for command in re.findall(r'`(python -m benchmarks\.[^`]*--first[^`]*)`', text):
         results = page_claims.RESULTS.glob('*.json')
         assert any(command == json.loads(p.read_text()).get('command') for p in results), command
+
+
+def test_what_was_tried_on_jazzy_stands_there_and_came_out() -> None:
+    """The table is written where ros2 is installed; nobody may put a failure into it and go on."""
+    text = (DOCS / 'jazzy.md').read_text(encoding='utf-8')
+    table = text.partition('<!-- tried -->')[2].partition('<!-- end of tried -->')[0]
+    rows = [line for line in table.splitlines() if line.startswith('| ') and '`' in line]
+    sentences = {row.split(' | ')[0].removeprefix('| ') for row in rows}
+    said = (ROOT / 'tools' / 'jazzy.py').read_text(encoding='utf-8')
+    for sentence in sentences:
+        assert sentence in said or sentence.startswith(('lifecycle ', 'then it is ')), sentence
+    assert len(rows) >= 34
+    assert 'FAILED' not in table
+
+
+def test_where_ros2_is_not_installed_nothing_is_said_to_be_tried() -> None:
+    if importlib.util.find_spec('ros2cli'):
+        pytest.skip('ros2 is installed here')
+    done = subprocess.run(
+        [sys.executable, str(ROOT / 'tools' / 'jazzy.py')], capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout[:18]) == (0, 'Nothing was tried:')

@@ -61,7 +61,7 @@ class Speaker(Node):
         """Say what comes again and again."""
         self.health.publish(diagnostics_message(
             [Item('input valve_opening', Level.STALE, 'silent for 9 s.'),
-             Item('recorder', Level.OK, 'Recording.')], 'U1', AT_S * 10**9,
+             Item('recorder', Level.OK, 'Recording.')], 'monitor', 'U1', AT_S * 10**9,
         ))  # fmt: skip
         self.predictions.publish(
             Prediction(

@@ -113,7 +113,7 @@ class Outputs:
     zone : tzinfo, optional
         In which sentences tell times.
     begun_ns : int
-        When the run began, the time of what is told before there are data; 0: not known, it is
+        When the run, or the first of those that continue each other, began, the time of what is told before there are data; 0: not known, it is
         told again with the first row.
 
     Notes
@@ -126,7 +126,7 @@ class Outputs:
         self, tag: str, output_unit: str = 'MW', zone: tzinfo | None = None, begun_ns: int = 0
     ) -> None:
         self._tag, self._unit, self._zone = tag, output_unit, zone
-        self._begun_ns = begun_ns
+        self.begun_ns = begun_ns
         self.curve: Characteristic | None = None
         self.status = CurveStatus.UNKNOWN
         self.cause = NO_CURVE_YET
@@ -155,9 +155,9 @@ class Outputs:
                 yield from self._single(event)
 
     def _rows(self, block: PredictionBlock, changes: list[AlarmChange]) -> Iterator[Output]:
-        if not self._begun_ns:
+        if not self.begun_ns:
             # At the start /clock told no time yet.
-            self._begun_ns = int(block.time_ns[0])
+            self.begun_ns = int(block.time_ns[0])
             yield from self.latched()
         left = iter(changes)
         change = next(left, None)
@@ -191,7 +191,7 @@ class Outputs:
             if event.kind == JournalKind.RESUMED:
                 # A subscriber to the restarted process must find everything there.
                 self.shift = None
-                yield from self._current(event.time_ns)
+                yield from self._current(event.time_ns or self.begun_ns)
             elif self._note(event):
                 yield from self._curve_messages(event.time_ns)
 
@@ -206,7 +206,7 @@ class Outputs:
 
     def latched(self) -> Iterator[Output]:
         """Yield the current messages of the latched topics."""
-        return self._current(self._begun_ns)
+        return self._current(self.begun_ns)
 
     def _current(self, time_ns: int) -> Iterator[Output]:
         """Yield what is known; what is not known yet has the given time."""

@@ -80,6 +80,12 @@ class Restart:
         return None if self.folder is None or saved is None else saved['began']
 
     @property
+    def begun_ns(self) -> int:
+        """Return when the first of the runs that are continued began; 0: it was not told."""
+        saved = self._store.saved
+        return 0 if saved is None else int(saved.get('begun_ns', 0))
+
+    @property
     def adopted(self) -> bool:
         """Return True if the earlier run recorded a curve that its state does not hold yet."""
         try:

@@ -101,6 +101,7 @@ class Session:
             }
             self.engine = self._restart.engine(self._make_engine)
             if self._restart.continues:
+                self._messages.begun_ns = self._restart.begun_ns
                 self._messages.restore(self.engine.monitor)
             if self._restart.continues and not self._restart.adopted:
                 # The curve of the earlier run is there at once; its alarms may have changed since.
@@ -318,6 +319,7 @@ class Session:
             'log_ns': self._log_clock.last_ns,
             'topics': {**self.inputs, **self.outputs},
             'began': recording.began,
+            'begun_ns': self._messages.begun_ns,
             'recording': None if folder is None else str(folder.absolute()),
         }
 

@@ -1,0 +1,380 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""Drive the real ros2 command line against the nodes, and write down what was tried and found.
+
+    python tools/jazzy.py [--write]
+
+It needs ros2cli and launch_ros, so a ROS 2 installation; without them it says so and ends with 0.
+Every check is a sentence, the command a person would type, and what it must say. ``--write`` puts
+the table into docs/jazzy.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib.util
+import os
+import platform
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import yaml
+
+PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'jazzy.md'
+_BEGIN, _END = '<!-- tried -->\n', '<!-- end of tried -->\n'
+_NODE = '/valveflow_monitor'
+# How long a command may take on a busy machine, and a node until it listens.
+_PATIENCE_S, _START_S = 120.0, 180.0
+
+
+class NotSeenError(Exception):
+    """A check did not find what it must."""
+
+
+class Bench:
+    """The nodes that run, the folder they run in, and the checks made so far.
+
+    Attributes
+    ----------
+    rows : list of tuple of str
+        Check, command and what was found; that begins with 'FAILED' where it was another thing.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.rows: list[tuple[str, str, str]] = []
+
+    def ros2(self, *words: str, patience_s: float = _PATIENCE_S) -> str:
+        """Return what a command of ros2 prints, stdout and stderr."""
+        command = [shutil.which('ros2') or 'ros2', *words]
+        done = subprocess.run(
+            command, cwd=self.folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            timeout=patience_s, check=False,
+        )  # fmt: skip
+        return done.stdout
+
+    def check(self, sentence: str, command: str, found: Callable[[], str]) -> None:
+        """Make a check; ``found`` returns what was seen, or raises `NotSeenError`."""
+        try:
+            seen = found()
+        except (NotSeenError, subprocess.TimeoutExpired) as error:
+            seen = f'FAILED: {error}'
+        print(f'{sentence}: {seen}', flush=True)
+        self.rows.append((sentence, command, seen))
+
+    def says(self, sentence: str, pattern: str, *words: str, refused: str = '') -> None:
+        """Check that a command of ros2 prints what a pattern matches, and nothing refused."""
+
+        def found() -> str:
+            said = self.ros2(*words)
+            match = re.search(pattern, said, re.S)
+            if match is None or (refused and re.search(refused, said)):
+                raise NotSeenError(said.strip()[-300:])
+            return ' '.join(match.group(match.lastindex or 0).split())[:120]
+
+        self.check(sentence, f'ros2 {" ".join(words)}', found)
+
+    @contextlib.contextmanager
+    def running(self, ready: str, *words: str) -> Iterator[subprocess.Popen[str]]:
+        """Run a command of ros2 until its output matches ``ready``; end it afterwards."""
+        log = self.folder / f'{len(list(self.folder.glob("*.log")))}.log'
+        with log.open('w') as out:
+            process = subprocess.Popen(
+                [shutil.which('ros2') or 'ros2', *words], cwd=self.folder, stdout=out,
+                stderr=subprocess.STDOUT, text=True, start_new_session=True,
+            )  # fmt: skip
+        try:
+            _until(lambda: re.search(ready, log.read_text()), f'{ready!r} in {log}')
+            yield process
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGINT)
+            process.wait(_PATIENCE_S)
+
+    @property
+    def log(self) -> str:
+        """Return what the command that was started last has printed."""
+        newest = max(self.folder.glob('*.log'), key=lambda path: int(path.stem))
+        return newest.read_text()
+
+
+def _until(condition: Callable[[], object], what: str, patience_s: float = _START_S) -> None:
+    end_s = time.monotonic() + patience_s
+    while not condition():
+        if time.monotonic() > end_s:
+            raise NotSeenError(f'{what} did not come within {patience_s:g} s')
+        time.sleep(0.2)
+
+
+def _monitor(bench: Bench, *more: str) -> contextlib.AbstractContextManager[object]:
+    given = ('--ros-args', '-p', f'record_directory:={bench.folder}', *more)
+    return bench.running('listening to', 'run', 'valveflow_ros', 'monitor', *given)
+
+
+def parameters(bench: Bench) -> None:
+    """Dump, load and set parameters, running and unconfigured."""
+    with _monitor(bench):
+        dump = bench.folder / 'dump.yaml'
+        dump.write_text(bench.ros2('param', 'dump', _NODE))
+
+        def loads(name: str, file: Path) -> None:
+            def found() -> str:
+                said = bench.ros2('param', 'load', _NODE, str(file)).splitlines()
+                bad = [line for line in said if not line.endswith(' successful')]
+                if bad or len(said) < 50:
+                    raise NotSeenError('; '.join(bad[:3]) or 'nothing was loaded')
+                return f'{len(said)} parameters, each "successful"'
+
+            bench.check(name, f'ros2 param load {_NODE} {file.name}', found)
+
+        loads('What was dumped loads into the running node', dump)
+        config = bench.folder / 'monitor.yaml'
+        text = (PAGE.parents[1] / 'config' / 'monitor.yaml').read_text()
+        own = {'record_directory': str(bench.folder)}
+        values = yaml.safe_load(text)['/**']['ros__parameters'] | own
+        config.write_text(yaml.safe_dump({_NODE: {'ros__parameters': values}}))
+        loads('config/monitor.yaml loads into the running node', config)
+        bench.says(
+            '3.0 for a whole number is taken',
+            'successful',
+            'param',
+            'set',
+            _NODE,
+            'alarm_flood',
+            '3.0',
+        )
+        bench.says('and stays one', 'Integer value is: 3', 'param', 'get', _NODE, 'alarm_flood')
+        bench.says(
+            'A value out of range is refused with its range', 'must be from [^\n]*',
+            'param', 'set', _NODE, 'alarm_dead_band', '5.0',
+        )  # fmt: skip
+        bench.says(
+            'What only the start may set is refused with what to do', 'cannot be changed[^\n]*',
+            'param', 'set', _NODE, 'unit_tag', 'U7',
+        )  # fmt: skip
+        for word, state in (('deactivate', 'inactive'), ('cleanup', 'unconfigured')):
+            bench.says(
+                f'lifecycle {word}', 'Transitioning successful', 'lifecycle', 'set', _NODE, word
+            )
+            bench.says(f'then it is {state}', state, 'lifecycle', 'get', _NODE)
+        bench.says(
+            'Unconfigured it may be set', 'successful', 'param', 'set', _NODE, 'unit_tag', 'U7'
+        )
+        bench.says(
+            'The unit percent, as YAML takes no bare %', 'successful',
+            'param', 'set', _NODE, 'valve_opening_unit', 'percent',
+        )  # fmt: skip
+        bench.says(
+            'activate is no way from there', '(Unknown transition)',
+            'lifecycle', 'set', _NODE, 'activate',
+        )  # fmt: skip
+        for word in ('configure', 'activate'):
+            bench.says(
+                f'lifecycle {word}', 'Transitioning successful', 'lifecycle', 'set', _NODE, word
+            )
+        bench.says(
+            'It has the new tag', 'frame_id: U7', 'topic', 'echo', '--once', '/diagnostics'
+        )  # fmt: skip
+
+
+def topics(bench: Bench) -> None:
+    """Look at topics: latched messages, quality of service, health, samples without a quality."""
+    override = f'qos_overrides.{_NODE}/prediction.publisher.reliability:=best_effort'
+    with _monitor(bench, '-p', override):
+        late = ['--once', '--qos-durability', 'transient_local', '--qos-reliability', 'reliable']
+        bench.says(
+            'A late subscriber sees that no alarm ever came', 'state: 0.*come since the start',
+            'topic', 'echo', *late, f'{_NODE}/alarms',
+        )  # fmt: skip
+        bench.says(
+            'The first curve message has a time', r'sec: (1[0-9]{9})', 'topic', 'echo', *late,
+            f'{_NODE}/characteristic',
+        )  # fmt: skip
+        bench.says(
+            'The quality of service is as overridden', '(Reliability: BEST_EFFORT)',
+            'topic', 'info', '-v', f'{_NODE}/prediction',
+        )  # fmt: skip
+        bench.says(
+            'Its type hash is that of the definition', 'Topic type hash: (RIHS01_[0-9a-f]{16})',
+            'topic', 'info', '-v', f'{_NODE}/characteristic',
+        )  # fmt: skip
+        bench.says(
+            'Health items are called NODE: ITEM', 'name: .?valveflow_monitor: input valve_opening',
+            'topic', 'echo', '--once', '/diagnostics',
+        )  # fmt: skip
+        bench.says(
+            'A service answers with a sentence', "message='([^']*)'", 'service', 'call',
+            f'{_NODE}/refit', 'std_srvs/srv/Trigger',
+        )  # fmt: skip
+        bench.says(
+            'Types of the services', 'valveflow_msgs/srv/OperateAlarm', 'service', 'type',
+            f'{_NODE}/operate_alarm',
+        )  # fmt: skip
+        sample = '{header: {stamp: now}, valve_opening: 50.0, main_steam_pressure: 13.0}'
+        kind = 'valveflow_msgs/msg/PlantSample'
+        with bench.running(
+            'publishing #3', 'topic', 'pub', '-r', '5', '/plant_sample', kind, sample
+        ):
+            bench.says(
+                'A sample without qualities is not used, and it is said why',
+                'does not set (valve_opening_quality)', 'topic', 'echo', '--once', '/diagnostics',
+                '--full-length',
+            )  # fmt: skip
+
+
+def launching(bench: Bench) -> None:
+    """Launch: arguments, two units, a killed and an ended monitor, the demo."""
+    bench.says(
+        'Every argument is explained', "'unit_tag':[^']*", 'launch', 'valveflow_ros',
+        'monitor.launch.py', '--show-args',
+    )  # fmt: skip
+
+    def launch(*words: str) -> contextlib.AbstractContextManager[object]:
+        return bench.running(
+            'listening to', 'launch', 'valveflow_ros', 'monitor.launch.py', *words,
+            f'record_directory:={bench.folder}',
+        )  # fmt: skip
+
+    with launch('namespace:=unit_1', 'unit_tag:=1E5'), launch('namespace:=unit_2', 'unit_tag:=U2'):
+        bench.says(
+            'Two units by namespace', r'(/unit_1/valveflow_monitor\s+/unit_2/valveflow_monitor)',
+            'node', 'list',
+        )  # fmt: skip
+        bench.says(
+            'A tag that looks like a number stays a text', 'String value is: 1E5', 'param', 'get',
+            '/unit_1/valveflow_monitor', 'unit_tag',
+        )  # fmt: skip
+    with launch('use_respawn:=true'):
+
+        def respawned() -> str:
+            os.kill(_pid(bench), signal.SIGKILL)
+            _until(lambda: bench.log.count('listening to') == 2, 'the monitor')
+            return 'a killed monitor listens again'
+
+        bench.check('A killed monitor is started again', 'use_respawn:=true, kill -9', respawned)
+
+        def down() -> str:
+            bench.ros2('lifecycle', 'set', _NODE, 'shutdown')
+            _until(lambda: 'finished cleanly' in bench.log, 'the end')
+            time.sleep(5.0)
+            if bench.log.count('process started') != 2:
+                raise NotSeenError('it was started again')
+            return 'not started again'
+
+        command = f'ros2 lifecycle set {_NODE} shutdown'
+        bench.check('One that its lifecycle shut down stays down', command, down)
+
+    def refused() -> str:
+        said = bench.ros2('launch', 'valveflow_ros', 'demo.launch.py', 'days:=abc')
+        if "days must be a number, not 'abc'" not in said or 'process started' in said:
+            raise NotSeenError(said[-300:])
+        return "days must be a number, not 'abc'; no process was started"
+
+    line = 'ros2 launch valveflow_ros demo.launch.py days:=abc'
+    bench.check('An argument that is no number is refused', line, refused)
+    for words in (('effects:=none', 'days:=0.02'), ('days:=0.02',)):
+
+        def plays(words: tuple[str, ...] = words) -> str:
+            said = bench.ros2(
+                'launch', 'valveflow_ros', 'demo.launch.py', *words,
+                f'record_directory:={bench.folder}/demo', patience_s=_START_S,
+            )  # fmt: skip
+            if said.count('finished cleanly') != 2:
+                raise NotSeenError(said[-300:])
+            return 'plant and monitor finished cleanly'
+
+        line = f'ros2 launch valveflow_ros demo.launch.py {" ".join(words)}'
+        bench.check('The demo runs', line, plays)
+
+
+def _pid(bench: Bench) -> int:
+    started = re.findall(r'\[monitor-\d+\]: process started with pid \[(\d+)\]', bench.log)
+    return int(started[-1])
+
+
+def read(bench: Bench) -> None:
+    """Read the recording of the demo with rosbags, and replay it."""
+    (folder, *_) = (bench.folder / 'demo').glob('valveflow_*')
+
+    def count_all() -> str:
+        from rosbags.highlevel import AnyReader
+
+        with AnyReader([folder]) as reader:
+            count = sum(1 for _ in reader.messages())
+            told = yaml.safe_load((folder / 'metadata.yaml').read_text())
+        info = told['rosbag2_bagfile_information']
+        if count != info['message_count']:
+            raise NotSeenError(f'{count} messages of {info["message_count"]}')
+        return f'metadata version {info["version"]}, {count} messages of {count}'
+
+    bench.check('rosbags reads the recording of the demo', 'rosbags AnyReader', count_all)
+
+    bench.says(
+        'Its replay gives every output again, byte for byte', '(identical)',
+        'run', 'valveflow_ros', 'replay', str(folder), '--verify',
+    )  # fmt: skip
+
+
+def table(bench: Bench) -> str:
+    """Return the page's table."""
+
+    def clean(text: str) -> str:
+        return text.replace(str(bench.folder), 'FOLDER').replace('|', '\\|')
+
+    lines = [
+        f'Tried with Python {platform.python_version()}, ros2cli '
+        f'{_version("ros2cli")}, launch {_version("launch")}, rclpy {_version("ros-rclpy")}.',
+        '', '| check | command | found |', '| --- | --- | --- |',
+    ]  # fmt: skip
+    lines += [f'| {clean(a)} | `{clean(b)}` | {clean(c)} |' for a, b, c in bench.rows]
+    return '\n'.join(lines) + '\n'
+
+
+def _version(package: str) -> str:
+    from importlib import metadata
+
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return 'of this installation'
+
+
+def main() -> int:
+    """Make all checks; return 1 if one failed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--write', action='store_true', help='put the table into docs/jazzy.md')
+    options = parser.parse_args()
+    missing = [name for name in ('ros2cli', 'launch_ros') if not importlib.util.find_spec(name)]
+    if missing or shutil.which('ros2') is None:
+        print(f'Nothing was tried: {", ".join(missing) or "the command ros2"} is not here.')
+        return 0
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 90 + 10)
+    with tempfile.TemporaryDirectory(prefix='valveflow_jazzy_') as name:
+        bench = Bench(Path(name))
+        for part in (parameters, topics, launching, read):
+            try:
+                part(bench)
+            except NotSeenError as error:
+                bench.rows.append((part.__doc__ or '', '', f'FAILED: {error}'))
+                print(error)
+        subprocess.run(['ros2', 'daemon', 'stop'], capture_output=True, check=False)
+        if options.write:
+            text = PAGE.read_text()
+            before, after = text.index(_BEGIN) + len(_BEGIN), text.index(_END)
+            PAGE.write_text(text[:before] + table(bench) + text[after:])
+    failed = sum(row[2].startswith('FAILED') for row in bench.rows)
+    print(f'{len(bench.rows)} checks, {failed} failed')
+    return 1 if failed else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
