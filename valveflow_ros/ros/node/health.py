@@ -196,7 +196,7 @@ class InputHealth:
         topic = self._topics[name]
         rejected = self._new(info.topic, 'rejected', sum(counts[r] for r in _REJECTED))
         lost = self._new(info.topic, 'lost', received.lost)
-        ahead, behind = self._stamps(info.signal)
+        off, behind = self._stamps(info.signal)
         if seen.wrong_types:
             return _wrong_type(topic, seen)
         if received.stale(now_s):
@@ -216,8 +216,8 @@ class InputHealth:
             return Level.WARN, f'{rejected} new readings were rejected. {why}'
         if received.without_time + received.waiting == received.received:
             return Level.ERROR, f'{topic} comes without a time; is /clock published?'
-        if ahead:
-            return Level.WARN, ahead
+        if off:
+            return Level.WARN, off
         if lost:
             return Level.WARN, f'{lost} messages of {topic} were lost on the way.'
         hz = received.rate_hz()
@@ -289,10 +289,13 @@ class InputHealth:
                 f"Stamps are up to {off} ahead of this machine's clock; set both by one server."
             )
             return ahead, ''
-        behind = f"tamps are {off} behind this machine's clock"
-        if lead_ns < -_FAR_BEHIND_NS:
-            return f'S{behind}; set both by one server, or play a recording with a /clock.', ''
-        return '', f's{behind}'
+        if lead_ns >= -_FAR_BEHIND_NS:
+            return '', f"stamps are {off} behind this machine's clock"
+        behind = (
+            f"Stamps are {off} behind this machine's clock; set both by one server, or play a "
+            'recording with a /clock.'
+        )
+        return behind, ''
 
     def _new(self, topic: str, what: str, count: int) -> int:
         """Return by how much a count has grown since the last look."""
