@@ -113,8 +113,8 @@ class Outputs:
     zone : tzinfo, optional
         In which sentences tell times.
     begun_ns : int
-        When the run, or the first of those that continue each other, began, the time of what is told before there are data; 0: not known, it is
-        told again with the first row.
+        When the run began, or the first of those that continue each other: the time of what is
+        told before there are data. 0: not known; it is told again with the first row.
 
     Notes
     -----
