@@ -47,14 +47,6 @@ def typed(kind: type, text: str) -> object:
     return word in _TRUE
 
 
-def start_again(event: ProcessExited, context: LaunchContext) -> list[TimerAction]:
-    """Start the monitor again; one that ended in order, as by its lifecycle, stays down."""
-    if event.returncode == 0 or context.is_shutdown:
-        return []
-    again = OpaqueFunction(function=monitor)
-    return [TimerAction(period=2.0, actions=[again], cancel_on_shutdown=True)]
-
-
 def monitor(context: LaunchContext) -> list[Node]:
     """Make the node, with those parameters that were given."""
 
@@ -65,18 +57,34 @@ def monitor(context: LaunchContext) -> list[Node]:
         name: typed(kind, given(name)) for name, (kind, _) in OVERRIDES.items() if given(name)
     }
     overrides['use_sim_time'] = typed(bool, given('use_sim_time'))
-    return [
-        Node(
+    # When it is started again the arguments may be those of another unit's include, or gone.
+    pushed, namespace = context.launch_configurations.get('ros_namespace', ''), given('namespace')
+    if (pushed or namespace) and not namespace.startswith('/'):
+        namespace = f'/{pushed.strip("/")}/{namespace}'.replace('//', '/').rstrip('/')
+    fixed = {
+        'namespace': namespace,
+        'parameters': [given('params_file'), parameter_file(overrides)],
+        'arguments': ['--ros-args', '--log-level', given('log_level')],
+    }
+    again = typed(bool, given('use_respawn'))
+
+    def node() -> Node:
+        return Node(
             package='valveflow_ros',
             executable='monitor',
             name='valveflow_monitor',
-            namespace=given('namespace'),
-            parameters=[given('params_file'), parameter_file(overrides)],
-            arguments=['--ros-args', '--log-level', given('log_level')],
-            on_exit=start_again if typed(bool, given('use_respawn')) else None,
+            on_exit=start_again if again else None,
             output='screen',
+            **fixed,
         )
-    ]
+
+    def start_again(event: ProcessExited, context: LaunchContext) -> list[TimerAction]:
+        """Start it again; one that ended in order, as by its lifecycle, stays down."""
+        if event.returncode == 0 or context.is_shutdown:
+            return []
+        return [TimerAction(period=2.0, actions=[node()], cancel_on_shutdown=True)]
+
+    return [node()]
 
 
 def bridge(context: LaunchContext) -> list[Node]:

@@ -124,3 +124,12 @@ def test_a_file_that_cannot_be_read_and_stays_is_said_at_once(tmp_path: Path) ->
     (tmp_path / 'recording_0.mcap').write_bytes(b'nothing of the kind')
     with pytest.raises(RecordingError, match=r'recording_0\.mcap'):
         list(messages_since(tmp_path, 0))
+
+
+def test_the_definitions_of_what_follows_are_told(tmp_path):
+    with RecordingWriter(tmp_path, definitions=STOCK) as writer:
+        writer.add_topic('/a', FLOAT64)
+        writer.write('/a', float64(1.0), START_NS, START_NS)
+    found = {}
+    assert len(list(messages_since(tmp_path, 0, found))) == 1
+    assert found == {'/a': STOCK.text(FLOAT64)}

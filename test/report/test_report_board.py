@@ -57,6 +57,13 @@ def test_the_health_of_another_unit_is_not_taken_for_this_ones(tag, early, prefi
     assert frame.recorder.sentence == 'fine'
 
 
+def test_what_bears_no_tag_is_no_units_before_one_is_known():
+    board = Board()
+    item = {'name': 'pump: state', 'hardware_id': '', 'level': 2, 'message': 'Too hot.'}
+    board.take(HEALTH, {'header': {'frame_id': ''}, 'status': [item]})
+    assert board.items == ()
+
+
 def test_what_others_say_of_the_same_device_is_left_alone():
     board = Board()
     said = {'hardware_id': 'U1', 'level': 2, 'message': 'Too hot.'}

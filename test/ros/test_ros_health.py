@@ -174,7 +174,7 @@ def test_silence_from_the_start() -> None:
     scene.publishers = {'valve_opening': Publishers(1)}
     scene.says(Level.STALE, 'has a publisher, but nothing has come')
     scene.health.mismatched.add('valve_opening')
-    scene.says(Level.ERROR, 'set input_reliability to best_effort')
+    scene.says(Level.ERROR, 'set input_reliability, and qos_overrides if given, to best_effort')
 
 
 def test_silence_after_speech() -> None:
@@ -189,6 +189,9 @@ def test_a_stamped_sample_speaks_for_all_its_signals() -> None:
     scene.statistics = {name: TopicStatistics() for name in TOPICS}
     scene.hear(PLANT_SAMPLE)
     scene.publishers = {PLANT_SAMPLE: Publishers(1)}
+    # Its quality was left alone; that is no reading, and is not counted.
+    scene.says(Level.OK, 'leaves valve_command_quality at 0, unknown', 'valve_command')
+    scene.counts['valve_command']['accepted'] = 5
     for info in SIGNALS:
         scene.says(Level.OK, '1 Hz', info.topic)
         assert scene.item(info.topic).values['Topic'] == '/plant/plant_sample'

@@ -13,6 +13,11 @@ import pytest
 import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import Parameter as ParameterMsg
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
@@ -230,6 +235,66 @@ def test_requests_that_wait_are_all_answered_in_one_turn(context: Any, tmp_path:
                 'the answer', 20.0,
             )  # fmt: skip
         assert not any(a.result().success for a in asked)
+    finally:
+        stage.close()
+
+
+def ask(stage: Stage, kind: Any, name: str, request: Any) -> Any:
+    """Ask what the loop of the monitor answers, not the executor."""
+    client = stage.other.create_client(kind, f'/valveflow_monitor/{name}')
+    wait_until(client.service_is_ready, name, 20.0)
+    future = client.call_async(request)
+
+    def turn() -> bool:
+        monitor_node.serve_requests(stage.monitor, 1.0)
+        stage.executor.spin_once(timeout_sec=0.01)
+        return future.done()
+
+    wait_until(turn, name, 20.0)
+    return future.result()
+
+
+def test_a_request_that_cannot_be_done_is_answered_and_ends_nothing(
+    context: Any, tmp_path: Path
+) -> None:
+    stage = Stage(context, tmp_path)
+    try:
+        stage.executor.remove_node(stage.monitor)
+        stage.monitor.trigger_configure()
+        stage.monitor.trigger_activate()
+        # A manager that knows no better asks for a transition that is not to be had.
+        request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
+        assert not ask(stage, ChangeState, 'change_state', request).success
+        strange = ParameterMsg(name='alarm_flood', value=ParameterValue(type=42))
+        good = Parameter('alarm_flood', value=7).to_parameter_msg()
+        request = SetParameters.Request(parameters=[good, strange, good])
+        results = ask(stage, SetParameters, 'set_parameters', request).results
+        assert [result.successful for result in results] == [True, False, False]
+        assert 'cannot be done' in results[1].reason
+        request = SetParametersAtomically.Request(parameters=[strange])
+        result = ask(stage, SetParametersAtomically, 'set_parameters_atomically', request).result
+        assert not result.successful
+        assert 'cannot be done' in result.reason
+        assert stage.monitor.session is not None
+        assert stage.monitor.session.listening
+    finally:
+        stage.close()
+
+
+def test_another_life_asks_for_the_reliability_of_its_own_parameters(
+    context: Any, tmp_path: Path
+) -> None:
+    stage = Stage(context, tmp_path, input_reliability='best_effort')
+    try:
+        for wanted in ('best_effort', 'reliable'):
+            set_one = [Parameter('input_reliability', value=wanted)]
+            assert stage.monitor.set_parameters_atomically(set_one).successful
+            assert stage.monitor.trigger_configure() == DONE
+            assert stage.monitor.trigger_activate() == DONE
+            (seen,) = stage.monitor.get_subscriptions_info_by_topic('/valve_opening')
+            assert seen.qos_profile.reliability.name.lower() == wanted
+            assert stage.monitor.trigger_deactivate() == DONE
+            assert stage.monitor.trigger_cleanup() == DONE
     finally:
         stage.close()
 

@@ -811,7 +811,7 @@ def test_each_output_stands_in_the_recording_once(
         for o in said
     ]
     monkeypatch.setattr(restart, 'recover_leftovers', lambda _: [])
-    monkeypatch.setattr(restart, 'messages_since', lambda _folder, _log_ns: tail)
+    monkeypatch.setattr(restart, 'messages_since', lambda *_: tail)
     saved = {
         'settings': dict(given), 'log_ns': 1, 'recording': 'folder', 'engine': None, 'began': {},
         'topics': {**NAMES, 'journal': '/m/journal'},
@@ -835,7 +835,7 @@ def test_a_run_with_other_parameters_goes_on_in_a_new_recording_and_says_what_it
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(restart, 'recover_leftovers', lambda _: [])
-    monkeypatch.setattr(restart, 'messages_since', lambda _folder, _log_ns: [])
+    monkeypatch.setattr(restart, 'messages_since', lambda *_: [])
     then, now = Settings(), Settings({'steady_min': 180.0, 'alarm_floor': 2.0})
     names = {name: f'/m/{name}' for name in OUTPUTS}
     worker: Any = SimpleNamespace(poll=list)

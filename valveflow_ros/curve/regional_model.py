@@ -131,9 +131,11 @@ class RegionalModel:
         knots[1:-1] = inner
         left = values[:-1].copy()
         left[1:] += jumps
+        with np.errstate(over='ignore'):  # a step of the fit that went too far; it is not taken
+            time_constants = np.exp(rest[:i])
         return replace(
             self, knots=knots, left=left, right=values[1:].copy(),
-            time_constants=np.exp(rest[:i]), delays=rest[i : 2 * i].copy(),
+            time_constants=time_constants, delays=rest[i : 2 * i].copy(),
             offset_mw=None if self.offset_mw is None else float(rest[2 * i]),
         )  # fmt: skip
 

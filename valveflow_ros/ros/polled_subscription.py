@@ -14,17 +14,30 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 
+from valveflow_ros.ros.process import one_line, with_place
+
 DEPTH = 1000
-# What a user may set from outside as qos_overrides.TOPIC.publisher.depth and the like.
-QOS_OVERRIDES = QoSOverridingOptions.with_default_policies()
+_POLICIES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
+
+
+def qos_overrides(node: Node, topic: str, entity: str) -> QoSOverridingOptions | None:
+    """Return what a user set from outside, as qos_overrides.TOPIC.publisher.depth and the like.
+
+    rclpy keeps a parameter for each policy that may be set; where none is set, none is wanted.
+    """
+    before = f'qos_overrides.{node.resolve_topic_name(topic)}.{entity}.'
+    given = getattr(node, '_parameter_overrides', {})
+    kinds = [kind for kind in _POLICIES if f'{before}{kind.name.lower()}' in given]
+    return QoSOverridingOptions(kinds) if kinds else None
 
 
 class RawMessage(NamedTuple):
@@ -103,6 +116,11 @@ class PolledSubscription:
         return str(self._subscription.topic_name)
 
     @property
+    def reliable(self) -> bool:
+        """Return True if reliable delivery is asked for, here or by an override."""
+        return self._subscription.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+
+    @property
     def polled(self) -> bool:
         """Return True if messages are polled rather than called back."""
         return self._polled
@@ -135,7 +153,6 @@ class PolledSubscription:
         on_mismatch: Callable[[str], None],
         group: CallbackGroup | None,
     ) -> None:
-        overrides = None if topic == '/clock' else QOS_OVERRIDES
         reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
         self._subscription = self._node.create_subscription(
             self._type,
@@ -144,7 +161,7 @@ class PolledSubscription:
             QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=DEPTH, reliability=reliability),
             raw=True,
             callback_group=group or MutuallyExclusiveCallbackGroup(),
-            qos_overriding_options=overrides,
+            qos_overriding_options=qos_overrides(self._node, topic, 'subscription'),
             # Each event costs the executor time at every look; the rest says nothing of use.
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=lambda _: on_mismatch(self.topic), use_default_callbacks=False
@@ -155,15 +172,32 @@ class PolledSubscription:
         self._waiting.append(_raw_message(data, info))
 
 
-def answer_request(service: Service) -> bool:
-    """Answer the oldest request of a service; return False if there is none."""
+def answer_request(service: Service, failed: Callable[[str], None]) -> bool:
+    """Answer the oldest request of a service; return False if there is none.
+
+    What cannot be done is said to ``failed``, and the answer is one without success.
+    """
     take = getattr(service.handle, 'service_take_request', None)
     request, header = (None, None) if take is None else take(service.srv_type.Request)
     if header is None:
         return False
-    response = service.callback(request, service.srv_type.Response())
+    response = service.srv_type.Response()
+    try:
+        response = service.callback(request, response)
+    except Exception as error:  # noqa: BLE001 - nothing that is asked may end the monitor
+        failed(f'{service.service_name} was asked what it cannot do: {with_place(error)}')
+        _refuse(request, response, f'This cannot be done ({one_line(error)}).')
     service.send_response(response, header)
     return True
+
+
+def _refuse(request: Any, response: Any, reason: str) -> None:
+    """Say no where the answer has a place for it; whoever sets parameters gets one for each."""
+    if hasattr(response, 'results') and hasattr(request, 'parameters'):
+        missing = len(request.parameters) - len(response.results)
+        response.results += [SetParametersResult(successful=False, reason=reason)] * missing
+    elif hasattr(response, 'result') and hasattr(response.result, 'reason'):
+        response.result = SetParametersResult(successful=False, reason=reason)
 
 
 def _raw_message(data: bytes, info: dict[str, Any]) -> RawMessage:

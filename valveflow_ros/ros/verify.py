@@ -12,7 +12,7 @@ from itertools import islice
 from pathlib import Path
 
 from rclpy.serialization import deserialize_message
-from valveflow_msgs.msg import FlowCharacteristic
+from valveflow_msgs.msg import Alarm, FlowCharacteristic
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.diagnosis import result
@@ -157,6 +157,9 @@ class _Replay:
 
     def verify(self) -> Verification:
         """Compare message by message, until the first difference."""
+        if self._is_earlier():
+            problem = 'was made by an earlier version, whose first messages were others; it can be'
+            raise RecordingError(self._log.path, f'{problem} replayed, not verified')
         recorded = self._messages(self._outputs)
         kept = set(self._outputs.values())
         try:
@@ -231,6 +234,17 @@ class _Replay:
         stamped = [topic for topic, name in self._inputs.items() if name == PLANT_SAMPLE]
         found = [self._log.topics[topic] for topic in stamped if topic in self._log.topics]
         return found[0].definition if found else ''
+
+    def _is_earlier(self) -> bool:
+        """Return True if no alarm was told at the beginning, as every run does now."""
+        alarms = [topic for topic, name in self._outputs.items() if name == 'alarms']
+        told, first = (next(self._messages(t), None) for t in (alarms, self._outputs))
+        if first is None:
+            return False
+        try:
+            return told is None or deserialize_message(told.data, Alarm).occurrence > 0
+        except Exception:  # noqa: BLE001 - the comparison says what is wrong with it
+            return False
 
     def _begun_ns(self) -> int:
         """Return the time of what was told before there were data."""

@@ -340,7 +340,9 @@ def _readings(files: list[FileContents], chosen: dict[str, Signal]) -> tuple[Rea
 _TRIES = 3
 
 
-def messages_since(folder: str | Path, after_ns: int) -> Iterator[LoggedMessage]:
+def messages_since(
+    folder: str | Path, after_ns: int, definitions: dict[str, str] | None = None
+) -> Iterator[LoggedMessage]:
     """Yield the messages of a recording's folder logged after ``after_ns``, in order.
 
     Parameters
@@ -348,13 +350,18 @@ def messages_since(folder: str | Path, after_ns: int) -> Iterator[LoggedMessage]
     folder : str or Path
     after_ns : int
         Log time.
+    definitions : dict, optional
+        Takes the ros2msg text of each topic's type.
 
     Raises
     ------
     RecordingError
         The files cannot be read; a folder without any gives nothing.
     """
-    for message in _read(Path(folder), after_ns).iter_messages():
+    found = _read(Path(folder), after_ns)
+    if definitions is not None:
+        definitions |= {topic: info.definition for topic, info in found.topics.items()}
+    for message in found.iter_messages():
         if message.log_time_ns > after_ns:
             yield message
 

@@ -121,8 +121,8 @@ class Board:
 
     def _health(self, fields: Fields) -> None:
         # `/diagnostics` is one topic for every node there is; a monitor sends its tag along.
-        tag = str(fields['header']['frame_id']) if self._tag is None else self._tag
-        ours = [s for s in fields['status'] if str(s['hardware_id']) == tag and _is_item(s)]
+        tag = str(fields['header']['frame_id']) or None if self._tag is None else self._tag
+        ours = [s for s in fields['status'] if s['hardware_id'] == tag and _is_item(s)]
         if ours:
             self._health_tag = str(ours[0]['hardware_id'])
         items = [_item(status) for status in ours[:_MOST_ITEMS]]

@@ -216,6 +216,10 @@ class InputHealth:
             return Level.WARN, f'{rejected} new readings were rejected. {why}'
         if received.without_time + received.waiting == received.received:
             return Level.ERROR, f'{topic} comes without a time; is /clock published?'
+        if name == PLANT_SAMPLE and not info.required and not any(counts.values()):
+            return Level.OK, (
+                f'{topic} has none, or leaves {info.topic}_quality at 0, unknown; it is optional.'
+            )
         if off:
             return Level.WARN, off
         if lost:
@@ -233,7 +237,7 @@ class InputHealth:
         if name in self.mismatched:
             return Level.ERROR, (
                 f'{topic} is published as best effort and asked for as reliable, so nothing '
-                'comes: set input_reliability to best_effort.'
+                'comes: set input_reliability, and qos_overrides if given, to best_effort.'
             )
         if not info.required and not seen.right:
             return Level.OK, f'{topic} is not sent; it is optional.'
@@ -246,6 +250,7 @@ class InputHealth:
     def _why(self, info: SignalInfo, counts: Mapping[str, int]) -> str:
         """Return why readings were rejected: the last impossible value, or the reasons so far."""
         found = self._impossible.pop(info.topic, None)
+        bad_quality = self._new(info.topic, 'bad_quality', counts['bad_quality'])
         if found is None:
             off_ns = self._last_ns[info.signal] - self._newest_ns
             outliers = self._new(info.topic, 'time_outlier', counts['time_outlier'])
@@ -254,7 +259,7 @@ class InputHealth:
                 if off_ns > 0:
                     return f'The last stamp is {off} ahead of the newest one used.'
                 return f'The last stamp is {off} behind the newest one used.'
-            if self._new(info.topic, 'bad_quality', counts['bad_quality']):
+            if bad_quality:
                 return (
                     f'The sender calls them bad, or does not set {info.topic}_quality, which is '
                     'then 0, unknown; 1 is good.'

@@ -489,7 +489,7 @@ def serve_requests(node: Node, longest_s: float) -> None:
         for service in tuple(node.services):
             if time.monotonic() > until_s:
                 return
-            answered |= answer_request(service)
+            answered |= answer_request(service, node.get_logger().error)
 
 
 def _spin(executor: Executor, longest_s: float) -> None:

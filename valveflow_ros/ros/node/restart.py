@@ -11,13 +11,14 @@ from typing import Any
 
 from valveflow_ros.errors import DataError, RecordingError, ValveflowError
 from valveflow_ros.logs import LoggedMessage, messages_since, recover_leftovers
+from valveflow_ros.logs.names import has_earlier_codes
 from valveflow_ros.logs.part_file import PART_SUFFIX, is_held
 from valveflow_ros.monitoring.alarms import AlarmState
 from valveflow_ros.monitoring.events import Event, JournalEntry, JournalKind
 from valveflow_ros.monitoring.offline import JournalReplayer
 from valveflow_ros.parameters import Settings, parameter
 from valveflow_ros.records import Readings
-from valveflow_ros.ros.decoding import Decoder, journal_entry
+from valveflow_ros.ros.decoding import PLANT_SAMPLE, Decoder, journal_entry
 from valveflow_ros.ros.node.diagnostics import Level, line_of
 from valveflow_ros.ros.node.engine import LiveEngine
 from valveflow_ros.ros.node.state_store import StateStore
@@ -68,7 +69,7 @@ class Restart:
         self._outputs = {topic: name for name, topic in outputs.items()}
         self._log = log
         self._tail: list[LoggedMessage] = []
-        self._missing = ''
+        self._missing = self._sample = ''
         self.continues = False
         self.log_ns = 0
         self.folder: Path | None = None
@@ -83,7 +84,7 @@ class Restart:
     def begun_ns(self) -> int:
         """Return when the first of the runs that are continued began; 0: it was not told."""
         saved = self._store.saved
-        return 0 if saved is None else int(saved.get('begun_ns', 0))
+        return 0 if saved is None else int(saved.get('begun_ns', saved['log_ns']))
 
     @property
     def adopted(self) -> bool:
@@ -163,7 +164,7 @@ class Restart:
         journal = [e for e in self._journal() if e.kind != JournalKind.DIAGNOSED]
         curves = self._store.curve
         replayer = JournalReplayer(engine.monitor, journal, curves=curves, left=problems)
-        decoder = Decoder(engine.monitor.settings)
+        decoder = Decoder(engine.monitor.settings, self._sample)
         messages = [m for m in self._tail if m.topic in self._inputs]
         for k in range(0, len(messages) + 1, _BLOCK):
             rows = [
@@ -207,7 +208,9 @@ class Restart:
         folder = Path(saved['recording'])
         try:
             recover_leftovers(folder)
-            self._tail = list(messages_since(folder, self.log_ns))
+            definitions: dict[str, str] = {}
+            self._tail = list(messages_since(folder, self.log_ns, definitions))
+            self._sample = definitions.get(self._topics.get(PLANT_SAMPLE, ''), '')
             if any(map(_written_now, folder.glob(f'*{PART_SUFFIX}'))):
                 self._missing = f'Another process records into {folder}; a new recording is begun.'
             # With the same parameters and names of topics it is one recording for a replay.
@@ -215,6 +218,8 @@ class Restart:
                 saved['topics'] == self._topics
                 and not self._settings.retuned(saved['settings'])
                 and not self._result_lost()
+                # One folder holds one meaning of its codes.
+                and not has_earlier_codes(self._sample)
             ):
                 self.folder = folder
         except (RecordingError, DataError) as error:

@@ -29,7 +29,7 @@ from valveflow_ros.ros.node.recording import BackgroundRecovery, Recording, reco
 from valveflow_ros.ros.node.restart import Restart
 from valveflow_ros.ros.node.state_store import StateStore
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs, OutputTopic
-from valveflow_ros.ros.polled_subscription import QOS_OVERRIDES, PolledSubscription
+from valveflow_ros.ros.polled_subscription import PolledSubscription, qos_overrides
 from valveflow_ros.ros.worker import DiagnosisWorker, FitWorker
 from valveflow_ros.signals.units import in_unit
 from valveflow_ros.state import State
@@ -95,7 +95,7 @@ class Session:
                     f'~/{name}',
                     _qos(topic),
                     event_callbacks=silent,
-                    qos_overriding_options=QOS_OVERRIDES,
+                    qos_overriding_options=qos_overrides(node, f'~/{name}', 'publisher'),
                 )
                 for name, topic in OUTPUTS.items()
             }
@@ -201,7 +201,8 @@ class Session:
             return
         # Whoever was told of a curve finds it again after a kill: first it is on disk.
         self._record(outputs)
-        self.confirm()
+        if not self.confirm():
+            self._log(Level.WARN, 'The new curve is not on disk yet; see recorder and state.')
         for output in outputs:
             self._publishers[output.name].publish(output.data)
 
