@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -13,15 +14,16 @@ from rclpy.node import Node
 from ros_helpers import Processes, wait_until
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
-from valveflow_msgs.msg import PlantSample
+from valveflow_msgs.msg import Alarm, PlantSample, Prediction
 
-from valveflow_ros.errors import ParameterError
-from valveflow_ros.logs import open_log, write_samples, write_table
+from valveflow_ros.errors import ParameterError, RecordingError
+from valveflow_ros.logs import RecordingWriter, open_log, write_samples, write_table
+from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import NS_PER_S, SIGNALS, SampleTable, Signal
 from valveflow_ros.ros import replay_main, simulator_main
 from valveflow_ros.ros.decoding import INPUT_BY_NAME, header_time_ns
-from valveflow_ros.ros.encoding import float64_bytes
+from valveflow_ros.ros.encoding import encode, float64_bytes
 from valveflow_ros.ros.node.intake import ClockTrack
 from valveflow_ros.ros.polled_subscription import PolledSubscription, RawMessage
 from valveflow_ros.ros.replay_main import steps_of
@@ -32,6 +34,7 @@ from valveflow_ros.ros.simulator_main import (
     stamped_steps,
     start_ns_of,
 )
+from valveflow_ros.ros.verify import verify
 
 REPLAY = 'valveflow_ros.ros.replay_main'
 TABLE = simulate(0.02, 3).table.part(0, 900)
@@ -226,3 +229,27 @@ def test_plain_values_need_a_clock_unless_in_real_time() -> None:
         except ParameterError:
             refused.append(given)
     assert refused == [(0.0, False, False), (60.0, False, False)]
+
+
+@pytest.mark.parametrize('occurrence', [None, 1, 0])
+def test_a_recording_whose_beginning_is_of_an_earlier_version_is_not_compared(
+    tmp_path: Path, occurrence: int | None
+) -> None:
+    """It told no alarm as normal at its beginning; byte for byte it can be nothing of today's."""
+    names = {'prediction': '/m/prediction', 'alarms': '/m/alarms'}
+    attachments = {
+        'parameters.json': json.dumps(dict(Settings())).encode(),
+        'topics.json': json.dumps({'inputs': {}, 'outputs': names}).encode(),
+    }
+    with RecordingWriter(tmp_path / 'log', attachments=attachments) as writer:
+        writer.add_topic('/m/prediction', 'valveflow_msgs/msg/Prediction')
+        writer.add_topic('/m/alarms', 'valveflow_msgs/msg/Alarm')
+        writer.write('/m/prediction', encode(Prediction()), 10**18, 10**18)
+        if occurrence is not None:
+            alarm = encode(Alarm(occurrence=occurrence))
+            writer.write('/m/alarms', alarm, 10**18 + 1, 10**18 + 1)
+    if occurrence == 0:
+        assert verify(tmp_path / 'log').difference  # compared, and found to be something else
+        return
+    with pytest.raises(RecordingError, match=r'earlier version, .* replayed, not verified'):
+        verify(tmp_path / 'log')
