@@ -282,3 +282,20 @@ def test_the_error_of_a_line_is_the_one_of_least_squares():
     both = curve_error(REFERENCE, np.array([1300.0, 2000.0]))
     assert both[0] == piece_error(REFERENCE.pieces[1], np.array([1300.0]))[0]
     assert both[1] == piece_error(REFERENCE.pieces[3], np.array([2000.0]))[0]
+
+
+@pytest.mark.parametrize(('step_mw', 'moved'), [(-8.0, True), (-8.5, True), (0.0, False)])
+def test_a_bent_curve_of_few_segments_is_judged_by_them(step_mw, moved):
+    """One piece over all openings lies far from the reference where it has no segments."""
+    segments = [
+        s for s in history(3, days=0.2, count=60, change=lambda day, u: step_mw)
+        if s.u_end < 1200.0 or s.u_start > 2150.0
+    ]  # fmt: skip
+    chord = curve_of(VALUES[[0, -1]] + step_mw, KNOTS[[0, -1]], end_ns=START_NS + DAY_NS)
+    shift = judge_shift(REFERENCE, chord, segments)
+    (piece,) = shift.pieces
+    assert abs(piece.middle_mw - step_mw) > 15.0
+    assert shift.moved == moved
+    assert piece.shift_mw == pytest.approx(step_mw, abs=1.5)
+    if moved:
+        assert f'gives {abs(piece.shift_mw):.1f} MW' in shift.sentence

@@ -147,8 +147,8 @@ class PieceShift:
     error_mw : float
         Standard error of ``middle_mw``.
     now_mw, now_error_mw : float
-        Mean difference of the segments after the change, with its error; NaN if the piece has
-        not moved, or the window does not show when.
+        Mean difference of the segments after the change, or of all the curve was fitted to if
+        they do not show when it was, with its error; NaN if the piece has not moved, or has none.
     flow_mw : float
         The reference in the middle.
     p_value : float
@@ -268,8 +268,8 @@ def judge_shift(
     Returns
     -------
     Shift
-        A piece counts as moved if the curves differ in its middle, or if its segments change
-        at some moment and differ from the reference after it.
+        A piece counts as moved if the curves differ in its middle and its segments bear it out,
+        or if its segments change at some moment and differ from the reference after it.
 
     Raises
     ------
@@ -299,6 +299,12 @@ def judge_shift(
     if since[0]:
         pieces = tuple(
             _with_now(reference, p, s, since[0]) for p, s in zip(pieces, series, strict=True)
+        )
+    else:
+        begun_ns = current.source.window_start_ns - 1
+        pieces = tuple(
+            _borne_out(_with_now(reference, p, s, begun_ns, least=1), limits.least_mw)
+            for p, s in zip(pieces, series, strict=True)
         )
     shift = Shift(
         reference.model_id, current.model_id, reference.source.window_end_ns,
@@ -415,13 +421,14 @@ def _judged(
 
 
 def _with_now(
-    reference: Characteristic, piece: PieceShift, series: SegmentResiduals, since_ns: int
-) -> PieceShift:
+    reference: Characteristic, piece: PieceShift, series: SegmentResiduals, since_ns: int,
+    least: int = LEAST_SIDE,
+) -> PieceShift:  # fmt: skip
     """Return a piece that moved with what its segments say after the common moment."""
     after = series.part(series.time_ns > since_ns)
     # A series that begins after that moment changed at one of its own.
     own = math.isfinite(piece.now_mw) and len(series) - len(after) < LEAST_SIDE
-    if not piece.moved or own or len(after) < LEAST_SIDE:
+    if not piece.moved or own or len(after) < least:
         return piece
     weights = after.weights
     mean = float(np.average(after.residual_mw, weights=weights))
@@ -429,10 +436,20 @@ def _with_now(
     middle = np.array([0.5 * (piece.u_from + piece.u_to)])
     since_ns, until_ns = int(after.time_ns[0]), int(after.time_ns[-1])
     error = math.hypot(
-        math.sqrt(scatter / (len(after) - 1)), _reference_error(reference, middle),
+        math.sqrt(scatter / max(1, len(after) - 1)), _reference_error(reference, middle),
         level_error_mw(reference.residuals.wander_mw, since_ns, until_ns),
     )  # fmt: skip
     return replace(piece, now_mw=mean, now_error_mw=error)
+
+
+def _borne_out(piece: PieceShift, least_mw: float) -> PieceShift:
+    """Return a piece as not moved if its own segments lie on the reference.
+
+    A curve of few segments may bend where there are none, and differ there by much.
+    """
+    if math.isfinite(piece.now_mw) and abs(piece.now_mw) < least_mw:
+        return replace(piece, moved=False)
+    return piece
 
 
 def _reference_error(reference: Characteristic, u: FloatArray) -> float:
