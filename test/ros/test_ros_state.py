@@ -28,12 +28,16 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as limits
 from hypothesis import strategies as st
+from valveflow_msgs.msg import PlantSample
 
 from valveflow_ros.errors import DataError, RecordingError
 from valveflow_ros.logs import LoggedMessage
+from valveflow_ros.logs.mcap.definitions import Definitions
 from valveflow_ros.monitoring.events import CurveAdopted, JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.parameters import Settings
+from valveflow_ros.records import NS_PER_S
+from valveflow_ros.ros import encoding
 from valveflow_ros.ros.decoding import journal_entry
 from valveflow_ros.ros.node import restart, state_store
 from valveflow_ros.ros.node.diagnostics import Level
@@ -866,6 +870,53 @@ def test_a_run_with_other_parameters_goes_on_in_a_new_recording_and_says_what_it
             'The reference and the alarms stay.',
         )
         assert (told in logged) == (folder is None)
+
+
+@pytest.mark.parametrize('earlier', [False, True])
+def test_the_tail_of_an_earlier_run_is_read_by_the_codes_it_was_recorded_with(
+    monkeypatch: pytest.MonkeyPatch, earlier: bool
+) -> None:
+    given, names = Settings(), {name: f'/m/{name}' for name in OUTPUTS}
+    text = Definitions().text('valveflow_msgs/msg/PlantSample')
+    if earlier:  # before there was a code for unknown
+        text = text.replace('QUALITY_GOOD=1', 'QUALITY_GOOD=0')
+    start_ns, tail = 1_700_000_000 * NS_PER_S, []
+    for k in range(60):
+        sample = PlantSample(
+            valve_opening=77.0, main_steam_pressure=13.0, main_steam_temperature=538.0,
+            generated_power=240.0,
+        )  # fmt: skip
+        sample.header.stamp = encoding.to_time(start_ns + k * NS_PER_S)
+        for name in ('valve_opening', 'main_steam_pressure', 'main_steam_temperature',
+                     'generated_power'):  # fmt: skip
+            setattr(sample, f'{name}_quality', 0 if earlier else PlantSample.QUALITY_GOOD)
+        log_ns = start_ns + k * NS_PER_S + 1
+        data = encoding.encode(sample)
+        tail.append(
+            LoggedMessage('/plant', 'valveflow_msgs/msg/PlantSample', log_ns, log_ns, data)
+        )
+
+    def messages(_folder: Path, _after: int, definitions: dict[str, str]) -> list[LoggedMessage]:
+        definitions['/plant'] = text
+        return tail
+
+    monkeypatch.setattr(restart, 'recover_leftovers', lambda _: [])
+    monkeypatch.setattr(restart, 'messages_since', messages)
+    worker: Any = SimpleNamespace(poll=list)
+    first = LiveEngine(given, worker)
+    saved = {
+        'settings': given, 'log_ns': 1, 'recording': 'folder', 'began': {},
+        'topics': {**names, 'plant_sample': '/plant'}, 'engine': first.snapshot(),
+    }  # fmt: skip
+    store: Any = SimpleNamespace(saved=saved, problem='', sentence='', curve=None)
+    ours = Restart(given, store, {'plant_sample': '/plant'}, names, lambda *_: None)
+    engine = ours.engine(lambda settings: LiveEngine(settings, worker))
+    list(ours.begin(given, engine, Outputs('unit')))
+    counts = engine.aligner.counts()
+    assert counts['generated_power']['accepted'] == 60
+    assert counts['generated_power']['bad_quality'] == 0
+    # Its folder would hold two meanings of a code.
+    assert ours.folder == (None if earlier else Path('folder'))
 
 
 @pytest.mark.parametrize('how', ['absent', 'other'])
