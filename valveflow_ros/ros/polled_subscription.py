@@ -116,11 +116,6 @@ class PolledSubscription:
         return str(self._subscription.topic_name)
 
     @property
-    def reliable(self) -> bool:
-        """Return True if reliable delivery is asked for, here or by an override."""
-        return self._subscription.qos_profile.reliability == ReliabilityPolicy.RELIABLE
-
-    @property
     def polled(self) -> bool:
         """Return True if messages are polled rather than called back."""
         return self._polled

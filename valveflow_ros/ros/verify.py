@@ -25,7 +25,7 @@ from valveflow_ros.monitoring.offline import JournalReplayer
 from valveflow_ros.monitoring.rows import Corrector
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import Readings
-from valveflow_ros.ros.decoding import PLANT_SAMPLE, Decoder, from_time, journal_entry
+from valveflow_ros.ros.decoding import Decoder, from_time, journal_entry
 from valveflow_ros.ros.node import parameter_files
 from valveflow_ros.ros.node.recording import PARAMETERS, TOPICS
 from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
@@ -198,7 +198,7 @@ class _Replay:
         yield from outputs.latched()
         monitor = Monitor(settings, corrector_of_run(self._log, settings))
         replayer = JournalReplayer(monitor, journal, diagnose_in_process, compute=self._fit)
-        aligner, decoder = Aligner(settings), Decoder(settings, self._definition())
+        aligner, decoder = Aligner(settings), Decoder(settings)
         inputs = self._messages(self._inputs)
         topics = self._log.topics
         total = sum(topics[topic].count for topic in self._inputs if topic in topics)
@@ -228,12 +228,6 @@ class _Replay:
         if not isinstance(found, Characteristic):
             raise DataError(f'A fit cannot be repeated. {found}')
         return found
-
-    def _definition(self) -> str:
-        """Return the text of the recorded PlantSample, empty if there is none."""
-        stamped = [topic for topic, name in self._inputs.items() if name == PLANT_SAMPLE]
-        found = [self._log.topics[topic] for topic in stamped if topic in self._log.topics]
-        return found[0].definition if found else ''
 
     def _is_earlier(self) -> bool:
         """Return True if no alarm was told at the beginning, as every run does now."""

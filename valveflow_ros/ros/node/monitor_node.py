@@ -52,7 +52,7 @@ _NOT_ON_DISK = 'It is not on disk yet; see recorder and state in /diagnostics.'
 # as from a replay, the next look follows at once.
 _PERIOD_S = 0.02
 _MUCH = 50
-# Requests are looked for twice as often: who asks has an answer within that time.
+# Requests are looked for twice as often as messages.
 _REQUESTS_EVERY_S = 0.01
 # Of each look; a storm of requests must not keep samples waiting.
 _REQUESTS_S = 0.05
@@ -492,14 +492,16 @@ def serve_requests(node: Node, longest_s: float) -> None:
             answered |= answer_request(service, node.get_logger().error)
 
 
-def _spin(executor: Executor, longest_s: float) -> None:
-    """Serve what else is ready; after that time the rest waits."""
+def _spin(executor: Executor, longest_s: float, failed: Callable[[str], None]) -> None:
+    """Serve what else is ready; after that time the rest waits. What fails is said."""
     until_s = time.monotonic() + longest_s
     with contextlib.suppress(TimeoutException, ShutdownException):
         while time.monotonic() < until_s:
             handler, _, _ = executor.wait_for_ready_callbacks(timeout_sec=0)
             handler()
-            handler.result()
+            # A request may come between the two looks.
+            if (error := handler.exception()) is not None:
+                failed(f'A callback failed: {with_place(error)}')
 
 
 def run(stop: StopFlag, presence: Presence) -> int:
@@ -529,7 +531,7 @@ def run(stop: StopFlag, presence: Presence) -> int:
             serve_requests(node, _REQUESTS_S)
             if begun_s >= spin_s:
                 spin_s = begun_s + _SPIN_EVERY_S
-                _spin(executor, _REQUESTS_S)
+                _spin(executor, _REQUESTS_S, node.get_logger().error)
             # Taken, fed, handed to the recorder: only a whole cycle counts.
             watchdog.completed(node.recorder_status)
             while found < _MUCH and (left_s := begun_s + _PERIOD_S - time.monotonic()) > 0.0:
