@@ -83,6 +83,15 @@ def test_what_the_monitor_would_refuse_is_named(run, tmp_path, text, part):
     assert 'x.yaml' in sentence
 
 
+@pytest.mark.parametrize(
+    'text', ['delay: 3.0\n', 'valveflow_monitor:\n  delay: 3.0\n', '/**:\n  ros__parameters: 3\n']
+)
+def test_parameters_that_ros_would_not_find_are_told_of(run, tmp_path, text):
+    file = tmp_path / 'x.yaml'
+    file.write_text(text)
+    assert 'Put the lines' in run('config', 'check', file).refused()
+
+
 def test_a_column_s_name_cannot_write_parameters(run, tmp_path):
     name = "PT\n    unit_tag: 'OWNED'\r\u2028    # [bar]"
     n = 600

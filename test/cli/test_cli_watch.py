@@ -73,9 +73,11 @@ def test_with_ros_another_process_takes_over(run, monkeypatch):
 
     run('watch', '--once', '--node', '/a/b')
     assert taken[0][1:3] == ['-m', 'valveflow_ros.ros.watch_main']
-    assert taken[0][3:] == ['--interval', '1.0', '--once', '--node', '/a/b']
-    run('watch', '--ask', 'shelve_alarms')
-    assert taken[1][3:] == ['--interval', '1.0', '--ask', 'shelve_alarms']
+    assert taken[0][3:] == ['--interval', '1.0', '--once', '--node', '/a/b', '--time-zone=']
+    run('watch', '--ask', 'shelve_alarms', '--alarm', 'residual', '--time-zone=-05:00')
+    assert taken[1][5:] == [
+        '--ask', 'shelve_alarms', '--alarm', 'residual', '--time-zone=-05:00',
+    ]  # fmt: skip
 
 
 def test_a_recording_on_a_page(tmp_path):
@@ -93,6 +95,7 @@ def test_a_recording_on_a_page(tmp_path):
         while 'valveflow_curve_pieces{unit="U1"} 2.0' not in _metrics(port):
             assert time.monotonic() < deadline_s
             time.sleep(0.05)
+        assert 'valveflow_monitor_up{unit="U1"} 0.0' in _metrics(port)
         process.send_signal(signal.SIGTERM)
         assert process.wait(20) in (0, 130)
         assert 'Traceback' not in process.stderr.read()
@@ -114,6 +117,8 @@ def _metrics(port: int) -> str:
         (['--page', '--ask', 'refit'], '--page does not go with'),
         (['--page', '--token-file', 'x', 'LOG'], '--token-file is for a running monitor'),
         (['--webhook', 'http://a/'], 'go with --page'),
+        (['--alarm', 'residual', 'LOG'], '--alarm goes with --ask'),
+        (['--time-zone', 'Mars', 'LOG'], '--time-zone must be a time zone, such as'),
         (['--name', 'plant'], 'go with --page'),
         (['--page', '--port', '0'], '--port must be a port from 1 to 65535'),
     ],
@@ -140,6 +145,6 @@ def test_the_page_of_a_running_monitor_is_another_process(run, monkeypatch):
     run('watch', '--page', '--node', '/a/b', '--webhook', 'http://a/', '--name', 'plant')
     assert taken[0][1:3] == ['-m', 'valveflow_ros.ros.page_main']
     assert taken[0][3:] == [
-        '--host', '127.0.0.1', '--port', '8350', '--name', 'plant', '--node', '/a/b',
-        '--webhook', 'http://a/',
+        '--host', '127.0.0.1', '--port', '8350', '--time-zone=', '--name', 'plant',
+        '--node', '/a/b', '--webhook', 'http://a/',
     ]  # fmt: skip

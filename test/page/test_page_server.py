@@ -17,6 +17,7 @@ from valveflow_ros.errors import DataError, InputError, RecordingError, Valveflo
 from valveflow_ros.page import server as module
 from valveflow_ros.page.server import MOST_CONNECTIONS, check_installed, read_token
 from valveflow_ros.page.unit import Shown
+from valveflow_ros.records import zone_of
 
 
 def asked(server, path='/', method='GET', body=None, **head):
@@ -72,6 +73,20 @@ def test_the_page_and_its_metrics_are_served_from_here_alone(serve):
     assert status == 200
     assert 'The valve sticks.' in text
     assert 'Lubricate' in text
+
+
+def test_times_are_told_and_drawn_in_a_zone(serve):
+    servers = [serve(shown_now(told()), zone=zone) for zone in (None, zone_of('+05:30'))]
+    found = []
+    for server, said in zip(servers, ('22:13 UTC', '03:43 UTC+05:30'), strict=True):
+        _, _, text = asked(server, '/_dash-layout')
+        assert said in text
+        assert f'Clock and pictures are in {said[6:]}.' in text
+        seen = tick(server, {})[1]['seen']['data']
+        _, whole = tick(server, {'generation': seen['generation']})
+        made = whole['{"part":"pictures","unit":0}']['data']
+        found.append(made['recent']['data'][0]['x'])
+    assert [b - a for a, b in zip(*found, strict=True)] == [5.5 * 3_600_000.0] * len(found[0])
 
 
 def test_a_browser_is_sent_what_has_changed_and_no_more(serve):

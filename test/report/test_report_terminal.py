@@ -11,6 +11,7 @@ import re
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from valveflow_ros.records import zone_of
 from valveflow_ros.report.terminal import text
 from valveflow_ros.report.terminal.frame import (
     AlarmView,
@@ -91,13 +92,19 @@ def test_everything_is_on_a_usual_terminal():
     for part in (
         'U1', '2023-11-14 22:18:20', 'fresh, 2 pieces', '1\u202f234 samples', '5 min old', '●',
         'o knee', 'Residual', 'limits −3.0 to +3.0', '25 % of the way',
-        'ALARM, not acknowledged, raised 11-14 22:13 UTC',
+        'ALARM, not acknowledged, raised 2023-11-14 22:13 UTC',
         'The unit gives 5 MW less.', 'opening 1 Hz', 'Recording.', 'cause named (stiction)',
         'It sticks.', '290 MW', '150 MW',
     ):  # fmt: skip
         assert part in text, part
     assert any(0x2800 < ord(c) < 0x2900 for c in text)
     assert '\x1b' not in text
+
+
+def test_times_are_told_in_a_zone():
+    text = re.sub(r'\n +', ' ', '\n'.join(screen(FULL, 80, 24, zone=zone_of('+05:30'))))
+    for part in ('2023-11-15 03:48:20 UTC+05:30', 'raised 2023-11-15 03:43 UTC+05:30'):
+        assert part in text, part
 
 
 def test_without_colour_the_words_are_the_same():

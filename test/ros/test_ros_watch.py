@@ -17,6 +17,7 @@ from ros_helpers import wait_until
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from valveflow_msgs.msg import Alarm, Diagnosis, DiagnosisCause, FlowCharacteristic, Prediction
+from valveflow_msgs.srv import OperateAlarm
 
 from valveflow_ros.report.terminal.screen import screen
 from valveflow_ros.ros import watch_main
@@ -149,16 +150,19 @@ def test_one_picture_of_a_real_process(speaker, processes):
 
 
 @pytest.mark.parametrize(('success', 'status'), [(True, 0), (False, 1)])
-def test_the_monitor_is_asked_and_its_answer_told(speaker, processes, success, status):
+@pytest.mark.parametrize('alarm', ['', 'residual'])
+def test_the_monitor_is_asked_and_its_answer_told(speaker, processes, success, status, alarm):
     asked = []
 
-    def answer(_request, response):
-        asked.append(response)
+    def answer(request, response):
+        asked.append(request)
         response.success, response.message = success, 'There is an answer.'
         return response
 
-    speaker.create_service(Trigger, '~/acknowledge_alarms', answer)
-    process = processes.start('valveflow_ros.ros.watch_main', '--ask', 'acknowledge_alarms')
+    kind, name = (OperateAlarm, 'operate_alarm') if alarm else (Trigger, 'acknowledge_alarms')
+    speaker.create_service(kind, f'~/{name}', answer)
+    words = ['--ask', 'acknowledge_alarms', *(['--alarm', alarm] if alarm else [])]
+    process = processes.start('valveflow_ros.ros.watch_main', *words)
     executor = SingleThreadedExecutor(context=speaker.context)
     executor.add_node(speaker)
 
@@ -168,7 +172,8 @@ def test_the_monitor_is_asked_and_its_answer_told(speaker, processes, success, s
 
     wait_until(done, 'the answer')
     executor.shutdown()
-    assert len(asked) == 1
+    (request,) = asked
+    assert not alarm or (request.name, request.action) == ('residual', 'acknowledge')
     assert process.returncode == status
     assert 'There is an answer.' in processes.output(process)
 

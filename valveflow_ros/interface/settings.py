@@ -89,8 +89,12 @@ def _window_days(span_s: float, period: float, longest_s: float) -> float:
     return max(least, math.ceil(100.0 * (span_s / 86400.0 + 0.01)) / 100.0)
 
 
-def read_parameters(file: Path | None, pairs: Sequence[str]) -> dict[str, Any]:
+def read_parameters(
+    file: Path | None, pairs: Sequence[str], *, of_node: bool = False
+) -> dict[str, Any]:
     """Return what a person has set: the file's values, then those of ``--set``.
+
+    ``of_node``: the file must be written as ROS 2 asks for it, values below a node's name.
 
     Raises
     ------
@@ -101,7 +105,7 @@ def read_parameters(file: Path | None, pairs: Sequence[str]) -> dict[str, Any]:
     UsageError
         A name or value of ``--set`` is wrong.
     """
-    given: dict[str, Any] = {} if file is None else _from_file(file)
+    given: dict[str, Any] = {} if file is None else _from_file(file, of_node)
     for text in pairs:
         name, equals, value = text.partition('=')
         if not equals or not name.strip():
@@ -129,7 +133,7 @@ def _value(name: str, text: str) -> object:
         return text
 
 
-def _from_file(file: Path) -> dict[str, Any]:
+def _from_file(file: Path, of_node: bool) -> dict[str, Any]:
     try:
         content = yaml.safe_load(file.read_text(encoding='utf-8'))
     except OSError as error:
@@ -141,10 +145,20 @@ def _from_file(file: Path) -> dict[str, Any]:
         return {}
     if not isinstance(content, dict):
         raise InputError(f'{file} is no parameter file: it must hold names and values.')
+    above = [name for name, value in content.items() if not _is_of_node(value)]
+    if of_node and above:
+        raise InputError(
+            f"{file}: ROS 2 does not take '{above[0]}' where it stands. Put the lines '/**:' and "
+            "'  ros__parameters:' above all parameters, and four blanks before each of them."
+        )
     try:
         return {name: parameter(name).check(value) for name, value in _flat(content).items()}
     except ParameterError as error:
         raise InputError(f'{file}: {error}') from None
+
+
+def _is_of_node(value: object) -> bool:
+    return isinstance(value, dict) and isinstance(value.get('ros__parameters'), dict)
 
 
 def _flat(content: dict[Any, Any]) -> dict[str, Any]:

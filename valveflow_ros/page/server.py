@@ -23,6 +23,8 @@ from urllib.parse import urlsplit
 from valveflow_ros.errors import DataError, InputError, RecordingError, UsageError, ValveflowError
 
 if TYPE_CHECKING:
+    from datetime import tzinfo
+
     # A verb that only names the options need not load it.
     from valveflow_ros.page.unit import Shown
 
@@ -303,6 +305,8 @@ class PageServer:
         Further counters for the metrics.
     complain : callable
         Takes a sentence where a request could not be answered.
+    zone : tzinfo, optional
+        Times are told in it; in UTC without.
 
     Raises
     ------
@@ -319,6 +323,7 @@ class PageServer:
         asking: Any = None,
         counters: Callable[[], dict[str, tuple[str, float]]] = dict,
         complain: Callable[[str], None] = lambda _: None,
+        zone: tzinfo | None = None,
     ) -> None:
         # Whoever else holds the port is told of before the libraries are loaded.
         listener = _listener(host, port)
@@ -329,7 +334,7 @@ class PageServer:
             from valveflow_ros.page.view import make_app
 
             _quiet()
-            app, policy = make_app(shown, asking)
+            app, policy = make_app(shown, asking, zone)
             self._sockets: dict[int, Any] = {}
             metrics = Metrics(shown, lambda: {**counters(), **self._counters()})
             # An error is told by the guard in a sentence.

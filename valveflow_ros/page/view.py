@@ -16,6 +16,7 @@ import time
 from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from datetime import tzinfo
 from hashlib import sha256
 from importlib import resources
 from itertools import chain, pairwise
@@ -26,7 +27,7 @@ from dash import ALL, MATCH, Dash, Input, Output, State, ctx, dcc, html, no_upda
 from valveflow_ros import __version__
 from valveflow_ros.page.unit import MINUTE_NS, MOST_UNITS, Shown, Snapshot
 from valveflow_ros.records import NS_PER_S
-from valveflow_ros.report.figure import Spec, axis, line, points, rounded, token
+from valveflow_ros.report.figure import Spec, axis, line, local_ms, points, rounded, token
 from valveflow_ros.report.page import read_text
 from valveflow_ros.report.terminal.frame import (
     ACKNOWLEDGED,
@@ -47,7 +48,7 @@ from valveflow_ros.report.terminal.frame import (
     short_name,
 )
 from valveflow_ros.report.terminal.text import clean
-from valveflow_ros.report.words import input_axis, moment
+from valveflow_ros.report.words import in_zone, input_axis, moment
 
 TICK_MS = 2000
 # The newest samples as they are; what is older is shown a point a minute.
@@ -69,8 +70,8 @@ Ask = Callable[[str, str], tuple[bool, str]]
 # Words.
 
 
-def _said(said: Said) -> Any:
-    text, tone = clean(said[0]), said[1]
+def _said(said: Said, zone: tzinfo | None) -> Any:
+    text, tone = clean(in_zone(said[0], zone)), said[1]
     first, point, rest = text.partition('. ')
     if tone == 'bad' and rest:
         # What it is stands out from why.
@@ -99,10 +100,10 @@ def summary(frame: Frame, present: bool) -> Said:
     return 'no alarm', 'good'
 
 
-def _head(unit: Snapshot) -> list[Any]:
+def _head(unit: Snapshot, zone: tzinfo | None) -> list[Any]:
     frame = unit.frame
     word, tone = summary(frame, unit.present)
-    when = moment(frame.now_ns) if frame.now_ns else 'no data yet'
+    when = in_zone(moment(frame.now_ns), zone) if frame.now_ns else 'no data yet'
     made = [
         html.H2([clean(unit.title), ' ', html.Span(word, className=f'pill {tone}')]),
         html.P(f'{when}, {clean(unit.key)}', className='where'),
@@ -110,11 +111,11 @@ def _head(unit: Snapshot) -> list[Any]:
     return [*made, html.P(clean(frame.note), className='notice')] if frame.note else made
 
 
-def _diagnosis(frame: Frame) -> list[Any]:
+def _diagnosis(frame: Frame, zone: tzinfo | None) -> list[Any]:
     found = frame.diagnosis
     said = diagnosis_words(None if found is None else replace(found, advice=()))
     advice = () if found is None else found.advice
-    return [_said(said), *(html.P(clean(paragraph)) for paragraph in advice)]
+    return [_said(said, zone), *(html.P(clean(in_zone(one, zone))) for one in advice)]
 
 
 def _row(item: HealthView) -> Any:
@@ -138,15 +139,15 @@ def _health(frame: Frame) -> list[Any]:
     return [html.Div(html.Table(html.Tbody(rows)), className='scroll')]
 
 
-def words(unit: Snapshot) -> dict[str, list[Any]]:
-    """Return the content of each of `PARTS` as Dash components."""
+def words(unit: Snapshot, zone: tzinfo | None = None) -> dict[str, list[Any]]:
+    """Return the content of each of `PARTS` as Dash components; times in a zone, or in UTC."""
     frame = unit.frame
     return {
-        'head': _head(unit),
-        'alarms': [_said(said) for said in alarms_words(frame)],
-        'curve_words': [_said(curve_words(frame.curve, _whole_minute(frame)))],
-        'now': [_said(sample_words(frame.last))],
-        'diagnosis': _diagnosis(frame),
+        'head': _head(unit, zone),
+        'alarms': [_said(said, zone) for said in alarms_words(frame)],
+        'curve_words': [_said(curve_words(frame.curve, _whole_minute(frame)), zone)],
+        'now': [_said(sample_words(frame.last), zone)],
+        'diagnosis': _diagnosis(frame, zone),
         'health': _health(frame),
     }
 
@@ -200,7 +201,7 @@ def _ms(time_ns: int) -> float:
     return time_ns // 1_000_000
 
 
-def recent_picture(frame: Frame) -> Spec:
+def recent_picture(frame: Frame, zone: tzinfo | None = None) -> Spec:
     """Return prediction and its limits against measurement over the last quarter of an hour."""
     found = _recent(frame)
     predicted = [s.measured_mw - s.residual_mw for s in found]
@@ -212,10 +213,10 @@ def recent_picture(frame: Frame) -> Spec:
     if not found:
         return _empty('No sample has come yet.')
     t = [_ms(s.time_ns) for s in found]
-    return _against(t, columns, '95 % limits')
+    return _against(t, columns, '95 % limits', zone)
 
 
-def day_picture(unit: Snapshot) -> Spec:
+def day_picture(unit: Snapshot, zone: tzinfo | None = None) -> Spec:
     """Return means of a minute over the last 24 hours, with a strip below to scroll in."""
     day = unit.day
     if len(day) < 2:
@@ -232,7 +233,7 @@ def day_picture(unit: Snapshot) -> Spec:
         values = (m.measured_mw, m.predicted_mw, m.low_mw, m.high_mw)
         for column, value in zip(columns, values, strict=True):
             column.append(value)
-    made = _against(t, columns, 'least to largest')
+    made = _against(t, columns, 'least to largest', zone)
     made['layout']['xaxis']['rangeslider'] = {
         'thickness': 0.16, 'bgcolor': token('panel'), 'borderwidth': 1,
         'bordercolor': token('rule'),
@@ -240,8 +241,11 @@ def day_picture(unit: Snapshot) -> Spec:
     return made
 
 
-def _against(t: Sequence[float], columns: Sequence[Sequence[float]], band: str) -> Spec:
+def _against(
+    t: Sequence[float], columns: Sequence[Sequence[float]], band: str, zone: tzinfo | None
+) -> Spec:
     """Return a picture over time; columns: measured, predicted, and the edges of a band."""
+    t = t if zone is None else [local_ms(ms, zone) for ms in t]
     measured, predicted, low, high = map(rounded, columns)
     edge: Any = {'line': {'width': 0}, 'showlegend': False}
     traces = [
@@ -282,10 +286,12 @@ class Maker:
     Parameters
     ----------
     shown : Shown
+    zone : tzinfo, optional
+        Times are told in it; in UTC without.
     """
 
-    def __init__(self, shown: Shown) -> None:
-        self.shown = shown
+    def __init__(self, shown: Shown, zone: tzinfo | None = None) -> None:
+        self.shown, self.zone = shown, zone
         self._kept: dict[tuple[str, str], tuple[object, Made]] = {}
         self._boot = secrets.token_hex(4)
 
@@ -296,13 +302,15 @@ class Maker:
 
     def parts(self, unit: Snapshot) -> dict[str, Made]:
         """Return every part of a unit by its name."""
-        frame, day = unit.frame, unit.day
+        frame, day, zone = unit.frame, unit.day, self.zone
         live = (frame.now_ns, frame.last, frame.curve)
-        told = self._once(unit, 'words', (frame, unit.present), lambda: _versions(words(unit)))
+        told = self._once(
+            unit, 'words', (frame, unit.present), lambda: _versions(words(unit, zone))
+        )
         return dict(told.content) | {
             'curve': self._once(unit, 'curve', live, lambda: curve_picture(frame)),
-            'recent': self._once(unit, 'recent', live[:2], lambda: recent_picture(frame)),
-            'day': self._once(unit, 'day', day[:1] + day[-1:], lambda: day_picture(unit)),
+            'recent': self._once(unit, 'recent', live[:2], lambda: recent_picture(frame, zone)),
+            'day': self._once(unit, 'day', day[:1] + day[-1:], lambda: day_picture(unit, zone)),
         }
 
     def _once(self, unit: Snapshot, what: str, of: object, make: Callable[[], Any]) -> Made:
@@ -395,7 +403,9 @@ def _page(maker: Maker, may_ask: bool) -> Any:
         html.Header([html.H1('valveflow'), html.Div(id='lost', role='alert'), *token_field]),
         html.Div(maker.shown.note, id='note', className='notice' if maker.shown.note else ''),
         html.Div(blocks, className=f'units{many}'),
-        html.Footer(f'Made by valveflow {__version__}. Clock and pictures are in UTC.'),
+        html.Footer(
+            f'Made by valveflow {__version__}. Clock and pictures are in {maker.zone or "UTC"}.'
+        ),
         dcc.Interval(id='tick', interval=TICK_MS), dcc.Interval(id='pulse', interval=1000),
         dcc.Store(id='seen', data={'generation': maker.generation}),
     ], id='page')  # fmt: skip
@@ -450,7 +460,9 @@ def _bytes(token: str) -> bytes:
     return token.encode(errors='backslashreplace')
 
 
-def make_app(shown: Shown, asking: Asking | None = None) -> tuple[Dash, str]:
+def make_app(
+    shown: Shown, asking: Asking | None = None, zone: tzinfo | None = None
+) -> tuple[Dash, str]:
     """Return the page as a Dash application, and its content security policy.
 
     Parameters
@@ -459,8 +471,10 @@ def make_app(shown: Shown, asking: Asking | None = None) -> tuple[Dash, str]:
         What is shown; replaced by another thread.
     asking : Asking, optional
         For whoever may ask a monitor for something; without it the page has no buttons.
+    zone : tzinfo, optional
+        Times are told in it; in UTC without.
     """
-    maker = Maker(shown)
+    maker = Maker(shown, zone)
     script = read_text('colours.js') + _file('page.js')
     app = Dash(
         'valveflow_page', title='valveflow', update_title='', assets_folder='no_assets',

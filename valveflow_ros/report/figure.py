@@ -114,7 +114,7 @@ def in_zone(figure: Figure, zone: tzinfo) -> Figure:
         title = dict(changed.get('title', {}))
         changed['title'] = {k: str(v).replace('UTC', str(zone)) for k, v in title.items()}
         if 'range' in changed:
-            changed['range'] = [_local_ms(v, zone) for v in changed['range']]
+            changed['range'] = [local_ms(v, zone) for v in changed['range']]
         layout[key] = changed
     for key in ('shapes', 'annotations'):
         if key in figure.layout:
@@ -124,7 +124,7 @@ def in_zone(figure: Figure, zone: tzinfo) -> Figure:
         new = dict(trace)
         for letter in 'xy':
             if is_date(axis_of(figure, trace, letter)):
-                new[letter] = [_local_ms(v, zone) for v in column(trace, letter)]
+                new[letter] = [local_ms(v, zone) for v in column(trace, letter)]
                 new.pop(f'{letter}0', None), new.pop(f'd{letter}', None)
         traces.append(new)
     return replace(figure, traces=traces, layout=layout)
@@ -138,13 +138,13 @@ def _moved(mark: Spec, dates: Sequence[str], zone: tzinfo) -> Spec:
         if ref[0] == letter and f'{letter}axis{ref[1:]}' in dates:
             for key in (letter, f'{letter}0', f'{letter}1'):
                 if isinstance(new.get(key), int | float):
-                    new[key] = _local_ms(new[key], zone)
+                    new[key] = local_ms(new[key], zone)
     if 'text' in new:
         new['text'] = str(new['text']).replace('(UTC)', f'({zone})')
     return new
 
 
-def _local_ms(ms: Any, zone: tzinfo) -> Any:
+def local_ms(ms: Any, zone: tzinfo) -> Any:
     """Return ms since 1970 as the clocks of a zone show them; a gap and a word stay."""
     if not isinstance(ms, int | float) or not math.isfinite(ms):
         return None if isinstance(ms, float) else ms

@@ -24,6 +24,8 @@ from valveflow_ros.errors import ValveflowError
 from valveflow_ros.page.notices import Notices
 from valveflow_ros.page.server import PageServer, check_installed, page_arguments, read_token
 from valveflow_ros.page.unit import MOST_UNITS, AlarmChange, Shown, Snapshot, Unit
+from valveflow_ros.records import zone_of
+from valveflow_ros.report.terminal.text import zone_argument
 from valveflow_ros.ros.domain import start_ros
 from valveflow_ros.ros.listening import Listener, full_name, hear_health, monitors, waiting_for
 from valveflow_ros.ros.process import Parser, StopFlag, complain, with_place
@@ -139,6 +141,7 @@ def parser() -> argparse.ArgumentParser:
         help='a monitor to show; may be given several times (default: every one that runs)',
     )  # fmt: skip
     page_arguments(made)
+    zone_argument(made)
     return made
 
 
@@ -178,8 +181,9 @@ def _run(options: argparse.Namespace, stop: StopFlag) -> int:
 
             asking = Asking(read_token(options.token_file), node.ask)
         server = PageServer(
-            shown, options.host, options.port, options.name, asking, notices.counters, _say
-        )
+            shown, options.host, options.port, options.name, asking, notices.counters, _say,
+            zone_of(options.time_zone),
+        )  # fmt: skip
         _say(f'The page is at {server.address}')
         looked_s = -_LOOK_S
         while not stop:

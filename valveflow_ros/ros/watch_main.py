@@ -11,6 +11,7 @@ import math
 import sys
 import time
 from collections.abc import Sequence
+from datetime import tzinfo
 from typing import Any
 
 import rclpy
@@ -18,12 +19,14 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 from std_srvs.srv import Trigger
+from valveflow_msgs.srv import OperateAlarm
 
 from valveflow_ros.errors import ValveflowError
+from valveflow_ros.records import zone_of
 from valveflow_ros.report.terminal.board import CURVE, HEALTH, Board
 from valveflow_ros.report.terminal.frame import Frame
 from valveflow_ros.report.terminal.screen import Screen
-from valveflow_ros.report.terminal.text import number
+from valveflow_ros.report.terminal.text import number, zone_argument
 from valveflow_ros.ros.domain import start_ros
 from valveflow_ros.ros.listening import Listener, full_name, hear_health, monitors, waiting_for
 from valveflow_ros.ros.outputs import SERVICES
@@ -33,6 +36,8 @@ _LOOK_S = 0.5
 # For one picture: how long a monitor may take to be found, and then to say how it is.
 _FIND_S, _HEAR_S = 5.0, 3.0
 _ANSWER_S = 10.0
+# How the services end that do something to all alarms.
+_OF_ALARMS = '_alarms'
 
 
 class WatchNode(Node):
@@ -107,9 +112,14 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         '--json', action='store_true', help='with --once: print the picture as JSON, for programs'
     )
+    zone_argument(made)
     made.add_argument(
         '--ask', metavar='SERVICE', choices=SERVICES,
         help=f'have the monitor do one of {", ".join(SERVICES)}; print its answer, then stop',
+    )  # fmt: skip
+    made.add_argument(
+        '--alarm', metavar='NAME', default='',
+        help='with --ask for alarms: only this one, residual or curve_shift',
     )  # fmt: skip
     return made
 
@@ -123,6 +133,8 @@ def main(args: Sequence[str] | None = None) -> int:
         made.error('--json goes with --once: one picture is one object')
     if options.ask and options.once:
         made.error('--ask and --once do not go together')
+    if options.alarm and not str(options.ask).endswith(_OF_ALARMS):
+        made.error('--alarm goes with --ask acknowledge_alarms, shelve_alarms or unshelve_alarms')
     try:
         start_ros(arguments)
         return _run(options)
@@ -147,10 +159,10 @@ def _run(options: argparse.Namespace) -> int:
     executor.add_node(node)
     try:
         if options.ask:
-            return _ask(node, executor, options.ask)
+            return _ask(node, executor, options.ask, options.alarm)
         if options.once:
-            return _once(node, executor, options.json)
-        with Screen(sys.stdout) as screen:
+            return _once(node, executor, options.json, zone_of(options.time_zone))
+        with Screen(sys.stdout, zone=zone_of(options.time_zone)) as screen:
             while True:
                 _listen(node, executor, options.interval)
                 screen.show(node.frame())
@@ -175,12 +187,17 @@ def _find(node: WatchNode, executor: SingleThreadedExecutor) -> bool:
     return bool(node.monitor)
 
 
-def _ask(node: WatchNode, executor: SingleThreadedExecutor, service: str) -> int:
+def _ask(node: WatchNode, executor: SingleThreadedExecutor, service: str, alarm: str) -> int:
     if not _find(node, executor):
         return complain('watch', node.frame().note)
-    client = node.create_client(Trigger, f'{node.monitor}/{service}')
+    if alarm:
+        client = node.create_client(OperateAlarm, f'{node.monitor}/operate_alarm')
+        request = OperateAlarm.Request(name=alarm, action=service.removesuffix(_OF_ALARMS))
+    else:
+        client = node.create_client(Trigger, f'{node.monitor}/{service}')
+        request = Trigger.Request()
     if client.wait_for_service(timeout_sec=_FIND_S):
-        answer = client.call_async(Trigger.Request())
+        answer = client.call_async(request)
         executor.spin_until_future_complete(answer, timeout_sec=_ANSWER_S)
         if answer.done():
             response = answer.result()
@@ -191,7 +208,9 @@ def _ask(node: WatchNode, executor: SingleThreadedExecutor, service: str) -> int
     return complain('watch', f'{node.monitor} does not answer; nothing is known to be done.')
 
 
-def _once(node: WatchNode, executor: SingleThreadedExecutor, as_json: bool) -> int:
+def _once(
+    node: WatchNode, executor: SingleThreadedExecutor, as_json: bool, zone: tzinfo | None
+) -> int:
     if not _find(node, executor):
         return complain('watch', node.frame().note)
     found_s = time.monotonic()
@@ -203,7 +222,7 @@ def _once(node: WatchNode, executor: SingleThreadedExecutor, as_json: bool) -> i
         content = _finite(dataclasses.asdict(frame))
         print(json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False))
     else:
-        print(Screen(sys.stdout).text(frame), flush=True)
+        print(Screen(sys.stdout, zone=zone).text(frame), flush=True)
     return 0
 
 

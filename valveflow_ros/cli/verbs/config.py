@@ -76,7 +76,7 @@ def _checked(file: Path) -> VerbResult:
     from valveflow_ros.interface.settings import read_parameters
     from valveflow_ros.parameters import PARAMETERS, Settings
 
-    given = read_parameters(file, [])
+    given = read_parameters(file, [], of_node=True)
     try:
         settings = Settings(given)
     except ParameterError as error:

@@ -16,7 +16,7 @@ from typing import NoReturn
 from valveflow_ros.cli.command import Console, VerbResult
 from valveflow_ros.errors import DataError, UsageError
 from valveflow_ros.page.server import check_installed, page_arguments
-from valveflow_ros.report.terminal.text import number
+from valveflow_ros.report.terminal.text import number, zone_argument
 
 _MODULE, _PAGE_MODULE = 'valveflow_ros.ros.watch_main', 'valveflow_ros.ros.page_main'
 # A day at a sample a second: what the page shows at most.
@@ -66,9 +66,14 @@ def arguments(parser: ArgumentParser) -> None:
         'set_reference, refit or diagnose; print its answer, then stop',
     )  # fmt: skip
     parser.add_argument(
+        '--alarm', metavar='NAME',
+        help='with --ask for alarms: only this one, residual or curve_shift',
+    )  # fmt: skip
+    parser.add_argument(
         '--page', action='store_true', help='show it on a page in the browser; options for it:'
     )
     page_arguments(parser)
+    zone_argument(parser)
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
@@ -78,6 +83,8 @@ def run(options: Namespace, console: Console) -> VerbResult:
         _watch_ros(options)
     if options.node is not None:
         raise UsageError('--node chooses a running monitor and does not go with a LOG.')
+    if options.alarm is not None:
+        raise UsageError('--alarm goes with --ask.')
     if options.ask is not None:
         raise UsageError('--ask is for a running monitor and does not go with a LOG.')
     if options.log.suffix.lower() in _TABLES:
@@ -108,6 +115,7 @@ def _page_of_log(options: Namespace, console: Console) -> VerbResult:
     from valveflow_ros.page.notices import Notices
     from valveflow_ros.page.server import PageServer
     from valveflow_ros.page.unit import Shown, Unit
+    from valveflow_ros.records import zone_of
     from valveflow_ros.report.terminal.screen import ending
 
     unit = Unit(str(options.log))
@@ -125,6 +133,7 @@ def _page_of_log(options: Namespace, console: Console) -> VerbResult:
                 options.name,
                 counters=notices.counters,
                 complain=console.warn,
+                zone=zone_of(options.time_zone),
             )
             console.say(f'The page is at {server.address}')
             while True:
@@ -132,7 +141,7 @@ def _page_of_log(options: Namespace, console: Console) -> VerbResult:
                     percent = f'{100.0 * watch.share:.0f} %'
                     if not shown.units:
                         shown.put((), f'Reading what was recorded so far: {percent}.')
-                shown.put((unit.snapshot(watch.frame()),))
+                shown.put((unit.snapshot(watch.frame(), present=not watch.finished),))
                 notices.tell(unit.changes())
                 time.sleep(options.interval)
     except KeyboardInterrupt:
@@ -147,18 +156,21 @@ def _page_of_log(options: Namespace, console: Console) -> VerbResult:
 def _watch_log(options: Namespace, console: Console) -> VerbResult:
     """Follow a recording; Ctrl-C is the usual end."""
     from valveflow_ros.interface.recording_view import LogWatch
+    from valveflow_ros.records import zone_of
     from valveflow_ros.report.terminal.screen import Screen
 
-    watch = LogWatch(options.log)
+    watch, zone = LogWatch(options.log), zone_of(options.time_zone)
     if options.once:
         for _ in watch.read():
             console(watch.share, 'reading what was recorded so far')
         frame = watch.frame()
-        return VerbResult(Screen(sys.stdout).text(frame), dataclasses.asdict(frame), drawn=True)
+        return VerbResult(
+            Screen(sys.stdout, zone=zone).text(frame), dataclasses.asdict(frame), drawn=True
+        )
     if options.json:
         raise UsageError('--json goes with --once: one picture is one object.')
     drawn_s = -options.interval
-    with Screen(sys.stdout) as screen:
+    with Screen(sys.stdout, zone=zone) as screen:
         try:
             while True:
                 for _ in watch.read():
@@ -193,11 +205,14 @@ def _watch_ros(options: Namespace) -> NoReturn:
     words += ['--json'] if options.json else []
     words += ['--node', options.node] if options.node else []
     words += ['--ask', options.ask] if options.ask else []
+    words += ['--alarm', options.alarm] if options.alarm else []
+    words += [f'--time-zone={options.time_zone}']
     _become(_MODULE, words)
 
 
 def _page_words(options: Namespace) -> list[str]:
     words = ['--host', options.host, '--port', str(options.port)]
+    words += [f'--time-zone={options.time_zone}']
     for name in options.name:
         words += ['--name', name]
     for option in ('node', 'token_file', 'on_alarm', 'webhook'):

@@ -202,7 +202,7 @@ def curve_words(curve: CurveView | None, now_ns: int) -> Said:
     told = [
         f'{_word(CURVE_STATES, curve.state)}, {counted(len(curve.breakpoints) - 1, "piece")}',
         f'{counted(curve.samples, "sample")} of {duration((last - first) / NS_PER_S)} '
-        f'until {moment(last).removesuffix(" UTC")[:-3]}',
+        f'until {_minute(last)}',
     ]
     if now_ns >= last:
         told.append(f'{duration((now_ns - last) / NS_PER_S)} old')
@@ -234,7 +234,7 @@ def sample_words(sample: SampleView | None) -> Said:
 
 def alarm_words(alarm: AlarmView) -> Said:
     """Say how an alarm stands."""
-    raised = f', raised {moment(alarm.raised_ns)[5:16]} UTC'
+    raised = f', raised {_minute(alarm.raised_ns)}'
     if not (alarm.standing and alarm.raised_ns):
         raised = ''
     tone = {UNACKNOWLEDGED: 'bad', ACKNOWLEDGED: 'bad'}.get(alarm.state, 'warn')
@@ -290,10 +290,14 @@ def diagnosis_words(diagnosis: DiagnosisView | None) -> Said:
     names = f' ({", ".join(diagnosis.causes)})' if diagnosis.causes else ''
     until = ''
     if diagnosis.until_ns:
-        until = f' in the data until {moment(diagnosis.until_ns)[:16]} UTC'
+        until = f' in the data until {_minute(diagnosis.until_ns)}'
     text = f'{_word(VERDICTS, diagnosis.verdict)}{names}{until}. {diagnosis.sentence}'
     text = ' '.join([text, *diagnosis.advice])
     return text, 'warn' if diagnosis.verdict in (2, 3) else ''
+
+
+def _minute(time_ns: int) -> str:
+    return f'{moment(time_ns)[:16]} UTC'
 
 
 def short_name(name: str) -> str:

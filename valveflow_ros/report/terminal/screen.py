@@ -10,6 +10,7 @@ import shutil
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from datetime import tzinfo
 from itertools import pairwise
 from types import FrameType, TracebackType
 from typing import TextIO
@@ -28,7 +29,7 @@ from valveflow_ros.report.terminal.frame import (
     sample_words,
 )
 from valveflow_ros.report.terminal.text import Line, cells, clean, cut, labelled, painted
-from valveflow_ros.report.words import duration, input_unit_plain, moment, signed
+from valveflow_ros.report.words import duration, in_zone, input_unit_plain, moment, signed
 
 _ENTER = '\x1b[?1049h\x1b[?25l'  # the other screen, no cursor
 _LEAVE = '\x1b[?25h\x1b[?1049l'
@@ -127,8 +128,9 @@ class Canvas:
 
 
 def screen(
-    frame: Frame, width: int, height: int, *, colour: bool = False, unicode: bool = True
-) -> list[str]:
+    frame: Frame, width: int, height: int, *, colour: bool = False, unicode: bool = True,
+    zone: tzinfo | None = None,
+) -> list[str]:  # fmt: skip
     """Return a frame as the lines that a terminal is sent.
 
     Parameters
@@ -138,23 +140,28 @@ def screen(
         The terminal's size; there are never more lines, nor longer ones.
     colour, unicode : bool
         What the terminal can do.
+    zone : tzinfo, optional
+        Times are told in it; in UTC without.
     """
-    lines = _lines(frame, max(20, width), max(5, height), unicode)
+    lines = _lines(frame, max(20, width), max(5, height), unicode, zone)
     return [painted(line, width, colour, unicode) for line in lines[: max(1, height)]]
 
 
-def _lines(frame: Frame, width: int, height: int, unicode: bool) -> list[Line]:
-    head = [_title(frame, width)]
+def _lines(
+    frame: Frame, width: int, height: int, unicode: bool, zone: tzinfo | None
+) -> list[Line]:
+    head = [_title(frame, width, zone)]
     if frame.note:
         head += labelled('         ', frame.note, 'warn', width, 2)
-    head += labelled('Curve    ', *curve_words(frame.curve, frame.now_ns), width, 2)
-    text = _text(frame, width, 1)
+    curve_text, tone = curve_words(frame.curve, frame.now_ns)
+    head += labelled('Curve    ', in_zone(curve_text, zone), tone, width, 2)
+    text = _text(frame, width, 1, zone)
     residual = list(labelled('Residual ', *sample_words(frame.last), width, 2))
     left = height - len(head) - len(residual) - len(text)
     curve_rows, residual_rows = _shares(left, frame)
     spare = left - (curve_rows + 1 if curve_rows else 0) - residual_rows
     if spare > 0:
-        longer = _text(frame, width, _LONGEST_TEXT)
+        longer = _text(frame, width, _LONGEST_TEXT, zone)
         text = longer if len(longer) <= len(text) + spare else text
     curve = _curve(frame, width, curve_rows, unicode) if curve_rows else []
     strip = _strip(frame.samples, width, residual_rows, unicode) if residual_rows else []
@@ -175,16 +182,20 @@ def _shares(left: int, frame: Frame) -> tuple[int, int]:
     return left - 1 - residual, residual
 
 
-def _title(frame: Frame, width: int) -> Line:
+def _when(frame: Frame, zone: tzinfo | None) -> str:
+    return in_zone(moment(frame.now_ns), zone) if frame.now_ns else 'no data yet'
+
+
+def _title(frame: Frame, width: int, zone: tzinfo | None) -> Line:
     unit = clean(frame.unit) or 'valveflow'
-    when = moment(frame.now_ns) if frame.now_ns else 'no data yet'
+    when = _when(frame, zone)
     left = f'{unit}   {when}'
     source = cut(clean(frame.source), max(0, width - cells(left) - 3))
     gap = ' ' * max(1, width - cells(left) - cells(source))
     return ((left, 'strong'), (gap, ''), (source, 'dim'))
 
 
-def _text(frame: Frame, width: int, most: int) -> list[Line]:
+def _text(frame: Frame, width: int, most: int, zone: tzinfo | None) -> list[Line]:
     """Return alarms, inputs, recorder and diagnosis, each in at most so many lines."""
     lines: list[Line] = []
     for label, told in (
@@ -194,7 +205,8 @@ def _text(frame: Frame, width: int, most: int) -> list[Line]:
         ('Diagnosis', [diagnosis_words(frame.diagnosis)]),
     ):
         for k, (text, tone) in enumerate(told):
-            lines += labelled(label if k == 0 else ' ' * len(label), text, tone, width, most)
+            before = label if k == 0 else ' ' * len(label)
+            lines += labelled(before, in_zone(text, zone), tone, width, most)
     return lines
 
 
@@ -291,11 +303,18 @@ class Screen:
     out : text stream
     environment : mapping, optional
         Where ``TERM`` and ``NO_COLOR`` are looked up; the process's by default.
+    zone : tzinfo, optional
+        Times are told in it; in UTC without.
     """
 
-    def __init__(self, out: TextIO, environment: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        out: TextIO,
+        environment: Mapping[str, str] | None = None,
+        zone: tzinfo | None = None,
+    ) -> None:
         known = os.environ if environment is None else environment
-        self._out = out
+        self._out, self._zone = out, zone
         terminal = out.isatty()
         self.in_place = terminal and known.get('TERM', 'dumb') not in ('dumb', '')
         self._colour = self.in_place and not known.get('NO_COLOR')
@@ -332,9 +351,9 @@ class Screen:
             body = '\x1b[K\r\n'.join(rows)
             self._out.write(f'\x1b[H{body}\x1b[K\x1b[J')
         else:
-            when = moment(frame.now_ns) if frame.now_ns else 'no data yet'
+            when = _when(frame, self._zone)
             lines = [f'{when}  {w}: {told}\n' for w, told in changes(self._before, frame)]
-            said = ''.join(lines)
+            said = in_zone(''.join(lines), self._zone)
             self._out.write(said if self._unicode else said.encode('ascii', 'replace').decode())
         self._before = frame
         self._out.flush()
@@ -345,7 +364,10 @@ class Screen:
 
     def _rows(self, frame: Frame) -> list[str]:
         size = shutil.get_terminal_size(_USUAL)
-        return screen(frame, size.columns, size.lines, colour=self._colour, unicode=self._unicode)
+        return screen(
+            frame, size.columns, size.lines, colour=self._colour, unicode=self._unicode,
+            zone=self._zone,
+        )  # fmt: skip
 
 
 def _handled() -> dict[signal.Signals, object]:

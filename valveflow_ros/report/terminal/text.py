@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from argparse import ArgumentTypeError
+from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Callable, Iterator
 
 # Pieces of a line: the text of each, and one of the tones below or '' for plain.
@@ -143,6 +143,28 @@ def whole(wanted: str, low: int, high: int | None, example: str) -> Callable[[st
         return value
 
     return read
+
+
+def zone_argument(parser: ArgumentParser) -> None:
+    """Add the option that says in which time zone people are told times."""
+    parser.add_argument(
+        '--time-zone', metavar='ZONE', type=_zone, default='',
+        help='zone in which times are told, such as Europe/Berlin or +01:00 (default: UTC)',
+    )  # fmt: skip
+
+
+def _zone(text: str) -> str:
+    # Loaded late, as a verb that only names the options need not load it.
+    from valveflow_ros.errors import InputError
+    from valveflow_ros.records import zone_of
+
+    try:
+        zone_of(text)
+    except InputError:
+        raise ArgumentTypeError(
+            f"must be a time zone, such as Europe/Berlin or +01:00; '{text}' is not"
+        ) from None
+    return text
 
 
 def _refusal(wanted: str, between: str, example: str, why: str) -> ArgumentTypeError:
