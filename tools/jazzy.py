@@ -265,6 +265,18 @@ def launching(bench: Bench) -> None:
             'The first, killed, comes again as itself, and a tag like a number stays a text',
             'use_respawn, kill -9, ros2 param get', itself,
         )  # fmt: skip
+    managed = bench.folder / 'managed.launch.yaml'
+    units = [_unit(k, f'U{k}', autostart='false', use_respawn='false') for k in (1, 2)]
+    managed.write_text(yaml.safe_dump({'launch': units}))
+    more = f'record_directory:={bench.folder}'
+    with bench.running('is not configured', 'launch', str(managed), more):
+        _until(lambda: bench.log.count('is not configured') == 2, 'both units')
+        bench.check(
+            "Two units, in the order of Nav2's lifecycle manager without bonds: startup, pause, "
+            'resume, reset, startup, shutdown',
+            'autostart:=false, ros2 service call NODE/change_state, NODE/get_state',
+            lambda: _managed(bench),
+        )
     with launch('valveflow_ros', 'monitor.launch.py', 'use_respawn:=true'):
 
         def respawned() -> str:
@@ -308,9 +320,37 @@ def launching(bench: Bench) -> None:
         bench.check('The demo runs', line, plays)
 
 
-def _unit(number: int, tag: str) -> dict[str, object]:
+def _managed(bench: Bench) -> str:
+    """Bring two units up and down as nav2_lifecycle_manager's `changeStateForAllNodes` does."""
+    forth = [f'/unit_{k}/valveflow_monitor' for k in (1, 2)]
+    up = [('configure', 1, 'inactive', forth), ('activate', 3, 'active', forth)]
+    down = [
+        ('deactivate', 4, 'inactive', forth[::-1]), ('cleanup', 2, 'unconfigured', forth[::-1])
+    ]  # fmt: skip
+    end = [('shutdown', 5, 'finalized', forth[::-1])]
+    done = 0
+    for word, number, state, nodes in [*up, down[0], up[1], *down, *up, *down, *end]:
+        for node in nodes:
+            said = bench.ros2(
+                'service', 'call', f'{node}/change_state', 'lifecycle_msgs/srv/ChangeState',
+                f'{{transition: {{id: {number}}}}}',
+            )  # fmt: skip
+            if 'success=True' not in said:
+                raise NotSeenError(f'{word} {node}: {said[-200:]}')
+            if state != 'finalized':  # who is has ended
+                said = bench.ros2(
+                    'service', 'call', f'{node}/get_state', 'lifecycle_msgs/srv/GetState'
+                )
+                if f"label='{state}'" not in said:
+                    raise NotSeenError(f'{word} {node}: {said[-200:]}')
+            done += 1
+    _until(lambda: bench.log.count('finished cleanly') == len(forth), 'the end of both')
+    return f'{done} transitions, each confirmed; both ended cleanly'
+
+
+def _unit(number: int, tag: str, **more: str) -> dict[str, object]:
     """Return the part of a launch file that starts a monitor for a unit."""
-    given = {'namespace': f'unit_{number}', 'unit_tag': tag, 'use_respawn': 'true'}
+    given = {'namespace': f'unit_{number}', 'unit_tag': tag, 'use_respawn': 'true', **more}
     include = {
         'file': '$(find-pkg-share valveflow_ros)/launch/monitor.launch.py',
         'arg': [{'name': name, 'value': value} for name, value in given.items()],

@@ -111,6 +111,21 @@ def test_a_curve_that_cannot_be_judged_suppresses_until_one_can():
     assert over.state == RETURNED
 
 
+def test_a_shift_of_another_size_than_was_told_is_told_again():
+    desk = Desk(LONG)
+    desk.judge(2.0)
+    assert desk.judge(2.3, 1) == []
+    (again,) = desk.judge(-5.0, 2)
+    assert (again.state, again.previous, again.occurrence) == (UNACKNOWLEDGED, UNACKNOWLEDGED, 1)
+    assert again.sentence.endswith('By -5.0 MW.')
+    assert desk.rows([0.0] * 10, 3) == []
+    desk.press('acknowledge', 14)
+    (acknowledged,) = desk.judge(-8.0, 15)
+    assert acknowledged.sentence.endswith('Acknowledged. By -8.0 MW.')
+    desk.press('shelve', 16)
+    assert desk.judge(-20.0, 17) == []
+
+
 # --- behind another -------------------------------------------------------------------------
 
 

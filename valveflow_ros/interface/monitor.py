@@ -99,8 +99,11 @@ class MonitorResult(Result):
     @property
     def alarms(self) -> list[AlarmChange]:
         """Return the changes of the alarms' states, without mere repetitions."""
-        changes = [e for e in self.events if isinstance(e, AlarmChange)]
-        return [c for c in changes if c.state != c.previous]
+        return [c for c in self._alarm_changes if c.state != c.previous]
+
+    @property
+    def _alarm_changes(self) -> list[AlarmChange]:
+        return [e for e in self.events if isinstance(e, AlarmChange)]
 
     @property
     def diagnoses(self) -> list[tuple[int, dict[str, Any]]]:
@@ -178,17 +181,17 @@ class MonitorResult(Result):
         return {'set': max(times[-1], self.start_ns), 'model_id': references[-1].model_id}
 
     def _alarms_json(self) -> list[dict[str, Any]]:
-        """Return one entry for each time that an alarm rose."""
+        """Return one entry for each time that an alarm rose, with what was told of it last."""
         found: dict[tuple[str, int], dict[str, Any]] = {}
-        for change in self.alarms:
+        for change in self._alarm_changes:
             stands = change.state in (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
             key = change.name, change.occurrence
             if stands:
                 found.setdefault(
                     key,
                     {'name': change.name, 'raised': change.time_ns, 'cleared': None,
-                     'state': '', 'sentence': change.sentence},
-                )  # fmt: skip
+                     'state': '', 'sentence': ''},
+                )['sentence'] = change.sentence  # fmt: skip
             if key in found:
                 found[key]['state'] = change.state.name.lower()
                 found[key]['cleared'] = None if stands else found[key]['cleared'] or change.time_ns

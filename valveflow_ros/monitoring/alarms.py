@@ -334,6 +334,10 @@ _DOUBT = 10.0
 # Share of a moved piece that must be judged unmoved: the ends of a curve, and its knots, lie
 # a little elsewhere in every window.
 _COVERED = 0.8
+# A shift has another size than was told if it differs by this share, and by two of its errors,
+# which are about half of the smallest shift that is seen.
+_ANOTHER = 0.25
+_SHOWN = (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
 
 
 class ShiftAlarm(Alarm):
@@ -344,7 +348,8 @@ class ShiftAlarm(Alarm):
     ISA-18.2 states as of the residual alarm, but without delays: a curve stands on days of data,
     and for the same reason it is suppressed by a curve that cannot be judged, not by minutes of
     bad data. A piece that moved and left the window with its load is not known to be back: the
-    alarm stands until its u are judged again, or until there is a new reference.
+    alarm stands until its u are judged again, or until there is a new reference. It is announced
+    again where its size turns out to be another: the first curves after a change know little.
 
     Parameters
     ----------
@@ -404,6 +409,16 @@ class ShiftAlarm(Alarm):
         if self.active:
             self._end(sentence)
         return self._tell(time_ns, model_id)
+
+    @property
+    def _again_ns(self) -> int | None:
+        """Return when it is to be told again: at once, if its size is not what was told."""
+        told = self.last
+        if self.active and told is not None and self.state == told.state in _SHOWN:
+            surely = max(_ANOTHER * abs(told.value), 0.5 * self._limit)
+            if abs(self._value - told.value) > surely:
+                return self._told_ns
+        return super()._again_ns
 
     def _end(self, sentence: str) -> None:
         self._ranges = []
