@@ -27,7 +27,7 @@ NUMBERS = [
     (verb, action)
     for verb, _, _ in VERBS
     for action in options_of(verb)
-    if getattr(action.type, '__module__', '') == text.__name__
+    if getattr(action.type, '__module__', '') == text.__name__ and action.dest != 'time_zone'
 ]
 
 

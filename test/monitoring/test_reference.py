@@ -207,6 +207,33 @@ def at(shift, u_from, u_to):
     return replace(shift, pieces=(replace(shift.pieces[0], u_from=u_from, u_to=u_to),))
 
 
+@pytest.mark.parametrize(
+    ('shifts', 'states'),
+    [
+        ([(0.6,), (0.7,), (0.6,)], [UNACKNOWLEDGED]),
+        ([(0.6,), CALM, (0.6,)], []),
+        ([(0.6,), (-0.6,), (0.6,)], []),
+        ([(0.6,), at(judgement(0.6), 1600.0, 2280.0)], []),
+        ([(-0.9,)], [UNACKNOWLEDGED]),
+    ],
+)
+def test_a_small_shift_has_to_be_seen_by_two_curves_in_a_row(shifts, states):
+    alarm = ShiftAlarm()
+    assert told(alarm, *shifts) == states
+    assert bool(alarm.ranges) == bool(states)
+
+
+def test_what_the_last_curve_saw_outlives_a_restart():
+    first, second = ShiftAlarm(), ShiftAlarm()
+    assert told(first, (0.6,)) == []
+    second.restore(first.snapshot())
+    assert told(second, (0.7,)) == [UNACKNOWLEDGED]
+    earlier = {key: value for key, value in first.snapshot().items() if key != 'seen'}
+    third = ShiftAlarm()
+    third.restore(earlier)
+    assert told(third, (0.7,)) == []
+
+
 def test_it_stands_while_what_moved_is_out_of_the_window():
     alarm, calm = ShiftAlarm(), judgement(*CALM)
     assert told(alarm, judgement(-5.0)) == [UNACKNOWLEDGED]
@@ -214,7 +241,7 @@ def test_it_stands_while_what_moved_is_out_of_the_window():
     elsewhere = [at(calm, 1600.0, 2280.0), at(calm, 1150.0, 2280.0), unknown]
     assert told(alarm, *elsewhere) == []
     assert alarm.ranges == ((1000.0, 1200.0),)
-    assert told(alarm, at(judgement(2.0), 1010.0, 1190.0), *elsewhere) == []
+    assert told(alarm, at(judgement(-4.5), 1010.0, 1190.0), *elsewhere) == []
     assert alarm.ranges == ((1010.0, 1190.0),)
     assert told(alarm, at(calm, 1005.0, 1400.0)) == [RETURNED]
     assert alarm.ranges == ()

@@ -296,14 +296,12 @@ def judge_shift(
         for k in range(len(current.pieces))
     )
     since = _since(pieces, series, scans)
-    if since[0]:
+    begun_ns = since[0] or current.source.window_start_ns - 1
+    if len(found):
+        least = LEAST_SIDE if since[0] else 1
+        least_mw = 0.0 if since[0] else limits.least_mw
         pieces = tuple(
-            _with_now(reference, p, s, since[0]) for p, s in zip(pieces, series, strict=True)
-        )
-    else:
-        begun_ns = current.source.window_start_ns - 1
-        pieces = tuple(
-            _borne_out(_with_now(reference, p, s, begun_ns, least=1), limits.least_mw)
+            _borne_out(_with_now(reference, p, s, begun_ns, least), s, begun_ns, least_mw)
             for p, s in zip(pieces, series, strict=True)
         )
     shift = Shift(
@@ -422,7 +420,7 @@ def _judged(
 
 def _with_now(
     reference: Characteristic, piece: PieceShift, series: SegmentResiduals, since_ns: int,
-    least: int = LEAST_SIDE,
+    least: int,
 ) -> PieceShift:  # fmt: skip
     """Return a piece that moved with what its segments say after the common moment."""
     after = series.part(series.time_ns > since_ns)
@@ -442,14 +440,18 @@ def _with_now(
     return replace(piece, now_mw=mean, now_error_mw=error)
 
 
-def _borne_out(piece: PieceShift, least_mw: float) -> PieceShift:
-    """Return a piece as not moved if its own segments lie on the reference.
+def _borne_out(
+    piece: PieceShift, series: SegmentResiduals, since_ns: int, least_mw: float
+) -> PieceShift:
+    """Return a piece as not moved if its own segments lie on the reference, or it has none.
 
-    A curve of few segments may bend where there are none, and differ there by much.
+    A curve may bend where there are few segments, and differ there by much.
     """
-    if math.isfinite(piece.now_mw) and abs(piece.now_mw) < least_mw:
-        return replace(piece, moved=False)
-    return piece
+    if math.isfinite(piece.now_mw):
+        borne_out = abs(piece.now_mw) >= least_mw
+    else:
+        borne_out = bool(np.any(series.time_ns > since_ns))
+    return piece if borne_out else replace(piece, moved=False)
 
 
 def _reference_error(reference: Characteristic, u: FloatArray) -> float:

@@ -337,6 +337,8 @@ _COVERED = 0.8
 # A shift has another size than was told if it differs by this share, and by two of its errors,
 # which are about half of the smallest shift that is seen.
 _ANOTHER = 0.25
+# A shift so many times as large as the smallest that is seen needs no second curve.
+_CLEAR = 2.0
 _SHOWN = (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
 
 
@@ -347,9 +349,10 @@ class ShiftAlarm(Alarm):
     -----
     ISA-18.2 states as of the residual alarm, but without delays: a curve stands on days of data,
     and for the same reason it is suppressed by a curve that cannot be judged, not by minutes of
-    bad data. A piece that moved and left the window with its load is not known to be back: the
-    alarm stands until its u are judged again, or until there is a new reference. It is announced
-    again where its size turns out to be another: the first curves after a change know little.
+    bad data. Two judgements in a row have to see it, unless it is large. A piece that moved and
+    left the window with its load is not known to be back: the alarm stands until its u are judged
+    again, or until there is a new reference. It is announced again where its size turns out to be
+    another: the first curves after a change know little.
 
     Parameters
     ----------
@@ -359,7 +362,7 @@ class ShiftAlarm(Alarm):
 
     NAME = 'curve_shift'
     REMEMBERED = (
-        *Alarm.REMEMBERED, '_value', '_limit', '_sentence', '_problem', '_ranges',
+        *Alarm.REMEMBERED, '_value', '_limit', '_sentence', '_problem', '_ranges', '_seen',
     )  # fmt: skip
 
     def __init__(self, settings: Settings | None = None) -> None:
@@ -368,6 +371,7 @@ class ShiftAlarm(Alarm):
         self._sentence = ''
         self._problem = ''
         self._ranges: list[tuple[float, float]] = []
+        self._seen: list[list[float]] = []  # u and MW of what the last judgement saw moved
         super().__init__(settings or Settings())
 
     @property
@@ -379,16 +383,11 @@ class ShiftAlarm(Alarm):
         """Take a judgement; return the change it makes, if any."""
         self.configure(settings)
         self.suppressed = False
-        worst = shift.largest
-        if worst is not None:
-            self._value, self._limit = worst.shift_mw, worst.smallest_mw
-            self._sentence = shift.sentence
-        self._remember(shift, settings)
-        if not self.active and worst is not None:
+        if not self.active and self._confirmed(shift):
             self.begin(time_ns)
-        doubt = any(_stands(p, settings) for p in shift.pieces)
-        if self.active and not doubt and not self._ranges:
-            self._end(shift.sentence)
+        self._seen = [[p.u_from, p.u_to, p.shift_mw] for p in shift.pieces if p.moved]
+        if self.active:
+            self._follow(shift, settings)
         return self._tell(time_ns, shift.model_id)
 
     def unjudged(
@@ -399,6 +398,10 @@ class ShiftAlarm(Alarm):
         self._problem = problem
         self.suppressed = True
         return self._tell(time_ns, model_id)
+
+    def restore(self, saved: State) -> None:
+        """Go on from a state; those of earlier versions began with the first judgement."""
+        super().restore({'seen': [], **saved})
 
     def reset(
         self, sentence: str, time_ns: int, model_id: str, settings: Settings
@@ -421,9 +424,32 @@ class ShiftAlarm(Alarm):
         return super()._again_ns
 
     def _end(self, sentence: str) -> None:
-        self._ranges = []
+        self._ranges, self._seen = [], []
         self._sentence, self._value = sentence, 0.0
         self.end(self._latch)
+
+    def _follow(self, shift: Shift, settings: Settings) -> None:
+        """Take the size of the shift, and let it end where it is known to be over."""
+        worst = shift.largest
+        if worst is not None:
+            self._value, self._limit = worst.shift_mw, worst.smallest_mw
+            self._sentence = shift.sentence
+        self._remember(shift, settings)
+        doubt = any(_stands(p, settings) for p in shift.pieces)
+        if not doubt and not self._ranges:
+            self._end(shift.sentence)
+
+    def _confirmed(self, shift: Shift) -> bool:
+        """Tell whether a piece moved that did so in the judgement before, or by very much."""
+        return any(
+            abs(p.shift_mw) > _CLEAR * p.smallest_mw
+            or any(
+                p.shift_mw * mw > 0.0 and p.u_from < high and low < p.u_to
+                for low, high, mw in self._seen
+            )
+            for p in shift.pieces
+            if p.moved
+        )
 
     def _remember(self, shift: Shift, settings: Settings) -> None:
         """Remember the ranges that moved; forget older ones that are judged anew."""
