@@ -6,8 +6,10 @@ Run: ``python -m benchmarks.monitor_study --seeds 10 --first 431`` for healthy u
 ``--effect gain_step --times 3`` for units on which that effect begins after half of the days,
 three times as large as by default; ``--effect all`` takes each effect of the catalogue, one at a
 time. Units are those of ``plant/thermal_unit.py``, and ``paper`` the one of the paper, all as
-means over a minute. The monitor runs over the record without diagnoses, with the defaults of its
-parameters; what was set there by looking at such units was set on seeds 421 to 430.
+means over a minute. ``--wear 1 --days 365`` lets each unit lose so many MW a month from the first
+day on, of what it gives in the mean. The monitor runs over the record without diagnoses, with the
+defaults of its parameters; what was set there by looking at such units was set on seeds 421 to
+430.
 """
 
 from __future__ import annotations
@@ -56,9 +58,15 @@ def effect_at(effect: Effect, times: float) -> str:
     return f'{effect.name}:{size.name}={value:g}{onset}'
 
 
-def row_of(seed: int, kind: str, days: float, effect: str = '') -> dict[str, Any]:
+def row_of(
+    seed: int, kind: str, days: float, effect: str = '', wear: float = 0.0
+) -> dict[str, Any]:
     """Run the monitor over one unit; return what it told."""
     record = record_of(kind, seed, days, [])
+    if wear:
+        month = np.asarray(record['time'] - record['time'].iloc[0]) / np.timedelta64(30, 'D')
+        power = record['generated_power_mw'].to_numpy()
+        record['generated_power_mw'] = power * (1.0 - wear / power.mean() * month)
     if effect:
         record = joined(record, record_of(kind, seed, days, [effect]))
     begin = time.process_time()
@@ -81,6 +89,7 @@ def row_of(seed: int, kind: str, days: float, effect: str = '') -> dict[str, Any
     return {
         'kind': kind, 'seed': seed, 'effect': effect, 'alarms': alarms,
         'reference_day': None if reference is None else day(reference['set']),
+        'wear': content['wear'] and round(content['wear']['mw_per_month'], 3),
         'curves': len(content['curves']), 'cpu_s': round(time.process_time() - begin, 1),
     }  # fmt: skip
 
@@ -111,6 +120,7 @@ def main() -> None:
     parser = study.options(__doc__, seeds=10, first=431, days=20.0, times=3.0)
     parser.add_argument('--kinds', default='choked,sequence,paper')
     parser.add_argument('--effect', action='append', default=[])
+    parser.add_argument('--wear', type=float, default=0.0)
     given = parser.parse_args()
     onset_days = 0.5 * given.days if given.effect else 0.0
     rows: list[dict[str, Any]] = []
@@ -120,9 +130,10 @@ def main() -> None:
         chosen = [e for e in named if e.name in given.effect or 'all' in given.effect]
         effects = [effect_at(e, given.times) for e in chosen] if given.effect else ['']
         for effect in effects:
-            work = partial(row_of, kind=kind, days=given.days, effect=effect)
+            work = partial(row_of, kind=kind, days=given.days, effect=effect, wear=given.wear)
             rows += study.rows_of(work, study.seeds(given.first, given.seeds))
-    what = f'{"_".join(given.effect)}_times_{given.times:g}' if given.effect else 'healthy'
+    what = f'wear_{given.wear:g}' if given.wear else 'healthy'
+    what = f'{"_".join(given.effect)}_times_{given.times:g}' if given.effect else what
     groups = {r['kind']: [s for s in rows if s['kind'] == r['kind']] for r in rows}
     study.keep(
         study.name_of(f'monitor_{what}', given.first, given.seeds),

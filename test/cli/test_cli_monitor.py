@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import valveflow_ros as vf
 from valveflow_ros.interface import monitor as interface
 from valveflow_ros.monitoring.events import Diagnosed
+from valveflow_ros.monitoring.reference import Wear
 from valveflow_ros.parameters import Settings
 
 HOUR_NS = 3600 * 10**9
@@ -71,3 +72,17 @@ def test_each_diagnosis_is_told_with_its_time_and_each_cause_once(
         'gain_step: It is 3 MW less. What to do: Look at the meter.',
         'spikes: What to do: Mend the wire.',
     ]
+
+
+def test_slow_wear_is_told(run, logs, tmp_path, monkeypatch):
+    wear = Wear(86_400 * 10**9, -3.04, -1.013)
+    made = interface.MonitorResult('plant.csv', (), 0, 31 * HOUR_NS, Settings(), wear)
+    monkeypatch.setattr(interface, 'monitor', lambda log, **_: made)
+    ran = run('monitor', logs / 'plant.csv', '-o', tmp_path)
+    sentence = (
+        'Since 1970-01-02 00:00:00 UTC the curve has changed slowly by −3.0 MW, −1.01 MW a month.'
+    )
+    assert sentence in ran.out
+    assert sentence in (tmp_path / 'report.html').read_text()
+    told = json.loads((tmp_path / 'monitor.json').read_text())['wear']
+    assert told == {'since_ns': wear.since_ns, 'total_mw': -3.04, 'mw_per_month': -1.013}

@@ -401,6 +401,7 @@ def test_an_alarm_whose_range_left_the_window_says_so(monitor: Monitor) -> None:
     monitor.set_reference(curve)
     reference, alarm = monitor.reference, monitor.reference.alarm
     reference.shift = judge_shift(curve, lifted(curve, 9.0))
+    assert 'if the next curve shows it too' in reference_item(monitor).sentence
     alarm.judge(reference.shift, 1, WORK)
     assert reference_item(monitor).sentence == reference.shift.sentence
     knot = curve.pieces[-1].u_from

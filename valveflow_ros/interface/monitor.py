@@ -37,6 +37,7 @@ from valveflow_ros.monitoring.events import (
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_aligned
 from valveflow_ros.monitoring.prediction import PredictionBlock
+from valveflow_ros.monitoring.reference import Wear
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import FloatArray, IntArray, SampleTable
 from valveflow_ros.report.history import (
@@ -51,7 +52,7 @@ from valveflow_ros.report.history import (
 )
 from valveflow_ros.report.page import Page, Section, paragraph, text
 from valveflow_ros.report.terminal.board import ALARM, CURVE, DIAGNOSIS
-from valveflow_ros.report.words import moment
+from valveflow_ros.report.words import moment, signed
 from valveflow_ros.signals.align import Aligner, aligned_blocks
 
 # Without diagnoses; each takes as long as `diagnose` over the window.
@@ -71,6 +72,8 @@ class MonitorResult(Result):
     start_ns, end_ns : int
         First and last row.
     settings : Settings
+    wear : Wear or None
+        How the curve changed slowly; None while that is not known.
     """
 
     verb = 'monitor'
@@ -79,11 +82,23 @@ class MonitorResult(Result):
     start_ns: int
     end_ns: int
     settings: Settings
+    wear: Wear | None = None
 
     @property
     def output_unit(self) -> str:
         """Return what the output is measured in."""
         return self.settings.output_unit
+
+    @property
+    def wear_words(self) -> str:
+        """Say how the curve has changed slowly; empty while that is not known."""
+        if self.wear is None:
+            return ''
+        since, unit = moment(self.wear.since_ns), self.output_unit
+        return (
+            f'Since {since} the curve has changed slowly by {signed(self.wear.total_mw)} {unit}, '
+            f'{signed(self.wear.mw_per_month, 2)} {unit} a month.'
+        )
 
     @property
     def curves(self) -> list[tuple[int, Characteristic]]:
@@ -132,6 +147,7 @@ class MonitorResult(Result):
         """Return the report: how the curve moved, and what the monitor said."""
         lead = paragraph(text(self.source), 'where')
         lead += paragraph(f'{moment(self.start_ns)} to {moment(self.end_ns)}', 'where')
+        lead += paragraph(text(self.wear_words), 'where') if self.wear else ''
         sections = history_sections(self.history()) or [
             Section('What the monitor said', [paragraph('No curve was found, and no alarm rose.')])
         ]
@@ -165,6 +181,7 @@ class MonitorResult(Result):
                 for at, d in self.diagnoses
             ],
             'reference': self._reference_json(),
+            'wear': None if self.wear is None else self.wear._asdict(),
         }
         return {'monitor.json': json.dumps(content, indent=2, allow_nan=False) + '\n'}
 
@@ -256,7 +273,9 @@ def monitor(
     table = SampleTable.concatenate(tables)
     check_signals(table, aligner.counts())
     times = table.time_ns
-    return MonitorResult(log.name, tuple(events), int(times[0]), int(times[-1]), settings)
+    return MonitorResult(
+        log.name, tuple(events), int(times[0]), int(times[-1]), settings, engine.reference.wear
+    )
 
 
 def _curve_moment(time_ns: int, c: Characteristic) -> CurveMoment:

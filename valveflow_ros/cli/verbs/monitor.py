@@ -104,4 +104,5 @@ def _text(found: MonitorResult) -> str:
         *(advice(name, c['meaning'], c['to_do']) for name, c in named.items()),
         'No curve became the reference.' if reference is None
         else f'The reference is curve {reference["model_id"]}, set {moment(reference["set"])}.',
+        found.wear_words,
     )  # fmt: skip

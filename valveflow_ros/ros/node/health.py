@@ -442,7 +442,8 @@ def reference_item(monitor: Monitor) -> Item:
         values['Shift since (s since 1970)'] = shift.since_ns // 10**9 or None
     if reference.problem:
         return Item('reference', Level.WARN, reference.problem, values)
-    level = Level.WARN if reference.alarm.standing else Level.OK
+    suspected = shift is not None and shift.moved
+    level = Level.WARN if reference.alarm.standing or suspected else Level.OK
     if reference.alarm.active and reference.alarm.state not in _ASIDE:
         level = Level.ERROR
     # After a restart no curve was judged yet, and the alarm stands all the same.
@@ -451,6 +452,8 @@ def reference_item(monitor: Monitor) -> Item:
         spans = ' and '.join(f'u {a:.0f} to {b:.0f}' for a, b in reference.alarm.ranges)
         moved = f'what moved, {spans}, is not judged unmoved yet' if spans else 'doubt is left'
         sentence = f'The alarm stands: {moved}. {sentence}'
+    elif suspected and not reference.alarm.active:
+        sentence += ' It is an alarm if the next curve shows it too.'
     return Item('reference', level, sentence, values)
 
 
