@@ -32,7 +32,11 @@ example:
   valveflow monitor plant.mcap -o result
 
 and quicker, without the diagnoses:
-  valveflow monitor plant.mcap -o result --no-diagnosis --set alarm_floor=2.0"""
+  valveflow monitor plant.mcap -o result --no-diagnosis --set alarm_floor=2.0
+
+and quickest, by a curve that is there already, without a fit:
+  valveflow monitor plant.mcap -o result --reference health/characteristic.json \\
+      --no-diagnosis --set refit_period=0 --set refit_segments=0 --set alarm_on_delay=600"""
 
 
 def arguments(parser: ArgumentParser) -> None:
