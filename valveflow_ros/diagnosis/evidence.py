@@ -362,6 +362,7 @@ _JUMP95 = 7.352
 _NOISES = 2.0
 _PLACES, _MISSES = 120, 8
 _DOUBLINGS, _HALVINGS = 12, 7
+_LONGER = 1.1
 _PROFILE_BLOCK_SUBS = 2
 
 
@@ -415,6 +416,10 @@ class Certainty:
         """
         keep = [j for j in range(self.table.shape[1]) if j != own]
         others = self.table[:, keep]
+        cause = self.model.active[c].cause
+        unknown, here = cause.unknowns[k], self.model.active[c].values[k]
+        if unknown.dated:
+            others = np.column_stack([others, self._lifted(c)])
         inverse = np.linalg.pinv(others.T @ others, hermitian=True)
 
         def cost(value: float) -> float:
@@ -427,8 +432,6 @@ class Certainty:
             toward = others.T @ e
             return float(e @ e) - float(toward @ inverse @ toward)
 
-        cause = self.model.active[c].cause
-        unknown, here = cause.unknowns[k], self.model.active[c].values[k]
         step = unknown.step_on(self.task.grids)
         if unknown.kind is Kind.LINE:
             most = cost(here) + _JUMP95 * self.variance * self._colour
@@ -443,6 +446,20 @@ class Certainty:
             margin = _NOISES * self.task.grids.reference.opening_noise
             low, high = max(low - margin, unknown.low), min(high + margin, unknown.high)
         return low, high
+
+    def _lifted(self, c: int) -> FloatArray:
+        """Return how innovations follow if what a change counts from is lifted, up to a factor.
+
+        A change is counted from its mean over the record, so that the curve is the mean curve.
+        Another onset has another mean, which the knots of the curve need not be able to follow,
+        and hours in which the change cannot show would speak for one onset and against another.
+        """
+        task, grids = self.task, self.task.grids
+        reference = replace(grids.reference, span_s=_LONGER * grids.reference.span_s)
+        other = replace(task, grids=replace(grids, reference=reference))
+        alone = replace(self.model, active=(self.model.active[c],))
+        column = task.innovations(other.residual(alone) - task.residual(alone))
+        return np.asarray(column / max(float(np.sqrt(column @ column)), 1e-300))
 
     def intervals(self) -> dict[str, dict[str, Estimate]]:
         """Return all estimates by cause and parameter."""
