@@ -429,6 +429,8 @@ class NaiveAlarm:
         self.state = 'NORMAL'
         self.condition = False
         self.watched = None  # time seen to pass while rows one after the other speak for a turn
+        self.gone = None  # time since the condition was over
+        self.longer = 1
         self.last = None
         self.changes = []  # (row, previous, state)
         self.row = 0
@@ -437,13 +439,15 @@ class NaiveAlarm:
         self.row += 1
         step = 0 if self.last is None else time - self.last
         self.last = time
+        if self.gone is not None:
+            self.gone += max(step, 0)
         if not 0 < step <= self.gap:
             self.watched = None
         if math.isnan(average):
             return
         if self.condition:
             speaks = abs(average) < limit * (1.0 - self.dead_band)
-            delay = self.off
+            delay = self.off * self.longer
         else:
             speaks = abs(average) > limit
             delay = self.on
@@ -459,6 +463,11 @@ class NaiveAlarm:
             self.turn()
 
     def turn(self):
+        if self.condition:
+            again = self.gone is not None and self.gone <= 7 * self.off
+            self.longer = min(2 * self.longer, 8) if again else 1
+        else:
+            self.gone = 0
         if self.condition:
             self.enter('UNACKNOWLEDGED')
         elif self.latch and self.state == 'UNACKNOWLEDGED':

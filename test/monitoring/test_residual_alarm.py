@@ -278,7 +278,8 @@ def test_what_waits_is_counted_once_whatever_else_happens_meanwhile():
 def test_with_its_own_delays_it_cannot_chatter():
     delay = {'alarm_on_delay': 0.0, 'alarm_off_delay': 300.0}
     alarm, told = lived(delay, ([*[2.0] * 301, *[0.0] * 301], 6 * 3600))
-    assert alarm.occurrence == sum(c.state == UNACKNOWLEDGED for _, c in told) == 36
+    # What comes back soon has to stay away for longer: for hours it is one alarm, come twice.
+    assert alarm.occurrence == sum(c.state == UNACKNOWLEDGED for _, c in told) == 2
     assert not any('held back' in c.sentence for _, c in told)
 
 

@@ -42,6 +42,9 @@ _PLACES = 10
 _CALM = 0.25
 # The alarm comes back to sight when it could be judged for at most so many blocks.
 _BLOCKS_TO_SEE = 5.0
+# An alarm that comes back within so many delays of a return is the one that was there; its delay
+# doubles then, up to this factor.
+_SOON, _LONGEST = 7, 8
 # What happened, as bits.
 _TURNED, _DARKENED, _SEEING, _SET_BACK, _DUE = 1, 2, 4, 8, 16
 _NEVER = (1 << 63) - 1
@@ -175,6 +178,8 @@ class ResidualAlarm(Alarm):
     some times a day, suppresses nothing. The alarm comes back when the evidence could be judged
     for some blocks, less what could not, and at once if the condition turns.
     The condition is over only where it was seen: the delay of a return does not run at other u.
+    What comes and goes is one thing: who comes back soon after a return has to stay away for twice
+    as long the next time.
 
     Parameters
     ----------
@@ -190,12 +195,16 @@ class ResidualAlarm(Alarm):
     """
 
     NAME = 'residual'
-    REMEMBERED = (*Alarm.REMEMBERED, '_memory', '_span', 'judged', 'onset_ns')
+    REMEMBERED = (
+        *Alarm.REMEMBERED, '_memory', '_span', 'judged', 'onset_ns', '_returned_ns', '_longer',
+    )  # fmt: skip
 
     def __init__(self, settings: Settings) -> None:
         self._memory = np.zeros(_PLACES, dtype=np.int64)
         self._span = np.zeros(2)
         self.onset_ns = 0
+        self._returned_ns: int | None = None
+        self._longer = 1  # the delay of a return, in units of the parameter
         self.judged = Judged(0, math.nan, math.nan)
         super().__init__(settings)
 
@@ -215,7 +224,7 @@ class ResidualAlarm(Alarm):
 
     def restore(self, saved: State) -> None:
         """Go on from a state; one of an earlier version does not know where it was seen."""
-        saved = {**saved.get('life', {}), **saved}
+        saved = {'returned_ns': None, 'longer': 1, **saved.get('life', {}), **saved}
         memory = saved.get('memory')
         if 'span' not in saved and isinstance(memory, np.ndarray):
             saved = {
@@ -229,6 +238,7 @@ class ResidualAlarm(Alarm):
         if not self.active:
             return []
         self._memory[_ACTIVE] = self._memory[_COUNTING] = 0
+        self._returned_ns = None
         self.judged = Judged(time_ns, 0.0, 0.0)
         self.end(self._latch)
         return self._tell(time_ns, model_id)
@@ -265,9 +275,9 @@ class ResidualAlarm(Alarm):
             due = [alarm.due_ns for alarm in everyone]
             taken = _watch(
                 time_ns[done:], evidence[done:], u[done:], _LIMIT, self._dead_band,
-                self._on_ns, self._off_ns, self._gap_ns, self._dark_ns, self._back_ns,
-                min((d for d in due if d is not None), default=_NEVER), self._memory,
-                self._span,
+                self._on_ns, self._longer * self._off_ns, self._gap_ns, self._dark_ns,
+                self._back_ns, min((d for d in due if d is not None), default=_NEVER),
+                self._memory, self._span,
             )  # fmt: skip
             if not taken:
                 break
@@ -277,6 +287,12 @@ class ResidualAlarm(Alarm):
             self._happened(now_ns, everyone)
             changes += [(done, c) for a in everyone for c in a.pass_time(now_ns, model_id)]
         return changes
+
+    def shift_time(self, step_ns: int) -> None:
+        """Follow a clock that was set back."""
+        super().shift_time(step_ns)
+        if self._returned_ns is not None:
+            self._returned_ns += step_ns
 
     def _happened(self, now_ns: int, everyone: Sequence[Alarm]) -> None:
         """Let lives go on by what happened at a row."""
@@ -290,8 +306,12 @@ class ResidualAlarm(Alarm):
             self.suppressed = False
         if what & _TURNED and self._memory[_ACTIVE]:
             self.onset_ns = int(self._memory[_CALM_NS])
+            before_ns = self._returned_ns
+            again = before_ns is not None and now_ns - before_ns <= _SOON * self._off_ns
+            self._longer = min(2 * self._longer, _LONGEST) if again else 1
             self.begin(now_ns)
         elif what & _TURNED:
+            self._returned_ns = now_ns
             self.end(self._latch)
 
     def _content(self, state: AlarmState) -> Content:
