@@ -14,7 +14,7 @@ from valveflow_ros.plant.simulator import DEFAULT_START_NS
 def extended_json(**causes: dict[str, float]) -> dict[str, Any]:
     """Return the content of the file, with some causes."""
     return {
-        'format': 'valveflow/extended_model', 'version': 1, 'pressure_exponent': 1.125,
+        'format': 'valveflow/extended_model', 'version': 2, 'pressure_exponent': 1.125,
         'start_ns': DEFAULT_START_NS,
         'reference': {
             'span_s': 34_560.0, 'temperature_degc': 539.0, 'log_pressure': 2.62,

@@ -298,7 +298,7 @@ _ALARM = (
               0.0, 86400.0, live=True),
     Parameter('alarm_off_delay', 86400.0, 's',
               'The return must last this long, at openings where the alarm was seen; twice as '
-              'long each time that the alarm comes back within seven of these times, at most eight.',
+              'long each time that it comes back within seven of these times, at most eight.',
               0.0, 864000.0, live=True),
     Parameter('alarm_dead_band', 0.3, '', 'The return is judged at limit x (1 - dead band).',
               0.0, 0.9, live=True),

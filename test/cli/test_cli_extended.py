@@ -96,7 +96,7 @@ def test_what_the_extended_model_knows_is_no_finding(run, logs, identified, tmp_
     ('change', 'said'),
     [
         ({'format': 'other'}, "'format' must be"),
-        ({'version': 2}, 'has version 2'),
+        ({'version': 9}, 'has version 9'),
         ({'causes': [{'name': 'magic', 'values': {}, 'switches_s': []}]}, 'is no cause'),
         ({'causes': [{'name': 'backlash', 'values': {}, 'switches_s': []}]}, 'is missing'),
         ({'causes': [{'name': 'backlash', 'values': {'w_percent': -1}, 'switches_s': []}]},

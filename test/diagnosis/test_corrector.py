@@ -199,7 +199,7 @@ def test_beyond_its_record_a_drift_goes_on_and_steps_stay(grids, rows):
     grown = shift_of(drift, later(rows, 20.0)) - shift_of(drift, rows)
     assert grown == pytest.approx(2.0 * VALUES['gain_drift'][0], rel=1e-3)
     step = model_of(grids, 'gain_step')
-    assert shift_of(step, later(rows, 20.0)) == pytest.approx(0.5 * VALUES['gain_step'][0])
+    assert shift_of(step, later(rows, 20.0)) == pytest.approx(VALUES['gain_step'][0])
     hidden = model_of(grids, 'intervals')  # 1.5 h of 9.6 on, then on again for good
     on = 1.0 - (5400.0 + (0.4 * 86_400.0 - 20_000.0)) / (0.4 * 86_400.0)
     assert shift_of(hidden, later(rows, 20.0)) == pytest.approx(VALUES['intervals'][0] * on)

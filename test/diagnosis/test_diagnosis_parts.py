@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -265,6 +266,15 @@ def test_the_extended_model_comes_back_from_its_file(grids):
     start_ns, reference = given.start_ns, given.reference
     assert (exponent, start_ns, reference) == (1.125, 5, grids.reference)
     np.testing.assert_array_equal(answer(grids, back), answer(grids, model))
+
+
+def test_a_model_of_the_first_version_is_read_unless_a_step_is_in_it(grids):
+    for name, values, old in (('gain_drift', (0.01,), True), ('gain_step', (0.01, 0.2), False)):
+        model = Extended(rough_model(), (Active(catalogue()[name], values),))
+        raw = model_to_json(ExtendedModel(model, StaticForm(), 5, grids.reference))
+        assert model_from_json(raw).model.names == (name,)
+        with nullcontext() if old else pytest.raises(DataError, match='Make it anew'):
+            assert model_from_json({**raw, 'version': 1}).model.names == (name,)
 
 
 @pytest.mark.parametrize('raw', [None, {}, {'format': 'valveflow/extended_model', 'version': 9}])

@@ -256,7 +256,7 @@ def model_can_be(raw: dict[str, Any]) -> bool:
     knots, levels = curve['knots'], dynamics['levels']
     times, delays = dynamics['time_constants_s'], dynamics['delays_s']
     return (
-        raw['format'] == 'valveflow/extended_model' and raw['version'] == 1
+        raw['format'] == 'valveflow/extended_model' and raw['version'] == 2
         and number(raw['pressure_exponent'], 0.5, 2) and count(raw['start_ns'])
         and all(number(u, *INPUT) for u in knots) and rises(knots) and len(knots) > 1
         and all(number(x, *POWER) for k in ('left', 'right') for x in curve[k])

@@ -415,9 +415,8 @@ def _final(found: Found) -> tuple[Task, Extended]:
 def _meaning(task: Task, model: Extended, cause: Active) -> str:
     """Say what a cause is worth at full load, against the model without it.
 
-    Causes that change with time are counted from their mean over the record: of a step it is the
-    difference between after and before, of a drift that between the end and the beginning, of
-    intervals that between in effect and not.
+    Of a step it is the difference between after and before, of a drift that between the end and
+    the beginning, of intervals that between in effect and not.
     """
     grids, whole = task.grids, task.grids.whole
     without = answer(grids, model.without(cause.name))

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.diagnosis.cause import Estimate, Kind, Stage, Unknown
+from valveflow_ros.diagnosis.cause import Active, Estimate, Kind, Stage, Unknown
 from valveflow_ros.diagnosis.causes import causes_for
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import (
@@ -20,7 +20,7 @@ from valveflow_ros.diagnosis.fitting import (
     free,
     level_tangents,
 )
-from valveflow_ros.diagnosis.grids import FOLDS, ORDER, SEALED_FOLD
+from valveflow_ros.diagnosis.grids import DAY_S, FOLDS, ORDER, SEALED_FOLD
 from valveflow_ros.diagnosis.screening import Screening, nuisance
 from valveflow_ros.fit.whitening import fit_ar, inflation
 from valveflow_ros.records import BoolArray, FloatArray, IntArray
@@ -252,8 +252,14 @@ def rmse(task: Task, model: Extended, rows: BoolArray) -> float:
 
 
 def sealed_gain(task: Task, before: Extended, after: Extended, tried: int) -> Gain:
-    """Compare two models, both fitted to the open blocks, on the sealed ones."""
-    rows = task.grids.sealed_rows
+    """Compare two models, both fitted to the open blocks, on the sealed ones.
+
+    Left out is the time in which by the open blocks an onset may lie: whether the change has
+    come there, nobody could have told.
+    """
+    rows = task.grids.sealed_rows & ~_while_unsure(task, after)
+    if not rows.any():
+        rows = task.grids.sealed_rows
     sealed = replace(task, rows=rows)
     old, new = fair_residual(task, before), fair_residual(task, after)
     rest, change = sealed.innovations(old), sealed.innovations(old - new)
@@ -261,6 +267,28 @@ def sealed_gain(task: Task, before: Extended, after: Extended, tried: int) -> Ga
     chance = sign_flip(scores[np.bincount(task.grids.sub[rows]) > 0])
     chance = min(1.0, chance * max(tried, 1))
     return Gain(rmse(task, before, rows), rmse(task, after, rows), chance)
+
+
+def _while_unsure(task: Task, model: Extended) -> BoolArray:
+    """Return the means in whose time an onset may lie, shape (m,)."""
+    day = task.grids.means(task.grids.time_s) / DAY_S
+    out = np.zeros(len(day), dtype=bool)
+    innovations = task.innovations(task.residual(model))
+    variance = float(innovations @ innovations) / len(innovations)
+    for a in model.active:
+        for k, unknown in enumerate(a.cause.unknowns):
+            if not unknown.dated:
+                continue
+
+            def cost(value: float, a: Active = a, k: int = k) -> float:
+                values = (*a.values[:k], value, *a.values[k + 1 :])
+                return task.cost(model.having(replace(a, values=values)))
+
+            here, step = a.values[k], unknown.step_on(task.grids)
+            most = cost(here) + _JUMP95 * variance
+            low, high = (_last_place(cost, here, way * step, unknown, most) for way in (-1.0, 1.0))
+            out |= (day >= low) & (day <= high)
+    return out
 
 
 def gain_of_form(task: Task, model: Extended, task_new: Task, new: Extended) -> Gain:
@@ -362,7 +390,6 @@ _JUMP95 = 7.352
 _NOISES = 2.0
 _PLACES, _MISSES = 120, 8
 _DOUBLINGS, _HALVINGS = 12, 7
-_LONGER = 1.1
 _PROFILE_BLOCK_SUBS = 2
 
 
@@ -418,8 +445,6 @@ class Certainty:
         others = self.table[:, keep]
         cause = self.model.active[c].cause
         unknown, here = cause.unknowns[k], self.model.active[c].values[k]
-        if unknown.dated:
-            others = np.column_stack([others, self._lifted(c)])
         inverse = np.linalg.pinv(others.T @ others, hermitian=True)
 
         def cost(value: float) -> float:
@@ -446,20 +471,6 @@ class Certainty:
             margin = _NOISES * self.task.grids.reference.opening_noise
             low, high = max(low - margin, unknown.low), min(high + margin, unknown.high)
         return low, high
-
-    def _lifted(self, c: int) -> FloatArray:
-        """Return how innovations follow if what a change counts from is lifted, up to a factor.
-
-        A change is counted from its mean over the record, so that the curve is the mean curve.
-        Another onset has another mean, which the knots of the curve need not be able to follow,
-        and hours in which the change cannot show would speak for one onset and against another.
-        """
-        task, grids = self.task, self.task.grids
-        reference = replace(grids.reference, span_s=_LONGER * grids.reference.span_s)
-        other = replace(task, grids=replace(grids, reference=reference))
-        alone = replace(self.model, active=(self.model.active[c],))
-        column = task.innovations(other.residual(alone) - task.residual(alone))
-        return np.asarray(column / max(float(np.sqrt(column @ column)), 1e-300))
 
     def intervals(self) -> dict[str, dict[str, Estimate]]:
         """Return all estimates by cause and parameter."""

@@ -173,7 +173,9 @@ class Diagnosis:
 
 # The extended model as JSON: what ``extended_model.json`` holds, and what is believed of one.
 
-MODEL_FORMAT, MODEL_VERSION = 'valveflow/extended_model', 1
+MODEL_FORMAT, MODEL_VERSION = 'valveflow/extended_model', 2
+# Version 1 counted these from their mean over the record, with another curve therefore.
+_COUNTED_OTHERWISE = ('curve_step', 'gain_step', 'input_step')
 _MOST_MODELS = 10  # on top of one another
 _WHOLE = 'extended model'
 
@@ -275,15 +277,21 @@ def model_from_json(raw: object, depth: int = 0) -> ExtendedModel:
     inside = f'{path}.' if path else ''
     if not isinstance(raw, dict) or not is_model(raw):
         raise DataError(f"This is no extended model: '{inside}format' must be '{MODEL_FORMAT}'.")
-    if raw.get('version') is not MODEL_VERSION:
+    if raw.get('version') not in (1, MODEL_VERSION) or isinstance(raw['version'], bool):
         where = f" in '{path}'" if path else ''
         raise DataError(
             f'The extended model has version {repr(raw.get("version"))[:20]}{where}, '
-            f'this program reads {MODEL_VERSION}.'
+            f'this program reads 1 and {MODEL_VERSION}.'
         )
     if depth >= _MOST_MODELS:
         raise fail(_WHOLE, path, f'lies more than {_MOST_MODELS} models deep')
     top = checked(raw, _SCHEMA, _WHOLE, path)
+    steps = [cause['name'] for cause in top['causes'] if cause['name'] in _COUNTED_OTHERWISE]
+    if raw['version'] < MODEL_VERSION and steps:
+        raise DataError(
+            f'The extended model has version {raw["version"]}, which counts {steps[0]} in another '
+            'way than this program. Make it anew from the log: valveflow diagnose LOG -o DIR.'
+        )
     earlier = model_from_json(raw['on_top_of'], depth + 1) if 'on_top_of' in raw else None
     reference = top['reference']
     noise = reference.pop('opening_noise') or 0.0

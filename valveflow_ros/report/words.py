@@ -220,10 +220,7 @@ def input_axis(value: float) -> dict[str, str]:
 
 
 # Causes whose change is counted from the mean of the record, see `diagnosis.causes`.
-_FROM_THE_MEAN = frozenset((
-    'curve_step', 'gain_drift', 'gain_step', 'input_drift', 'input_step', 'intervals',
-    'output_offset_drift',
-))  # fmt: skip
+_FROM_THE_MEAN = frozenset(('gain_drift', 'input_drift', 'intervals', 'output_offset_drift'))
 
 
 def held_words(held: tuple[HeldCause, ...]) -> str:
@@ -235,8 +232,8 @@ def held_words(held: tuple[HeldCause, ...]) -> str:
     names = ', '.join(f'{h.name} ({values})' if values else h.name for h, values in told)
     if any(h.name in _FROM_THE_MEAN for h in held):
         curve = (
-            'What changes with time is counted from its mean over the record it was found in: the '
-            'curve is that of this mean, neither that of before nor that of after. '
+            'A drift, and what comes and goes, is counted from its mean over the record it was '
+            'found in: the curve is that of this mean. '
         )
     else:
         curve = f'The curve is that of the unit without {"it" if len(held) == 1 else "them"}. '

@@ -41,17 +41,18 @@ def drift_size(screening: Screening, carrier: int) -> float:
 def ramp(grids: Grids, time_s: FloatArray) -> FloatArray:
     """Return a ramp that rises by 1 in ten days and is 0 in the middle of the record.
 
-    What changes with time is counted from the record's mean throughout: the curve is then the
-    mean curve, and the levels between regions stay where they are while a change is fitted.
+    The curve is then the mean curve.
     """
     return np.asarray((time_s - 0.5 * grids.reference.span_s) / TEN_DAYS_S)
 
 
 def since(grids: Grids, t0_days: float) -> FloatArray:
-    """Return a step of height 1 at an onset, its mean over the record taken off."""
-    onset, span = t0_days * DAY_S, grids.reference.span_s
-    after = min(max(1.0 - onset / span, 0.0), 1.0)
-    return np.where(grids.time_s >= onset, 1.0, 0.0) - after
+    """Return a step of height 1 at an onset.
+
+    The curve is then that of before, whose pieces are straight; a mean of both would have the
+    knots of both, more than are fitted, and what is left of them would look like another cause.
+    """
+    return np.where(grids.time_s >= t0_days * DAY_S, 1.0, 0.0)
 
 
 def a_day(grids: Grids) -> str:
@@ -276,7 +277,7 @@ def apply_intervals(values: Values, grids: Grids, extra: Values) -> FloatArray:
     """
     # Return the factor on x; ``extra`` holds the times of switches in seconds.
     inside = np.searchsorted(np.asarray(extra), grids.time_s, side='right') % 2
-    # Counted from the record's mean, as everything in time.
+    # Counted from the record's mean, as a drift.
     span = grids.reference.span_s
     edges = np.clip(np.append(np.asarray(extra), span if len(extra) % 2 else []), 0.0, span)
     share = float(np.sum(edges[1::2] - edges[::2])) / span
