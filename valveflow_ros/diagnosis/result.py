@@ -60,7 +60,10 @@ class NamedCause:
     @property
     def to_do(self) -> str:
         """Return what an operator does about it; empty for a covariate."""
-        return TO_DO.get(self.name, '').replace('`', '')
+        told = TO_DO.get(self.name, '')
+        for name, e in self.parameters.items():
+            told = told.replace(f'`{name}`', f'{name} = {e.value:.4g} {e.unit}'.rstrip())
+        return told.replace('`', '')
 
 
 @dataclass(frozen=True, slots=True)
