@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -199,6 +200,55 @@ def acts() -> str:
     ]  # fmt: skip
     head = ('act, among others', 'runs', 'messages claimed', 'found', 'runs with a false claim')
     return table(head, rows)
+
+
+def results() -> str:
+    """Return what a reader of the README asks first, with the command of each."""
+    said = dict(line.split(': ', 1) for line in result('paper_study_2001_2020')['summary'])
+    slope, knee = re.findall(r'error median (\S+) worst', said['published'])[:2]
+    thermal = result('thermal_curves_minute_101_200')['summary']
+    errors = [thermal[kind]['error_mw'] for kind in _KIND_WORDS]
+    units = sum(thermal[kind]['units'] for kind in _KIND_WORDS)
+    medians = [e['median'] for e in errors]
+    healthy, faulty = (result(name)['summary'] for name in _MONITOR)
+    physics = [healthy[kind] for kind in healthy if kind != 'paper']
+    tried, found, stood = (
+        sum(s[key] for s in faulty.values())
+        for key in ('units', 'with_alarm', 'standing_at_the_end')
+    )
+    hidden, null = (result(f'diagnosis_{n}_5d') for n in ('hidden_9000_9011', 'null_9000_9149'))
+    valves = result('refinery_valves')['measured']['per_valve']['verdict']
+    lost = result('torture_kill9')['measured']['most_lost_s']
+    rows = [
+        _row('the curve on the plant of the paper, ten days, 20 seeds',
+             f'largest slope error {slope} in the median (the paper: 0.008), largest knee error '
+             f'{knee} (the paper: 36)', 'paper_study_2001_2020'),
+        ('its 95 % errors hold the truth, 200 random plants', *_coverage()[0][1:]),
+        _row(f'the curve on {units} units built from physics, means over a minute',
+             f'error {min(medians):.2f} to {max(medians):.2f} MW in the median, '
+             f'{max(e["largest"] for e in errors):.2f} MW at most',
+             'thermal_curves_minute_101_200'),
+        _row('false alarms on healthy units, 20 days each',
+             f'{healthy["paper"]["alarms"]} in {20 * healthy["paper"]["units"]} days on the plant '
+             f'of the paper, {sum(s["alarms"] for s in physics)} in '
+             f'{20 * sum(s["units"] for s in physics)} days on units built from physics',
+             next(iter(_MONITOR))),
+        _row('an effect of three times its default size begins on day 10',
+             f'alarm on {found} of {tried}, standing on day 20 on {stood} of these',
+             list(_MONITOR)[1]),
+        _row('one hidden effect, 2 to 3 times the smallest that can be seen, five days',
+             f'named, and no other, in {hidden["right"]} of {hidden["records"]}',
+             'diagnosis_hidden_9000_9011_5d'),
+        _row('nothing hidden, five days', f'nothing named in {null["right"]} of {null["records"]}',
+             'diagnosis_null_9000_9149_5d'),
+        _row('sticking valves of a refinery, from command and process value (real data)',
+             f'{valves["found"] * valves["sticky"]:.0f} of {valves["sticky"]} found, '
+             f'{valves["falsely_named"] * valves["sound"]:.0f} of {valves["sound"]} sound ones '
+             f'named, {valves["open"]} not judged', 'refinery_valves'),
+        _row('a monitor is killed (kill -9) 200 times', f'at most {lost:.2f} s of it were lost',
+             'torture_kill9'),
+    ]  # fmt: skip
+    return table(('question', 'answer', 'measured by'), rows)
 
 
 def measured() -> str:

@@ -41,13 +41,6 @@ _SERVICES = {
     'set_reference': "today's curve is what later ones are judged against",
     'diagnose': 'diagnose the window now; the result follows on `~/diagnosis`',
 }
-# What an integrator changes first.
-_COMMON = (
-    'unit_tag', 'main_steam_pressure_unit', 'generated_power_unit', 'stamp_source',
-    'input_reliability', 'sample_period', 'time_constant', 'window_days', 'refit_period',
-    'alarm_run_length', 'alarm_floor', 'reference_file', 'model_file', 'record_directory',
-    'record_keep',
-)  # fmt: skip
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -154,18 +147,6 @@ def parameters() -> str:
         for row in TABLE
     )  # fmt: skip
     return table(('parameter', 'default', 'unit', 'range', ''), rows)
-
-
-def common_parameters() -> str:
-    """Return the parameters that are changed first."""
-    rows = {row.name: row for row in TABLE}
-    return table(
-        ('parameter', 'default', 'unit', ''),
-        (
-            (f'`{name}`', _default(rows[name]), rows[name].unit, rows[name].sentence)
-            for name in _COMMON
-        ),
-    )
 
 
 _FIELD = re.compile(r'^([A-Za-z0-9_/\[\]]+)\s+([A-Za-z0-9_]+)\s*(=\s*(\S+))?\s*(?:#\s*(.*))?$')

@@ -441,7 +441,11 @@ class Certainty:
         own : int or None
             Column of this parameter in the table, which must not follow.
         """
-        keep = [j for j in range(self.table.shape[1]) if j != own]
+        mine = {own}
+        if self.model.active[c].cause.unknowns[k].kind is Kind.LINE:
+            # The size at the place found, held against another place, would bring the cause back.
+            mine = set(self._columns_of(c))
+        keep = [j for j in range(self.table.shape[1]) if j not in mine]
         others = self.table[:, keep]
         cause = self.model.active[c].cause
         unknown, here = cause.unknowns[k], self.model.active[c].values[k]
@@ -471,6 +475,11 @@ class Certainty:
             margin = _NOISES * self.task.grids.reference.opening_noise
             low, high = max(low - margin, unknown.low), min(high + margin, unknown.high)
         return low, high
+
+    def _columns_of(self, c: int) -> range:
+        """Return the columns of a cause in the table: its parameters that Gauss-Newton moves."""
+        moved = [sum(u.kind is not Kind.LINE for u in a.cause.unknowns) for a in self.model.active]
+        return range(sum(moved[:c]), sum(moved[: c + 1]))
 
     def intervals(self) -> dict[str, dict[str, Estimate]]:
         """Return all estimates by cause and parameter."""

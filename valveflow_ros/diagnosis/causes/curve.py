@@ -130,9 +130,10 @@ def curve_step_starts(screening: Screening) -> Sequence[Start]:
 
 def curve_step_sentence(values: SentenceValues) -> str:
     """Say it."""
+    full = max(values['u_from'], values['u_to'])  # at once where the one is not below the other
     return (
         f'From {values.onset} the curve lacks part of its course: '
-        f'{values["s_mw"]:+.2g} MW above u = {values["u_to"]:.4g}, nothing below '
+        f'{values["s_mw"]:+.2g} MW above u = {full:.4g}, nothing below '
         f'{values["u_from"]:.4g} (a valve that sticks, or another order of opening).'
     )
 
