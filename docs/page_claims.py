@@ -234,10 +234,11 @@ def results() -> str:
              f'{20 * sum(s["units"] for s in physics)} days on units built from physics',
              next(iter(_MONITOR))),
         _row('an effect of three times its default size begins on day 10',
-             f'alarm on {found} of {tried}, standing on day 20 on {stood} of these',
+             f'alarm in {found} of {tried} runs, still standing on day 20 in {stood} of these',
              list(_MONITOR)[1]),
         _row('one hidden effect, 2 to 3 times the smallest that can be seen, five days',
-             f'named, and no other, in {hidden["right"]} of {hidden["records"]}',
+             f'named, and no other, in {hidden["right"]} of {hidden["records"]}; another name '
+             f'with confidence in {hidden["named_with_confidence_wrongly"]}',
              'diagnosis_hidden_9000_9011_5d'),
         _row('nothing hidden, five days', f'nothing named in {null["right"]} of {null["records"]}',
              'diagnosis_null_9000_9149_5d'),

@@ -148,7 +148,9 @@ def test_every_parameter_is_in_the_handbook() -> None:
 
 def test_every_study_that_a_page_quotes_is_kept() -> None:
     text = re.sub(r'\s+', ' ', ''.join(page.read_text() for page in PAGES))
-    for command in re.findall(r'`(python -m benchmarks\.[^`]*--first[^`]*)`', text):
+    commands = re.findall(r'`(python -m benchmarks\.[^`]*--first[^`]*)`', text)
+    assert len(commands) > 10
+    for command in commands:
         results = page_claims.RESULTS.glob('*.json')
         assert any(command == json.loads(p.read_text()).get('command') for p in results), command
 

@@ -84,12 +84,28 @@ def test_what_the_monitor_would_refuse_is_named(run, tmp_path, text, part):
 
 
 @pytest.mark.parametrize(
-    'text', ['delay: 3.0\n', 'valveflow_monitor:\n  delay: 3.0\n', '/**:\n  ros__parameters: 3\n']
+    'text',
+    [
+        'delay: 3.0\n',
+        'valveflow_monitor:\n  delay: 3.0\n',
+        '/**:\n  ros__parameters: 3\n',
+        '/**:\n  ros__parameters:\n  delay: 3.0\n',
+    ],
 )
-def test_parameters_that_ros_would_not_find_are_told_of(run, tmp_path, text):
+def test_parameters_without_a_node_are_told_of(run, tmp_path, text):
     file = tmp_path / 'x.yaml'
     file.write_text(text)
     assert 'Put the lines' in run('config', 'check', file).refused()
+
+
+@pytest.mark.parametrize(
+    'text', ['/unit_1:\n  valveflow_monitor:\n    ros__parameters:\n      delay: 3.0\n',
+             '/**:\n  ros__parameters:\n']
+)  # fmt: skip
+def test_a_namespace_and_a_node_without_parameters_are_taken(run, tmp_path, text):
+    file = tmp_path / 'x.yaml'
+    file.write_text(text)
+    assert 'the monitor takes it' in run('config', 'check', file).out
 
 
 def test_a_column_s_name_cannot_write_parameters(run, tmp_path):

@@ -214,6 +214,7 @@ def at(shift, u_from, u_to):
         ([(0.6,), CALM, (0.6,)], []),
         ([(0.6,), (-0.6,), (0.6,)], []),
         ([(0.6,), at(judgement(0.6), 1600.0, 2280.0)], []),
+        ([(0.6,), at(judgement(0.6), 1150.0, 2280.0)], []),
         ([(-0.9,)], [UNACKNOWLEDGED]),
     ],
 )
@@ -221,6 +222,13 @@ def test_a_small_shift_has_to_be_seen_by_two_curves_in_a_row(shifts, states):
     alarm = ShiftAlarm()
     assert told(alarm, *shifts) == states
     assert bool(alarm.ranges) == bool(states)
+
+
+def test_what_was_seen_against_another_reference_confirms_nothing():
+    alarm = ShiftAlarm()
+    assert told(alarm, (0.6,)) == []
+    assert alarm.reset('There is a new reference.', START_NS, 'now', STRICT) == []
+    assert told(alarm, (0.7,)) == []
 
 
 def test_what_the_last_curve_saw_outlives_a_restart():

@@ -16,7 +16,7 @@ from report_stories import HOUR_NS, KNOTS, START_NS, STEP_MW, history
 
 from valveflow_ros.monitoring.alarm_state import AlarmState
 from valveflow_ros.report.figure import Figure
-from valveflow_ros.report.history import AlarmMoment, History, history_sections
+from valveflow_ros.report.history import AlarmMoment, History, history_of, history_sections
 
 # The states that have a bar, as the picture names them; in the first two the condition stands.
 BARS = {
@@ -94,6 +94,23 @@ def test_a_step_shows_at_its_hour_and_only_where_it_was():
     knees = figure.traces[-1]
     assert knees['y'] == [KNOTS[1]] * 4
     assert knees['error_y']['array'] == [10.0] * 4
+
+
+def test_what_has_no_time_is_no_part_of_the_story_and_a_shift_has_its_last_words():
+    normal, stands = AlarmState.NORMAL, AlarmState.UNACKNOWLEDGED
+    told = [
+        AlarmMoment(0, 'curve_shift', normal, 'It has not come.', again=True),
+        AlarmMoment(0, 'residual', normal, 'It has not come.', again=True),
+        AlarmMoment(START_NS, 'curve_shift', stands, '3 MW less.'),
+        AlarmMoment(START_NS + 1, 'residual', stands, '9 MW less.'),
+        AlarmMoment(START_NS + HOUR_NS, 'curve_shift', stands, '8 MW less.', again=True),
+        AlarmMoment(START_NS + HOUR_NS, 'residual', stands, 'Not known.', again=True),
+    ]
+    story = history_of(told, (), ())
+    assert story.start_ns == START_NS
+    assert [(a.time_ns, a.sentence) for a in story.alarms] == [
+        (START_NS, '8 MW less.'), (START_NS + 1, '9 MW less.'),
+    ]  # fmt: skip
 
 
 @given(st.lists(st.floats(-50.0, 50.0), min_size=3, max_size=3))

@@ -14,6 +14,7 @@ from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import DAY_S, Active, Estimate, SentenceValues
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.evidence import (
+    LARGEST_P,
     Certainty,
     Gain,
     by_segment,
@@ -24,7 +25,13 @@ from valveflow_ros.diagnosis.evidence import (
     sealed_gain,
 )
 from valveflow_ros.diagnosis.extended import Extended, answer
-from valveflow_ros.diagnosis.fitting import Task, improve, search_levels, search_lines
+from valveflow_ros.diagnosis.fitting import (
+    Task,
+    improve,
+    search_levels,
+    search_lines,
+    search_onsets,
+)
 from valveflow_ros.diagnosis.grids import ORDER, CovariateRows, Grids, make_grids
 from valveflow_ros.diagnosis.loop import actuator
 from valveflow_ros.diagnosis.record_faults import Fault, faults
@@ -49,8 +56,6 @@ from valveflow_ros.signals.static_form import StaticForm
 #
 # A name that the open blocks suggest stands only if blocks nothing was fitted to confirm it at
 # the 5 % level, the number of causes tried taken into account.
-
-LARGEST_P = 0.05
 
 
 def confirm(found: Found) -> None:
@@ -272,6 +277,7 @@ def diagnose(
     found = search(task, start, progress, rough)
     progress(0.7, 'the sealed blocks')
     confirm(found)
+    found.model = _dated(found)
     progress(0.8, 'what is left')
     rest = _look_again(found)
     rest = _withdraw(found, rest)
@@ -342,25 +348,25 @@ def _wandering(grids: Grids, screening: Screening, slow: Wander) -> FloatArray |
 
 def _look_again(found: Found) -> _Rest:
     """Look at what the model with all causes leaves."""
-    model = _dated(found)
-    screening = Screening(found.task, model)
+    screening = Screening(found.task, found.model)
     slow = wander(screening)
-    left = structure(found.task, model, _wandering(found.task.grids, screening, slow))
+    left = structure(found.task, found.model, _wandering(found.task.grids, screening, slow))
     own = _own_misfit(found, left)
     if own:
         left = replace(left, gain=0.0, explained_mw2=0.0)
-    slowly = drift(found.task, model)
-    return _Rest(slow, left, period(found.task, model), slowly, own)
+    slowly = drift(found.task, found.model)
+    return _Rest(slow, left, period(found.task, found.model), slowly, own)
 
 
 def _dated(found: Found) -> Extended:
     """Return the model with its onsets as all blocks tell them.
 
     A change that came in a sealed block, or beside one, is put at the wrong end of it by the
-    others; hours between there and the truth would look like a slow disturbance.
+    others; the hours between there and the truth would look like a misfit, or a slow
+    disturbance. So of the sealed blocks nothing is used but the moment of a change.
     """
     every = replace(found.task, rows=found.task.grids.whole)
-    return search_lines(every, found.model, every.cost(found.model))[0]
+    return search_onsets(every, found.model)
 
 
 def _own_misfit(found: Found, left: Structure) -> str:

@@ -215,6 +215,7 @@ def _wald(task: Task, without: Extended, model: Extended, e: FloatArray) -> floa
 
 # What a cause is worth on blocks of time that nothing was fitted to, opened once.
 
+LARGEST_P = 0.05
 _FLIPS = 100_000
 _CHUNK = 5_000
 _SEED = 7
@@ -254,17 +255,19 @@ def rmse(task: Task, model: Extended, rows: BoolArray) -> float:
 def sealed_gain(task: Task, before: Extended, after: Extended, tried: int) -> Gain:
     """Compare two models, both fitted to the open blocks, on the sealed ones.
 
-    Left out is the time in which by the open blocks an onset may lie: whether the change has
-    come there, nobody could have told.
+    Nothing is confirmed or refused by the time in which by the open blocks an onset may lie:
+    whether the change has come there, nobody could have told.
     """
-    rows = task.grids.sealed_rows & ~_while_unsure(task, after)
-    if not rows.any():
-        rows = task.grids.sealed_rows
-    sealed = replace(task, rows=rows)
+    rows = task.grids.sealed_rows
+    told = rows & ~_while_unsure(task, after)
+    # Fewer sub-blocks than that could confirm nothing, whatever they say.
+    enough = len(np.unique(task.grids.sub[told])) >= np.log2(max(tried, 1) / LARGEST_P)
+    sealed = replace(task, rows=told if enough else rows)
     old, new = fair_residual(task, before), fair_residual(task, after)
     rest, change = sealed.innovations(old), sealed.innovations(old - new)
-    scores = np.bincount(task.grids.sub[rows], rest * change).astype(np.float64)
-    chance = sign_flip(scores[np.bincount(task.grids.sub[rows]) > 0])
+    sub = task.grids.sub[sealed.rows]
+    scores = np.bincount(sub, rest * change).astype(np.float64)
+    chance = sign_flip(scores[np.bincount(sub) > 0])
     chance = min(1.0, chance * max(tried, 1))
     return Gain(rmse(task, before, rows), rmse(task, after, rows), chance)
 
@@ -285,7 +288,7 @@ def _while_unsure(task: Task, model: Extended) -> BoolArray:
                 return task.cost(model.having(replace(a, values=values)))
 
             here, step = a.values[k], unknown.step_on(task.grids)
-            most = cost(here) + _JUMP95 * variance
+            most = cost(here) + _JUMP95 * variance * colour(task, innovations)
             low, high = (_last_place(cost, here, way * step, unknown, most) for way in (-1.0, 1.0))
             out |= (day >= low) & (day <= high)
     return out
@@ -442,7 +445,7 @@ class Certainty:
             Column of this parameter in the table, which must not follow.
         """
         mine = {own}
-        if self.model.active[c].cause.unknowns[k].kind is Kind.LINE:
+        if self.model.active[c].cause.unknowns[k].dated:
             # The size at the place found, held against another place, would bring the cause back.
             mine = set(self._columns_of(c))
         keep = [j for j in range(self.table.shape[1]) if j not in mine]

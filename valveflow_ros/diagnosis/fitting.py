@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -406,8 +406,14 @@ def _along(model: Extended, c: int, direction: Values, by: float) -> Extended:
 
 def search_lines(task: Task, model: Extended, cost: float) -> tuple[Extended, float]:
     """Move every parameter of kind ``LINE`` along a line while the cost falls."""
-    for c, a in enumerate(model.active):
-        directions = _directions(a.cause, task.grids)
+    return _search_lines(task, model, cost, range(len(model.active)))
+
+
+def _search_lines(
+    task: Task, model: Extended, cost: float, causes: Iterable[int]
+) -> tuple[Extended, float]:
+    for c in causes:
+        directions = _directions(model.active[c].cause, task.grids)
         for share in _LINE_SHARES if directions else ():
             for direction, sign in itertools.product(directions, (1.0, -1.0)):
                 model, cost = descend(
@@ -415,6 +421,12 @@ def search_lines(task: Task, model: Extended, cost: float) -> tuple[Extended, fl
                     partial(_along, c=c, direction=direction, by=sign * share),
                 )  # fmt: skip
     return model, cost
+
+
+def search_onsets(task: Task, model: Extended) -> Extended:
+    """Move onsets along the time while the cost falls; everything else stays."""
+    dated = [c for c, a in enumerate(model.active) if any(u.dated for u in a.cause.unknowns)]
+    return _search_lines(task, model, task.cost(model), dated)[0]
 
 
 def settle(task: Task, model: Extended, rounds: int, steps: int) -> tuple[Task, Extended, float]:

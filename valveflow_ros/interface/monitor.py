@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,6 +47,7 @@ from valveflow_ros.report.history import (
     DiagnosisMoment,
     History,
     Moment,
+    alarms_of,
     history_of,
     history_sections,
     moment_of,
@@ -139,7 +141,10 @@ class MonitorResult(Result):
             self.start_ns,
             self.end_ns,
             tuple(_curve_moment(at, c) for at, c in self.curves),
-            tuple(AlarmMoment(a.time_ns, a.name, a.state, a.sentence) for a in self.alarms),
+            alarms_of(
+                AlarmMoment(a.time_ns, a.name, a.state, a.sentence, a.state == a.previous)
+                for a in self._alarm_changes
+            ),
             tuple(DiagnosisMoment(at, d['sentence']) for at, d in self.diagnoses),
         )
 
@@ -204,11 +209,13 @@ class MonitorResult(Result):
             stands = change.state in (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
             key = change.name, change.occurrence
             if stands:
-                found.setdefault(
+                entry = found.setdefault(
                     key,
                     {'name': change.name, 'raised': change.time_ns, 'cleared': None,
                      'state': '', 'sentence': ''},
-                )['sentence'] = change.sentence  # fmt: skip
+                )  # fmt: skip
+                if not entry['sentence'] or math.isfinite(change.value):
+                    entry['sentence'] = change.sentence
             if key in found:
                 found[key]['state'] = change.state.name.lower()
                 found[key]['cleared'] = None if stands else found[key]['cleared'] or change.time_ns

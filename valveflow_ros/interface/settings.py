@@ -145,10 +145,9 @@ def _from_file(file: Path, of_node: bool) -> dict[str, Any]:
         return {}
     if not isinstance(content, dict):
         raise InputError(f'{file} is no parameter file: it must hold names and values.')
-    above = [name for name, value in content.items() if not _is_of_node(value)]
-    if of_node and above:
+    if of_node and (stray := _without_node(content)):
         raise InputError(
-            f"{file}: ROS 2 does not take '{above[0]}' where it stands. Put the lines '/**:' and "
+            f"{file}: ROS 2 does not take '{stray}' where it stands. Put the lines '/**:' and "
             "'  ros__parameters:' above all parameters, and four blanks before each of them."
         )
     try:
@@ -157,8 +156,15 @@ def _from_file(file: Path, of_node: bool) -> dict[str, Any]:
         raise InputError(f'{file}: {error}') from None
 
 
-def _is_of_node(value: object) -> bool:
-    return isinstance(value, dict) and isinstance(value.get('ros__parameters'), dict)
+def _without_node(content: dict[Any, Any]) -> str:
+    """Return the first name that stands below no ``ros__parameters``; empty if none does."""
+    for name, value in content.items():
+        if name == 'ros__parameters' and isinstance(value, dict | None):
+            continue
+        below = _without_node(value) if isinstance(value, dict) and value else str(name)
+        if below:
+            return below
+    return ''
 
 
 def _flat(content: dict[Any, Any]) -> dict[str, Any]:

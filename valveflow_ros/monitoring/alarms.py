@@ -235,10 +235,10 @@ class ResidualAlarm(Alarm):
 
     def reset(self, time_ns: int, model_id: str) -> list[AlarmChange]:
         """Let the condition be over, as with a new reference."""
+        self._returned_ns, self._longer = None, 1
         if not self.active:
             return []
         self._memory[_ACTIVE] = self._memory[_COUNTING] = 0
-        self._returned_ns = None
         self.judged = Judged(time_ns, 0.0, 0.0)
         self.end(self._latch)
         return self._tell(time_ns, model_id)
@@ -359,6 +359,8 @@ _COVERED = 0.8
 _ANOTHER = 0.25
 # A shift so many times as large as the smallest that is seen needs no second curve.
 _CLEAR = 2.0
+# Two pieces are one for that if they share so much of the shorter one.
+_OVERLAP = 0.5
 _SHOWN = (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
 
 
@@ -429,6 +431,7 @@ class ShiftAlarm(Alarm):
         """Let the condition be over, as with a new reference."""
         self.configure(settings)
         self.suppressed = False
+        self.forget()
         if self.active:
             self._end(sentence)
         return self._tell(time_ns, model_id)
@@ -443,8 +446,13 @@ class ShiftAlarm(Alarm):
                 return self._told_ns
         return super()._again_ns
 
+    def forget(self) -> None:
+        """Let the last judgement confirm nothing, as it was one against another reference."""
+        self._seen = []
+
     def _end(self, sentence: str) -> None:
-        self._ranges, self._seen = [], []
+        self._ranges = []
+        self.forget()
         self._sentence, self._value = sentence, 0.0
         self.end(self._latch)
 
@@ -464,7 +472,9 @@ class ShiftAlarm(Alarm):
         return any(
             abs(p.shift_mw) > _CLEAR * p.smallest_mw
             or any(
-                p.shift_mw * mw > 0.0 and p.u_from < high and low < p.u_to
+                p.shift_mw * mw > 0.0
+                and min(p.u_to, high) - max(p.u_from, low)
+                >= _OVERLAP * min(p.u_to - p.u_from, high - low)
                 for low, high, mw in self._seen
             )
             for p in shift.pieces

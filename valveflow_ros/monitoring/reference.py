@@ -203,6 +203,8 @@ class ReferenceCurve:
         """Return the curve that is to be the reference from now on; None if that is as before."""
         if self.fault_ns is not None or current.source.window_start_ns < self.regime_ns:
             return None
+        if self.shift is not None and self.shift.moved:
+            return None  # the next curve tells whether that is an alarm
         if self.first is not None and self._beyond_budget(current, settings):
             self._candidate = None
             worn = self.curve is None or self.curve.model_id != self.first.model_id
@@ -255,6 +257,7 @@ class ReferenceCurve:
     def _take(self, curve: Characteristic) -> None:
         self.curve, self._candidate = curve, None
         self.shift, self.problem = None, ''
+        self.alarm.forget()
 
     def _beyond_budget(self, current: Characteristic, settings: Settings) -> bool:
         """Tell whether the curve is further from the first reference than wear may bring it."""

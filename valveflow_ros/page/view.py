@@ -108,7 +108,8 @@ def _head(unit: Snapshot, zone: tzinfo | None) -> list[Any]:
         html.H2([clean(unit.title), ' ', html.Span(word, className=f'pill {tone}')]),
         html.P(f'{when}, {clean(unit.key)}', className='where'),
     ]
-    return [*made, html.P(clean(frame.note), className='notice')] if frame.note else made
+    note = clean(in_zone(frame.note, zone))
+    return [*made, html.P(note, className='notice')] if note else made
 
 
 def _diagnosis(frame: Frame, zone: tzinfo | None) -> list[Any]:
@@ -118,22 +119,22 @@ def _diagnosis(frame: Frame, zone: tzinfo | None) -> list[Any]:
     return [_said(said, zone), *(html.P(clean(in_zone(one, zone))) for one in advice)]
 
 
-def _row(item: HealthView) -> Any:
+def _row(item: HealthView, zone: tzinfo | None) -> Any:
     word, tone = _LEVELS.get(item.level, (f'level {item.level}', 'bad'))
     return html.Tr([
         html.Th(short_name(item.name), scope='row'),
         html.Td(html.Span(word, className=f'pill {tone}')),
-        html.Td(clean(item.sentence), className='words'),
+        html.Td(clean(in_zone(item.sentence, zone)), className='words'),
     ])  # fmt: skip
 
 
-def _health(frame: Frame) -> list[Any]:
+def _health(frame: Frame, zone: tzinfo | None) -> list[Any]:
     text, tone = recorder_words(frame)
     if not frame.inputs:
         return [html.P('Nothing has come from any input yet.', className='dim')]
-    rows = [_row(item) for item in frame.inputs]
+    rows = [_row(item, zone) for item in frame.inputs]
     if frame.recorder is not None:
-        rows.append(_row(frame.recorder))
+        rows.append(_row(frame.recorder, zone))
     else:
         rows.append(html.Tr([html.Th('recorder'), html.Td(), html.Td(text, className=tone)]))
     return [html.Div(html.Table(html.Tbody(rows)), className='scroll')]
@@ -148,7 +149,7 @@ def words(unit: Snapshot, zone: tzinfo | None = None) -> dict[str, list[Any]]:
         'curve_words': [_said(curve_words(frame.curve, _whole_minute(frame)), zone)],
         'now': [_said(sample_words(frame.last), zone)],
         'diagnosis': _diagnosis(frame, zone),
-        'health': _health(frame),
+        'health': _health(frame, zone),
     }
 
 

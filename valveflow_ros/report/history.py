@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -111,6 +111,8 @@ class History:
 
 
 Moment = CurveMoment | AlarmMoment | DiagnosisMoment
+# The alarm whose sentence, not only its moment, changes while it stands.
+_SHIFT = 'curve_shift'
 Item = TypeVar('Item')
 
 
@@ -157,23 +159,40 @@ def history_of(
     notes : iterable of str
         What could not be read, as sentences.
     """
-    found, said = sorted(told, key=lambda m: m.time_ns), tuple(notes)
+    # What was latched before the plant's clock had told a time has none, and tells nothing yet.
+    found = sorted((m for m in told if m.time_ns > 0), key=lambda m: m.time_ns)
+    said = tuple(notes)
     if not found and not said:
         return None
     times = [*times_ns, *(m.time_ns for m in found)]
     curves = _once((m for m in found if isinstance(m, CurveMoment)), lambda c: c.model_id)
     diagnoses = _once((m for m in found if isinstance(m, DiagnosisMoment)), lambda d: d)
-    alarms, known = [], set()
-    for a in _once((m for m in found if isinstance(m, AlarmMoment)), lambda a: a):
-        # That an alarm still stands, which is told every day, is no change. The first word of a
-        # standing alarm counts even so: it stood when the recording began.
-        if not a.again or (a.name not in known and a.state != AlarmState.NORMAL):
-            alarms.append(a)
-        known.add(a.name)
+    alarms = alarms_of(_once((m for m in found if isinstance(m, AlarmMoment)), lambda a: a))
     return History(
-        min(times, default=0), max(times, default=0), tuple(curves), tuple(alarms),
+        min(times, default=0), max(times, default=0), tuple(curves), alarms,
         tuple(diagnoses), said,
     )  # fmt: skip
+
+
+def alarms_of(told: Iterable[AlarmMoment]) -> tuple[AlarmMoment, ...]:
+    """Return the changes among what was told of alarms, in order, each with its last words.
+
+    That an alarm still stands, which is told every day, is no change; but how far a shift has gone
+    is known better then. The first word of a standing alarm counts even so: it stood when the
+    recording began.
+    """
+    changes: list[AlarmMoment] = []
+    last: dict[str, int | None] = {}  # where the last change of an alarm stands
+    for a in told:
+        place = last.get(a.name)
+        if not a.again or (a.name not in last and a.state != AlarmState.NORMAL):
+            last[a.name] = len(changes)
+            changes.append(a)
+        elif a.name == _SHIFT and place is not None and changes[place].state == a.state:
+            changes[place] = replace(changes[place], sentence=a.sentence)
+        else:
+            last.setdefault(a.name, None)
+    return tuple(changes)
 
 
 def _once(items: Iterable[Item], key: Callable[[Item], Hashable]) -> list[Item]:

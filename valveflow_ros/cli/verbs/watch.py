@@ -98,8 +98,9 @@ def run(options: Namespace, console: Console) -> VerbResult:
 def _check_together(options: Namespace) -> None:
     """Refuse options that do not go together; raises `UsageError`."""
     if options.page:
-        if options.once or options.json or options.ask is not None:
-            raise UsageError('--page does not go with --once, --json or --ask.')
+        asked = (options.ask, options.alarm)
+        if options.once or options.json or any(option is not None for option in asked):
+            raise UsageError('--page does not go with --once, --json, --ask or --alarm.')
         if options.log is not None and options.token_file is not None:
             raise UsageError('--token-file is for a running monitor and does not go with a LOG.')
         check_installed()

@@ -152,7 +152,7 @@ def _lines(
 ) -> list[Line]:
     head = [_title(frame, width, zone)]
     if frame.note:
-        head += labelled('         ', frame.note, 'warn', width, 2)
+        head += labelled('         ', in_zone(frame.note, zone), 'warn', width, 2)
     curve_text, tone = curve_words(frame.curve, frame.now_ns)
     head += labelled('Curve    ', in_zone(curve_text, zone), tone, width, 2)
     text = _text(frame, width, 1, zone)
