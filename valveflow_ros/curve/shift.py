@@ -77,7 +77,7 @@ def _judgement(shift: Shift) -> str:
     return (
         f'Piece {number} (u {short(worst.u_from)} to {short(worst.u_to)}) gives '
         f'{short(abs(worst.shift_mw), 1)} MW ({abs(worst.percent):.1f} %) {side} than '
-        f'{reference}, {_since_words(shift)}, confidence {_confidence(worst)}.'
+        f'{reference}, {_since_words(shift)}. Confidence that it moved: {_confidence(worst)}.'
         f'{_others(shift, others)}'
     )
 
@@ -99,8 +99,8 @@ def _at(time_ns: int, unit: Literal['D', 'm']) -> str:
 def _since_words(shift: Shift) -> str:
     if shift.since_ns > 0:
         return (
-            f'since about {minute(shift.since_ns)} (between {minute(shift.since_low_ns)} and '
-            f'{minute(shift.since_high_ns)})'
+            f'since about {minute(shift.since_ns)} (95 % interval {minute(shift.since_low_ns)} '
+            f'to {minute(shift.since_high_ns)})'
         )
     if shift.reference_ns >= shift.first_ns > 0:
         return 'since when cannot be told (the reference was made from the same days)'
