@@ -43,6 +43,7 @@ _MARGIN = 8  # left of the pictures: a number and its tick
 _LEAST_CURVE, _LEAST_RESIDUAL = 4, 3
 _MOST_RESIDUAL = 9
 _LONGEST_TEXT = 3
+_WHOLE = 100  # lines of a sentence that is told to its end
 
 
 class Canvas:
@@ -129,7 +130,7 @@ class Canvas:
 
 def screen(
     frame: Frame, width: int, height: int, *, colour: bool = False, unicode: bool = True,
-    zone: tzinfo | None = None,
+    zone: tzinfo | None = None, whole: bool = False,
 ) -> list[str]:  # fmt: skip
     """Return a frame as the lines that a terminal is sent.
 
@@ -142,25 +143,30 @@ def screen(
         What the terminal can do.
     zone : tzinfo, optional
         Times are told in it; in UTC without.
+    whole : bool
+        Every sentence is told to its end, in as many lines more as that takes.
     """
-    lines = _lines(frame, max(20, width), max(5, height), unicode, zone)
-    return [painted(line, width, colour, unicode) for line in lines[: max(1, height)]]
+    lines = _lines(frame, max(20, width), max(5, height), unicode, zone, whole)
+    shown = lines if whole else lines[: max(1, height)]
+    return [painted(line, width, colour, unicode) for line in shown]
 
 
 def _lines(
-    frame: Frame, width: int, height: int, unicode: bool, zone: tzinfo | None
+    frame: Frame, width: int, height: int, unicode: bool, zone: tzinfo | None, whole: bool
 ) -> list[Line]:
+    most = _WHOLE if whole else 2
     head = [_title(frame, width, zone)]
     if frame.note:
-        head += labelled('         ', in_zone(frame.note, zone), 'warn', width, 2)
+        head += labelled('         ', in_zone(frame.note, zone), 'warn', width, most)
     curve_text, tone = curve_words(frame.curve, frame.now_ns)
-    head += labelled('Curve    ', in_zone(curve_text, zone), tone, width, 2)
-    text = _text(frame, width, 1, zone)
+    head += labelled('Curve    ', in_zone(curve_text, zone), tone, width, most)
+    text = _text(frame, width, _WHOLE if whole else 1, zone)
+    height += len(text) if whole else 0
     residual = list(labelled('Residual ', *sample_words(frame.last), width, 2))
     left = height - len(head) - len(residual) - len(text)
     curve_rows, residual_rows = _shares(left, frame)
     spare = left - (curve_rows + 1 if curve_rows else 0) - residual_rows
-    if spare > 0:
+    if spare > 0 and not whole:
         longer = _text(frame, width, _LONGEST_TEXT, zone)
         text = longer if len(longer) <= len(text) + spare else text
     curve = _curve(frame, width, curve_rows, unicode) if curve_rows else []
@@ -360,13 +366,13 @@ class Screen:
 
     def text(self, frame: Frame) -> str:
         """Return a frame as text that stays."""
-        return '\n'.join(self._rows(frame)).rstrip()
+        return '\n'.join(self._rows(frame, whole=True)).rstrip()
 
-    def _rows(self, frame: Frame) -> list[str]:
+    def _rows(self, frame: Frame, whole: bool = False) -> list[str]:
         size = shutil.get_terminal_size(_USUAL)
         return screen(
             frame, size.columns, size.lines, colour=self._colour, unicode=self._unicode,
-            zone=self._zone,
+            zone=self._zone, whole=whole,
         )  # fmt: skip
 
 
