@@ -116,12 +116,19 @@ def _alarm() -> list[tuple[str, str, str]]:
             for kind, s in result(study)['summary'].items()
         )
         rows.append(_row(question, told, study))
+    name = 'monitor_wear_1_441_441'
+    (worn,) = result(name)['rows']
+    rows.append(_row(
+        'the same on the unit of the paper over a year in which it loses 1 MW a month',
+        f'{worn["wear"]:+.2f} MW a month told, '
+        f'{sum(len(a["raised_days"]) for a in worn["alarms"].values())} alarms', name,
+    ))  # fmt: skip
     return rows
 
 
 _MONITOR = {
-    'monitor_healthy_431_438': 'the monitor on healthy units, 20 days each, means over a minute',
-    'monitor_all_times_3_431_431': 'the same with an effect of three times its default from day '
+    'monitor_healthy_441_448': 'the monitor on healthy units, 20 days each, means over a minute',
+    'monitor_all_times_3_441_441': 'the same with an effect of three times its default from day '
     '10 on, one unit an effect; alarms since then',
 }
 
