@@ -272,7 +272,7 @@ def launching(bench: Bench) -> None:
     with bench.running('is not configured', 'launch', str(managed), more):
         _until(lambda: bench.log.count('is not configured') == 2, 'both units')
         bench.check(
-            "Two units brought up and down in the order of Nav2's lifecycle manager, without bonds",
+            "Two units up and down in the order of Nav2's lifecycle manager, without bonds",
             'autostart:=false, ros2 service call NODE/change_state, NODE/get_state',
             lambda: _managed(bench),
         )

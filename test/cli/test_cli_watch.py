@@ -19,7 +19,9 @@ from monitor_recording import recording
 from valveflow_ros.cli.verbs import watch as verb
 
 
-def test_once_prints_a_picture_as_wide_as_the_terminal_and_no_sentence_is_cut(run, tmp_path, monkeypatch):
+def test_once_prints_a_picture_as_wide_as_the_terminal_and_no_sentence_is_cut(
+    run, tmp_path, monkeypatch
+):
     folder = recording(tmp_path / 'r')
     monkeypatch.setenv('COLUMNS', '80')
     monkeypatch.setenv('LINES', '24')

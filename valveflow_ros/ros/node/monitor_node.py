@@ -58,6 +58,7 @@ _REQUESTS_EVERY_S = 0.01
 _REQUESTS_S = 0.05
 # The executor has the rest, events of the middleware and /clock, and costs several times as much.
 _SPIN_EVERY_S = 0.1
+_FAREWELL_S = 0.5
 # The default of ten loses the eleventh request of a burst without a word.
 _REQUESTS = QoSProfile(depth=1000)
 # The compiler works when a configuration runs for the first time, and an activation may feed what
@@ -541,5 +542,8 @@ def run(stop: StopFlag, presence: Presence) -> int:
     finally:
         watchdog.stopping('Finishing the recording.')
         node.end_session()
+        if node.finalized:
+            # The answer to who asked for the shutdown is still on its way.
+            time.sleep(_FAREWELL_S)
         executor.shutdown(timeout_sec=0.5)
         node.destroy_node()
