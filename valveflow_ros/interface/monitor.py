@@ -103,6 +103,20 @@ class MonitorResult(Result):
         )
 
     @property
+    def reference_words(self) -> str:
+        """Say which curve is the reference, or why none is."""
+        reference = self._reference_json()
+        if reference is not None:
+            return (
+                f'The reference is curve {reference["model_id"]}, set {moment(reference["set"])}.'
+            )
+        days = self.settings.real('reference_after')
+        return (
+            f'No curve became the reference, so none could be found to have shifted: that takes '
+            f'{days:g} days without trouble behind a curve, or --reference FILE.'
+        )
+
+    @property
     def curves(self) -> list[tuple[int, Characteristic]]:
         """Return each curve with the time (ns) of the row after which it was adopted."""
         adopted = [e.characteristic for e in self.events if isinstance(e, CurveAdopted)]
@@ -152,7 +166,7 @@ class MonitorResult(Result):
         """Return the report: how the curve moved, and what the monitor said."""
         lead = paragraph(text(self.source), 'where')
         lead += paragraph(f'{moment(self.start_ns)} to {moment(self.end_ns)}', 'where')
-        lead += paragraph(text(self.wear_words), 'where') if self.wear else ''
+        lead += paragraph(text(f'{self.reference_words} {self.wear_words}'), 'where')
         sections = history_sections(self.history()) or [
             Section('What the monitor said', [paragraph('No curve was found, and no alarm rose.')])
         ]

@@ -90,7 +90,6 @@ def _text(found: MonitorResult) -> str:
         ]
         for alarm in content['alarms']
     ]
-    reference = content['reference']
     diagnoses = [
         [moment(at), VERDICT_WORDS[d['verdict']], ', '.join(c['name'] for c in d['causes']) or '-']
         for at, d in found.diagnoses
@@ -106,7 +105,6 @@ def _text(found: MonitorResult) -> str:
         columns(diagnoses, ['diagnosis', 'verdict', 'causes']) if diagnoses else '',
         *(d['sentence'] for _, d in found.diagnoses[-1:]),
         *(advice(name, c['meaning'], c['to_do']) for name, c in named.items()),
-        'No curve became the reference.' if reference is None
-        else f'The reference is curve {reference["model_id"]}, set {moment(reference["set"])}.',
+        found.reference_words,
         found.wear_words,
     )  # fmt: skip
