@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What was measured, read from the results of the studies: no figure here is typed by hand."""
+"""What was measured, read from the results of the studies: no figure of ours is typed by hand."""
 
 from __future__ import annotations
 
