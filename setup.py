@@ -98,6 +98,8 @@ setup(
     extras_require={
         'excel': ['python-calamine'],
         'figures': ['matplotlib'],
+        'fleet': ['dask', 'distributed', 'pyarrow'],
+        'gateway': ['asyncua'],
         'page': ['dash>=3', 'prometheus-client', 'waitress>=3'],
         'parquet': ['pyarrow'],
         'test': ['hypothesis', 'psutil', 'pytest'],
