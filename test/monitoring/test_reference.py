@@ -168,11 +168,11 @@ LOOSE = STRICT.changed({'alarm_latch': False})
 CALM = (0.0, 1.0)  # moved by so many MW, with this chance that it did not
 
 
-def told(alarm, *shifts, settings=STRICT):
+def told(alarm, *shifts, settings=STRICT, begin_s=0, every_s=600):
     shifts = [judgement(*s) if isinstance(s, tuple) else s for s in shifts]
     return [
         change.state for k, shift in enumerate(shifts)
-        for change in alarm.judge(shift, START_NS + k, settings)
+        for change in alarm.judge(shift, START_NS + (begin_s + k * every_s) * NS_PER_S, settings)
     ]  # fmt: skip
 
 
@@ -228,18 +228,29 @@ def test_what_was_seen_against_another_reference_confirms_nothing():
     alarm = ShiftAlarm()
     assert told(alarm, (0.6,)) == []
     assert alarm.reset('There is a new reference.', START_NS, 'now', STRICT) == []
-    assert told(alarm, (0.7,)) == []
+    assert told(alarm, (0.7,), begin_s=600) == []
+
+
+def test_curves_asked_for_one_after_another_are_one_judgement():
+    alarm = ShiftAlarm()
+    assert told(alarm, (0.6,), (0.6,), (0.6,), every_s=60) == []
+    assert told(alarm, (0.6,), begin_s=600) == [UNACKNOWLEDGED]
+    calm = ShiftAlarm()
+    assert told(calm, (0.6,), CALM, (0.6,), (0.6,), every_s=60) == []
+    assert told(calm, (0.6,), begin_s=600) == []
+    assert told(calm, (0.6,), begin_s=720) == [UNACKNOWLEDGED]
 
 
 def test_what_the_last_curve_saw_outlives_a_restart():
     first, second = ShiftAlarm(), ShiftAlarm()
     assert told(first, (0.6,)) == []
     second.restore(first.snapshot())
-    assert told(second, (0.7,)) == [UNACKNOWLEDGED]
-    earlier = {key: value for key, value in first.snapshot().items() if key != 'seen'}
+    assert told(second, (0.7,), begin_s=600) == [UNACKNOWLEDGED]
+    new = ('seen', 'seen_ns')
+    earlier = {key: value for key, value in first.snapshot().items() if key not in new}
     third = ShiftAlarm()
     third.restore(earlier)
-    assert told(third, (0.7,)) == []
+    assert told(third, (0.7,), begin_s=600) == []
 
 
 def test_it_stands_while_what_moved_is_out_of_the_window():

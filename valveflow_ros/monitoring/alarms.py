@@ -385,6 +385,7 @@ class ShiftAlarm(Alarm):
     NAME = 'curve_shift'
     REMEMBERED = (
         *Alarm.REMEMBERED, '_value', '_limit', '_sentence', '_problem', '_ranges', '_seen',
+        '_seen_ns',
     )  # fmt: skip
 
     def __init__(self, settings: Settings | None = None) -> None:
@@ -394,6 +395,7 @@ class ShiftAlarm(Alarm):
         self._problem = ''
         self._ranges: list[tuple[float, float]] = []
         self._seen: list[list[float]] = []  # u and MW of what the last judgement saw moved
+        self._seen_ns = 0
         super().__init__(settings or Settings())
 
     @property
@@ -405,9 +407,13 @@ class ShiftAlarm(Alarm):
         """Take a judgement; return the change it makes, if any."""
         self.configure(settings)
         self.suppressed = False
-        if not self.active and self._confirmed(shift):
+        # A curve that was asked for soon after another stands on nearly the same data.
+        another = time_ns - self._seen_ns >= settings.real('refit_period') * NS_PER_S
+        if not self.active and self._confirmed(shift, self._seen if another else []):
             self.begin(time_ns)
-        self._seen = [[p.u_from, p.u_to, p.shift_mw] for p in shift.pieces if p.moved]
+        seen = [[p.u_from, p.u_to, p.shift_mw] for p in shift.pieces if p.moved]
+        if another or not (seen and self._seen):
+            self._seen, self._seen_ns = seen, time_ns
         if self.active:
             self._follow(shift, settings)
         return self._tell(time_ns, shift.model_id)
@@ -423,7 +429,7 @@ class ShiftAlarm(Alarm):
 
     def restore(self, saved: State) -> None:
         """Go on from a state; those of earlier versions began with the first judgement."""
-        super().restore({'seen': [], **saved})
+        super().restore({'seen': [], 'seen_ns': 0, **saved})
 
     def reset(
         self, sentence: str, time_ns: int, model_id: str, settings: Settings
@@ -467,15 +473,15 @@ class ShiftAlarm(Alarm):
         if not doubt and not self._ranges:
             self._end(shift.sentence)
 
-    def _confirmed(self, shift: Shift) -> bool:
-        """Tell whether a piece moved that did so in the judgement before, or by very much."""
+    def _confirmed(self, shift: Shift, seen: list[list[float]]) -> bool:
+        """Tell whether a piece moved that was seen moved before, or moved by very much."""
         return any(
             abs(p.shift_mw) > _CLEAR * p.smallest_mw
             or any(
                 p.shift_mw * mw > 0.0
                 and min(p.u_to, high) - max(p.u_from, low)
                 >= _OVERLAP * min(p.u_to - p.u_from, high - low)
-                for low, high, mw in self._seen
+                for low, high, mw in seen
             )
             for p in shift.pieces
             if p.moved
