@@ -302,8 +302,19 @@ class TestMonitor:
     def test_report_and_picture(self, told, tmp_path):
         assert set(told.write(tmp_path).files) == {'monitor.json', 'report.html'}
         page = (tmp_path / 'report.html').read_text()
-        assert 'How the curve moved' in page
-        assert 'What the monitor said' in page
+        parts = ['The answer', 'How the curve moved', 'What the monitor said']
+        places = [page.index(f'<h2>{part}</h2>') for part in parts]
+        assert places == sorted(places)
+        # What stands at the end and the named cause come before any picture.
+        answer = page[places[0] : places[1]]
+        standing = [a for a in told.to_json()['alarms'] if a['cleared'] is None]
+        assert standing
+        for alarm in standing:
+            assert f'<b>{alarm["name"].replace("_", " ")}</b>' in answer
+        assert 'gain_step: ' in answer
+        assert told.diagnoses[-1][1]['sentence'].split('<')[0][:60] in answer
+        model_id = told.to_json()['reference']['model_id']
+        assert f'is curve {model_id}, from data of 20' in told.reference_words
         assert len(told.plot('alarms').data) > 0
 
     def test_it_says_what_the_engine_fed_in_one_go_says(self, log):
@@ -331,6 +342,7 @@ class TestMonitor:
         model_id = identified.characteristic.model_id
         assert told.to_json()['reference'] == {'set': told.start_ns, 'model_id': model_id}
         assert len(told.curves) > 1
+        assert f'is curve {model_id}, from data of 20' in told.reference_words
         for _, curve in told.curves:
             assert [h.name for h in curve.held] == ['output_offset_drift']
 

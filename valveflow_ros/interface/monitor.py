@@ -41,6 +41,7 @@ from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.monitoring.reference import Wear
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import FloatArray, IntArray, SampleTable
+from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.history import (
     AlarmMoment,
     CurveMoment,
@@ -52,9 +53,9 @@ from valveflow_ros.report.history import (
     history_sections,
     moment_of,
 )
-from valveflow_ros.report.page import Page, Section, paragraph, text
+from valveflow_ros.report.page import Page, Section, folded, notice, paragraph, table, text
 from valveflow_ros.report.terminal.board import ALARM, CURVE, DIAGNOSIS
-from valveflow_ros.report.words import moment, signed
+from valveflow_ros.report.words import VERDICT_WORDS, advice, counted, moment, signed
 from valveflow_ros.signals.align import Aligner, aligned_blocks
 
 # Without diagnoses; each takes as long as `diagnose` over the window.
@@ -105,10 +106,14 @@ class MonitorResult(Result):
     @property
     def reference_words(self) -> str:
         """Say which curve is the reference, or why none is."""
-        reference = self._reference_json()
-        if reference is not None:
+        curve = next(
+            (e.characteristic for e in reversed(self.events) if isinstance(e, ReferenceSet)), None
+        )
+        if curve is not None:
+            first, last = curve.source.window_start_ns, curve.source.window_end_ns
             return (
-                f'The reference is curve {reference["model_id"]}, set {moment(reference["set"])}.'
+                f'The reference that later curves are judged against is curve {curve.model_id}, '
+                f'from data of {moment(first)} to {moment(last)}.'
             )
         days = self.settings.real('reference_after')
         return (
@@ -167,14 +172,42 @@ class MonitorResult(Result):
         lead = paragraph(text(self.source), 'where')
         lead += paragraph(f'{moment(self.start_ns)} to {moment(self.end_ns)}', 'where')
         lead += paragraph(text(f'{self.reference_words} {self.wear_words}'), 'where')
-        sections = history_sections(self.history()) or [
-            Section('What the monitor said', [paragraph('No curve was found, and no alarm rose.')])
-        ]
+        sections = [Section('The answer', self._answer()), *history_sections(self.history())]
         foot = (
             f'Made by valveflow {text(__version__)}. The same numbers, unrounded, stand in '
             'monitor.json beside this page.'
         )
         return Page('What the monitor would have told', lead, sections, foot, self.verb)
+
+    def _answer(self) -> list[str | Figure]:
+        """Return what stands at the end, why as far as it is known, and every diagnosis."""
+        alarms, curves = self._alarms_json(), len(self.curves)
+        standing = [a for a in alarms if a['cleared'] is None]
+        parts: list[str | Figure] = [
+            notice(f'<b>{text(a["name"].replace("_", " "))}</b>: {text(a["sentence"])}')
+            for a in standing
+        ]
+        if not standing:
+            gone = f' {counted(len(alarms), "alarm")} came and went.' if alarms else ''
+            known = 'No alarm stands at the end.' if curves else 'No curve was found.'
+            parts.append(paragraph(known + gone, '' if gone or not curves else 'good'))
+        if not self.diagnoses:
+            return parts
+        parts.append(paragraph(f'The last diagnosis: {text(self.diagnoses[-1][1]["sentence"])}'))
+        parts += [paragraph(text(told)) for told in self.advice]
+        rows = [
+            [moment(at), VERDICT_WORDS[d['verdict']], text(d['sentence'])]
+            for at, d in self.diagnoses
+        ]
+        body = table(['data up to', 'verdict', 'what it said'], rows, sentences=True)
+        return [*parts, folded(counted(len(rows), 'diagnosis', 'diagnoses'), body)]
+
+    @property
+    def advice(self) -> list[str]:
+        """Return what each named cause means in MW and what to do, as it was found last."""
+        named = {c['name']: c for _, d in self.diagnoses for c in d['causes']}
+        told = [advice(name, c['meaning'], c['to_do']) for name, c in named.items()]
+        return [words for words in told if words]
 
     def texts(self) -> dict[str, str]:
         """Return ``monitor.json``; times are ns since 1970."""

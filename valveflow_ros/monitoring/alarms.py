@@ -197,6 +197,7 @@ class ResidualAlarm(Alarm):
     NAME = 'residual'
     REMEMBERED = (
         *Alarm.REMEMBERED, '_memory', '_span', 'judged', 'onset_ns', '_returned_ns', '_longer',
+        '_left_mw',
     )  # fmt: skip
 
     def __init__(self, settings: Settings) -> None:
@@ -205,6 +206,7 @@ class ResidualAlarm(Alarm):
         self.onset_ns = 0
         self._returned_ns: int | None = None
         self._longer = 1  # the delay of a return, in units of the parameter
+        self._left_mw = 0.0  # how far the unit was from the curve when the alarm came
         self.judged = Judged(0, math.nan, math.nan)
         super().__init__(settings)
 
@@ -224,7 +226,13 @@ class ResidualAlarm(Alarm):
 
     def restore(self, saved: State) -> None:
         """Go on from a state; one of an earlier version does not know where it was seen."""
-        saved = {'returned_ns': None, 'longer': 1, **saved.get('life', {}), **saved}
+        saved = {
+            'returned_ns': None,
+            'longer': 1,
+            'left_mw': 0.0,
+            **saved.get('life', {}),
+            **saved,
+        }
         memory = saved.get('memory')
         if 'span' not in saved and isinstance(memory, np.ndarray):
             saved = {
@@ -309,6 +317,7 @@ class ResidualAlarm(Alarm):
             before_ns = self._returned_ns
             again = before_ns is not None and now_ns - before_ns <= _SOON * self._off_ns
             self._longer = min(2 * self._longer, _LONGEST) if again else 1
+            self._left_mw = self.judged.shift_mw
             self.begin(now_ns)
         elif what & _TURNED:
             self._returned_ns = now_ns
@@ -316,7 +325,14 @@ class ResidualAlarm(Alarm):
 
     def _content(self, state: AlarmState) -> Content:
         value, shift_mw = self.judged.evidence, self.judged.shift_mw
-        return Content(value, _LIMIT, '', _sentence(state, shift_mw))
+        if abs(shift_mw) > 0.0 or state != AlarmState.UNACKNOWLEDGED or not self._left_mw:
+            return Content(value, _LIMIT, '', _sentence(state, shift_mw))
+        side = 'more' if self._left_mw > 0.0 else 'less'
+        sentence = (
+            f'The unit gave {abs(self._left_mw):.1f} MW {side} than the valve curve says; at the '
+            'openings since then the residual does not show it, and does not show that it is over.'
+        )
+        return Content(value, _LIMIT, '', sentence)
 
     def _blind(self) -> str:
         minutes = self._dark_ns / (60.0 * NS_PER_S)

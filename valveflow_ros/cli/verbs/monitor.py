@@ -78,7 +78,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
 
 def _text(found: MonitorResult) -> str:
-    from valveflow_ros.report.words import VERDICT_WORDS, advice, counted, moment
+    from valveflow_ros.report.words import VERDICT_WORDS, counted, moment
 
     content = found.to_json()
     alarms = [
@@ -94,8 +94,6 @@ def _text(found: MonitorResult) -> str:
         [moment(at), VERDICT_WORDS[d['verdict']], ', '.join(c['name'] for c in d['causes']) or '-']
         for at, d in found.diagnoses
     ]
-    # What was named several times is told once, as it was found last.
-    named = {c['name']: c for _, d in found.diagnoses for c in d['causes']}
     return lines(
         f'{found.source}: {moment(found.start_ns)} to {moment(found.end_ns)}',
         f'{counted(len(content["curves"]), "curve")}, {counted(len(alarms), "alarm")}, '
@@ -104,7 +102,7 @@ def _text(found: MonitorResult) -> str:
         *(a['sentence'] for a in content['alarms'] if a['cleared'] is None),
         columns(diagnoses, ['diagnosis', 'verdict', 'causes']) if diagnoses else '',
         *(d['sentence'] for _, d in found.diagnoses[-1:]),
-        *(advice(name, c['meaning'], c['to_do']) for name, c in named.items()),
+        *found.advice,
         found.reference_words,
         found.wear_words,
     )  # fmt: skip
