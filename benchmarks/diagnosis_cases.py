@@ -234,6 +234,12 @@ def outside(label: str, seed: int) -> Case:
     return Case('outside', label, seed, _unit(rng), (), (), outside_share=share)
 
 
+def slow(label: str, seed: int) -> Case:
+    """Return a plant whose power changes slowly, in a shape that no one cause has."""
+    rng = np.random.default_rng([seed, len(label), 1])
+    return Case('slow', label, seed, _unit(rng), (), ())
+
+
 def null(seed: int) -> Case:
     """Return a plant with nothing hidden, but tempting."""
     rng = np.random.default_rng([seed, 0])

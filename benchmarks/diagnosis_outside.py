@@ -118,6 +118,66 @@ OUTSIDE: dict[str, Callable[[Measured], FloatArray]] = {
 }  # fmt: skip
 
 
+# Slow changes that are no single cause of the catalogue, over the record's time x of 0 to 1.
+_LOW, _HIGH, _NEAR = 0.15, 0.85, 0.2
+
+
+def _moments(rng: np.random.Generator) -> tuple[float, float]:
+    while True:
+        a, b = sorted(rng.uniform(_LOW, _HIGH, 2).tolist())
+        if b - a >= _NEAR:
+            return a, b
+
+
+def _two_steps(x: FloatArray, rng: np.random.Generator) -> FloatArray:
+    a, b = _moments(rng)
+    share = rng.uniform(0.3, 0.7)
+    return np.asarray(share * (x >= a) + (1.0 - share) * (x >= b))
+
+
+def _fouling(x: FloatArray, rng: np.random.Generator) -> FloatArray:
+    return np.asarray(1.0 - np.exp(-x / rng.uniform(0.15, 0.3)))
+
+
+def _late_drift(x: FloatArray, rng: np.random.Generator) -> FloatArray:
+    a = rng.uniform(0.3, 0.6)
+    return np.asarray(np.maximum(x - a, 0.0) / (1.0 - a))
+
+
+def _wash(x: FloatArray, rng: np.random.Generator) -> FloatArray:
+    a = rng.uniform(0.4, 0.8)
+    return np.asarray(np.where(x < a, x / a, 0.0))
+
+
+def _switching(x: FloatArray, rng: np.random.Generator) -> FloatArray:
+    return np.asarray(np.floor(x * rng.integers(5, 9) + rng.random()) % 2.0)
+
+
+def _random_walk(x: FloatArray, rng: np.random.Generator) -> FloatArray:
+    walk = np.cumsum(rng.normal(size=121))
+    walk -= walk.mean()
+    return np.asarray(np.interp(120.0 * x, np.arange(121), walk / np.abs(walk).max()))
+
+
+SLOW: dict[str, Callable[[FloatArray, np.random.Generator], FloatArray]] = {
+    'two steps': _two_steps, 'fouling': _fouling, 'late drift': _late_drift,
+    'drift then wash': _wash, 'switching offset': _switching, 'random walk': _random_walk,
+}  # fmt: skip
+_SLOW_SHARE = (0.01, 0.02)  # of the power
+
+
+def slowly(log: SimulatedLog, label: str, seed: int) -> SimulatedLog:
+    """Return the record with a slow change of 1 to 2 % of the power; an offset has no load."""
+    rng = np.random.default_rng([seed, *(ord(c) for c in label)])
+    values = log.table.values.copy()
+    power = values[:, Signal.GENERATED_POWER]
+    size = rng.uniform(*_SLOW_SHARE) * rng.choice([-1.0, 1.0])
+    course = size * SLOW[label](np.arange(len(power)) / len(power), rng)
+    of = float(np.nanmean(power)) if label == 'switching offset' else power
+    values[:, Signal.GENERATED_POWER] = power + of * course
+    return replace(log, table=SampleTable(log.table.time_ns, values, log.table.quality))
+
+
 def added_to(log: SimulatedLog, label: str, seed: int, share: float) -> SimulatedLog:
     """Return the record with an effect of ``share`` times the noise's sd in its power."""
     table = log.table

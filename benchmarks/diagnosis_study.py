@@ -31,9 +31,10 @@ from benchmarks.diagnosis_cases import (
     hidden,
     null,
     outside,
+    slow,
 )
 from benchmarks.diagnosis_oracle import Oracle, oracle
-from benchmarks.diagnosis_outside import OUTSIDE, added_to
+from benchmarks.diagnosis_outside import OUTSIDE, SLOW, added_to, slowly
 from valveflow_ros.diagnosis.diagnose import Record, diagnose
 from valveflow_ros.diagnosis.grids import make_grids
 from valveflow_ros.diagnosis.result import Diagnosis
@@ -45,7 +46,7 @@ from valveflow_ros.plant.simulator import SimulatedLog, simulate
 from valveflow_ros.records import IntArray
 from valveflow_ros.signals.static_form import StaticForm
 
-KINDS = ('hidden', 'null', 'pair', 'confounded', 'outside')
+KINDS = ('hidden', 'null', 'pair', 'confounded', 'outside', 'slow')
 # Four fifths of 64, which is four times the 16 that just reach detection.
 ENOUGH = 51.0
 OTHER_SEED = 1_000_003  # of the record that an earlier model comes from
@@ -64,6 +65,8 @@ def run(case: Case, days: float) -> tuple[Diagnosis, SimulatedLog, Record, dict[
     log = simulate(days, case.seed, case.unit, effects=case.effects)
     if case.outside_share:
         log = added_to(log, case.label, case.seed, case.outside_share)
+    if case.kind == 'slow':
+        log = slowly(log, case.label, case.seed)
     begin = time.process_time()
     task, spans, settings = watched(log, days)
     if case.given:
@@ -137,11 +140,14 @@ def row_of(case: Case, days: float) -> dict[str, Any]:
         **about,
         'verdict': found.verdict,
         'names': names,
-        'right': set(names) == set(case.names)
+        'right': _told(found, case.label)
+        if case.kind == 'slow'
+        else set(names) == set(case.names)
         and (found.verdict == 'unexplained') == (case.kind == 'outside'),
         'not_told_apart': list(found.not_told_apart),
         'unexplained_by': list(found.unexplained_by),
         'disturbance_mw': found.disturbance.rms_mw if found.disturbance else None,
+        'shape': found.disturbance.shape if found.disturbance else '',
         'share': None if share is None else round(share, 3),
         'available': None if best is None else round(best.available, 1),
         'p_values': [c.gain.p_value for c in found.causes],
@@ -149,6 +155,17 @@ def row_of(case: Case, days: float) -> dict[str, Any]:
         'rejected': {n: r for n, r in found.rejected if n in case.names},
         'cpu_s': {k: round(v, 1) for k, v in cpu.items()},
     }
+
+
+def _told(found: Diagnosis, label: str) -> bool:
+    """Tell whether a slow change was told as one in time, and no cause named in its place.
+
+    An offset that switches is what the cause ``intervals`` is for.
+    """
+    names = {c.name for c in found.causes}
+    if label == 'switching offset' and names:
+        return names == {'intervals'}
+    return not names and (found.verdict == 'unexplained' or found.disturbance is not None)
 
 
 def cases(args: argparse.Namespace) -> list[Case]:
@@ -159,6 +176,8 @@ def cases(args: argparse.Namespace) -> list[Case]:
         return [null(seed) for seed in seeds]
     if args.kind == 'outside':
         return [outside(label, seed) for seed in seeds for label in OUTSIDE]
+    if args.kind == 'slow':
+        return [slow(label, seed) for seed in seeds for label in SLOW]
     if args.kind == 'confounded':
         return [confounded(c, seed, args.days, times) for seed in seeds for c in CONFOUNDED]
     if args.kind == 'pair':
@@ -217,9 +236,8 @@ def totals(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _confidently_wrong(row: dict[str, Any]) -> bool:
     """Tell whether a name that is not the truth was given, and nothing set beside it."""
-    true = (
-        set() if row['kind'] in ('null', 'outside') else set(row['label'].split(',')[0].split('+'))
-    )
+    none = row['kind'] in ('null', 'outside', 'slow')
+    true = set() if none else set(row['label'].split(',')[0].split('+'))
     return bool(set(row['names']) - true) and not true & set(row.get('not_told_apart', ()))
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
-from valveflow_ros.diagnosis.cause import DAY_S, Active, Estimate, SentenceValues
+from valveflow_ros.diagnosis.cause import DAY_S, Active, Estimate, SentenceValues, told
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.evidence import (
     LARGEST_P,
@@ -45,7 +45,7 @@ from valveflow_ros.diagnosis.result import (
 )
 from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.diagnosis.search import Found, Progress, search, simplified
-from valveflow_ros.diagnosis.slow import Drift, drift
+from valveflow_ros.diagnosis.slow import NAMED_SHAPE, NO_SHAPE, Course, Drift, courses, drift
 from valveflow_ros.diagnosis.structure import Period, Structure, Wander, period, structure, wander
 from valveflow_ros.errors import DataError, listed
 from valveflow_ros.records import BoolArray, FloatArray, IntArray, SampleTable
@@ -169,6 +169,17 @@ def notes(grids: Grids) -> tuple[str, ...]:
 _LEAST_SPREAD = 0.01
 _FAR_MORE = 8.0
 _OWN_MISFIT = 0.004  # of the power's range
+# Causes that are a level of the power in time, and the shapes that are theirs, by their families.
+_LEVELS = (
+    'gain_drift', 'output_offset_drift', 'input_drift', 'gain_step', 'input_step', 'intervals',
+)  # fmt: skip
+_SHAPES = {
+    ('drift',): ('drift',), ('step',): ('step',), ('drift', 'step'): ('drift and step',),
+    ('hidden',): ('there and back',),
+}  # fmt: skip
+# Log-likelihood by which another shape must be better than one name; than several, none.
+_ANOTHER_SHAPE = 6.0
+_LEAST_SHAPE = 5.0  # the same over a wander of no shape
 _LAST_STEPS = 10  # knots go slowly beside a bump
 _FULL_LOAD = 0.9  # quantile of the power
 _ACTS = 0.05  # share of the largest change below which there is none
@@ -235,11 +246,17 @@ class _Rest:
     period: Period
     drift: Drift
     own_misfit: str = ''
+    course: Course | None = None
+    start_ns: int = 0
 
     @property
     def disturbance(self) -> Disturbance | None:
         """Return the slow wander of the power, a drift if it is one."""
-        slow = self.drift
+        slow, course = self.drift, self.course
+        if course is not None:
+            hours = self.drift.time_scale_s or self.wander.time_scale_s
+            words = course_words(course, self.start_ns)
+            return Disturbance(course.rms_mw, hours, course.rms_mw, words)
         if slow.there:
             return Disturbance(slow.rms_mw, slow.time_scale_s, slow.rms_mw)
         if self.wander.there:
@@ -279,7 +296,8 @@ def diagnose(
     confirm(found)
     found.model = _dated(found)
     progress(0.8, 'what is left')
-    rest = _look_again(found)
+    course = _course(found)
+    rest = replace(_look_again(found), course=course, start_ns=found.task.grids.start_ns)
     rest = _withdraw(found, rest)
     return _conclude(record, found, rest, wrong, progress)
 
@@ -356,6 +374,74 @@ def _look_again(found: Found) -> _Rest:
         left = replace(left, gain=0.0, explained_mw2=0.0)
     slowly = drift(found.task, found.model)
     return _Rest(slow, left, period(found.task, found.model), slowly, own)
+
+
+def _course(found: Found) -> Course | None:
+    """Return the shape of a change in time that the causes do not explain; None if there is none.
+
+    Names of causes in time are taken back where another shape, or a wander of none, is better than
+    what they make together: a dated step and a drift can stand for nearly any slow change.
+    """
+    names = [name for name in found.model.names if name in _LEVELS]
+    tried = courses(found.task, found.model, names)
+    if not tried:
+        return None
+    best = max(tried.values(), key=lambda c: c.score)
+    if names:
+        families = tuple(sorted(catalogue()[name].family for name in names))
+        mine = [tried[shape] for shape in (NAMED_SHAPE, *_SHAPES.get(families, ()))]
+        if 'intervals' in names and best.name == NO_SHAPE:
+            return None  # each switch costs a number, which a wander has for nothing
+        least = _ANOTHER_SHAPE if len(names) == 1 else 0.0
+        if best.score - max(c.score for c in mine) <= least:
+            return None
+        for name in names:
+            found.model = found.model.without(name)
+            found.evidence.pop(name, None)
+            found.near.pop(name, None)
+            found.reasons[name] = _OF_SHAPE[best.name]
+        found.model, _ = improve(found.task, found.model, 3)
+    if best.name == NO_SHAPE or best.score - tried[NO_SHAPE].score < _LEAST_SHAPE:
+        return None
+    return best
+
+
+_OF_SHAPE = {
+    NO_SHAPE: 'the power wanders slowly all the time, which would look the same',
+    'drift': 'the power changes evenly in time, which fits better',
+    'step': 'the power changes once, which fits better',
+    'late drift': 'a drift that begins within the record fits better',
+    'exponential': 'a change that slows down fits better',
+    'drift and step': 'a drift with a step fits better',
+    'drift and back': 'a drift that ends at once fits better',
+    'there and back': 'a change that is undone later fits better',
+    'two steps': 'two steps in time fit better',
+}
+
+
+def course_words(course: Course, start_ns: int) -> str:
+    """Say how the power changes in time, in MW and UTC."""
+    mw = [f'{size:+.2g} MW' for size in course.mw]
+    at = [told(start_ns, s, _COURSE_STEP_S) for s in course.at_s]
+    if course.name == 'drift':
+        return f'evenly, {mw[0]} over the record'
+    if course.name == 'step':
+        return f'by {mw[0]} about {at[0]}'
+    if course.name == 'late drift':
+        return f'evenly from about {at[0]} on, {mw[0]} by the end of the record'
+    if course.name == 'exponential':
+        hours = course.at_s[0] / 3600.0
+        return f'fast at first and then slower, by {mw[0]} with a time constant of {hours:.2g} h'
+    if course.name == 'drift and step':
+        return f'evenly, {mw[0]} over the record, and by {mw[1]} about {at[0]} besides'
+    if course.name == 'drift and back':
+        return f'evenly, {mw[0]} until about {at[0]}, and then back at once'
+    if course.name == 'there and back':
+        return f'by {mw[0]} from about {at[0]} to {at[1]}'
+    return f'by {mw[0]} about {at[0]} and by {mw[1]} about {at[1]}'
+
+
+_COURSE_STEP_S = 3600
 
 
 def _dated(found: Found) -> Extended:
@@ -537,11 +623,16 @@ def _verdict(found: Found, rest: _Rest, record_wrong: bool) -> tuple[str, bool]:
             return UNEXPLAINED, bool(found.model.active)
     if found.model.active or record_wrong:
         return NAMED, False
-    return NOTHING, False
+    return (NOTHING if rest.course is None else UNEXPLAINED), False
 
 
 def _unexplained(rest: _Rest) -> tuple[str, ...]:
-    names = rest.structure.variables if rest.structure.there else ()
+    course, structure = rest.course, rest.structure
+    names = structure.variables if structure.there else ()
+    if course is not None:
+        # A large change in time shows in what goes along with it by chance, too.
+        small = course.rms_mw**2 < structure.explained_mw2
+        names = (*names, 'the time') if small else ('the time',)
     return (*names, rest.period.words) if rest.period.there else names
 
 

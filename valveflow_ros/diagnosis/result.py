@@ -77,16 +77,21 @@ class Disturbance:
     drift_mw : float or None
         Of a wander over many hours and days the root mean square about its mean over the
         record; see `slow.drift`.
+    shape : str
+        Words for the shape of the change in time, where it has one; see `slow.courses`.
     """
 
     rms_mw: float
     time_scale_s: float
     drift_mw: float | None = None
+    shape: str = ''
 
     @property
     def sentence(self) -> str:
         """Return it as a sentence for an operator."""
         hours = self.time_scale_s / 3600.0
+        if self.shape:
+            return f'The power changes in time: {self.shape}. It has no cause in these signals.'
         if self.drift_mw is not None:
             length = 'days' if hours >= _DAYS_FROM_H else 'hours'
             return (
@@ -396,7 +401,7 @@ def to_json(d: Diagnosis) -> dict[str, Any]:
         'experiments': list(d.experiments),
         'disturbance': {
             'rms_mw': d.disturbance.rms_mw, 'time_scale_s': d.disturbance.time_scale_s,
-            'drift_mw': d.disturbance.drift_mw,
+            'drift_mw': d.disturbance.drift_mw, 'shape': d.disturbance.shape,
         }
         if d.disturbance
         else None,

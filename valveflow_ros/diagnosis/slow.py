@@ -12,11 +12,15 @@ process, of unknown variance and time scale:
 with P_i the mean load relative to that of the record. Variance and time scale are those of the
 largest likelihood on a grid, for the size of the wander of the largest restricted likelihood;
 coefficients and the noise's variance are known in closed form.
+
+A change of the power in time that is no wander has a shape: steps, a drift that begins late, an
+exponential. Shapes are added to the mean of the same process and compared by the likelihood, each
+number paid for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +29,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import Task
 from valveflow_ros.diagnosis.grids import Grids
-from valveflow_ros.records import BoolArray, FloatArray
+from valveflow_ros.records import BoolArray, FloatArray, IntArray
 
 _TIME_SCALES_H = (0.5, 1.0, 3.0, 8.0, 24.0, 72.0, 240.0)
 _RATIOS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0, 10_000.0)
@@ -144,28 +148,33 @@ def _fits(found: Levels, column: FloatArray | None = None) -> Iterator[tuple[_Fi
     k, p = found.free.shape
     flat = found.power, *(found.free.T), *(() if column is None else (column,))
     table = np.column_stack(flat)
+    for lower, hours, ratio in _wanders(found):
+        white = solve_triangular(lower, table, lower=True)
+        basis, size = np.linalg.qr(white[:, 1 : 1 + p])
+        left = white - basis @ (basis.T @ white)
+        rest = left[:, 0]
+        cost = float(rest @ rest)
+        scale = -float(np.log(np.diag(lower)).sum())
+        fit = _Fit(
+            scale - 0.5 * k * float(np.log(cost / k)),
+            scale - 0.5 * (k - p) * float(np.log(cost / (k - p)))
+            - float(np.log(np.abs(np.diag(size))).sum()),
+            hours, ratio,
+        )  # fmt: skip
+        more = 0.0
+        if column is not None:
+            own, toward = float(left[:, -1] @ left[:, -1]), float(left[:, -1] @ rest)
+            explained = toward * toward / own if own > 0.0 else 0.0
+            more = -0.5 * k * float(np.log(max(1.0 - explained / cost, 1e-300)))
+        yield fit, more
+
+
+def _wanders(found: Levels) -> Iterator[tuple[FloatArray, float, float]]:
+    """Yield the factor of the covariance of every wander tried, its time scale and variance."""
     for hours in _TIME_SCALES_H:
         wander = _covariance(found, hours)
         for ratio in (0.0, *_RATIOS) if hours == _TIME_SCALES_H[0] else _RATIOS:
-            lower, _ = cho_factor(np.diag(found.noise) + ratio * wander, lower=True)
-            white = solve_triangular(lower, table, lower=True)
-            basis, size = np.linalg.qr(white[:, 1 : 1 + p])
-            left = white - basis @ (basis.T @ white)
-            rest = left[:, 0]
-            cost = float(rest @ rest)
-            scale = -float(np.log(np.diag(lower)).sum())
-            fit = _Fit(
-                scale - 0.5 * k * float(np.log(cost / k)),
-                scale - 0.5 * (k - p) * float(np.log(cost / (k - p)))
-                - float(np.log(np.abs(np.diag(size))).sum()),
-                hours, ratio,
-            )  # fmt: skip
-            more = 0.0
-            if column is not None:
-                own, toward = float(left[:, -1] @ left[:, -1]), float(left[:, -1] @ rest)
-                explained = toward * toward / own if own > 0.0 else 0.0
-                more = -0.5 * k * float(np.log(max(1.0 - explained / cost, 1e-300)))
-            yield fit, more
+            yield cho_factor(np.diag(found.noise) + ratio * wander, lower=True)[0], hours, ratio
 
 
 def covariate_gain(task: Task, model: Extended, name: str) -> float:
@@ -241,3 +250,185 @@ def drift(task: Task, model: Extended) -> Drift:
     rms = float(np.sqrt(np.var(level) + unseen))
     least_mw = _LEAST_DRIFT_MW * task.grids.size
     return Drift(best.restricted - none.restricted, rms, 3600.0 * best.hours, least_mw)
+
+
+# The shape of a change in time.
+#
+# Each shape is P_i f(t_i). A step at a wrong time, or a drift with a step, can stand for many
+# other shapes; so names of causes in time are held against the shapes, and against a wander alone.
+
+PENALTY = 5.0  # log-likelihood that each number chosen from the data must bring
+_OF_WANDER = 2.0 * 2.0  # for its variance and its time scale, which are tried on a grid
+_MOMENTS = 96
+_EDGE = 0.04  # of the record, at either end, in which nothing is seen to begin
+_APART = 2  # moments between two steps
+_RATES = (0.08, 0.12, 0.18, 0.27, 0.4, 0.6)  # time constants in lengths of the record
+NO_SHAPE, NAMED_SHAPE = 'wander', 'named'
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """How the power changes in time, as one of the shapes tried.
+
+    Attributes
+    ----------
+    name : str
+        'drift', 'step', 'late drift', 'exponential', 'drift and step', 'drift and back',
+        'there and back', 'two steps'; `NO_SHAPE` for a wander alone and `NAMED_SHAPE` for
+        the causes named.
+    score : float
+        Log-likelihood, less what its numbers cost.
+    mw : tuple of float
+        Its sizes at the mean load, in MW.
+    at_s : tuple of float
+        Its moments in s since the first row; of an exponential the time constant.
+    rms_mw : float
+        Root mean square about its mean over the record.
+    """
+
+    name: str
+    score: float
+    mw: tuple[float, ...] = ()
+    at_s: tuple[float, ...] = ()
+    rms_mw: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Shape:
+    """Columns of a shape, (k, columns), and what it is told by."""
+
+    name: str
+    columns: FloatArray
+    at_s: tuple[float, ...]
+    numbers: int
+
+
+def _shapes(found: Levels) -> list[_Shape]:
+    """Return every shape of one column; steps first, in order of time."""
+    t, load = found.hours, found.load
+    span = float(t[-1] - t[0])
+    moments = np.linspace(t[0] + _EDGE * span, t[-1] - _EDGE * span, _MOMENTS)
+    even = (t - t[0]) / span
+    after = t[:, None] >= moments
+    begins = np.maximum(t[:, None] - moments, 0.0) / (t[-1] - moments)
+    ends = np.where(after, 0.0, (t[:, None] - t[0]) / (moments - t[0]))
+    rates = span * np.array(_RATES)
+    falls = 1.0 - np.exp(-(t[:, None] - t[0]) / rates)
+    return [
+        _Shape(name, column * load, (3600.0 * float(at),), 2)
+        for name, columns, when in (
+            ('step', after, moments), ('late drift', begins, moments),
+            ('drift and back', ends, moments), ('exponential', falls, rates),
+        )
+        for column, at in zip(np.asarray(columns, dtype=np.float64).T, when, strict=True)
+    ] + [_Shape('drift', even * load, (), 1)]  # fmt: skip
+
+
+def courses(task: Task, model: Extended, names: Sequence[str]) -> dict[str, Course]:
+    """Return the best course of each shape, by name; empty in a record too short for any.
+
+    Parameters
+    ----------
+    task : Task
+    model : Extended
+    names : sequence of str
+        Causes in time that the model holds: they are taken out, and what they do together is a
+        shape of its own, `NAMED_SHAPE`, that has cost its numbers.
+    """
+    without = model
+    for name in names:
+        without = without.without(name)
+    found, _ = levels(task, without, task.grids.whole, careful=False)
+    if not found.enough:
+        return {}
+    single = _shapes(found)
+    if names:
+        full, _ = levels(task, model, task.grids.whole, careful=False)
+        numbers = sum(a.size for a in model.active if a.name in names)
+        single.append(_Shape(NAMED_SHAPE, found.power - full.power, (), numbers))
+    columns = np.column_stack([s.columns for s in single])
+    best: dict[str, tuple[float, tuple[int, ...], FloatArray]] = {}
+    for offer in _scored(found, single, columns):
+        if offer[0] not in best or offer[1] > best[offer[0]][0]:
+            best[offer[0]] = offer[1:]
+    return {
+        name: _course(name, score, chosen, sizes, single, found)
+        for name, (score, chosen, sizes) in best.items()
+    }
+
+
+def _scored(
+    found: Levels, single: list[_Shape], columns: FloatArray
+) -> Iterator[tuple[str, float, tuple[int, ...], FloatArray]]:
+    """Yield name, score, columns and sizes of every shape's best, under every wander tried."""
+    k, p = found.free.shape
+    table = np.column_stack([found.power, found.free, columns])
+    kinds = np.array([s.name for s in single])
+    paid = PENALTY * np.array([s.numbers for s in single])
+    steps, drift_at = np.flatnonzero(kinds == 'step'), int(np.flatnonzero(kinds == 'drift')[0])
+    for lower, _, ratio in _wanders(found):
+        white = solve_triangular(lower, table, lower=True)
+        basis, _ = np.linalg.qr(white[:, 1 : 1 + p])
+        left = white - basis @ (basis.T @ white)
+        rest, own = left[:, 0], left[:, 1 + p :]
+        gram, toward = own.T @ own, own.T @ rest
+        cost = float(rest @ rest)
+        level = -float(np.log(np.diag(lower)).sum()) - (_OF_WANDER if ratio else 0.0)
+
+        def worth(gain: FloatArray, cost: float = cost, level: float = level) -> FloatArray:
+            rest = np.maximum(cost - gain, 1e-9 * cost)
+            return np.asarray(level - 0.5 * k * np.log(rest / k))
+
+        yield NO_SHAPE, float(worth(np.zeros(1))[0]), (), np.empty(0)
+        size = np.maximum(np.diag(gram), 1e-12)
+        score = worth(toward**2 / size) - paid
+        for name in dict.fromkeys(kinds):
+            mine = np.flatnonzero(kinds == name)
+            j = int(mine[score[mine].argmax()])
+            yield str(name), float(score[j]), (j,), toward[[j]] / size[j]
+        gain, a, b = _pairs(gram, toward, np.full(len(steps), drift_at), steps)
+        j = int(gain.argmax())
+        chosen = drift_at, int(steps[j])
+        yield 'drift and step', float(worth(gain)[j] - 3 * PENALTY), chosen, np.array([a[j], b[j]])
+        one, two = np.triu_indices(len(steps), _APART)
+        one, two = steps[one], steps[two]
+        gain, a, b = _pairs(gram, toward, one, two)
+        j = int(gain.argmax())
+        chosen = int(one[j]), int(two[j])
+        yield 'two steps', float(worth(gain)[j] - 4 * PENALTY), chosen, np.array([a[j], b[j]])
+        # The same two of equal size and opposite sign.
+        gain = (toward[one] - toward[two]) ** 2 / np.maximum(
+            gram[one, one] + gram[two, two] - 2.0 * gram[one, two], 1e-12
+        )
+        j = int(gain.argmax())
+        chosen = int(one[j]), int(two[j])
+        height = (toward[one[j]] - toward[two[j]]) / (
+            gram[one[j], one[j]] + gram[two[j], two[j]] - 2.0 * gram[one[j], two[j]]
+        )
+        sizes = np.array([height, -height])
+        yield 'there and back', float(worth(gain)[j] - 3 * PENALTY), chosen, sizes
+
+
+def _pairs(
+    gram: FloatArray, toward: FloatArray, one: IntArray, two: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what pairs of columns explain together, and the size of either."""
+    g11, g22, g12 = gram[one, one], gram[two, two], gram[one, two]
+    b1, b2 = toward[one], toward[two]
+    det = np.maximum(g11 * g22 - g12 * g12, 1e-9 * g11 * g22 + 1e-300)
+    a, b = (g22 * b1 - g12 * b2) / det, (g11 * b2 - g12 * b1) / det
+    return a * b1 + b * b2, a, b
+
+
+def _course(
+    name: str, score: float, chosen: tuple[int, ...], sizes: FloatArray, single: list[_Shape],
+    found: Levels,
+) -> Course:  # fmt: skip
+    if not chosen or name == NAMED_SHAPE:
+        return Course(name, score)
+    made = sum(
+        (mw * single[j].columns / found.load for j, mw in zip(chosen, sizes, strict=True)),
+        np.zeros(len(found.hours)),
+    )
+    at_s = tuple(at for j in chosen for at in single[j].at_s)
+    return Course(name, score, tuple(sizes.tolist()), at_s, float(np.std(made)))
