@@ -67,7 +67,7 @@ def connected(scheduler: str) -> Iterator[Any]:
         # One thread a worker, also of compiled loops: the workers are the parallel part.
         with LocalCluster(
             n_workers=len(os.sched_getaffinity(0)), threads_per_worker=1, processes=True,
-            dashboard_address=None, silence_logs=logging.CRITICAL,
+            dashboard_address='127.0.0.1:0', silence_logs=logging.CRITICAL,
             env={'NUMBA_NUM_THREADS': '1'},
         ) as cluster, Client(cluster, set_as_default=False) as client:  # fmt: skip
             yield client
@@ -340,7 +340,7 @@ def fleet(
     with connected(scheduler) as client:
         progress.say(workers_words(client))
         chains = [_chain(months, folder) for months in units.values()]
-        for task, row in spread(client, unit_month, chains, failed_row):
+        for task, row in spread(client, unit_month, chains):
             unit, done = task.of.unit, done + 1
             anew, failed = anew + row['anew'], failed + (row['status'] == 'failed')
             rows[unit].append(row)

@@ -176,7 +176,7 @@ def read_fleet(
                 for log in _logs_at(source.parent / Path(row['log']).expanduser(), skipped):
                     add(_unit_name(row['unit']), log, how, source)
             except (ValueError, ValveflowError) as error:  # the former of shlex
-                raise InputError(f'{source}, line {line}: {error}') from None
+                raise InputError(f'{source}, line {line}: {str(error).rstrip(".")}.') from None
     if not found:
         raise InputError(
             f'There is no log in {listed([str(s) for s in sources])}: a log ends in '

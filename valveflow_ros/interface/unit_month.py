@@ -90,7 +90,7 @@ def unit_month(task: FleetTask) -> Row:
                 f'is not there on {platform.node()}; DIR and logs must be on a disk that all '
                 'workers share',
             )
-        key = _key(task)
+        key = key_of(task)
         kept = _kept(task.place / _ROW, key)
         if kept is not None:
             return {**kept, 'anew': False}
@@ -129,7 +129,7 @@ def _base(task: FleetTask) -> Row:
     }
 
 
-def _key(task: FleetTask) -> str:
+def key_of(task: FleetTask) -> str:
     """Return the hash of all that a task's results follow from."""
     found = hashlib.sha256(f'{__version__}\n{task.of.options.text}\n'.encode())
     curves = [task.folder / c for c in (task.before, task.first) if c]
