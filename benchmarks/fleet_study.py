@@ -2,21 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a fleet costs beside its work, and whether anything it suffers changes its results.
 
-    python -m benchmarks.fleet_study [--units N] [--months N] [--kills N] [--broken N]
-        [--tiny N] [--folder DIR] [--output DIR]
+    python -m benchmarks.fleet_study [--parts PART...] [--units N] [--months N] [--kills N]
+        [--broken N] [--tiny N] [--folder DIR] [--output DIR]
 
-Half of the units are the paper's, recorded once a second, half are built from physics, as means of
-a minute. Told are:
+Every fifth unit is the paper's, recorded once a second; the others are built from physics, as
+means of a minute. The parts:
 
-speed       the units in two halves, each with one worker and with two, in the order 1 2 2 1
-overhead    what a task costs beside reading, `identify`, `diagnose` and `monitor`
+scheduling  tasks that do nothing, in chains as those of a fleet
+speed       four units with one worker and with two, the months in two halves, in the order 1 2
+            2 1; the other units with two
 faults      all units again with broken logs among them, workers killed one after the other, and
             the command itself killed in the middle and started again: the results are compared,
             byte by byte, with those of the undisturbed runs
-scheduling  tasks that do nothing, in chains as those of a fleet
 
-A machine that does something else meanwhile tells less speed; `busy_percent` is the share of
-their time in which the workers had a task.
+A machine that does something else meanwhile tells less speed than it has: `busy_percent` is the
+share of their time in which the workers had a task, `cpu_s` what they used of processors. On free
+cores two workers would be as much faster as ``times_on_free_cores`` says.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def plants(folder: Path, units: int, months: int) -> list[Path]:
     """Simulate the units, each one record cut into months; return their folders."""
     found = []
     for number in range(units):
-        kind = 'choked' if number % 2 else 'paper'
+        kind = 'choked' if number % 5 else 'paper'
         place = folder / 'plants' / f'{kind}_{number:02d}'
         found.append(place)
         if place.exists():
@@ -95,17 +96,24 @@ def warmed(made: Any) -> None:
 
 
 def timed_fleet(logs: list[Path], out: Path, workers: int) -> dict[str, Any]:
-    """Run a fleet; return its wall time and what its tasks took, in s."""
-    with cluster(workers) as made:
+    """Run a fleet; return its wall time and what the tasks took that it did, in s."""
+    from distributed import Client
+
+    kept = {p: p.stat().st_mtime_ns for p in out.glob('units/*/*/row.json')}
+    with cluster(workers) as made, Client(made, set_as_default=False) as client:
         warmed(made)
+        cpu = sum(client.run(time.process_time).values())
         begun = time.perf_counter()
         found = vf.fleet(logs, out, scheduler=made.scheduler_address, options=_WORDS)
         wall = time.perf_counter() - begun
-    rows = found.to_dataframe()
-    verbs, tasks = float(rows[list(_VERBS)].sum().sum()), float(rows.task_s.sum())
+        cpu = sum(client.run(time.process_time).values()) - cpu
+    new = [p for p in out.glob('units/*/*/row.json') if kept.get(p) != p.stat().st_mtime_ns]
+    rows = [json.loads(p.read_text())['row'] for p in new]
+    tasks = sum(row['task_s'] for row in rows)
     return {
-        'workers': workers, 'tasks': len(rows), 'failed': found.failed, 'wall_s': round(wall, 1),
-        'task_s': round(tasks, 1), 'verbs_s': round(verbs, 1),
+        'workers': workers, 'tasks': found.anew, 'failed': found.failed, 'wall_s': round(wall, 1),
+        'cpu_s': round(cpu, 1), 'task_s': round(tasks, 1),
+        'verbs_s': round(sum(row[v] for row in rows for v in _VERBS), 1),
         'busy_percent': round(100.0 * tasks / (wall * workers), 1),
         'load_average': round(os.getloadavg()[0], 1),
     }  # fmt: skip
@@ -248,46 +256,64 @@ def sizes(out: Path, logs: list[Path]) -> dict[str, float]:
     }  # fmt: skip
 
 
-def run(folder: Path, o: Any) -> dict[str, Any]:
-    """Measure everything; return it by name."""
-    found: dict[str, Any] = {'machine': study.machine()}
+def part_scheduling(folder: Path, o: Any) -> dict[str, Any]:
+    """Measure tasks that do nothing: ten and a hundred a unit."""
+    return {'runs': [scheduling(o.tiny, max(o.tiny // n, 1)) for n in (10, 100)]}
+
+
+def part_speed(folder: Path, o: Any) -> dict[str, Any]:
+    """Run all units, four of them with one worker too."""
     logs = plants(folder, o.units, o.months)
-    found['scheduling'] = [scheduling(o.tiny, max(o.tiny // 10, 1)),
-                           scheduling(o.tiny, max(o.tiny // 100, 1))]  # fmt: skip
-    print(found['scheduling'], flush=True)
-    halves = logs[: o.units // 2], logs[o.units // 2 :]
-    found['speed'] = []
-    for half, workers in ((0, 1), (0, 2), (1, 2), (1, 1)):
-        out = folder / f'half{half}_{workers}'
-        found['speed'].append(timed_fleet(halves[half], out, workers))
-        print(found['speed'][-1], flush=True)
-    one, two = (sum(r['wall_s'] for r in found['speed'] if r['workers'] == w) for w in (1, 2))
-    tasks, verbs = (sum(r[k] for r in found['speed']) for k in ('task_s', 'verbs_s'))
-    count = sum(r['tasks'] for r in found['speed'])
-    tiny_ms = max(s['wall_ms_per_task'] for s in found['scheduling'])
-    found |= {
-        'times_one_worker': round(one / two, 2),
-        'work_s_per_task': round(verbs / count, 2),
-        'overhead_percent': round(
-            100.0 * (tasks - verbs + count * tiny_ms / 1000.0) / verbs, 2
+    runs = []
+    early = [p for u in logs[:4] for p in sorted(u.glob('*.csv'))[: o.months // 2]]
+    for what, workers in ((early, 1), (early, 2), (logs[:4], 2), (logs[:4], 1), (logs[4:], 2)):
+        # What is done is not done again; a later call names all that its page is to show.
+        out = folder / ('rest' if what == logs[4:] else f'of_{workers}')
+        runs.append(timed_fleet(what, out, workers))
+        print(runs[-1], flush=True)
+    one, two = (
+        {k: sum(r[k] for r in runs[:4] if r['workers'] == w)
+         for k in ('wall_s', 'cpu_s', 'task_s')}
+        for w in (1, 2)
+    )  # fmt: skip
+    tasks, verbs, cpu, count = (
+        sum(r[k] for r in runs) for k in ('task_s', 'verbs_s', 'cpu_s', 'tasks')
+    )
+    return {
+        'runs': runs,
+        'times_one_worker': round(one['wall_s'] / two['wall_s'], 2),
+        'times_on_free_cores': round(
+            one['cpu_s'] / two['cpu_s'] * two['task_s'] / two['wall_s'], 2
         ),
-        'sizes': sizes(folder / 'half0_2', halves[0]),
-    }  # fmt: skip
-    same = {w: digests(folder / f'half0_{w}') | digests(folder / f'half1_{w}') for w in (1, 2)}
-    found['one_and_two_workers_identical'] = same[1] == same[2]
+        'work_s_per_task': round(verbs / count, 2),
+        'cpu_s_per_task': round(cpu / count, 2),
+        'beside_work_ms_per_task': round(1000.0 * (tasks - verbs) / count, 1),
+        'sizes': sizes(folder / 'of_2', logs[:4]),
+        'one_and_two_workers_identical': digests(folder / 'of_1') == digests(folder / 'of_2'),
+    }
+
+
+def part_faults(folder: Path, o: Any) -> dict[str, Any]:
+    """Run all units again, disturbed; compare with the runs of `part_speed` in the folder."""
+    logs = plants(folder, o.units, o.months)
+    calm = digests(folder / 'of_2') | digests(folder / 'rest')
     broken = break_logs(folder, logs, o.broken)
     out = folder / 'disturbed'
-    found['faults'] = disturbed(broken, out, o.kills, len(same[2]) + o.broken)
+    found = disturbed(broken, out, o.kills, len(calm) + o.broken)
     rows = pd.DataFrame(_frame(out))
     bad = rows[rows.log.str.contains('broken')]
     after = digests(out, skip='_broken')
-    found['faults'] |= {
+    return found | {
         'broken_logs': o.broken, 'rows_of_broken_logs': len(bad),
-        'their_sentences': sorted({' '.join(s).rsplit('/', 1)[-1][:120] for s in bad.sentences}),
+        'their_sentences': sorted({
+            ' '.join(s).rsplit('/', 1)[-1][:120] for s in bad.sentences
+        }),
         'other_failed': int((rows.status == 'failed').sum() - len(bad)),
-        'logs_compared': len(after), 'identical': after == same[2],
+        'logs_compared': len(after), 'identical': after == calm,
     }  # fmt: skip
-    return found
+
+
+PARTS = {'scheduling': part_scheduling, 'speed': part_speed, 'faults': part_faults}
 
 
 def _frame(out: Path) -> Any:
@@ -301,14 +327,17 @@ def main() -> int:
     parser = study.options(
         (__doc__ or '').split('\n')[0], units=10, months=20, kills=20, broken=10, tiny=10_000
     )
+    parser.add_argument('--parts', nargs='+', choices=list(PARTS), default=list(PARTS))
     parser.add_argument('--folder', type=Path, help='keeps the simulated logs and the results')
-    parser.add_argument('--output', type=Path, help='folder for fleet_study.json')
+    parser.add_argument('--output', type=Path, help='folder for fleet_PART.json')
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
-        found = run(options.folder or Path(place), options)
-    print(json.dumps(found, indent=1))
-    if options.output is not None:
-        study.keep('fleet_study', folder=options.output, **found)
+        for part in options.parts:
+            found = PARTS[part](options.folder or Path(place), options)
+            print(json.dumps({part: found}, indent=1), flush=True)
+            if options.output is not None:
+                content = {'machine': study.machine(), **found}
+                study.keep(f'fleet_{part}', folder=options.output, **content)
     return 0
 
 

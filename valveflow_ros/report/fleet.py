@@ -91,13 +91,7 @@ def story_of(unit: str, rows: Sequence[Row]) -> UnitStory:
     named = dict.fromkeys(c['name'] for row in changed for c in row.get('causes') or ())
     alarms = [a['name'] for a in last.get('alarms') or () if a['cleared'] is None]
     failures = [(row['log'], ' '.join(row['sentences'])) for row in rows if row['sentences']]
-    output = last.get('output_unit', 'MW')
-    piece = ''
-    if changed:
-        piece = (
-            f'{signed(last["change_mw"])} {output} at u {last["change_u_from"]:.0f} to '
-            f'{last["change_u_to"]:.0f}'
-        )
+    piece = _moved(last, 'change') if changed else ''
     changes = [
         (row['start'], row['change_mean_mw']) for row in curves
         if row.get('change_mean_mw') is not None
@@ -105,7 +99,8 @@ def story_of(unit: str, rows: Sequence[Row]) -> UnitStory:
     if curves:
         changes.insert(0, (curves[0]['start'], 0.0))
     return UnitStory(
-        unit, len(rows), sum(row['status'] == 'failed' for row in rows), output, bool(changed),
+        unit, len(rows), sum(row['status'] == 'failed' for row in rows),
+        last.get('output_unit', 'MW'), bool(changed),
         last.get('change_mean_mw'), piece, _since(changed[0]) if changed else '', tuple(named),
         tuple(dict.fromkeys(alarms)), tuple(changes), tuple(failures), _history(curves),
     )  # fmt: skip
@@ -219,6 +214,7 @@ def changes_figure(stories: Sequence[UnitStory]) -> Figure:
         'type': 'heatmap', 'name': 'change', 'x': moments(begin + step * np.arange(columns)),
         'y': [text(s.unit) for s in shown], 'z': [rounded(row, 3) for row in z],
         'zmin': -largest, 'zmax': largest, 'zmid': 0.0, 'colorscale': 'RdBu', 'ygap': 2,
+        'reversescale': True,
         'colorbar': {'title': {'text': unit}},
         'hovertemplate': f'%{{y}}, %{{x|%d %b %Y}}<br>%{{z:+.2f}} {unit}<extra></extra>',
     }  # fmt: skip
@@ -248,7 +244,7 @@ def unit_page(unit: str, rows: Sequence[Row]) -> Page:
     sections = [Section('Has it changed', [paragraph(text(answer))])]
     if len(story.history.curves) > 1:
         sections[0].parts.append(curve_history_figure(story.history))
-    head = ['log', 'from', 'to', 'against the log before', 'diagnosis', 'alarms', 'reports']
+    head = ['log', 'from', 'against the log before', 'diagnosis', 'alarms', 'reports']
     sections.append(Section('Log by log', [
         table(head, [_log_cells(row) for row in rows], sentences=True),
     ]))  # fmt: skip
@@ -263,7 +259,6 @@ def unit_page(unit: str, rows: Sequence[Row]) -> Page:
 
 
 def _log_cells(row: Row) -> list[str]:
-    start, end = (moment(row[k])[:16] if row.get(k) else '-' for k in ('start', 'end'))
     diagnosis = VERDICT_WORDS[row['verdict']] if row.get('verdict') else '-'
     if names := [c['name'] for c in row.get('causes') or ()]:
         diagnosis = ', '.join(names)
@@ -272,9 +267,17 @@ def _log_cells(row: Row) -> list[str]:
     links = [
         _link(verb, row['log'], verb, REPORT) for verb in _VERBS if row.get(done[verb]) is not None
     ]
-    shift = row.get('shift_sentence') or 'no curve before it'
+    moved = 'no curve before it' if row.get('shift_moved') is None else 'no change seen'
+    if row.get('shift_moved'):
+        moved = _moved(row, 'shift')
     return [
-        text(row['log']), start, end,
-        text(' '.join(row['sentences']) or shift), text(diagnosis), text(alarms) or '-',
+        text(row['log']), moment(row['start'])[:16] if row.get('start') else '-',
+        text(' '.join(row['sentences']) or moved), text(diagnosis), text(alarms) or '-',
         ' '.join(links) or '-',
     ]  # fmt: skip
+
+
+def _moved(row: Row, name: str) -> str:
+    """Say by how much the piece moved that moved most."""
+    low, high = row[f'{name}_u_from'], row[f'{name}_u_to']
+    return f'{signed(row[f"{name}_mw"])} {row["output_unit"]} at u {low:.0f} to {high:.0f}'
