@@ -23,6 +23,7 @@ from valveflow_ros.interface.unit_logs import UnitLog, read_fleet, read_options
 from valveflow_ros.interface.unit_month import FleetTask, key_of, unit_month
 
 pytest.importorskip('distributed')
+pytest.importorskip('pyarrow')
 WORDS = ['--no-diagnosis', '--set', 'diagnosis_hour=-1']
 GIVEN = {'diagnosis_hour': -1}
 TIMES = ('read_s', 'identify_s', 'diagnose_s', 'monitor_s', 'task_s')

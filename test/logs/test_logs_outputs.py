@@ -15,6 +15,7 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.interface.files import write_outputs
 from valveflow_ros.logs import open_log
 
+pytest.importorskip('pyarrow')
 HEALTH = 'diagnostic_msgs/msg/DiagnosticArray'
 
 

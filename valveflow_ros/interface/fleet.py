@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -44,14 +45,12 @@ def connected(scheduler: str) -> Iterator[Any]:
     RecordingError, UsageError
         There is no scheduler at the address, or it is none.
     """
-    import logging
-
     import dask
     from distributed import Client, LocalCluster
 
     # What workers do is told by rows; the library's own words, and its tracebacks, are not.
     quiet = {'logging': {'distributed': 'critical', 'bokeh': 'critical'}}
-    with dask.config.set(quiet), _silenced(logging.getLogger('distributed')):
+    with dask.config.set(quiet), _silenced():
         if scheduler:
             try:
                 client = Client(scheduler, timeout=_WAIT_S, set_as_default=False)
@@ -74,13 +73,17 @@ def connected(scheduler: str) -> Iterator[Any]:
 
 
 @contextmanager
-def _silenced(logger: Any) -> Iterator[None]:
-    before = logger.level
-    logger.setLevel('CRITICAL')
+def _silenced() -> Iterator[None]:
+    """Let the loggers of the library, of which some have levels of their own, say nothing."""
+    names = [n for n in logging.root.manager.loggerDict if n.partition('.')[0] == 'distributed']
+    before = {name: logging.getLogger(name).level for name in names}
+    for name in names:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         yield
     finally:
-        logger.setLevel(before)
+        for name, level in before.items():
+            logging.getLogger(name).setLevel(level)
 
 
 def workers_words(client: Any) -> str:
