@@ -84,6 +84,7 @@ def cluster(workers: int) -> Iterator[Any]:
         n_workers=workers, threads_per_worker=1, processes=True, dashboard_address='127.0.0.1:0',
         silence_logs=50, env={'NUMBA_NUM_THREADS': '1'},
     ) as made:  # fmt: skip
+        made.adapt(minimum=workers, maximum=workers, interval='1s')
         yield made
 
 

@@ -64,11 +64,14 @@ def connected(scheduler: str) -> Iterator[Any]:
                 yield client
             return
         # One thread a worker, also of compiled loops: the workers are the parallel part.
+        cores = len(os.sched_getaffinity(0))
         with LocalCluster(
-            n_workers=len(os.sched_getaffinity(0)), threads_per_worker=1, processes=True,
+            n_workers=cores, threads_per_worker=1, processes=True,
             dashboard_address='127.0.0.1:0', silence_logs=logging.CRITICAL,
             env={'NUMBA_NUM_THREADS': '1'},
         ) as cluster, Client(cluster, set_as_default=False) as client:  # fmt: skip
+            # A worker that is killed while it starts is given up by its nanny: others take over.
+            cluster.adapt(minimum=cores, maximum=cores, interval='1s')
             yield client
 
 
