@@ -182,6 +182,23 @@ def _loops() -> list[tuple[str, str, str]]:
     return rows
 
 
+def _fleet() -> list[tuple[str, str, str]]:
+    """Return what a fleet costs beside its work, and what it survives."""
+    speed, faults = result('fleet_speed'), result('fleet_faults')
+    tiny = max(r['wall_ms_per_task'] for r in result('fleet_scheduling')['runs'])
+    beside = speed['beside_work_ms_per_task'] + tiny
+    return [
+        _row(f'a log of a fleet, {speed["cpu_s_per_task"]:.1f} s of processor time: needed beside '
+             'the work', f'{beside:.0f} ms', 'fleet_speed'),
+        _row(f'{faults["logs_compared"]} logs on two workers, {faults["workers_killed"]} workers '
+             f'killed, {faults["broken_logs"]} broken logs, the command killed after '
+             f'{faults["command_killed_after_tasks"]}',
+             f'{faults["rows_of_broken_logs"]} rows with a sentence, results '
+             + ('identical' if faults['identical'] else 'not identical')
+             + ' to those of an undisturbed run', 'fleet_faults'),
+    ]  # fmt: skip
+
+
 def _speed() -> list[tuple[str, str, str]]:
     name = 'ten_days'
     steps = {step['step']: step for step in result(name)['steps']}
@@ -262,5 +279,5 @@ def results() -> str:
 def measured() -> str:
     """Return what the studies found, with the command of each."""
     rows = [*_paper(), *_partition(), *_coverage(), *_rivals(), *_thermal(), *_alarm(),
-            *_diagnosis(), *_loops(), *_speed()]  # fmt: skip
+            *_diagnosis(), *_loops(), *_speed(), *_fleet()]  # fmt: skip
     return table(('question', 'answer', 'measured by'), rows)

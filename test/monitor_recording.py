@@ -26,7 +26,15 @@ TYPES = {
     '/main_steam_temperature': FLOAT64,
     '/generated_power': FLOAT64,
 }
-_CODES = {'bool': '?', 'uint8': 'B', 'int32': 'i', 'uint32': 'I', 'uint64': 'Q', 'float64': 'd'}
+_CODES = {
+    'bool': '?',
+    'byte': 'B',
+    'uint8': 'B',
+    'int32': 'i',
+    'uint32': 'I',
+    'uint64': 'Q',
+    'float64': 'd',
+}
 
 
 def cdr(type_name: str, values: dict[str, Any]) -> bytes:

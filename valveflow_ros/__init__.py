@@ -3,8 +3,8 @@
 """Online identification and monitoring of main steam valve flow characteristics.
 
 The Python interface, ``import valveflow_ros as vf``: `open_log`, `identify`, `diagnose`,
-`compare`, `validate`, `monitor`, `judge_loop`, `simulate`, `load_characteristic`. Its parts are
-loaded when they are first used.
+`compare`, `validate`, `monitor`, `fleet`, `judge_loop`, `simulate`, `load_characteristic`. Its
+parts are loaded when they are first used.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from valveflow_ros.interface import Progress
     from valveflow_ros.interface.compare import compare, validate
     from valveflow_ros.interface.diagnose import diagnose
+    from valveflow_ros.interface.fleet import fleet
     from valveflow_ros.interface.identify import identify
     from valveflow_ros.interface.logs import open_log
     from valveflow_ros.interface.loop import judge_loop
@@ -25,6 +26,7 @@ __all__ = [
     'Progress',
     'compare',
     'diagnose',
+    'fleet',
     'identify',
     'judge_loop',
     'load_characteristic',
@@ -36,6 +38,7 @@ __all__ = [
 _MODULES = {
     'compare': 'compare',
     'diagnose': 'diagnose',
+    'fleet': 'fleet',
     'identify': 'identify',
     'judge_loop': 'loop',
     'load_characteristic': 'models',

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from logged import rewritten
-from monitor_recording import FLOAT64, Monitor, cdr, diagnosis
+from monitor_recording import FLOAT64, Monitor, cdr, diagnosis, recording
 
 from valveflow_ros.interface.logs import steps_of
 from valveflow_ros.interface.settings import settings_for
@@ -150,3 +150,17 @@ def test_info_names_what_is_attached(run, logs, tmp_path):
     data = run('info', tmp_path / 'a.mcap', '--json').json
     attached = open_log(tmp_path / 'a.mcap').attachments
     assert data['attachments'] == {name: len(text) for name, text in attached.items()}
+
+
+def test_export_writes_what_a_monitor_said(run, logs, tmp_path):
+    said, out = recording(tmp_path / 'said', seconds=3), tmp_path / 'said.csv'
+    ran = run('export', said, '-o', out, '--outputs', '--json')
+    assert ran.json['tables'] == {
+        str(tmp_path / f'said_{kind}.csv'): n
+        for kind, n in (('curves', 1), ('predictions', 3), ('alarms', 1), ('diagnoses', 1))
+    }
+    assert (tmp_path / 'said_alarms.csv').read_text().count('The unit gives less.') == 1
+    assert '--overwrite' in run('export', said, '-o', out, '--outputs').refused()
+    assert run('export', said, '-o', out, '--outputs', '--overwrite').status == 0
+    none = run('export', logs / 'plant.csv', '-o', out, '--outputs').refused()
+    assert 'holds nothing that a monitor said' in none

@@ -41,6 +41,7 @@ VERBS: tuple[tuple[str, str, str], ...] = (
     ('identify', 'identify', 'find the flow characteristic'),
     ('diagnose', 'diagnose', 'what the simulation gets wrong, and why'),
     ('monitor', 'monitor', 'what the monitor would have told over a log'),
+    ('fleet', 'fleet', 'identify, diagnose and monitor many units and months at once'),
     ('validate', 'validate', 'hold a characteristic against other days'),
     ('loop', 'loop', 'judge one control valve: sticks, slack, sound, or cannot be told'),
     ('compare', 'compare', 'the proposed method beside two of the literature'),

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from valveflow_ros.errors import InputError, RecordingError
 
 if TYPE_CHECKING:
+    from valveflow_ros.logs import LogContents
     from valveflow_ros.records import SampleTable
     from valveflow_ros.report.page import Page
 
@@ -122,6 +123,35 @@ def write_log(table: SampleTable, path: Path, overwrite: bool = False) -> Path:
             write_table(table, draft)
         return path
     return write_samples(table, path, overwrite=overwrite or is_empty(path)).path
+
+
+def write_outputs(log: LogContents, path: Path, overwrite: bool = False) -> dict[Path, int]:
+    """Write what a monitor said in a recording, one table a kind; return the rows by file.
+
+    Parameters
+    ----------
+    log : LogContents
+    path : Path
+        ``out.csv`` or ``out.parquet`` gives ``out_curves.csv``, ``out_alarms.csv``, ...
+
+    Raises
+    ------
+    DataError
+        The recording holds nothing of a monitor.
+    RecordingError
+        A table cannot be written, or is there already.
+    """
+    from valveflow_ros.logs import outputs_in
+    from valveflow_ros.logs import write_outputs as write_kind
+
+    places = {kind: path.with_stem(f'{path.stem}_{kind}') for kind in outputs_in(log)}
+    for place in places.values():
+        check_output(place, TABLES, overwrite=overwrite)
+    found = {}
+    for kind, place in places.items():
+        with whole_file(place) as draft:
+            found[place] = write_kind(log, kind, draft)
+    return found
 
 
 def is_empty(path: Path) -> bool:

@@ -15,6 +15,7 @@ from valveflow_ros.logs.mcap.recorder import (
 )
 from valveflow_ros.logs.mcap.recover import RecoveryReport, recover, recover_leftovers
 from valveflow_ros.logs.mcap.writer import LATCHED, Message, Qos, RecordingWriter
+from valveflow_ros.logs.outputs import outputs_in, write_outputs
 from valveflow_ros.logs.reader import open_log
 from valveflow_ros.logs.tables.table import RawTable, read_table, write_table
 
@@ -37,9 +38,11 @@ __all__ = [
     'WrittenLog',
     'messages_since',
     'open_log',
+    'outputs_in',
     'read_table',
     'recover',
     'recover_leftovers',
+    'write_outputs',
     'write_samples',
     'write_table',
 ]

@@ -22,10 +22,12 @@ from valveflow_ros.logs.mcap.reading import read_recording
 from valveflow_ros.logs.mcap.records import MAGIC
 from valveflow_ros.logs.part_file import PART_SUFFIX
 from valveflow_ros.logs.source import Source, os_errors
+from valveflow_ros.logs.sqlite import read_bag
 from valveflow_ros.logs.tables.refusal import AS_SEEN, TableOptions
 from valveflow_ros.logs.tables.table import open_table
 
 MAX_METADATA_BYTES = 16 << 20
+BAG_SUFFIX = '.db3'
 TABLE_SUFFIXES = ('.csv', '.tsv', '.txt', '.parquet', '.pq', '.xlsx', '.xlsm')
 
 
@@ -41,8 +43,8 @@ def open_log(
     Parameters
     ----------
     path : str or Path
-        An ``.mcap`` file in any state, a rosbag2 folder, a ``.csv``, ``.xlsx``
-        or ``.parquet`` table.
+        An ``.mcap`` file in any state, a ``.db3`` file or folder of rosbag2, a ``.csv``,
+        ``.xlsx`` or ``.parquet`` table.
     columns : mapping of str to str, optional
         Contract name to the topic or column that is to stand for it.
     absent : collection of str
@@ -65,12 +67,13 @@ def open_log(
         is_folder = False
     if is_folder:
         files, warnings = _files_of(place)
-        contents = read_recording(files, str(path), names)
+        read = read_bag if files[0].suffix == BAG_SUFFIX else read_recording
+        contents = read(files, str(path), names)
         return replace(contents, warnings=(*warnings, *contents.warnings))
     if place.suffix.lower() in TABLE_SUFFIXES:
         return open_table(place, names, absent, table)
-    if place.suffix.lower() == '.db3':
-        raise RecordingError(path, _sqlite_problem())
+    if place.suffix.lower() == BAG_SUFFIX:
+        return read_bag([place], str(path), names)
     if place.suffix.lower() not in ('.mcap', PART_SUFFIX):
         with Source.open(place) as source:
             if source.read(0, len(MAGIC)) != MAGIC:
@@ -88,9 +91,10 @@ def _files_of(folder: Path) -> tuple[list[Path], list[str]]:
     whole = {path.name for path in found if path.suffix == '.mcap'}
     listed = _listed(folder) if METADATA_NAME in names else []
     if not found:
-        if any(name.endswith('.db3') for name in names):
-            raise RecordingError(folder, _sqlite_problem())
-        raise RecordingError(folder, 'has no .mcap file in it')
+        bags = sorted(folder / name for name in names if name.endswith(BAG_SUFFIX))
+        if bags:
+            return bags, []
+        raise RecordingError(folder, 'has no .mcap file in it, and no .db3')
     missing = [name for name in listed if name not in whole]
     warnings = [f"'{name}' is named in {METADATA_NAME} and is not there." for name in missing]
     if not listed:
@@ -124,18 +128,12 @@ def _listed(folder: Path) -> list[str]:
     try:
         top = yaml.load(raw, Loader=SafeLoader)
         info = top['rosbag2_bagfile_information']
-        storage, names = info['storage_identifier'], info['relative_file_paths']
+        names = info['relative_file_paths']
         mode = str(info.get('compression_mode') or '').lower()
     except (yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError, RecursionError):
         return []
-    if storage == 'sqlite3':
-        raise RecordingError(folder, _sqlite_problem())
     if mode in ('file', 'message'):
-        problem = f'is compressed {mode} by {mode} by rosbag2, which no reader of MCAP understands'
+        problem = f'is compressed {mode} by {mode} by rosbag2, which is not read here'
         raise RecordingError(folder, f"{problem}; rewrite it with 'ros2 bag convert'")
     # Only names within the folder count, whatever path is written there.
     return [Path(str(name)).name for name in names if name] if isinstance(names, list) else []
-
-
-def _sqlite_problem() -> str:
-    return "is a recording in sqlite3; rewrite it as MCAP with 'ros2 bag convert'"

@@ -13,8 +13,12 @@ _DESCRIPTION = """\
 Write a log as a table with one row a sample: the rows the engine sees, in its units. Where a
 signal has no usable value the cell is empty.
 
+With --outputs what a monitor said in its recording instead, one table a kind: curves,
+predictions, alarms, diagnoses and health become said_curves.csv, said_predictions.csv, ...
+
 example:
-  valveflow export plant.mcap -o plant.csv"""
+  valveflow export plant.mcap -o plant.csv
+  valveflow export recordings/U1 -o said.parquet --outputs"""
 
 
 def arguments(parser: ArgumentParser) -> None:
@@ -25,6 +29,10 @@ def arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         '-o', '--output', metavar='TABLE', type=Path, required=True, help='a .csv or .parquet file'
     )
+    parser.add_argument(
+        '--outputs', action='store_true',
+        help='what the monitor said: TABLE names the tables, which get a kind behind their name',
+    )  # fmt: skip
     add_mapping(parser)
     parser.add_argument(
         '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs',
@@ -36,6 +44,8 @@ def arguments(parser: ArgumentParser) -> None:
 def run(options: Namespace, console: Console) -> VerbResult:
     """Align and write."""
     mapping = mapping_of(options)
+    if options.outputs:
+        return _outputs(options, console)
     from valveflow_ros.errors import DataError
     from valveflow_ros.interface.files import TABLES, check_output, write_log
     from valveflow_ros.interface.logs import open_log
@@ -80,3 +90,16 @@ def run(options: Namespace, console: Console) -> VerbResult:
         'readings': counts,
     }
     return VerbResult(text, data)
+
+
+def _outputs(options: Namespace, console: Console) -> VerbResult:
+    """Write what the monitor said."""
+    from valveflow_ros.interface.files import TABLES, check_output, write_outputs
+    from valveflow_ros.logs import open_log
+    from valveflow_ros.report.words import counted
+
+    check_output(options.output, TABLES, source=options.log, overwrite=True)
+    console(0.1, 'reading')
+    found = write_outputs(open_log(options.log), options.output, options.overwrite)
+    text = '\n'.join(f'Wrote {counted(n, "row")} to {path}.' for path, n in found.items())
+    return VerbResult(text, {'tables': {str(path): n for path, n in found.items()}})

@@ -1,0 +1,97 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""What a monitor said, as tables: the same in CSV and Parquet, and what the messages say."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from monitor_recording import START_NS, Monitor, alarm, cdr, head, recording
+
+from valveflow_ros.errors import DataError
+from valveflow_ros.interface.files import write_outputs
+from valveflow_ros.logs import open_log
+
+pytest.importorskip('pyarrow')
+HEALTH = 'diagnostic_msgs/msg/DiagnosticArray'
+
+
+@pytest.fixture(scope='module')
+def log(tmp_path_factory):
+    folder = recording(tmp_path_factory.mktemp('log') / 'said', seconds=5)
+    monitor = Monitor(folder)
+    monitor.writer.add_topic('/diagnostics', HEALTH)
+    status = [
+        {'level': 1, 'name': 'valveflow_monitor: fit', 'message': 'too old', 'hardware_id': 'U1',
+         'values': [{'key': 'Age of the curve (s)', 'value': '7'}]},
+        {'level': 0, 'name': 'valveflow_monitor: recorder', 'message': 'recording'},
+    ]  # fmt: skip
+    monitor.say('/diagnostics', cdr(HEALTH, {'header': head(START_NS), 'status': status}))
+    monitor.say('alarms', alarm(START_NS, 0, 'Gone, "again"; 3 MW.'))
+    monitor.writer.close()
+    return open_log(folder)
+
+
+@pytest.fixture(scope='module')
+def tables(log, tmp_path_factory):
+    folder = tmp_path_factory.mktemp('tables')
+    found = [write_outputs(log, folder / f'said{kind}') for kind in ('.csv', '.parquet')]
+    return folder, [{path.stem: n for path, n in one.items()} for one in found]
+
+
+def test_there_is_one_table_a_kind(tables):
+    folder, (csv, parquet) = tables
+    rows = {'curves': 1, 'predictions': 5, 'alarms': 2, 'diagnoses': 1, 'health': 2}
+    assert csv == parquet == {f'said_{kind}': n for kind, n in rows.items()}
+    assert sorted(p.name for p in folder.iterdir()) == sorted(
+        f'said_{kind}{suffix}' for kind in rows for suffix in ('.csv', '.parquet')
+    )
+
+
+def test_values_are_those_of_the_messages(log, tables):
+    folder, _ = tables
+    read = {k: pd.read_parquet(folder / f'said_{k}.parquet') for k in ('curves', 'predictions')}
+    topic = '/valveflow_monitor/prediction'
+    decoder = log.decoder(topic)
+    wanted = [decoder.decode(m.data) for m in log.iter_messages([topic])]
+    assert list(read['predictions'].residual_mw) == [w['residual_mw'] for w in wanted]
+    ns = [w['header']['stamp']['sec'] * 10**9 for w in wanted]
+    assert list(read['predictions'].time.astype(np.int64)) == ns
+    (curve,) = read['curves'].itertuples()
+    assert list(curve.breakpoints) == [1000.0, 1500.0, 2200.0]
+    assert (curve.unit_tag, curve.topic) == ('U1', '/valveflow_monitor/characteristic')
+    assert curve.window_end == pd.Timestamp(START_NS, tz='UTC')
+    assert pd.isna(curve.shift_since)
+
+
+@pytest.mark.parametrize('kind', ['curves', 'predictions', 'alarms', 'diagnoses', 'health'])
+def test_csv_and_parquet_say_the_same(kind, tables):
+    folder, _ = tables
+    parquet = pd.read_parquet(folder / f'said_{kind}.parquet')
+    csv = pd.read_csv(folder / f'said_{kind}.csv')
+    assert list(csv.columns) == list(parquet.columns)
+    for name in parquet.columns:
+        for theirs, ours in zip(csv[name], parquet[name], strict=True):
+            if isinstance(ours, np.ndarray):
+                assert len(json.loads(theirs)) == len(ours)
+            elif isinstance(ours, pd.Timestamp):
+                assert pd.Timestamp(theirs) == ours
+            else:
+                assert theirs == ours or (pd.isna(theirs) and (pd.isna(ours) or ours == ''))
+
+
+def test_health_has_a_row_for_each_item(tables):
+    rows = pd.read_csv(tables[0] / 'said_health.csv')
+    assert list(rows.message) == ['too old', 'recording']
+    assert json.loads(rows['values'][0]) == [{'key': 'Age of the curve (s)', 'value': '7'}]
+
+
+def test_a_log_without_a_monitor_is_refused(tmp_path):
+    monitor = Monitor(tmp_path / 'silent')
+    monitor.say('/valve_opening', b'\x00\x01\x00\x00' + bytes(8))
+    monitor.writer.close()
+    with pytest.raises(DataError, match='holds nothing that a monitor said'):
+        write_outputs(open_log(tmp_path / 'silent'), tmp_path / 'x.csv')

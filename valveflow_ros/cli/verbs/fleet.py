@@ -1,0 +1,98 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""``valveflow fleet``: many units and months at once."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+
+from valveflow_ros.cli.command import (
+    Console,
+    TableOption,
+    VerbResult,
+    add_mapping,
+    columns,
+    lines,
+)
+
+_DESCRIPTION = """\
+Identify, diagnose and monitor many logs of many units, side by side on the cores of this machine
+or on a Dask cluster. The curve of a log is the reference of the next one of its unit. DIR gets
+fleet.html (which units lose power, since when and why), fleet.parquet (one row a log) and the
+reports of each log in units/UNIT/LOG. Run it again after a stop, or with further logs: what is
+done and unchanged is not done again.
+
+The unit of a log is the folder it stands in; its logs are taken in the order of their names. A
+manifest says otherwise: a CSV file with the columns unit, log and, if wanted, options, such as
+--constant main_steam_temperature=540. The paths in it are seen from its folder.
+
+example:
+  valveflow fleet plants -o result        with plants/UNIT/2026-01.csv, 2026-02.csv, ...
+  valveflow fleet fleet.csv -o result --no-diagnosis
+  valveflow fleet fleet.csv -o /shared/result --scheduler tcp://10.0.0.5:8786"""
+
+
+def arguments(parser: ArgumentParser) -> None:
+    """Add description, example and options."""
+    parser.description = _DESCRIPTION
+    parser.usage = 'valveflow fleet LOGS... -o DIR [options]'
+    parser.add_argument(
+        'logs', metavar='LOGS', nargs='+', type=Path, help='logs, folders, globs or manifests'
+    )
+    parser.add_argument(
+        '-o', '--output', metavar='DIR', type=Path, required=True,
+        help='folder for the results, made if absent',
+    )  # fmt: skip
+    parser.add_argument(
+        '--scheduler', metavar='ADDRESS', default='',
+        help='a Dask scheduler, such as tcp://10.0.0.5:8786, whose workers see LOGS and DIR under '
+        'the same names (default: one worker for each core of this machine)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--no-diagnosis', action='store_true',
+        help="leave out the monitor's own diagnoses; each log is diagnosed once all the same",
+    )  # fmt: skip
+    parser.add_argument(
+        '--params', metavar='FILE', type=Path, help='parameters, a YAML file as the node takes it'
+    )
+    parser.add_argument(
+        '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs',
+        help='one parameter, such as time_constant=120; stands above the file',
+    )  # fmt: skip
+    add_mapping(parser)
+
+
+def run(options: Namespace, console: Console) -> VerbResult:
+    """Read what there is to do, do it, tell the outcome."""
+    console(0.0, 'starting')
+    from valveflow_ros.interface.fleet import fleet
+    from valveflow_ros.report.words import counted, signed
+
+    words = [f'--params={options.params}'] if options.params else []
+    for name, said in (('set', options.pairs), ('constant', options.constant)):
+        words += [f'--{name}={value}' for value in said]
+    for given in options.column:
+        named = given if isinstance(given, TableOption) else TableOption('column', given)
+        words.append(f'--{named.option}={named.value}')
+    words += ['--no-diagnosis'] if options.no_diagnosis else []
+    found = fleet(
+        options.logs, options.output, scheduler=options.scheduler, options=words,
+        progress=console,
+    )  # fmt: skip
+    moved = sorted((s for s in found.stories if s.moved), key=lambda s: s.change_mw or 0.0)
+    rows = [
+        [s.unit, f'{signed(s.change_mw or 0.0)} {s.output_unit}', s.since,
+         ', '.join(s.causes) or 'not named']
+        for s in moved
+    ]  # fmt: skip
+    content = found.to_json()
+    text = lines(
+        f'{counted(len(found.stories), "unit")}: {counted(found.anew, "log")} done now, '
+        f'{found.unchanged} unchanged, {found.failed} without a result.',
+        columns(rows, ['unit that changed', 'mean', 'since', 'causes']) if rows
+        else 'No unit is seen to have changed.',
+        *(f'{s.unit} {log}: {why}' for s in found.stories for log, why in s.failures[:3]),
+        f'Wrote {" and ".join(content["files"].values())}.',
+    )  # fmt: skip
+    return VerbResult(text, content)

@@ -1,0 +1,361 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""``fleet``: many units and months identified, diagnosed and monitored on Dask."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from valveflow_ros.errors import (
+    InputError,
+    RecordingError,
+    UsageError,
+    ValveflowError,
+    counted,
+    listed,
+)
+from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface.files import check_folder, whole_file, write_texts
+from valveflow_ros.interface.unit_logs import UnitLog, read_fleet
+from valveflow_ros.interface.unit_month import LIBRARIES, FleetTask, Row, failed_row, unit_month
+from valveflow_ros.report.fleet import REPORT, UNITS, UnitStory, fleet_page, story_of, unit_page
+from valveflow_ros.report.page import plotly_script
+
+DATA, PAGE = 'fleet.parquet', 'fleet.html'
+_WAIT_S = 10
+
+
+@contextmanager
+def connected(scheduler: str) -> Iterator[Any]:
+    """Give a client of a scheduler, or of a cluster of this machine's cores.
+
+    Raises
+    ------
+    InputError
+        The extra is not installed.
+    RecordingError, UsageError
+        There is no scheduler at the address, or it is none.
+    """
+    import dask
+    from distributed import Client, LocalCluster
+
+    # What workers do is told by rows; the library's own words, and its tracebacks, are not.
+    quiet = {'logging': {'distributed': 'critical', 'bokeh': 'critical'}}
+    with dask.config.set(quiet), _silenced():
+        if scheduler:
+            try:
+                client = Client(scheduler, timeout=_WAIT_S, set_as_default=False)
+            except ValueError as error:
+                raise UsageError(f"--scheduler '{scheduler}' is no address ({error}).") from None
+            except (OSError, TimeoutError) as error:
+                raise RecordingError(
+                    scheduler, f'no Dask scheduler answers there within {_WAIT_S} s'
+                ) from error
+            with client:
+                yield client
+            return
+        # One thread a worker, also of compiled loops: the workers are the parallel part.
+        cores = len(os.sched_getaffinity(0))
+        with LocalCluster(
+            n_workers=cores, threads_per_worker=1, processes=True,
+            dashboard_address='127.0.0.1:0', silence_logs=logging.CRITICAL,
+            env={'NUMBA_NUM_THREADS': '1'},
+        ) as cluster, Client(cluster, set_as_default=False) as client:  # fmt: skip
+            # A worker that is killed while it starts is given up by its nanny: others take over.
+            cluster.adapt(minimum=cores, maximum=cores, interval='1s')
+            yield client
+
+
+@contextmanager
+def _silenced() -> Iterator[None]:
+    """Let the loggers of the library, of which some have levels of their own, say nothing."""
+    names = [n for n in logging.root.manager.loggerDict if n.partition('.')[0] == 'distributed']
+    before = {name: logging.getLogger(name).level for name in names}
+    for name in names:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for name, level in before.items():
+            logging.getLogger(name).setLevel(level)
+
+
+def workers_words(client: Any) -> str:
+    """Say how many workers there are and what memory each is bounded to."""
+    workers = client.scheduler_info(n_workers=-1)['workers'].values()
+    if not workers:
+        return f'{client.scheduler.address} has no worker yet; waiting for one.'
+    limits = sorted({w['memory_limit'] or 0 for w in workers})
+    bound = 'without a bound of memory' if not limits[0] else (
+        f'each bounded to {limits[0] / 1e9:.1f} GB of memory'
+    )  # fmt: skip
+    return f'{counted(len(workers), "worker")}, {bound}.'
+
+
+Chain = Generator[FleetTask, Row, None]
+
+
+def spread(
+    client: Any, work: Callable[[FleetTask], Row], chains: Sequence[Chain]
+) -> Iterator[tuple[FleetTask, Row]]:
+    """Do chains of tasks on the workers; yield each task with its row as it is done.
+
+    Parameters
+    ----------
+    client : distributed.Client
+    work : callable
+        Done on a worker.
+    chains : sequence of generator
+        Each yields a task and is sent its row. A chain has one task on the cluster at a time: the
+        scheduler never knows of more tasks than there are units, and nothing that is done is lost
+        with a worker. Chains that are further on come first, so that units end one after another.
+
+    Raises
+    ------
+    ValveflowError
+        The scheduler has gone.
+    """
+    from distributed import as_completed
+
+    under_way: dict[str, tuple[Chain, FleetTask, int]] = {}
+    futures = as_completed(loop=client.loop)
+
+    def submit(chain: Chain, task: FleetTask, depth: int) -> None:
+        future = client.submit(work, task, pure=False, priority=depth)
+        under_way[future.key] = chain, task, depth
+        futures.add(future)
+
+    for chain in chains:
+        submit(chain, next(chain), 0)
+    for future in futures:
+        chain, task, depth = under_way.pop(future.key)
+        row = _outcome(future, task)
+        yield task, row
+        with suppress(StopIteration):
+            submit(chain, chain.send(row), depth + 1)
+
+
+def _outcome(future: Any, task: FleetTask) -> Row:
+    from distributed import CancelledError, KilledWorker
+
+    try:
+        return dict(future.result())
+    except KilledWorker as error:
+        died = f'{error.allowed_failures + 1} workers that did it died one after the other'
+        return failed_row(task, f'{died}, as for want of memory; the next run tries it again.')
+    except (CancelledError, OSError):
+        raise ValveflowError(
+            'The scheduler has gone. What is done stays: run the same command again.'
+        ) from None
+    except Exception as error:  # noqa: BLE001 - whatever keeps a worker from beginning
+        about = ' '.join(f'{type(error).__name__}: {error}'.split())[:200]
+        return failed_row(task, f'The worker could not do it ({about}).')
+
+
+def _chain(logs: Sequence[UnitLog], folder: Path) -> Chain:
+    """Yield the tasks of a unit: the curve of a log is the reference of the next."""
+    before = first = ''
+    for log in logs:
+        row = yield FleetTask(log, folder, before, first)
+        before = row.get('curve') or before
+        first = first or before
+
+
+# The results.
+
+
+def _schema() -> Any:
+    """Return the columns of the data set; times are UTC, powers MW or what `output_unit` says."""
+    import pyarrow as pa
+
+    f, s, n, b = pa.float64(), pa.string(), pa.int64(), pa.bool_()
+    at = pa.timestamp('ns', tz='UTC')
+
+    def records(**fields: Any) -> Any:
+        return pa.list_(pa.struct(list(fields.items())))
+
+    def judged(name: str) -> dict[str, Any]:
+        return {
+            f'{name}_moved': b, f'{name}_mw': f, f'{name}_u_from': f, f'{name}_u_to': f,
+            f'{name}_p_value': f, f'{name}_since': at, f'{name}_since_low': at,
+            f'{name}_since_high': at, f'{name}_sentence': s,
+        }  # fmt: skip
+
+    parameter = records(name=s, value=f, low=f, high=f, unit=s)
+    return pa.schema({
+        'log': s, 'source': s, 'status': s, 'sentences': pa.list_(s), 'start': at, 'end': at,
+        # curve
+        'curve': s, 'model_id': s, 'reference': s, 'output_unit': s, 'axis': s,
+        'pressure_exponent': f, 'pressure_scale_exponent': f, 'offset_mw': f,
+        'reference_pressure_mpa': f,
+        'pieces': records(
+            u_from=f, u_to=f, slope=f, intercept=f, slope_stderr=f, intercept_stderr=f, samples=n,
+        ),
+        'u': pa.list_(f), 'power_mw': pa.list_(f), 'breakpoint_low': pa.list_(f),
+        'breakpoint_high': pa.list_(f),
+        'dynamics': records(
+            power_from=f, power_to=f, time_constant_s=f, delay_s=f, time_constant_stderr_s=f,
+            delay_stderr_s=f,
+        ),
+        **judged('shift'), **judged('change'), 'change_mean_mw': f,
+        # errors
+        'rmse_mw': f, 'explained': f, 'rmse_simulation': f, 'rmse_extended': f,
+        'rmse_noise_floor': f,
+        # causes
+        'verdict': s,
+        'causes': records(
+            name=s, sentence=s, meaning=s, to_do=s, parameters=parameter, rmse_before=f,
+            rmse_after=f, reduction=f, p_value=f,
+        ),
+        'not_told_apart': pa.list_(s), 'unexplained_by': pa.list_(s),
+        # alarms
+        'alarms': records(name=s, raised=at, cleared=at, state=s, sentence=s),
+        'monitor_curves': n, 'monitor_diagnoses': records(time=at, verdict=s, causes=pa.list_(s)),
+        'wear_mw_per_month': f,
+        # quality
+        'rows': n, 'steady': n, 'slope_response': n, 'samples': n, 'temperature_flag': b,
+        'rejected': records(reason=s, count=n), 'notes': pa.list_(s),
+        # versions, timing
+        'versions': pa.struct([(name, s) for name in ('valveflow', 'python', *LIBRARIES)]),
+        'read_s': f, 'identify_s': f, 'diagnose_s': f, 'monitor_s': f, 'task_s': f,
+    })  # fmt: skip
+
+
+def partition_of(folder: Path, unit: str) -> Path:
+    """Return the file of a unit in the data set."""
+    return folder / DATA / f'unit={quote(unit, safe="")}' / 'part-0.parquet'
+
+
+def _write_unit(folder: Path, unit: str, rows: Sequence[Row]) -> UnitStory:
+    """Write the data and the page of a unit whose logs are all done."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    path = partition_of(folder, unit)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as draft:
+        pq.write_table(pa.Table.from_pylist(list(rows), schema=_schema()), draft)
+    write_texts(folder / UNITS / unit, {REPORT: unit_page(unit, rows).to_html()})
+    return story_of(unit, rows)
+
+
+@dataclass(frozen=True, slots=True)
+class FleetResult:
+    """What a run over a fleet came to.
+
+    Attributes
+    ----------
+    folder : Path
+        Holds ``fleet.parquet``, ``fleet.html`` and ``units``.
+    stories : tuple of UnitStory
+        What the page tells of each unit, in order of their names.
+    anew, unchanged, failed : int
+        Tasks done now, found done and unchanged, and those without any result.
+    """
+
+    folder: Path
+    stories: tuple[UnitStory, ...]
+    anew: int
+    unchanged: int
+    failed: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the result as a dict of plain values."""
+        return {
+            'format': 'valveflow/fleet',
+            'version': 1,
+            'tasks': {'anew': self.anew, 'unchanged': self.unchanged, 'failed': self.failed},
+            'units': [story.to_json() for story in self.stories],
+            'files': {name: str(self.folder / name) for name in (DATA, PAGE)},
+        }
+
+    def to_dataframe(self) -> Any:
+        """Return the data set as a pandas.DataFrame, one row a log."""
+        import pyarrow as pa
+        import pyarrow.dataset as ds
+
+        units = ds.partitioning(pa.schema([('unit', pa.string())]), flavor='hive')
+        return ds.dataset(self.folder / DATA, partitioning=units).to_table().to_pandas()
+
+
+def check_installed() -> None:
+    """Raise `InputError` where what a fleet needs is not installed."""
+    plotly_script()
+    missing = [n for n in ('dask', 'distributed', 'pyarrow') if find_spec(n) is None]
+    if missing:
+        what = 'which is' if len(missing) == 1 else 'which are'
+        raise InputError(
+            f'A fleet needs {listed(missing)}, {what} not installed: '
+            f'pip install {" ".join(missing)}.'
+        )
+
+
+def fleet(
+    logs: Sequence[str | Path],
+    folder: str | Path,
+    *,
+    scheduler: str = '',
+    options: Sequence[str] = (),
+    progress: Progress = SILENT,
+) -> FleetResult:
+    """Identify, diagnose and monitor the logs of many units, in parallel.
+
+    Each log is a task: what `identify`, `diagnose` and `monitor` give for it is written into
+    ``folder/units/UNIT/LOG``, and the curve of a log is the reference of the next one of its unit.
+    What an earlier run has done, and what has not changed since, is not done again.
+
+    Parameters
+    ----------
+    logs : sequence of str or Path
+        Logs, folders, globs or manifests; see `read_fleet`.
+    folder : str or Path
+        Made if absent. It gets ``fleet.parquet`` and ``fleet.html``, of these logs alone.
+    scheduler : str
+        Address of a Dask scheduler whose workers see logs and folder under the same names; a
+        cluster of this machine's cores without it.
+    options : sequence of str
+        How logs are read and judged; see `read_options`.
+    progress : Progress
+
+    Raises
+    ------
+    InputError, UsageError
+        The extra is not installed, an option is wrong, or two units have one name.
+    RecordingError
+        A log is not there, the folder cannot be written, or no scheduler answers.
+    ValveflowError
+        The scheduler has gone meanwhile.
+    """
+    check_installed()
+    folder = Path(folder).absolute()
+    units = read_fleet(logs, options, folder)
+    check_folder(folder)
+    (folder / UNITS).mkdir(parents=True, exist_ok=True)
+    rows: dict[str, list[Row]] = {unit: [] for unit in units}
+    stories, done, total = [], 0, sum(map(len, units.values()))
+    anew = failed = 0
+    with connected(scheduler) as client:
+        progress.say(workers_words(client))
+        chains = [_chain(months, folder) for months in units.values()]
+        for task, row in spread(client, unit_month, chains):
+            unit, done = task.of.unit, done + 1
+            anew, failed = anew + row['anew'], failed + (row['status'] == 'failed')
+            rows[unit].append(row)
+            progress(done / total, f'{unit} {task.of.name}')
+            if len(rows[unit]) == len(units[unit]):
+                stories.append(_write_unit(folder, unit, rows.pop(unit)))
+    for old in (folder / DATA).glob('unit=*'):
+        if old not in {partition_of(folder, unit).parent for unit in units}:
+            shutil.rmtree(old, ignore_errors=True)
+    stories.sort(key=lambda story: story.unit)
+    write_texts(folder, {PAGE: fleet_page(stories).to_html()})
+    return FleetResult(folder, tuple(stories), anew, total - anew, failed)
