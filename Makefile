@@ -32,7 +32,7 @@ PARALLEL ?= -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 PYTHONS ?= python3.10 python3.12
 # Checked as strictly as mypy can; ros/ is not, because rclpy carries no annotations.
 STRICT := $(wildcard $(addprefix valveflow_ros/,*.py signals segments partition curve fit \
-  monitoring diagnosis baselines plant logs report interface page cli) tools)
+  monitoring diagnosis baselines plant logs opcua report interface page cli) tools)
 BENCHMARKS := node_load partition reading ten_days
 STUDIES := paper_study coverage_study segment_study shift_study monitor_study \
   compare_study study_figures refinery_valves
