@@ -27,7 +27,7 @@ KINDS = {
     'sh', 'sh long', 'sh jazzy', 'sh make', 'console', 'console fails', 'yaml', 'text', 'python',
 }  # fmt: skip
 RUN = ('sh', 'console', 'console fails')
-EXECUTABLES = {'monitor', 'page', 'replay', 'plant_simulator', 'watch'}
+EXECUTABLES = {'monitor', 'opcua_gateway', 'page', 'replay', 'plant_simulator', 'watch'}
 
 
 class Block(NamedTuple):
@@ -118,7 +118,16 @@ def _check_ros(words: list[str]) -> None:
     for option, value in itertools.pairwise(words):
         if option == '-p':
             name = value.split(':=')[0]
-            others = {'rate', 'stamped', 'use_clock', 'effects', 'days', 'seed', 'use_sim_time'}
+            others = {
+                'rate',
+                'stamped',
+                'use_clock',
+                'effects',
+                'days',
+                'seed',
+                'use_sim_time',
+                'mapping_file',
+            }
             assert name in PARAMETERS or name in others, value
         elif option == '-r':
             assert value.split(':=')[0] in topics or value.startswith('__'), value
