@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import datetime
 import ipaddress
 import json
@@ -129,6 +130,60 @@ class OpcUaServer:
     def restart(self) -> None:
         self.kill()
         self.process = self._start()
+
+
+class Relay:
+    """A TCP relay before a server: the wire that a test cuts, or in which everything is stuck."""
+
+    def __init__(self, to: int) -> None:
+        self._to = to
+        self._listener = socket.create_server(('127.0.0.1', 0))
+        self.port = int(self._listener.getsockname()[1])
+        self._pairs: list[tuple[socket.socket, socket.socket]] = []
+        self._open, self._flows = True, threading.Event()
+        self._flows.set()
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                near, _ = self._listener.accept()
+                if not self._open:
+                    near.close()
+                    continue
+                far = socket.create_connection(('127.0.0.1', self._to))
+                self._pairs.append((near, far))
+                for pair in ((near, far), (far, near)):
+                    threading.Thread(target=self._pump, args=pair, daemon=True).start()
+
+    def _pump(self, source: socket.socket, sink: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(65536):
+                self._flows.wait()
+                sink.sendall(data)
+
+    def cut(self) -> None:
+        """Close what is open and accept nothing."""
+        self._open = False
+        for pair in self._pairs:
+            for end in pair:
+                with contextlib.suppress(OSError):
+                    end.shutdown(socket.SHUT_RDWR)
+                end.close()
+        self._pairs.clear()
+
+    def hold(self) -> None:
+        """Let nothing through; connections stay open and new ones are accepted."""
+        self._flows.clear()
+
+    def mend(self) -> None:
+        """Let everything through again."""
+        self._open = True
+        self._flows.set()
+
+    def close(self) -> None:
+        self.cut()
+        self._listener.close()
 
 
 class Users:
