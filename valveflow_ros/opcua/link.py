@@ -201,7 +201,16 @@ async def connected(endpoint: str, security: Security, user: User) -> AsyncItera
         assert user.private_key is not None
         client.user_certificate = load_certificate(user.certificate)
         client.user_private_key = await load_key(user.private_key, client.user_certificate)
-    await asyncio.wait_for(client.connect(), 4.0 * ANSWER_S)
+    try:
+        await asyncio.wait_for(client.connect(), 4.0 * ANSWER_S)
+    except asyncio.TimeoutError:
+        if security.none:
+            raise
+        # So servers act to whom the first encrypted message means nothing.
+        raise DataError(
+            f'no answer within {ANSWER_S:g} s: the server does not offer this policy, does not '
+            "accept the certificate, or does not have the one named as 'trusted'"
+        ) from None
     try:
         yield client
     finally:

@@ -128,11 +128,12 @@ class GatewayUnit:
         state, unit, sampler = self.link.state, self.unit, self.sampler
         ahead = state.clock_ahead_s
         for_s = counted(round(now_s - state.since_s), 'second')
-        if not state.up:
+        if not (state.up or state.problem):
+            level, told = Level.WARN, f'Connecting to {unit.endpoint}.'
+        elif not state.up:
             level, told = Level.ERROR, f'No link to {unit.endpoint} for {for_s}'
-            told += f': {state.problem}.' if state.problem else '.'
-            if state.attempts:
-                told += f' Tried {counted(state.attempts, "time")}; it goes on trying.'
+            told += f': {state.problem}. '
+            told += f'Tried {counted(state.attempts, "time")}; it goes on trying.'
         elif abs(ahead) > _CLOCK_S:
             level = Level.WARN
             told = (
@@ -161,6 +162,8 @@ class GatewayUnit:
         if now_s - self._trouble_s.get(signal, -math.inf) < _SHOWN_S:
             told = ', '.join(f'{n} {name}' for name, n in values.items() if n and name in _TROUBLE)
             return Item(f'signal {topic}', Level.WARN, f'Since the start: {told}.', values)
+        if not self.link.state.up:
+            return Item(f'signal {topic}', Level.STALE, 'There is no link.', values)
         if not counts.received:
             return Item(f'signal {topic}', Level.WARN, 'Nothing came yet.', values)
         return Item(f'signal {topic}', Level.OK, 'Values come.', values)
@@ -224,7 +227,7 @@ class Way:
             self._start(self._offer.mark(self._tag, present))
 
     def _on_message(self, name: str, message: Any) -> None:
-        time_ns = from_time(message.header.stamp)
+        self._present, time_ns = True, from_time(message.header.stamp)
         self._start(self._offer.update(self._tag, name, variables(message), time_ns))
         if name == 'diagnosis' and message.verdict != Diagnosis.UNKNOWN:
             values = {'State': message.verdict, 'PreviousState': 0, 'Value': math.nan,
@@ -236,6 +239,7 @@ class Way:
 
     def _on_alarm(self, message: Alarm) -> None:
         time_ns, name = from_time(message.header.stamp), f'alarms.{message.name}'
+        self._present = True
         if name not in self.OBJECTS:
             return
         self._start(self._offer.update(self._tag, name, variables(message), time_ns))
@@ -365,7 +369,6 @@ def _serve(
     publisher = node.create_publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10))
     changes = {unit.name: Changes() for unit in units}
     log = node.get_logger()
-    say = {Level.OK: log.info, Level.WARN: log.warning, Level.ERROR: log.error}
     next_s = 0.0
     while not stop:
         executor.spin_once(timeout_sec=_LOOK_S)
@@ -380,8 +383,16 @@ def _serve(
         for unit in units:
             items = unit.items(now_s)
             publisher.publish(diagnostics_message(items, unit.name, unit.unit.tag, now_ns))
-            for item in changes[unit.name].pick(items, now_s):
-                say[item.level](f'{unit.unit.tag}, {item.name}: {item.sentence}')
+            fresh = (item for item in items if item.level != Level.STALE)
+            for item in changes[unit.name].pick(fresh, now_s):
+                told = f'{unit.unit.tag}, {item.name}: {item.sentence}'
+                # rclpy wants one severity for each place in the code.
+                if item.level == Level.OK:
+                    log.info(told)
+                elif item.level == Level.WARN:
+                    log.warning(told)
+                else:
+                    log.error(told)
 
 
 if __name__ == '__main__':
