@@ -23,9 +23,10 @@ from opcua_server import (
     write_mapping,
 )
 
-from valveflow_ros.opcua.link import Link, check_installed
+from valveflow_ros.opcua.link import Link
 from valveflow_ros.opcua.mapping import read_mapping_file
 from valveflow_ros.opcua.sampler import Sample, Sampler
+from valveflow_ros.opcua.session import check_installed
 from valveflow_ros.records import SIGNALS, Quality
 
 pytestmark = pytest.mark.skipif(
@@ -85,7 +86,8 @@ class Running:
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     """A function that starts a link; it is ended after the test."""
-    monkeypatch.setattr('valveflow_ros.opcua.link.ANSWER_S', 2.0)
+    for module in ('link', 'session'):
+        monkeypatch.setattr(f'valveflow_ros.opcua.{module}.ANSWER_S', 2.0)
     with contextlib.ExitStack() as stack:
 
         def start(content):

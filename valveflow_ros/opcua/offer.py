@@ -11,8 +11,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 from valveflow_ros.errors import DataError
-from valveflow_ros.opcua.link import in_words, load_certificate, load_key, to_datetime, uri_of
 from valveflow_ros.opcua.mapping import Offer, User
+from valveflow_ros.opcua.session import in_words, load_certificate, load_key, to_datetime, uri_of
 
 NAMESPACE = 'urn:valveflow'
 # Severity of an event, 1 to 1000, by the priority of the alarm; without a standing condition 100.

@@ -27,11 +27,12 @@ from valveflow_msgs.msg import Alarm, Diagnosis, DiagnosisCause, FlowCharacteris
 from valveflow_ros.errors import InputError, ValveflowError, counted
 from valveflow_ros.logs.mcap.importing import write_readings
 from valveflow_ros.monitoring.alarms import ResidualAlarm, ShiftAlarm
-from valveflow_ros.opcua.link import Link, check_installed
+from valveflow_ros.opcua.link import Link
 from valveflow_ros.opcua.mapping import GatewayMapping, UnitMapping, read_mapping_file
 from valveflow_ros.opcua.offer import NO_CONDITION, SEVERITY, Field, OfferServer
 from valveflow_ros.opcua.offer import Alarm as AlarmEvent
 from valveflow_ros.opcua.sampler import Counts, Sample, Sampler
+from valveflow_ros.opcua.session import check_installed
 from valveflow_ros.parameters import Parameter
 from valveflow_ros.records import NS_PER_S, SIGNALS, Readings, Signal
 from valveflow_ros.ros.declare import declare, unknown_overrides
