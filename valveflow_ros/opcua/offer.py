@@ -7,12 +7,19 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import hmac
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from valveflow_ros.errors import DataError
-from valveflow_ros.opcua.mapping import Offer, User
-from valveflow_ros.opcua.session import in_words, load_certificate, load_key, to_datetime, uri_of
+from valveflow_ros.opcua.mapping import Offer, Security, User
+from valveflow_ros.opcua.session import (
+    connected,
+    in_words,
+    load_certificate,
+    load_key,
+    to_datetime,
+    uri_of,
+)
 
 NAMESPACE = 'urn:valveflow'
 # Severity of an event, 1 to 1000, by the priority of the alarm; without a standing condition 100.
@@ -219,3 +226,20 @@ def _id(index: int, text: str) -> Any:
     from asyncua import ua
 
     return ua.NodeId(text, index)
+
+
+async def read_offered(endpoint: str, security: Security, names: Sequence[str]) -> list[Any]:
+    """Return variables of such a server by name, such as ``U1.characteristic.status``.
+
+    One that has no value yet is None.
+
+    Raises
+    ------
+    Exception
+        The server cannot be reached or refuses; see `in_words`.
+    """
+    async with connected(endpoint, security, User()) as client:
+        index = await client.get_namespace_index(NAMESPACE)
+        nodes = [client.get_node(_id(index, name)) for name in names]
+        data = [await node.read_data_value(raise_on_bad_status=False) for node in nodes]
+        return [None if found.Value is None else found.Value.Value for found in data]
