@@ -43,6 +43,8 @@ SECURITY: tuple[Parameter, ...] = (
               choices=('SignAndEncrypt', 'Sign')),
     Parameter('certificate', '', '', 'Own certificate, .der or .pem.'),
     Parameter('private_key', '', '', 'Its private key, .pem or .der.'),
+    Parameter('trusted', '', '', 'Certificate of the other side, .der or .pem, or a list of them; '
+              'no other is accepted.'),
     Parameter('allow_unencrypted', False, '', 'Accept policy None, or mode Sign.'),
 )  # fmt: skip
 USER: tuple[Parameter, ...] = (
@@ -241,8 +243,7 @@ class _Reader:
         return tuple(nodes)
 
     def _security(self, where: str, given: object, user: User) -> Security:
-        # Of several certificates any is accepted; no other is.
-        names = [*(row.name for row in SECURITY), 'trusted']
+        names = [row.name for row in SECURITY]
         content = self._section(where, {} if given is None else given, names)
         trusted = content.pop('trusted', None)
         values = self._values(where, content, SECURITY)

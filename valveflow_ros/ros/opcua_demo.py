@@ -21,7 +21,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from valveflow_msgs.msg import PlantSample
 
-from valveflow_ros.cli.main import main as valveflow
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.opcua.mapping import Security
 from valveflow_ros.opcua.offer import read_offered
@@ -100,15 +99,18 @@ class Demo:
         end = datetime.now(timezone.utc)
         words = ['import', f'opcua://127.0.0.1:{self._port}', '--mapping', str(mapping), '--from',
                  (end - timedelta(hours=_HOURS)).isoformat(), '--to', end.isoformat(),
-                 '-o', str(self._folder / 'history.mcap'), '--overwrite', '--quiet']  # fmt: skip
+                 '-o', str(self._folder / 'history.mcap'), '--overwrite']  # fmt: skip
         tell('A curve takes hours of data; the server has them: valveflow import opcua://...')
-        if valveflow(words) or self._stop:
-            raise _Stopped
+        self._valveflow(*words)
         tell('valveflow identify:')
         report = self._folder / 'result'
-        if valveflow(['identify', words[words.index('-o') + 1], '-o', str(report), '--quiet']):
-            raise _Stopped
+        self._valveflow('identify', str(self._folder / 'history.mcap'), '-o', str(report))
         tell(f'The report: {report / "report.html"}')
+
+    def _valveflow(self, *words: str) -> None:
+        command = [sys.executable, '-m', 'valveflow_ros.cli', *words, '--quiet']
+        if subprocess.run(command, check=False).returncode or self._stop:
+            raise _Stopped
 
     def _offers(self) -> bool:
         none = Security('None', '', None, None, ())
