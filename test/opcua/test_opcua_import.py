@@ -69,6 +69,17 @@ def test_parts_of_something_else_are_not_mixed(tmp_path):
         import_history(Source(), T0, T0 + 21 * HOUR_NS, path)
 
 
+def test_a_part_that_is_damaged_is_named(tmp_path):
+    path = tmp_path / 'log.mcap'
+    with pytest.raises(DataError):
+        import_history(Source(fail_at=2), T0, T0 + 20 * HOUR_NS, path)
+    (tmp_path / 'log.mcap.parts' / '000001.npz').write_bytes(b'PK no zip')
+    with pytest.raises(RecordingError, match='is damaged; remove it'):
+        import_history(Source(), T0, T0 + 20 * HOUR_NS, path)
+    (tmp_path / 'log.mcap.parts' / '000001.npz').unlink()
+    assert import_history(Source(), T0, T0 + 20 * HOUR_NS, path).messages == 20 * 60 * 4
+
+
 @pytest.mark.skipif(importlib.util.find_spec('asyncua') is None, reason='asyncua is an extra')
 def test_the_history_of_a_server_by_the_command(tmp_path, capsys):
     server = OpcUaServer(free_port(), '--history')

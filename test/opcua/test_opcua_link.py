@@ -282,3 +282,62 @@ def test_a_server_that_is_killed_and_started_again(run, times):
     stamps = [x.time_ns for x in link.samples]
     assert stamps == list(range(stamps[0], stamps[-1] + 1, link.unit.period_ns))
     server.kill()
+
+
+class Republishing:
+    """A session that still has some messages."""
+
+    def __init__(self, *numbers):
+        self.numbers = numbers
+
+    async def republish(self, _subscription, number):
+        from asyncua import ua
+
+        if number not in self.numbers:
+            raise ua.UaStatusCodeError(ua.StatusCodes.BadMessageNotAvailable)
+        return message(number, float(number)).NotificationMessage
+
+
+def message(number, *values):
+    """A message of the server with the power; without values a keep-alive."""
+    from asyncua import ua
+
+    items = [
+        ua.MonitoredItemNotification(ClientHandle=3, Value=ua.DataValue(ua.Variant(v)))
+        for v in values
+    ]
+    data = [ua.DataChangeNotification(MonitoredItems=items)] if items else []
+    return ua.PublishResult(
+        SubscriptionId=1,
+        NotificationMessage=ua.NotificationMessage(SequenceNumber=number, NotificationData=data),
+    )
+
+
+def test_missing_messages_are_asked_for_and_counted(tmp_path):
+    unit = read_mapping_file(write_mapping(tmp_path, mapping(1))).units[0]
+    sampler = Sampler(unit, time.time_ns())
+    link = Link(unit, lambda command: command(sampler))
+
+    async def take(session, *messages):
+        for one in messages:
+            await link._published(one, session)
+
+    asyncio.run(take(Republishing(3), message(1, 1.0), message(2), message(5, 5.0), message(6)))
+    # 2 and 4 are lost, 3 came again; keep-alives have the number of what comes next.
+    assert (link.state.lost_messages, link.state.republished) == (2, 1)
+    assert sampler.counts[3].received == 3
+    asyncio.run(take(Republishing(), message(7)))
+    # What a keep-alive shows to be missing is missing too.
+    assert link.state.lost_messages == 3
+
+
+def test_an_overflow_of_the_servers_queue_is_counted(tmp_path):
+    from asyncua import ua
+
+    unit = read_mapping_file(write_mapping(tmp_path, mapping(1))).units[0]
+    link = Link(unit, lambda command: None)
+    full = message(1, 1.0)
+    item = full.NotificationMessage.NotificationData[0].MonitoredItems[0]
+    item.Value = ua.DataValue(ua.Variant(1.0), StatusCode=ua.StatusCode(0x480))
+    asyncio.run(link._published(full, None))
+    assert link.state.overflows == {3: 1}

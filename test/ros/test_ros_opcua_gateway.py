@@ -9,6 +9,7 @@ import importlib.util
 import json
 import signal
 import socket
+from types import SimpleNamespace
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
@@ -26,6 +27,11 @@ from rclpy.node import Node
 from ros_helpers import wait_until
 from test_ros_watch import AT_S, Speaker
 from valveflow_msgs.msg import Alarm, PlantSample
+
+import valveflow_ros as vf
+from valveflow_ros.opcua.mapping import read_mapping_file
+from valveflow_ros.records import Readings
+from valveflow_ros.ros.gateway_main import GatewayUnit
 
 pytestmark = [
     pytest.mark.ros,
@@ -260,3 +266,14 @@ def test_a_mapping_that_cannot_be_used_ends_it_with_a_sentence(
     told = processes.output(gateway)
     assert sentence in told
     assert 'Traceback' not in told
+
+
+def test_the_history_of_an_outage_is_a_recording(tmp_path):
+    unit = read_mapping_file(
+        write_mapping(tmp_path, mapping(1, backfill_directory='new/backfill'))
+    ).units[0]
+    parts = [Readings.of([(AT_S * 10**9 + k, k % 4, 10.0, 0) for k in range(8)])]
+    told = GatewayUnit._save(SimpleNamespace(unit=unit), parts)
+    path = tmp_path / 'new/backfill/backfill_U1_20231114T221320Z.mcap'
+    assert told == f'8 values in {path}'
+    assert len(vf.open_log(path).readings) == 8

@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -137,5 +138,8 @@ def _save(file: Path, parts: list[Readings]) -> None:
 
 
 def _load(file: Path) -> Readings:
-    with np.load(file) as columns:
-        return Readings(*(columns[name] for name in ('time_ns', 'signal', 'value', 'quality')))
+    try:
+        with np.load(file, allow_pickle=False) as columns:
+            return Readings(*(columns[name] for name in ('time_ns', 'signal', 'value', 'quality')))
+    except (ValueError, KeyError, EOFError, BadZipFile):
+        raise RecordingError(file, 'is damaged; remove it, and it is read again') from None

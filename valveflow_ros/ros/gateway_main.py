@@ -181,8 +181,10 @@ class GatewayUnit:
     def _save(self, parts: list[Readings]) -> str:
         """Write the history of an outage; called in a thread of its own."""
         start = time.strftime('%Y%m%dT%H%M%SZ', time.gmtime(int(parts[0].time_ns[0]) // NS_PER_S))
-        assert self.unit.backfill_directory is not None
-        path = self.unit.backfill_directory / f'backfill_{self.unit.tag}_{start}.mcap'
+        folder = self.unit.backfill_directory
+        assert folder is not None
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        path = folder / f'backfill_{self.unit.tag}_{start}.mcap'
         signals = [node.signal for node in self.unit.nodes]
         written = write_readings(parts, signals, path, prefix=self.unit.namespace, overwrite=True)
         return f'{counted(written.messages, "value")} in {path}'
@@ -339,9 +341,10 @@ def _run(stop: StopFlag) -> int:
         mapping = read_mapping_file(Path(str(values['mapping_file'])))
         ways = []
         if mapping.offer is not None:
-            server = OfferServer(mapping.offer, _units_offered(mapping))
-            loop.start(server.start()).result(_OFFER_S)
-            ways = [Way(node, unit, server, loop.start) for unit in mapping.units]
+            offered = OfferServer(mapping.offer, _units_offered(mapping))
+            loop.start(offered.start()).result(_OFFER_S)
+            server = offered
+            ways = [Way(node, unit, offered, loop.start) for unit in mapping.units]
             log.info(f'Curve, alarms and diagnosis are offered at {mapping.offer.endpoint}.')
         units = [GatewayUnit(node, unit) for unit in mapping.units]
         for unit in units:
