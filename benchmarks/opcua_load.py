@@ -163,8 +163,11 @@ def measured(folder: Path, port: int, seconds: float, restarts: int) -> dict[str
     listener = Listener()
     try:
         listener.until_good(time.time_ns())
-        listener.spin(3.0)
-        before = listener.total('received')
+        # Every value once, when the subscription begins, told by the next message of the health.
+        while listener.total('received') < _UNITS * len(SIGNALS):
+            listener.spin(0.5)
+        listener.spin(2.0)
+        before, losses = listener.total('received'), listener.total('losses')
         seen = psutil.Process(gateway.pid)
         used = seen.cpu_times()
         listener.samples = listener.good = 0
@@ -184,6 +187,9 @@ def measured(folder: Path, port: int, seconds: float, restarts: int) -> dict[str
             'changes_received': listener.total('received') - before,
             'changes_lost': listener.total('lost'),
             'messages_lost': listener.total('messages_lost'),
+            'messages_sent_again': listener.total('messages_sent_again'),
+            'links_lost': listener.total('losses') - losses,
+            'received_before': before,
             'samples': samples, 'samples_good': good,
             'sample_age_s_median': round(statistics.median(ages), 3),
             'sample_age_s_worst': round(ages[-1], 3),

@@ -103,6 +103,7 @@ class Link:
         self._confirmed_ns = 0
         self._heard_s = 0.0
         self._sequence = 0
+        self._session: Any = None
         self._held_back: list[tuple[list[Change], int]] | None = None
 
     async def run(self) -> None:
@@ -162,10 +163,12 @@ class Link:
             PublishingEnabled=True,
         )
         self._sequence, self._heard_s = 0, time.monotonic()
-        session = client.uaclient.session
+        session = self._session = client.uaclient.session
 
         async def published(result: ua.PublishResult) -> None:
-            await self._published(result, session)
+            # A session that could not be closed may still speak.
+            if session is self._session:
+                await self._published(result, session)
 
         made = await session.create_subscription(wanted, published)
         self.state.nodes.clear()

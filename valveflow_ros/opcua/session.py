@@ -209,6 +209,7 @@ async def connected(endpoint: str, security: Security, user: User) -> AsyncItera
     finally:
         with contextlib.suppress(Exception, asyncio.CancelledError):
             await asyncio.wait_for(client.disconnect(), ANSWER_S)
+        client.disconnect_socket()
 
 
 async def resolve(client: Client, node: Node) -> ua.NodeId:
