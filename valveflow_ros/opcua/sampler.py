@@ -122,7 +122,6 @@ class Sampler:
         self.confirmed_ns = 0
         self._next_ns = (now_ns // unit.period_ns + 1) * unit.period_ns
         self.sent = self.unconfirmed = 0
-        self.unconfirmed_from_ns = 0
 
     def keep_alive(self, seconds: float) -> None:
         """Take how long the server may be silent while nothing changes."""
@@ -179,7 +178,6 @@ class Sampler:
                 break
             if not confirmed:
                 self.unconfirmed += 1
-                self.unconfirmed_from_ns = self.unconfirmed_from_ns or self._next_ns
             samples.append(self._sample(self._next_ns, confirmed))
             self._next_ns += self._period_ns
         self.sent += len(samples)
