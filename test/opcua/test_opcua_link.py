@@ -309,6 +309,7 @@ def message(number, *values):
     data = [ua.DataChangeNotification(MonitoredItems=items)] if items else []
     return ua.PublishResult(
         SubscriptionId=1,
+        MoreNotifications=False,
         NotificationMessage=ua.NotificationMessage(SequenceNumber=number, NotificationData=data),
     )
 
@@ -341,3 +342,16 @@ def test_an_overflow_of_the_servers_queue_is_counted(tmp_path):
     item.Value = ua.DataValue(ua.Variant(1.0), StatusCode=ua.StatusCode(0x480))
     asyncio.run(link._published(full, None))
     assert link.state.overflows == {3: 1}
+
+
+def test_a_message_with_more_to_follow_confirms_nothing(tmp_path):
+    unit = read_mapping_file(write_mapping(tmp_path, mapping(1))).units[0]
+    sampler = Sampler(unit, time.time_ns())
+    link = Link(unit, lambda command: command(sampler))
+    first, last = message(1, 1.0), message(2, 2.0)
+    first.MoreNotifications = True
+    asyncio.run(link._published(first, None))
+    assert sampler.confirmed_ns == 0
+    asyncio.run(link._published(last, None))
+    assert sampler.confirmed_ns > 0
+    assert sampler.counts[3].received == 2

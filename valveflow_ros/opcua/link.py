@@ -241,14 +241,16 @@ class Link:
                 if not again.NotificationData:
                     raise DataError('It is empty.')
                 self.state.republished += 1
-                self._deliver(again.NotificationData, now_ns)
+                self._deliver(again.NotificationData, now_ns, self._confirmed_ns)
             except Exception:  # noqa: BLE001 - it is lost, whatever the server said
                 self.state.lost_messages += 1
         # A message without values, a keep-alive, has the number of the next one with values.
         self._sequence = number if message.NotificationData else max(self._sequence, number - 1)
-        self._deliver(message.NotificationData or [], now_ns)
+        # Where the server has more to send at once, not all up to now is here yet.
+        confirmed_ns = self._confirmed_ns if result.MoreNotifications else now_ns
+        self._deliver(message.NotificationData or [], now_ns, confirmed_ns)
 
-    def _deliver(self, notifications: Iterable[Any], now_ns: int) -> None:
+    def _deliver(self, notifications: Iterable[Any], now_ns: int, confirmed_ns: int) -> None:
         from asyncua import ua
 
         changes = []
@@ -266,9 +268,9 @@ class Link:
                     lost[change.signal] = lost.get(change.signal, 0) + 1
                 changes.append(change)
         if self._held_back is not None:
-            self._held_back.append((changes, now_ns))
+            self._held_back.append((changes, confirmed_ns))
         else:
-            self._give(changes, now_ns)
+            self._give(changes, confirmed_ns)
 
     def _give(self, changes: list[Change], confirmed_ns: int) -> None:
         self._newest_ns.update((change.signal, change.source_ns) for change in changes)
