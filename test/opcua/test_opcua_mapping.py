@@ -43,8 +43,8 @@ def test_the_example_is_one_that_is_taken(tmp_path):
     found = read_mapping_file(path)
     assert found.units[0].user.password == 'secret'
     assert len(found.units[0].nodes) == 5
-    assert found.offer is not None
-    assert found.offer.security.trusted == (tmp_path / 'dcs.der',)
+    assert found.server is not None
+    assert found.server.security.trusted == (tmp_path / 'dcs.der',)
 
 
 def changed(*keys: str | int, to: object) -> dict:
@@ -77,7 +77,10 @@ REFUSED = [
     (changed('security', to={}), "'certificate' is missing"),
     (changed('security', to={'certificate': 'no.der'}), 'cannot be read as certificate'),
     (changed('user', to={'name': 'x'}), "'password_file' is missing"),
-    (changed('offer', to={'endpoint': 'opc.tcp://127.0.0.1:1'}), "offer, security: 'certificate'"),
+    (
+        changed('server', to={'endpoint': 'opc.tcp://127.0.0.1:1'}),
+        "server, security: 'certificate'",
+    ),
     ({**mapping(1), 'units': mapping(1)['units'] * 2}, "two units have the namespace '/u1'"),
 ]
 

@@ -147,7 +147,7 @@ def test_what_a_monitor_says_is_read_by_opc_ua(processes, context, server, tmp_p
 
     keys = {name: certificate(tmp_path, name) for name in ('gateway', 'dcs', 'stranger')}
     port = free_port()
-    content = mapping(server.port, offer={
+    content = mapping(server.port, server={
         'endpoint': f'opc.tcp://127.0.0.1:{port}',
         'security': {'certificate': keys['gateway'][0], 'private_key': keys['gateway'][1],
                      'trusted': [keys['dcs'][0]]},
@@ -238,7 +238,7 @@ def test_a_server_address_that_is_taken_is_told(processes, tmp_path):
             'endpoint': f'opc.tcp://127.0.0.1:{taken.getsockname()[1]}',
             'security': {'policy': 'None', 'allow_unencrypted': True},
         }
-        gateway = start(processes, tmp_path, mapping(1, offer=offer))
+        gateway = start(processes, tmp_path, mapping(1, server=offer))
         assert gateway.wait(60) == 1
     told = processes.output(gateway)
     assert 'cannot be offered: ' in told

@@ -120,7 +120,7 @@ class UnitMapping:
 
 
 @dataclass(frozen=True, slots=True)
-class Offer:
+class ServerSettings:
     """The server that shows curve, alarms and diagnosis."""
 
     endpoint: str
@@ -133,7 +133,7 @@ class GatewayMapping:
     """A whole mapping file."""
 
     units: tuple[UnitMapping, ...]
-    offer: Offer | None
+    server: ServerSettings | None
 
 
 def read_mapping_file(path: str | Path) -> GatewayMapping:
@@ -166,7 +166,7 @@ class _Reader:
 
     def read(self, content: object) -> GatewayMapping:
         link = [row.name for row in LINK]
-        top = self._section('', content, [*link, 'security', 'user', 'units', 'offer'])
+        top = self._section('', content, [*link, 'security', 'user', 'units', 'server'])
         rows = top.get('units')
         if not isinstance(rows, list) or not rows:
             raise self._error('', "'units' must be a list with a unit at least")
@@ -177,17 +177,17 @@ class _Reader:
             twice = [name for name in names if names.count(name) > 1]
             if twice:
                 raise self._error('', f"two units have the {what} '{twice[0]}'")
-        offer = None
-        if 'offer' in top:
-            given = self._section('offer', top['offer'], ['endpoint', 'security', 'user'])
-            user = self._user('offer, user', given.get('user'))
-            offer = Offer(
-                self._endpoint('offer', given.get('endpoint')),
-                self._security('offer, security', given.get('security'), user), user,
+        server = None
+        if 'server' in top:
+            given = self._section('server', top['server'], ['endpoint', 'security', 'user'])
+            user = self._user('server, user', given.get('user'))
+            server = ServerSettings(
+                self._endpoint('server', given.get('endpoint')),
+                self._security('server, security', given.get('security'), user), user,
             )  # fmt: skip
             if user.certificate is not None:
-                raise self._error('offer, user', 'takes name and password_file only')
-        return GatewayMapping(units, offer)
+                raise self._error('server, user', 'takes name and password_file only')
+        return GatewayMapping(units, server)
 
     def _unit(self, where: str, given: object, common: dict[str, Any]) -> UnitMapping:
         names = [row.name for row in LINK]

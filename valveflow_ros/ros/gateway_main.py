@@ -29,8 +29,8 @@ from valveflow_ros.logs.mcap.importing import write_readings
 from valveflow_ros.monitoring.alarms import ResidualAlarm, ShiftAlarm
 from valveflow_ros.opcua.link import Link
 from valveflow_ros.opcua.mapping import GatewayMapping, UnitMapping, read_mapping_file
-from valveflow_ros.opcua.offer import NO_CONDITION, SEVERITY, Field, OfferServer
-from valveflow_ros.opcua.offer import Alarm as AlarmEvent
+from valveflow_ros.opcua.results_server import NO_CONDITION, SEVERITY, Field, ResultsServer
+from valveflow_ros.opcua.results_server import Alarm as AlarmEvent
 from valveflow_ros.opcua.sampler import Counts, Sample, Sampler
 from valveflow_ros.opcua.session import check_installed
 from valveflow_ros.parameters import Parameter
@@ -190,14 +190,14 @@ class GatewayUnit:
         return f'{counted(written.messages, "value")} in {path}'
 
 
-class Way:
+class ResultsBridge:
     """Brings what a unit's monitor publishes to the OPC UA server.
 
     Parameters
     ----------
     node : Node
     unit : UnitMapping
-    offer : OfferServer
+    server : ResultsServer
     start : callable
         Begins a coroutine in the server's loop.
     """
@@ -210,10 +210,10 @@ class Way:
         self,
         node: Node,
         unit: UnitMapping,
-        offer: OfferServer,
+        server: ResultsServer,
         start: Callable[[Coroutine[Any, Any, Any]], Any],
     ) -> None:
-        self._node, self._tag, self._offer, self._start = node, unit.tag, offer, start
+        self._node, self._tag, self._server, self._start = node, unit.tag, server, start
         self._monitor = f'{unit.namespace}/{unit.monitor}'
         self._present = True
         for kind, name in ((FlowCharacteristic, 'characteristic'), (Diagnosis, 'diagnosis')):
@@ -227,25 +227,25 @@ class Way:
         present = self._node.count_publishers(f'{self._monitor}/characteristic') > 0
         if present != self._present:
             self._present = present
-            self._start(self._offer.mark(self._tag, present))
+            self._start(self._server.mark(self._tag, present))
 
     def _on_message(self, name: str, message: Any) -> None:
         self._present, time_ns = True, from_time(message.header.stamp)
-        self._start(self._offer.update(self._tag, name, variables(message), time_ns))
+        self._start(self._server.update(self._tag, name, variables(message), time_ns))
         if name == 'diagnosis' and message.verdict != Diagnosis.UNKNOWN:
             values = {'State': message.verdict, 'PreviousState': 0, 'Value': math.nan,
                       'Limit': math.nan, 'Unit': ''}  # fmt: skip
             wrong = message.verdict != Diagnosis.NOTHING
             severity = SEVERITY[Alarm.MEDIUM] if wrong else NO_CONDITION
             event = AlarmEvent('diagnosis', time_ns, message.sentence, severity, values)
-            self._start(self._offer.alarm(self._tag, event))
+            self._start(self._server.alarm(self._tag, event))
 
     def _on_alarm(self, message: Alarm) -> None:
         time_ns, name = from_time(message.header.stamp), f'alarms.{message.name}'
         self._present = True
         if name not in self.OBJECTS:
             return
-        self._start(self._offer.update(self._tag, name, variables(message), time_ns))
+        self._start(self._server.update(self._tag, name, variables(message), time_ns))
         # What is only told again rings no bell.
         if message.state == message.previous_state:
             return
@@ -256,7 +256,7 @@ class Way:
             'Value': message.value, 'Limit': message.limit, 'Unit': message.unit,
         }  # fmt: skip
         event = AlarmEvent(message.name, time_ns, message.sentence, severity, values)
-        self._start(self._offer.alarm(self._tag, event))
+        self._start(self._server.alarm(self._tag, event))
 
 
 def fields(kind: Any) -> Iterable[Field]:
@@ -296,7 +296,7 @@ def variables(message: Any) -> dict[str, object]:
 
 def _units_offered(mapping: GatewayMapping) -> dict[str, dict[str, list[Field]]]:
     kinds = {'characteristic': FlowCharacteristic, 'diagnosis': Diagnosis}
-    objects = {name: list(fields(kinds.get(name, Alarm))) for name in Way.OBJECTS}
+    objects = {name: list(fields(kinds.get(name, Alarm))) for name in ResultsBridge.OBJECTS}
     return {unit.tag: objects for unit in mapping.units}
 
 
@@ -330,7 +330,7 @@ def _run(stop: StopFlag) -> int:
     loop = LoopThread()
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    server: OfferServer | None = None
+    server: ResultsServer | None = None
     try:
         values = declare(node, TABLE)
         log = node.get_logger()
@@ -339,18 +339,18 @@ def _run(stop: StopFlag) -> int:
         if not values['mapping_file']:
             raise InputError('Name the mapping file: --ros-args -p mapping_file:=opcua.yaml.')
         mapping = read_mapping_file(Path(str(values['mapping_file'])))
-        ways = []
-        if mapping.offer is not None:
-            offered = OfferServer(mapping.offer, _units_offered(mapping))
+        bridges = []
+        if mapping.server is not None:
+            offered = ResultsServer(mapping.server, _units_offered(mapping))
             loop.start(offered.start()).result(_OFFER_S)
             server = offered
-            ways = [Way(node, unit, offered, loop.start) for unit in mapping.units]
-            log.info(f'Curve, alarms and diagnosis are offered at {mapping.offer.endpoint}.')
+            bridges = [ResultsBridge(node, unit, offered, loop.start) for unit in mapping.units]
+            log.info(f'Curve, alarms and diagnosis are offered at {mapping.server.endpoint}.')
         units = [GatewayUnit(node, unit) for unit in mapping.units]
         for unit in units:
             loop.start(unit.link.run())
         period_s = float(str(values['diagnostics_period']))
-        _serve(node, executor, stop, units, ways, period_s)
+        _serve(node, executor, stop, units, bridges, period_s)
     finally:
         stop.last()
         if server is not None:
@@ -367,7 +367,7 @@ def _serve(
     executor: SingleThreadedExecutor,
     stop: StopFlag,
     units: Sequence[GatewayUnit],
-    ways: Sequence[Way],
+    bridges: Sequence[ResultsBridge],
     diagnostics_period_s: float,
 ) -> None:
     publisher = node.create_publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10))
@@ -382,8 +382,8 @@ def _serve(
         if now_s < next_s:
             continue
         next_s = now_s + diagnostics_period_s
-        for way in ways:
-            way.look()
+        for bridge in bridges:
+            bridge.look()
         for unit in units:
             items = unit.items(now_s)
             publisher.publish(diagnostics_message(items, unit.name, unit.unit.tag, now_ns))

@@ -23,8 +23,8 @@ from valveflow_msgs.msg import PlantSample
 
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.opcua.mapping import Security
-from valveflow_ros.opcua.offer import read_offered
 from valveflow_ros.opcua.plant_server import NAMESPACE
+from valveflow_ros.opcua.results_server import read_results
 from valveflow_ros.opcua.session import check_installed
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.ros.demo import Process, tell
@@ -116,7 +116,7 @@ class Demo:
         none = Security('None', '', None, None, ())
         names = [f'U1.characteristic.{name}' for name in ('status', 'cause')]
         endpoint = f'opc.tcp://127.0.0.1:{self._offered}'
-        status, cause = asyncio.run(read_offered(endpoint, none, names))
+        status, cause = asyncio.run(read_results(endpoint, none, names))
         if status is None:
             return False
         tell(f'Read back at {endpoint}: {names[0]} is {_STATUS[status]}. {cause}')
@@ -169,7 +169,7 @@ class Demo:
         path.write_text(json.dumps({  # JSON is YAML
             'endpoint': f'opc.tcp://127.0.0.1:{self._port}', 'security': _UNENCRYPTED,
             'units': [{'namespace': '', 'tag': 'U1', 'signals': signals}],
-            'offer': {'endpoint': f'opc.tcp://127.0.0.1:{self._offered}',
+            'server': {'endpoint': f'opc.tcp://127.0.0.1:{self._offered}',
                       'security': _UNENCRYPTED},
         }, indent=1))  # fmt: skip
         return path

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from valveflow_ros.errors import DataError
-from valveflow_ros.opcua.mapping import Offer, Security, User
+from valveflow_ros.opcua.mapping import Security, ServerSettings, User
 from valveflow_ros.opcua.session import (
     connected,
     in_words,
@@ -72,19 +72,21 @@ class _Readers:
         return Role(role=UserRole.User)
 
 
-class OfferServer:
+class ResultsServer:
     """The server; all calls belong into one event loop.
 
     Parameters
     ----------
-    offer : Offer
+    settings : ServerSettings
     units : mapping of str to mapping of str to sequence of Field
         By the tag of the unit: its objects, such as ``characteristic`` and ``alarms.residual``,
         and their variables. The id of a variable is ``ns=N;s=TAG.OBJECT.FIELD``.
     """
 
-    def __init__(self, offer: Offer, units: Mapping[str, Mapping[str, Iterable[Field]]]) -> None:
-        self._offer, self._units = offer, units
+    def __init__(
+        self, settings: ServerSettings, units: Mapping[str, Mapping[str, Iterable[Field]]]
+    ) -> None:
+        self._settings, self._units = settings, units
         self._server: Any = None
         self._variables: dict[tuple[str, str, str], tuple[Any, Any]] = {}
         self._last: dict[tuple[str, str, str], Any] = {}
@@ -104,12 +106,12 @@ class OfferServer:
         from asyncua import Server, ua
         from asyncua.crypto.uacrypto import der_from_x509
 
-        offer, security = self._offer, self._offer.security
+        settings, security = self._settings, self._settings.security
         trusted = [der_from_x509(load_certificate(path)) for path in security.trusted]
-        self._server = server = Server(user_manager=_Readers(trusted, offer.user))
+        self._server = server = Server(user_manager=_Readers(trusted, settings.user))
         await server.init()
         server.set_server_name('valveflow')
-        server.set_endpoint(offer.endpoint)
+        server.set_endpoint(settings.endpoint)
         if security.none:
             server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
         else:
@@ -123,13 +125,13 @@ class OfferServer:
             server.set_security_policy(
                 [getattr(ua.SecurityPolicyType, f'{security.policy}_{security.mode}')]
             )
-        tokens = ua.UserNameIdentityToken if offer.user.name else ua.AnonymousIdentityToken
+        tokens = ua.UserNameIdentityToken if settings.user.name else ua.AnonymousIdentityToken
         server.set_identity_tokens([tokens])
         await self._build()
         try:
             await server.start()
         except OSError as error:
-            raise DataError(f'{offer.endpoint} cannot be offered: {in_words(error)}.') from None
+            raise DataError(f'{settings.endpoint} cannot be offered: {in_words(error)}.') from None
 
     async def stop(self) -> None:
         """Close it."""
@@ -228,7 +230,7 @@ def _id(index: int, text: str) -> Any:
     return ua.NodeId(text, index)
 
 
-async def read_offered(endpoint: str, security: Security, names: Sequence[str]) -> list[Any]:
+async def read_results(endpoint: str, security: Security, names: Sequence[str]) -> list[Any]:
     """Return variables of such a server by name, such as ``U1.characteristic.status``.
 
     One that has no value yet is None.
