@@ -7,6 +7,7 @@ from __future__ import annotations
 import asyncio
 import importlib.util
 import json
+import os
 import signal
 import socket
 from types import SimpleNamespace
@@ -277,3 +278,14 @@ def test_the_history_of_an_outage_is_a_recording(tmp_path):
     path = tmp_path / 'new/backfill/backfill_U1_20231114T221320Z.mcap'
     assert told == f'8 values in {path}'
     assert len(vf.open_log(path).readings) == 8
+
+
+@pytest.mark.slow
+def test_the_demo_tells_its_story(processes, tmp_path):
+    if not os.environ.get('VALVEFLOW_SLOW'):
+        pytest.skip('a minute; VALVEFLOW_SLOW=1 runs it')
+    demo = processes.start('valveflow_ros.ros.opcua_demo', '--output', str(tmp_path / 'demo'))
+    assert demo.wait(300) == 0
+    told = processes.output(demo)
+    for words in ('publishes plant_sample', 'Read back', 'is killed', 'started again', 'pieces'):
+        assert words in told
