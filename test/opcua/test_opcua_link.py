@@ -355,3 +355,17 @@ def test_a_message_with_more_to_follow_confirms_nothing(tmp_path):
     asyncio.run(link._published(last, None))
     assert sampler.confirmed_ns > 0
     assert sampler.counts[3].received == 2
+
+
+def test_the_end_of_a_subscription_confirms_nothing(tmp_path):
+    from asyncua import ua
+
+    unit = read_mapping_file(write_mapping(tmp_path, mapping(1))).units[0]
+    sampler = Sampler(unit, time.time_ns())
+    link = Link(unit, lambda command: command(sampler))
+    end = message(0)
+    status = ua.StatusCode(ua.StatusCodes.BadShutdown)
+    end.NotificationMessage.NotificationData = [ua.StatusChangeNotification(Status=status)]
+    asyncio.run(link._published(end, None))
+    assert sampler.confirmed_ns == 0
+    assert link.state.lost_messages == 0

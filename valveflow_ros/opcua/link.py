@@ -231,7 +231,14 @@ class Link:
 
     async def _published(self, result: ua.PublishResult, session: Any) -> None:
         """Take a message of the server; those missing before it are asked for again."""
+        from asyncua import ua
+
         now_ns, message = time.time_ns(), result.NotificationMessage
+        if any(isinstance(n, ua.StatusChangeNotification) for n in message.NotificationData or ()):
+            # The server has ended the subscription; or asyncua says so itself of a lost link, and
+            # that confirms nothing. What an old session still sends is no longer wanted.
+            self._session, self._heard_s = None, -math.inf
+            return
         self._heard_s = time.monotonic()
         number = int(message.SequenceNumber)
         expected = self._sequence % 0xFFFFFFFF + 1
@@ -286,6 +293,8 @@ class Link:
             now_s = time.monotonic()
             if client.state is not UaClientState.CONNECTED:
                 raise ConnectionError
+            if self._heard_s == -math.inf:
+                raise DataError('the server has ended the subscription')
             if now_s - self._heard_s > longest_silence_s:
                 raise DataError(f'the server was silent for {longest_silence_s:.0f} s')
             if now_s - looked_s > _LOOK_S:
