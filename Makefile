@@ -1,5 +1,6 @@
 # make setup   .venv and install/, from pinned wheels; quick when nothing changed
 # make demo    set-up, then a simulated plant, the monitor, an alarm and a recording
+# make demo-opcua   set-up, then a plant behind an OPC UA server, gateway and monitor: a lost link, the way back
 # make test    set-up, then every test on all cores (PYTEST_ARGS='-k partition' for some, PARALLEL= for one by one)
 # make test-versions   every test with Python 3.12 and the libraries of Ubuntu 24.04, and with Python 3.10
 #                 and the newest, each in a copy under build/ (PYTHONS='python3.10 /path/to/python3.12')
@@ -21,7 +22,7 @@
 
 SHELL := bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-versions test-slow lint format bench bench-gate mutation repeat torture study study-diagnosis certify-partition lock clean
+.PHONY: help setup demo demo-opcua test test-versions test-slow lint format bench bench-gate mutation repeat torture study study-diagnosis certify-partition lock clean
 
 export PYTHON
 ENV := source ./env.sh &&
@@ -32,7 +33,7 @@ PARALLEL ?= -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 PYTHONS ?= python3.10 python3.12
 # Checked as strictly as mypy can; ros/ is not, because rclpy carries no annotations.
 STRICT := $(wildcard $(addprefix valveflow_ros/,*.py signals segments partition curve fit \
-  monitoring diagnosis baselines plant logs report interface page cli) tools)
+  monitoring diagnosis baselines plant logs opcua report interface page cli) tools)
 BENCHMARKS := node_load partition reading ten_days
 STUDIES := paper_study coverage_study segment_study shift_study monitor_study \
   compare_study study_figures refinery_valves
@@ -45,6 +46,9 @@ setup:
 
 demo: setup
 	@$(VALVEFLOW_DEMO)
+
+demo-opcua: setup
+	@$(ENV) python -m valveflow_ros.ros.opcua_demo --output demo_output/opcua
 
 test: setup
 	@$(ENV) VALVEFLOW_REQUIRE_ROS=1 python -m pytest $(PARALLEL) $(PYTEST_ARGS)

@@ -21,7 +21,7 @@ README = Path(__file__).resolve().with_name('README.md')
 COMMAND = ['valveflow = valveflow_ros.cli.main:main']
 NODES = [
     f'{name} = valveflow_ros.ros:{name}'
-    for name in ('monitor', 'page', 'plant_simulator', 'replay', 'watch')
+    for name in ('monitor', 'opcua_gateway', 'page', 'plant_simulator', 'replay', 'watch')
 ]
 # pip would put the nodes beside the command, under names as plain as `monitor`, also
 # where there is no ROS. ros2 looks for them in lib/valveflow_ros, where colcon puts them.

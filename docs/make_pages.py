@@ -26,6 +26,7 @@ PARTS: dict[str, Callable[[], str]] = {
     'services': page_tables.services,
     'parameters': page_tables.parameters,
     'messages': page_tables.messages,
+    'mapping': page_tables.mapping,
     'effects': page_effects.index,
     'measured': page_claims.measured,
     'results': page_claims.results,

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from valveflow_ros.cli.main import VERBS
+from valveflow_ros.opcua.mapping import LINK, NODE, SECURITY, USER
 from valveflow_ros.parameters import TABLE, Parameter
 from valveflow_ros.records import SIGNALS
 
@@ -147,6 +148,16 @@ def parameters() -> str:
         for row in TABLE
     )  # fmt: skip
     return table(('parameter', 'default', 'unit', 'range', ''), rows)
+
+
+def mapping() -> str:
+    """Return every key of the mapping file of the OPC UA gateway."""
+    places = (('', LINK), ('security: ', SECURITY), ('user: ', USER), ('a signal: ', NODE))
+    rows = (
+        (f'{place}`{row.name}`', _default(row), row.unit, _range(row), row.sentence)
+        for place, keys in places for row in keys
+    )  # fmt: skip
+    return table(('key', 'default', 'unit', 'range', ''), rows)
 
 
 _FIELD = re.compile(r'^([A-Za-z0-9_/\[\]]+)\s+([A-Za-z0-9_]+)\s*(=\s*(\S+))?\s*(?:#\s*(.*))?$')

@@ -22,7 +22,7 @@ SIGNAL = BASE | {'signals'}
 SEGMENT = SIGNAL | {'segments', 'partition'}
 MODEL = SEGMENT | {'curve', 'fit'}
 METHOD = MODEL | {'monitoring', 'diagnosis', 'baselines', 'plant'}
-FACES = METHOD | {'logs', 'report', 'interface', 'page'}
+FACES = METHOD | {'logs', 'opcua', 'report', 'interface', 'page'}
 ALLOWED: dict[str, set[str]] = {
     '': {'interface'},
     'errors': set(),
@@ -40,9 +40,10 @@ ALLOWED: dict[str, set[str]] = {
     'baselines': MODEL | {'monitoring'},
     'plant': BASE,
     'logs': {'errors', 'records'},
+    'opcua': SIGNAL | {'plant'},
     'report': METHOD,
     'page': METHOD | {'report'},
-    'interface': METHOD | {'logs', 'report'},
+    'interface': METHOD | {'logs', 'opcua', 'report'},
     'cli': FACES,
     'ros': FACES,
 }
@@ -177,6 +178,17 @@ def test_nobody_knows_what_is_not_his(rooms, known):
         if name.split('.')[0] in known
     ]
     assert wrong == []
+
+
+def test_only_one_folder_knows_asyncua():
+    """It is an extra under the LGPL: optional, and imported where it is needed alone."""
+    users = {
+        room(path)
+        for path in sources()
+        for _, name in imported(path)
+        if name.split('.')[0] == 'asyncua'
+    }
+    assert users == {'opcua'}
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ KINDS = {
     'sh', 'sh long', 'sh jazzy', 'sh make', 'console', 'console fails', 'yaml', 'text', 'python',
 }  # fmt: skip
 RUN = ('sh', 'console', 'console fails')
-EXECUTABLES = {'monitor', 'page', 'replay', 'plant_simulator', 'watch'}
+EXECUTABLES = {'monitor', 'opcua_gateway', 'page', 'replay', 'plant_simulator', 'watch'}
 
 
 class Block(NamedTuple):
@@ -118,7 +118,16 @@ def _check_ros(words: list[str]) -> None:
     for option, value in itertools.pairwise(words):
         if option == '-p':
             name = value.split(':=')[0]
-            others = {'rate', 'stamped', 'use_clock', 'effects', 'days', 'seed', 'use_sim_time'}
+            others = {
+                'rate',
+                'stamped',
+                'use_clock',
+                'effects',
+                'days',
+                'seed',
+                'use_sim_time',
+                'mapping_file',
+            }
             assert name in PARAMETERS or name in others, value
         elif option == '-r':
             assert value.split(':=')[0] in topics or value.startswith('__'), value
@@ -219,6 +228,13 @@ def test_the_live_tutorial_works(
     assert run(ROOT / 'docs/tutorial_live.md', tmp_path, RUN, environment) > 0
 
 
+@pytest.mark.ros
+def test_the_opcua_tutorial_works(tmp_path: Path, ros_environment: dict[str, str]) -> None:
+    pytest.importorskip('asyncua')
+    environment = {**ros_environment, **_shim(tmp_path)}
+    assert run(ROOT / 'docs/tutorial_opcua.md', tmp_path, RUN, environment) > 0
+
+
 SHORT_TEST = 'test_the_commands_of_a_page_work_in_their_order'
 
 
@@ -231,7 +247,7 @@ def test_the_commands_of_a_page_work_in_their_order(
 
 def test_every_page_that_is_run_here_is_named() -> None:
     """A page with commands that no test runs would be a promise."""
-    named = {*SHORT, 'docs/tutorial_live.md'}
+    named = {*SHORT, 'docs/tutorial_live.md', 'docs/tutorial_opcua.md'}
     others = {b.page for b in ALL if b.kind in RUN} - named
     assert not others
 

@@ -94,7 +94,7 @@ def test_executables_are_those_of_the_contract(arguments):
         re.split(r'\s*=\s*', line) for line in arguments['entry_points']['console_scripts']
     )
     assert set(scripts) == {
-        'monitor', 'page', 'plant_simulator', 'replay', 'watch', 'valveflow',
+        'monitor', 'opcua_gateway', 'page', 'plant_simulator', 'replay', 'watch', 'valveflow',
     }  # fmt: skip
     for target in scripts.values():
         module, _, name = target.partition(':')
@@ -214,7 +214,9 @@ def without(module, code):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize('name', ['monitor', 'page', 'plant_simulator', 'replay', 'watch'])
+@pytest.mark.parametrize(
+    'name', ['monitor', 'opcua_gateway', 'page', 'plant_simulator', 'replay', 'watch']
+)
 def test_a_node_without_the_messages_names_the_command(name):
     code = f'import valveflow_ros.ros\nsys.exit(valveflow_ros.ros.{name}())'
     done = without('valveflow_msgs', code)

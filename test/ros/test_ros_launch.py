@@ -10,9 +10,12 @@ from pathlib import Path
 import pytest
 import yaml
 
+from valveflow_ros.errors import ValveflowError
+from valveflow_ros.ros.process import read_units
+
 ROOT = Path(__file__).resolve().parents[2]
 LAUNCH = ROOT / 'launch'
-PYTHON = ['monitor.launch.py', 'replay.launch.py', 'demo.launch.py']
+PYTHON = ['monitor.launch.py', 'replay.launch.py', 'demo.launch.py', 'units.launch.py']
 
 
 def test_the_yaml_twin_explains_its_arguments_and_uses_them_all() -> None:
@@ -38,7 +41,8 @@ def test_python_launch_files_explain_their_arguments(name: str) -> None:
         LaunchContext()
     )
     arguments = description.get_launch_arguments()
-    assert {'namespace', 'log_level'} <= {argument.name for argument in arguments}
+    which = 'units' if name.startswith('units') else 'namespace'
+    assert {which, 'log_level'} <= {argument.name for argument in arguments}
     for argument in arguments:
         assert argument.description.strip().endswith('.'), argument.name
 
@@ -57,3 +61,33 @@ def test_the_service_ends_the_monitor_in_order() -> None:
     assert service['KillSignal'] == 'SIGTERM'
     assert float(service['TimeoutStopSec']) > 2.0
     assert '/lib/valveflow_ros/monitor ' in service['ExecStart']
+
+
+def test_the_list_of_units_is_read_beside_its_files(tmp_path: Path) -> None:
+    for name in ('u1.yaml', 'u2.yaml', 'opcua.yaml'):
+        (tmp_path / name).touch()
+    path = tmp_path / 'units.yaml'
+    path.write_text((ROOT / 'config' / 'units.yaml').read_text())
+    first, second = read_units(path)
+    assert (first.namespace, second.namespace) == ('/u1', '/u2')
+    assert first.params_file == str(tmp_path / 'u1.yaml')
+    assert first.gateway == second.gateway == str(tmp_path / 'opcua.yaml')
+
+
+@pytest.mark.parametrize(
+    ('text', 'sentence'),
+    [
+        ('[', 'cannot be read as a list of units'),
+        ('{}', 'a list of units is expected'),
+        ('- {namespace: /u1}', 'unit 1: namespace and params_file are expected'),
+        ('- {namespace: /u1, params_file: x, port: 1}', 'unit 1: namespace and params_file are'),
+        ('- {namespace: /u1, params_file: no.yaml}', 'is not there; unit 1 of units.yaml'),
+        ('[{namespace: u1, params_file: units.yaml}, {namespace: /u1, params_file: units.yaml}]',
+         "two units have the namespace '/u1'"),
+    ],
+)  # fmt: skip
+def test_a_list_that_cannot_be_used_is_refused(tmp_path: Path, text: str, sentence: str) -> None:
+    path = tmp_path / 'units.yaml'
+    path.write_text(text)
+    with pytest.raises(ValveflowError, match=sentence):
+        read_units(path)

@@ -28,6 +28,7 @@ def _start(executable: str, module: str) -> int:
 
 
 monitor = partial(_start, 'monitor', 'monitor_main')
+opcua_gateway = partial(_start, 'opcua_gateway', 'gateway_main')
 page = partial(_start, 'page', 'page_main')
 plant_simulator = partial(_start, 'plant_simulator', 'simulator_main')
 replay = partial(_start, 'replay', 'replay_main')

@@ -13,10 +13,12 @@ import sys
 import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from tempfile import NamedTemporaryFile
 from types import FrameType
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
+from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.parameters import Parameter
 
 _ASKED_TO_STOP = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -149,3 +151,49 @@ def usage(about: str, example: str, rows: Iterable[Parameter]) -> str:
         lines.append(f'  {row.name:28} {default}{unit}')
         lines.append(f'  {"":28} {row.sentence}')
     return '\n'.join(lines)
+
+
+class UnitOfHost(NamedTuple):
+    """A unit in the list of a host: absolute paths, the gateway's empty where it has none."""
+
+    namespace: str
+    params_file: str
+    gateway: str
+
+
+def read_units(path: str | Path) -> list[UnitOfHost]:
+    """Read the list of units for `units.launch.py`.
+
+    Raises
+    ------
+    RecordingError
+        It cannot be read, or a file that it names is not there.
+    InputError
+        It is no such list, or two units have the same namespace.
+    """
+    import yaml
+
+    path = Path(path).expanduser().absolute()
+    try:
+        rows = yaml.safe_load(path.read_text(encoding='utf-8'))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        raise RecordingError(path, 'cannot be read as a list of units (YAML)') from None
+    known = set(UnitOfHost._fields)
+    if not isinstance(rows, list) or not rows:
+        raise InputError(f'{path}: a list of units is expected, such as config/units.yaml.')
+    units = []
+    for k, row in enumerate(rows, 1):
+        if not isinstance(row, dict) or not {'namespace', 'params_file'} <= set(row) <= known:
+            raise InputError(
+                f'{path}, unit {k}: namespace and params_file are expected, and gateway where it '
+                'has one.'
+            )
+        files = [str(path.parent / str(row[n])) if row.get(n) else '' for n in UnitOfHost._fields]
+        for name in filter(None, files[1:]):
+            if not Path(name).is_file():
+                raise RecordingError(name, f'is not there; unit {k} of {path.name} names it')
+        units.append(UnitOfHost(str(row['namespace']), *files[1:]))
+    names = [unit.namespace.strip('/') for unit in units]
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise InputError(f"{path}: two units have the namespace '/{twice.pop()}'.")
+    return units

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 from argparse import ArgumentParser, Namespace
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,11 +35,17 @@ given as a constant. --dry-run only shows what was understood.
 example:
   valveflow import history.csv --dry-run
 
+a period of the history of an OPC UA server, with the mapping of the gateway; one that was
+stopped goes on when the command is given again:
+  valveflow import opcua://127.0.0.1:4840 --mapping opcua.yaml --from 2026-01-01
+      --to 2026-02-01 -o january.mcap
+
 and with columns whose names say nothing:
   valveflow import history.csv -o history.mcap --column valve_opening=CV_POS
       --column main_steam_pressure=PT_100:bar --column generated_power=MW_GROSS
       --constant main_steam_temperature=540 --time-zone Europe/Berlin"""
 
+_OPCUA = 'opcua://'
 _HEAD = ('your column', 'is', 'why', 'in', 'runs from', '', '')
 _FLAGS = ('dry_run', 'overwrite', 'quiet', 'json')
 # Of these the table shows that one is needed, and not which.
@@ -49,7 +56,10 @@ def arguments(parser: ArgumentParser) -> None:
     """Add description, example and options."""
     parser.description = _DESCRIPTION
     parser.usage = 'valveflow import TABLE -o LOG.mcap [options]'
-    parser.add_argument('table', metavar='TABLE', type=Path, help='a .csv, .xlsx or .parquet file')
+    parser.add_argument(
+        'table', metavar='TABLE', type=_source,
+        help='a .csv, .xlsx or .parquet file, or opcua://host:port',
+    )  # fmt: skip
     parser.add_argument(
         '-o', '--output', metavar='LOG', type=Path,
         help='where to write: an .mcap file, or a folder as ros2 bag makes it',
@@ -59,10 +69,22 @@ def arguments(parser: ArgumentParser) -> None:
     )
     add_mapping(parser)
     parser.add_argument('--overwrite', action='store_true', help='replace a log that is there')
+    historian = parser.add_argument_group('history of an OPC UA server')
+    historian.add_argument(
+        '--mapping', metavar='FILE', type=Path,
+        help='which nodes are which signals, and how the server lets you in: docs/gateway.md',
+    )  # fmt: skip
+    historian.add_argument('--unit', metavar='TAG', help='which unit of several in that file')
+    historian.add_argument(
+        '--from', dest='begin', metavar='TIME', help='such as 2026-01-31 or 2026-01-31T06:00Z'
+    )
+    historian.add_argument('--to', dest='end', metavar='TIME', help='not included')
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
     """Read, convert, write, and say what was understood."""
+    if isinstance(options.table, str):
+        return _from_history(options, console)
     mapping = mapping_of(options)
     if options.output is None and not options.dry_run:
         raise UsageError('Name the log to write with -o LOG.mcap, or add --dry-run to look only.')
@@ -85,6 +107,54 @@ def run(options: Namespace, console: Console) -> VerbResult:
         )
     except RefusedError as refused:
         raise InputError(_refusal(refused, options)) from None
+
+
+def _source(text: str) -> Path | str:
+    return text if text.startswith(_OPCUA) else Path(text)
+
+
+def _from_history(options: Namespace, console: Console) -> VerbResult:
+    wanted = (options.mapping, options.begin, options.end, options.output)
+    if None in wanted:
+        raise UsageError(
+            'The history of a server wants --mapping FILE, --from TIME, --to TIME and -o LOG.'
+        )
+    if options.constant or options.column or options.dry_run:
+        raise UsageError('The mapping file says all about the nodes: no --column or the like.')
+    from valveflow_ros.opcua.session import OpcUaHistory, check_installed
+
+    check_installed()
+    from valveflow_ros.interface.files import check_log
+    from valveflow_ros.interface.history_import import import_history
+    from valveflow_ros.opcua.mapping import read_mapping_file
+
+    begin_ns, end_ns = _time_ns(options.begin), _time_ns(options.end)
+    if begin_ns >= end_ns:
+        raise UsageError('--from must be before --to.')
+    units = {unit.tag: unit for unit in read_mapping_file(options.mapping).units}
+    tag = options.unit or (next(iter(units)) if len(units) == 1 else '')
+    if tag not in units:
+        raise InputError(f'--unit must be one of {", ".join(units)}, the units of the mapping.')
+    check_log(options.output, overwrite=options.overwrite)
+    source = OpcUaHistory(units[tag], 'opc.tcp://' + options.table.removeprefix(_OPCUA))
+    written = import_history(
+        source, begin_ns, end_ns, options.output, overwrite=options.overwrite, progress=console
+    )
+    return VerbResult(
+        f'Wrote {written.path}: {written.messages} values of {len(source.columns)} signals.',
+        {'log': str(written.path), 'source': source.name, 'values': written.messages,
+         'start_ns': begin_ns, 'end_ns': end_ns},
+    )  # fmt: skip
+
+
+def _time_ns(text: str) -> int:
+    """Return a time in ns, in UTC where it names no zone."""
+    try:
+        moment = datetime.fromisoformat(text.replace('Z', '+00:00'))
+    except ValueError:
+        raise UsageError(f"'{text}' is no time such as 2026-01-31T06:00Z.") from None
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
+    return round(moment.timestamp()) * 1_000_000_000
 
 
 def _imported(options: Namespace, mapping: LogMapping, console: Console) -> VerbResult:

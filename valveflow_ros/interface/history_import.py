@@ -1,0 +1,145 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""Read a historian directly, part by part, into a log; one that was stopped goes on."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Protocol
+from zipfile import BadZipFile
+
+import numpy as np
+
+from valveflow_ros.errors import DataError, RecordingError, counted
+from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface.files import reason
+from valveflow_ros.logs.mcap.importing import WrittenLog, write_readings
+from valveflow_ros.records import NS_PER_S, SIGNALS, Readings, Signal
+
+# Parts of this length are read at once; what is stopped reads no more than one again.
+_PART_NS = 4 * 3600 * NS_PER_S
+_SUFFIX = '.parts'
+
+
+class HistorySource(Protocol):
+    """Where history comes from; a further historian needs no more than this.
+
+    Attributes
+    ----------
+    name : str
+        What it is called in sentences and in the log: an address without a password.
+    columns : mapping of Signal to str
+        The signals that it has, and what they are called there.
+    """
+
+    @property
+    def name(self) -> str:
+        """Return what it is called."""
+
+    @property
+    def columns(self) -> Mapping[Signal, str]:
+        """Return what the signals are called there."""
+
+    def read(self, start_ns: int, end_ns: int) -> list[Readings]:
+        """Return the readings of ``[start_ns, end_ns)``, in the order of time, engine units.
+
+        Raises
+        ------
+        DataError
+            It cannot be reached, or has no such signal or no history.
+        """
+
+
+def import_history(
+    source: HistorySource,
+    start_ns: int,
+    end_ns: int,
+    path: str | Path,
+    *,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
+) -> WrittenLog:
+    """Read a period of history and write it as a recording.
+
+    What is read waits in a folder beside the recording, ``NAME.parts``. The same call goes on
+    where an earlier one was stopped.
+
+    Parameters
+    ----------
+    source : HistorySource
+    start_ns, end_ns : int
+        The period, ns since 1970; its end is not included.
+    path : str or Path
+        As for `write_readings`.
+
+    Raises
+    ------
+    DataError
+        As `HistorySource.read`; or there is no value in the period.
+    RecordingError
+        The recording exists, cannot be written, or the folder is that of another import.
+    """
+    path = Path(path)
+    folder = path.with_name(path.name + _SUFFIX)
+    columns = {SIGNALS[signal].topic: name for signal, name in source.columns.items()}
+    asked = json.dumps(
+        {'source': source.name, 'columns': columns, 'start_ns': start_ns, 'end_ns': end_ns}
+    )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        told = folder / 'import.json'
+        if told.exists() and told.read_text() != asked:
+            raise RecordingError(
+                folder, 'is of an import of something else that was stopped; remove it'
+            )
+        told.write_text(asked)
+        starts = range(start_ns, end_ns, _PART_NS)
+        files = [folder / f'{k:06d}.npz' for k in range(len(starts))]
+        if there := sum(file.exists() for file in files):
+            progress.say(f'{there} of {counted(len(files), "part")} had been read before.')
+        for k, (begin_ns, file) in enumerate(zip(starts, files, strict=True)):
+            progress(0.05 + 0.85 * k / len(files), 'reading')
+            if not file.exists():
+                _save(file, source.read(begin_ns, min(begin_ns + _PART_NS, end_ns)))
+        progress(0.9, 'writing')
+        units = [{'topic': topic, 'unit': SIGNALS[s].unit} for s, topic in _topics(source)]
+        try:
+            written = write_readings(
+                map(_load, files), list(source.columns), path, overwrite=overwrite,
+                attachments={'import.json': json.dumps(
+                    {**json.loads(asked), 'signals': units}, indent=2
+                ).encode()},
+            )  # fmt: skip
+        except DataError:
+            raise DataError(f'{source.name} has no value in this period.') from None
+    except OSError as error:
+        raise RecordingError(folder, f'cannot be used for the work ({reason(error)})') from None
+    shutil.rmtree(folder, ignore_errors=True)
+    return written
+
+
+def _topics(source: HistorySource) -> list[tuple[Signal, str]]:
+    return [(signal, SIGNALS[signal].topic) for signal in sorted(source.columns)]
+
+
+def _save(file: Path, parts: list[Readings]) -> None:
+    """Write a part under its own name once it is whole."""
+    part = file.with_suffix('.tmp')
+    columns = {
+        name: np.concatenate([getattr(p, name) for p in parts])
+        for name in ('time_ns', 'signal', 'value', 'quality')
+    }
+    with part.open('wb') as out:
+        np.savez(out, **columns)  # type: ignore[arg-type]
+    part.replace(file)
+
+
+def _load(file: Path) -> Readings:
+    try:
+        with np.load(file, allow_pickle=False) as columns:
+            return Readings(*(columns[name] for name in ('time_ns', 'signal', 'value', 'quality')))
+    except (ValueError, KeyError, EOFError, BadZipFile):
+        raise RecordingError(file, 'is damaged; remove it, and it is read again') from None

@@ -1,0 +1,247 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""An OPC UA server that shows curve, alarms and diagnosis, to be read only. Knows asyncua."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import hmac
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from valveflow_ros.errors import DataError
+from valveflow_ros.opcua.mapping import Security, ServerSettings, User
+from valveflow_ros.opcua.session import (
+    connected,
+    in_words,
+    load_certificate,
+    load_key,
+    to_datetime,
+    uri_of,
+)
+
+NAMESPACE = 'urn:valveflow'
+# Severity of an event, 1 to 1000, by the priority of the alarm; without a standing condition 100.
+SEVERITY, NO_CONDITION = {1: 300, 2: 600, 3: 900}, 100
+_EVENT_FIELDS = {'State': 'Byte', 'PreviousState': 'Byte', 'Value': 'Double', 'Limit': 'Double',
+                 'Unit': 'String'}  # fmt: skip
+
+
+class Field(NamedTuple):
+    """A variable: name, OPC UA type ('Double', 'DateTime' as ns, ...), and whether an array."""
+
+    name: str
+    kind: str
+    array: bool = False
+
+
+class Alarm(NamedTuple):
+    """What an event tells; values of `Alarm.msg`."""
+
+    name: str
+    time_ns: int
+    sentence: str
+    severity: int
+    values: Mapping[str, object]
+
+
+class _Readers:
+    """Lets in who has a trusted certificate, and the password where one is wanted; to read only.
+
+    The certificate is that of the secure channel: what a client says of itself later, when it
+    makes the session, is up to the client.
+    """
+
+    def __init__(self, trusted: Iterable[bytes], user: User) -> None:
+        self._trusted, self._user = tuple(trusted), user
+
+    def get_user(
+        self, _server: Any, username: Any = None, password: Any = None, certificate: Any = None
+    ) -> Any:
+        from asyncua.crypto.permission_rules import User as Role
+        from asyncua.crypto.permission_rules import UserRole
+
+        if self._trusted and certificate not in self._trusted:
+            return None
+        if self._user.name:
+            told = password.decode() if isinstance(password, bytes) else str(password or '')
+            same = hmac.compare_digest(told.encode(), self._user.password.encode())
+            if username != self._user.name or not same:
+                return None
+        return Role(role=UserRole.User)
+
+
+class ResultsServer:
+    """The server; all calls belong into one event loop.
+
+    Parameters
+    ----------
+    settings : ServerSettings
+    units : mapping of str to mapping of str to sequence of Field
+        By the tag of the unit: its objects, such as ``characteristic`` and ``alarms.residual``,
+        and their variables. The id of a variable is ``ns=N;s=TAG.OBJECT.FIELD``.
+    """
+
+    def __init__(
+        self, settings: ServerSettings, units: Mapping[str, Mapping[str, Iterable[Field]]]
+    ) -> None:
+        self._settings, self._units = settings, units
+        self._server: Any = None
+        self._variables: dict[tuple[str, str, str], tuple[Any, Any]] = {}
+        self._last: dict[tuple[str, str, str], Any] = {}
+        self._events: dict[str, Any] = {}
+        self._one = asyncio.Lock()
+
+    async def start(self) -> None:
+        """Listen.
+
+        Raises
+        ------
+        DataError
+            The address is taken or is not this machine's.
+        RecordingError
+            A certificate or key cannot be used.
+        """
+        from asyncua import Server, ua
+        from asyncua.crypto.uacrypto import der_from_x509
+
+        settings, security = self._settings, self._settings.security
+        trusted = [der_from_x509(load_certificate(path)) for path in security.trusted]
+        self._server = server = Server(user_manager=_Readers(trusted, settings.user))
+        await server.init()
+        server.set_server_name('valveflow')
+        server.set_endpoint(settings.endpoint)
+        if security.none:
+            server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+        else:
+            assert security.certificate is not None
+            assert security.private_key is not None
+            own = load_certificate(security.certificate)
+            await load_key(security.private_key, own)
+            await server.load_certificate(security.certificate)
+            await server.load_private_key(security.private_key)
+            await server.set_application_uri(uri_of(own) or NAMESPACE)
+            server.set_security_policy(
+                [getattr(ua.SecurityPolicyType, f'{security.policy}_{security.mode}')]
+            )
+        tokens = ua.UserNameIdentityToken if settings.user.name else ua.AnonymousIdentityToken
+        server.set_identity_tokens([tokens])
+        await self._build()
+        try:
+            await server.start()
+        except OSError as error:
+            raise DataError(f'{settings.endpoint} cannot be offered: {in_words(error)}.') from None
+
+    async def stop(self) -> None:
+        """Close it."""
+        if self._server is not None:
+            await self._server.stop()
+
+    async def update(
+        self, tag: str, name: str, values: Mapping[str, object], time_ns: int
+    ) -> None:
+        """Write the variables of an object; times are in ns, a number that is absent is NaN."""
+        from asyncua import ua
+
+        async with self._one:
+            for field, value in values.items():
+                node, kind = self._variables[tag, name, field]
+                if kind == ua.VariantType.DateTime:
+                    value = to_datetime(int(str(value)))
+                data = ua.DataValue(
+                    ua.Variant(value, kind, is_array=isinstance(value, list)),
+                    SourceTimestamp=to_datetime(time_ns),
+                )
+                self._last[tag, name, field] = data
+                await self._write(node, data)
+
+    async def alarm(self, tag: str, alarm: Alarm) -> None:
+        """Send the event of an alarm's change, or of a diagnosis."""
+        from asyncua import ua
+
+        async with self._one:
+            generator = self._events[tag]
+            event = generator.event
+            event.SourceName = alarm.name
+            event.Severity = ua.UInt16(alarm.severity)
+            for name in _EVENT_FIELDS:
+                setattr(event, name, alarm.values[name])
+            await generator.trigger(to_datetime(alarm.time_ns), alarm.sentence)
+
+    async def mark(self, tag: str, present: bool) -> None:
+        """Mark what is known of a unit: good, or the last usable value after its monitor ended."""
+        from asyncua import ua
+
+        code = ua.StatusCodes.Good if present else ua.StatusCodes.UncertainLastUsableValue
+        async with self._one:
+            for key, data in self._last.items():
+                if key[0] == tag:
+                    node, _ = self._variables[key]
+                    await self._write(
+                        node, dataclasses.replace(data, StatusCode=ua.StatusCode(code))
+                    )
+
+    async def _write(self, node: Any, data: Any) -> None:
+        from asyncua import ua
+
+        # As the server itself: for clients the variables are not writable.
+        await self._server.iserver.aspace.write_attribute_value(
+            node.nodeid, ua.AttributeIds.Value, data
+        )
+
+    async def _build(self) -> None:
+        from asyncua import ua
+
+        server = self._server
+        index = await server.register_namespace(NAMESPACE)
+        kind = await server.create_custom_event_type(
+            index, 'ValveflowAlarmType', ua.ObjectIds.BaseEventType,
+            [(name, getattr(ua.VariantType, of)) for name, of in _EVENT_FIELDS.items()],
+        )  # fmt: skip
+        waiting = ua.StatusCode(ua.StatusCodes.BadWaitingForInitialData)
+        root = await server.nodes.objects.add_folder(_id(index, 'valveflow'), f'{index}:valveflow')
+        for tag, objects in self._units.items():
+            places = {'': await root.add_object(_id(index, tag), f'{index}:{tag}')}
+            self._events[tag] = await server.get_event_generator(kind, places[''])
+            for name, fields in objects.items():
+                above = ''
+                for word in name.split('.'):
+                    here = f'{above}.{word}' if above else word
+                    if here not in places:
+                        places[here] = await places[above].add_object(
+                            _id(index, f'{tag}.{here}'), f'{index}:{word}'
+                        )
+                    above = here
+                for field in fields:
+                    of = getattr(ua.VariantType, field.kind)
+                    node = await places[name].add_variable(
+                        _id(index, f'{tag}.{name}.{field.name}'), f'{index}:{field.name}',
+                        ua.Variant([] if field.array else ua.get_default_value(of), of,
+                                   is_array=field.array), of,
+                    )  # fmt: skip
+                    self._variables[tag, name, field.name] = node, of
+                    await self._write(node, ua.DataValue(StatusCode=waiting))
+
+
+def _id(index: int, text: str) -> Any:
+    from asyncua import ua
+
+    return ua.NodeId(text, index)
+
+
+async def read_results(endpoint: str, security: Security, names: Sequence[str]) -> list[Any]:
+    """Return variables of such a server by name, such as ``U1.characteristic.status``.
+
+    One that has no value yet is None.
+
+    Raises
+    ------
+    Exception
+        The server cannot be reached or refuses; see `in_words`.
+    """
+    async with connected(endpoint, security, User()) as client:
+        index = await client.get_namespace_index(NAMESPACE)
+        nodes = [client.get_node(_id(index, name)) for name in names]
+        data = [await node.read_data_value(raise_on_bad_status=False) for node in nodes]
+        return [None if found.Value is None else found.Value.Value for found in data]

@@ -1,0 +1,320 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""A session with an OPC UA server: certificates, values, history, errors in words."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+from collections.abc import AsyncIterator, Iterable
+from dataclasses import replace
+from datetime import datetime, timedelta, timezone
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from valveflow_ros.errors import DataError, RecordingError, ValveflowError
+from valveflow_ros.opcua.mapping import Node, Security, UnitMapping, User
+from valveflow_ros.opcua.sampler import Change
+from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Readings, Signal
+
+if TYPE_CHECKING:
+    from asyncua import Client, ua
+    from cryptography.x509 import Certificate
+
+EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
+# An answer is waited for so long; a server that keeps silent for longer is gone.
+ANSWER_S = 4.0
+# Values of so much time are read from a history at once: each takes about a kilobyte meanwhile.
+HISTORY_PART_NS = 3600 * NS_PER_S
+_REFUSED_CERTIFICATE = 'the server does not accept the certificate of the gateway'
+WORDS = {
+    'BadCertificateTimeInvalid': f'{_REFUSED_CERTIFICATE}: it has expired or is not valid yet',
+    'BadCertificateUntrusted': f'{_REFUSED_CERTIFICATE}: it must be trusted there first',
+    'BadSecurityChecksFailed': f'{_REFUSED_CERTIFICATE}: it must be trusted there first',
+    'BadIdentityTokenRejected': 'the server does not accept the user',
+    'BadIdentityTokenInvalid': 'the server does not accept the user',
+    'BadUserAccessDenied': 'the server does not accept the user, or he may not read',
+    'BadSecurityPolicyRejected': 'the server does not offer this security policy',
+    'BadNodeIdUnknown': 'the server has no such node',
+    'BadNodeIdInvalid': 'the server has no such node',
+    'BadTooManySessions': 'the server has as many sessions as it allows',
+}
+
+
+def check_installed() -> None:
+    """Return if asyncua is there; raises `DataError`."""
+    if find_spec('asyncua') is None:
+        raise DataError('OPC UA needs asyncua, not installed here: pip install asyncua.')
+    # It logs each lost link with a traceback; what matters is told in sentences.
+    log = logging.getLogger('asyncua')
+    log.addHandler(logging.NullHandler())
+    log.propagate = False
+
+
+def to_ns(moment: datetime | None) -> int:
+    """Return a time in ns since the epoch, 0 for none or one before it."""
+    if moment is None:
+        return 0
+    aware = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
+    return max(0, (aware - EPOCH) // timedelta(microseconds=1) * 1000)
+
+
+def to_datetime(time_ns: int) -> datetime:
+    """Return a time as OPC UA takes it, in UTC."""
+    return EPOCH + timedelta(microseconds=time_ns // 1000)
+
+
+def change_of(node: Node, data: ua.DataValue, received_ns: int) -> Change:
+    """Return a value of the server as a change in the monitor's unit."""
+    status = data.StatusCode.value if data.StatusCode is not None else 0
+    quality = (Quality.GOOD, Quality.UNCERTAIN, Quality.BAD, Quality.BAD)[status >> 30]
+    value = data.Value.Value if data.Value is not None else None
+    number, problem = math.nan, ''
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        number = value * node.unit.scale + node.unit.offset
+        problem = '' if math.isfinite(number) or quality == Quality.BAD else 'not_finite'
+    elif quality != Quality.BAD:
+        problem = 'wrong_type'
+    if problem:
+        quality = Quality.BAD
+    source_ns = to_ns(data.SourceTimestamp or data.ServerTimestamp)
+    return Change(int(node.signal), source_ns, received_ns, number, int(quality), problem)
+
+
+def in_words(error: BaseException) -> str:
+    """Return why a link failed, without a period at its end."""
+    if isinstance(error, ValveflowError):
+        return str(error).rstrip('.')
+    name = type(error).__name__
+    if isinstance(error, ConnectionRefusedError):
+        return 'nobody listens there'
+    if isinstance(error, asyncio.TimeoutError | TimeoutError):
+        return f'no answer within {ANSWER_S:g} s'
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror.lower()
+    if 'No matching endpoints' in str(error):
+        return 'the server does not offer this security policy and mode'
+    if 'certificate mismatch' in str(error) or name == 'InvalidSignature':
+        return "the server does not have the certificate named as 'trusted'"
+    if name in ('ConnectionError', 'ConnectionResetError', 'IncompleteReadError'):
+        return 'the server has closed the link'
+    told = WORDS.get(name, '')
+    return f'{told} ({name})' if told else f'{name}: {" ".join(str(error).split())[:120]}'
+
+
+def load_certificate(path: Path) -> Certificate:
+    """Return a certificate that is valid now.
+
+    Raises
+    ------
+    RecordingError
+        It cannot be read, or its time is over or has not come.
+    """
+    from cryptography import x509
+
+    try:
+        data = path.read_bytes()
+        pem = data.lstrip().startswith(b'-----')
+        found = (
+            x509.load_pem_x509_certificate(data) if pem else x509.load_der_x509_certificate(data)
+        )
+    except (OSError, ValueError):
+        raise RecordingError(path, 'is no certificate that can be read') from None
+    now = datetime.now(timezone.utc)
+    if found.not_valid_after_utc < now:
+        raise RecordingError(path, f'expired on {found.not_valid_after_utc:%Y-%m-%d}')
+    if found.not_valid_before_utc > now:
+        raise RecordingError(path, f'is not valid before {found.not_valid_before_utc:%Y-%m-%d}')
+    return found
+
+
+def uri_of(certificate: Certificate) -> str:
+    """Return the application URI of a certificate, empty if it names none."""
+    from cryptography import x509
+
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return ''
+    return next(iter(names.get_values_for_type(x509.UniformResourceIdentifier)), '')
+
+
+async def load_key(path: Path, certificate: Certificate) -> Any:
+    """Return the private key of a certificate; raises `RecordingError`."""
+    from asyncua.crypto import uacrypto
+
+    try:
+        key = await uacrypto.load_private_key(path)
+    except (OSError, ValueError, TypeError):
+        raise RecordingError(path, 'is no private key that can be read') from None
+    if key.public_key() != certificate.public_key():
+        raise RecordingError(path, 'is not the key of the certificate beside it')
+    return key
+
+
+@contextlib.asynccontextmanager
+async def connected(endpoint: str, security: Security, user: User) -> AsyncIterator[Client]:
+    """Open a session, and close it at the end.
+
+    Raises
+    ------
+    ValveflowError
+        A certificate or key cannot be used, or has expired.
+    Exception
+        Whatever asyncua raises where the server cannot be reached or refuses; see `in_words`.
+    """
+    from asyncua import Client
+    from asyncua.crypto import security_policies
+    from asyncua.ua import MessageSecurityMode
+
+    client = Client(endpoint, timeout=ANSWER_S, watchdog_intervall=ANSWER_S)
+    client.name = client.description = 'valveflow'
+    client.session_timeout = 60_000
+    if not security.none:
+        assert security.certificate is not None
+        assert security.private_key is not None
+        own = load_certificate(security.certificate)
+        trusted = [load_certificate(path) for path in security.trusted]
+        client.application_uri = uri_of(own) or client.application_uri
+        key = await load_key(security.private_key, own)
+        policy = getattr(security_policies, f'SecurityPolicy{security.policy}')
+        client.security_policy = policy(
+            trusted[0], own, key, getattr(MessageSecurityMode, security.mode)
+        )
+        client.uaclient.set_security(client.security_policy)
+    if user.name:
+        client.set_user(user.name)
+        client.set_password(user.password)
+    elif user.certificate is not None:
+        assert user.private_key is not None
+        client.user_certificate = load_certificate(user.certificate)
+        client.user_private_key = await load_key(user.private_key, client.user_certificate)
+    try:
+        await asyncio.wait_for(client.connect(), 4.0 * ANSWER_S)
+    except asyncio.TimeoutError:
+        if security.none:
+            raise
+        # So servers act to whom the first encrypted message means nothing.
+        raise DataError(
+            f'no answer within {ANSWER_S:g} s: the server does not offer this policy, does not '
+            "accept the certificate, or does not have the one named as 'trusted'"
+        ) from None
+    try:
+        yield client
+    finally:
+        with contextlib.suppress(Exception, asyncio.CancelledError):
+            await asyncio.wait_for(client.disconnect(), ANSWER_S)
+        client.disconnect_socket()
+
+
+async def resolve(client: Client, node: Node) -> ua.NodeId:
+    """Return the id of a node; a namespace given by its URI is looked up on the server.
+
+    Raises
+    ------
+    DataError
+        The server does not know the namespace, or the id is of no known form.
+    """
+    from asyncua import ua
+
+    text = node.node
+    topic = SIGNALS[node.signal].topic
+    if text.startswith('nsu='):
+        uri, _, rest = text[4:].partition(';')
+        try:
+            text = f'ns={await client.get_namespace_index(uri)};{rest}'
+        except ValueError:
+            raise DataError(f"{topic}: the server has no namespace '{uri}'.") from None
+    try:
+        return ua.NodeId.from_string(text)
+    except (ua.UaError, ValueError):
+        raise DataError(f"{topic}: '{node.node}' is no node id.") from None
+
+
+async def read_history(
+    client: Client, node: Node, node_id: ua.NodeId, start_ns: int, end_ns: int
+) -> list[Change]:
+    """Return the values of a node's history in the order of time, ends included.
+
+    Raises
+    ------
+    Exception
+        The server has none, or cannot be reached; see `in_words`.
+    """
+    values = await client.get_node(node_id).read_raw_history(
+        to_datetime(start_ns), to_datetime(end_ns), return_bounds=False
+    )
+    changes = [change_of(node, value, end_ns) for value in values]
+    return sorted(change for change in changes if start_ns <= change.source_ns <= end_ns)
+
+
+def readings_of(changes: Iterable[Change]) -> Readings:
+    """Return changes as readings in the order of time; bad ones are NaN."""
+    rows = sorted((c.source_ns, c.signal, c.value, c.quality) for c in changes)
+    found = Readings.of([(t, s, v, q) for t, s, v, q in rows])
+    return replace(found, value=np.where(found.quality == Quality.BAD, np.nan, found.value))
+
+
+async def history(
+    client: Client, nodes: Iterable[Node], start_ns: int, end_ns: int
+) -> AsyncIterator[Readings]:
+    """Yield the history of nodes in parts of an hour, ends included once.
+
+    Raises
+    ------
+    DataError
+        A node is not there.
+    Exception
+        The server has no history, or cannot be reached; see `in_words`.
+    """
+    ids = [(node, await resolve(client, node)) for node in nodes]
+    for part_ns in range(start_ns, end_ns, HISTORY_PART_NS):
+        last_ns = min(part_ns + HISTORY_PART_NS, end_ns) - 1000
+        changes: list[Change] = []
+        for node, node_id in ids:
+            try:
+                changes += await read_history(client, node, node_id, part_ns, last_ns)
+            except Exception as error:  # noqa: BLE001 - with the name of the signal
+                raise DataError(
+                    f'{SIGNALS[node.signal].topic}, {node.node}: {in_words(error)}.'
+                ) from None
+        yield readings_of(changes)
+
+
+class OpcUaHistory:
+    """The history of a unit's nodes, as a source for `valveflow import`.
+
+    Parameters
+    ----------
+    unit : UnitMapping
+    endpoint : str
+        In place of the unit's own.
+    """
+
+    def __init__(self, unit: UnitMapping, endpoint: str) -> None:
+        self._unit, self._endpoint = unit, endpoint
+        self.name = endpoint
+        self.columns: dict[Signal, str] = {node.signal: node.node for node in unit.nodes}
+
+    def read(self, start_ns: int, end_ns: int) -> list[Readings]:
+        """Return the readings of a period, its end not included, in the monitor's units.
+
+        Raises
+        ------
+        DataError
+            The server has no such node or no history, or cannot be reached.
+        """
+
+        async def parts() -> list[Readings]:
+            async with connected(self._endpoint, self._unit.security, self._unit.user) as client:
+                return [p async for p in history(client, self._unit.nodes, start_ns, end_ns)]
+
+        try:
+            return asyncio.run(parts())
+        except Exception as error:  # noqa: BLE001 - whatever it was: in words
+            raise DataError(f'{self._endpoint}: {in_words(error)}.') from None

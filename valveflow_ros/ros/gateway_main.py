@@ -1,0 +1,403 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""The executable `opcua_gateway`: values of OPC UA servers as `plant_sample`, results back."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import queue
+import sys
+import threading
+import time
+from collections.abc import Callable, Coroutine, Iterable, Sequence
+from concurrent.futures import Future
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from valveflow_msgs.msg import Alarm, Diagnosis, DiagnosisCause, FlowCharacteristic, PlantSample
+
+from valveflow_ros.errors import InputError, ValveflowError, counted
+from valveflow_ros.logs.mcap.importing import write_readings
+from valveflow_ros.monitoring.alarms import ResidualAlarm, ShiftAlarm
+from valveflow_ros.opcua.link import Link
+from valveflow_ros.opcua.mapping import GatewayMapping, UnitMapping, read_mapping_file
+from valveflow_ros.opcua.results_server import NO_CONDITION, SEVERITY, Field, ResultsServer
+from valveflow_ros.opcua.results_server import Alarm as AlarmEvent
+from valveflow_ros.opcua.sampler import Counts, Sample, Sampler
+from valveflow_ros.opcua.session import check_installed
+from valveflow_ros.parameters import Parameter
+from valveflow_ros.records import NS_PER_S, SIGNALS, Readings, Signal
+from valveflow_ros.ros.declare import declare, unknown_overrides
+from valveflow_ros.ros.decoding import PLANT_SAMPLE, from_time
+from valveflow_ros.ros.domain import start_ros
+from valveflow_ros.ros.encoding import header
+from valveflow_ros.ros.node.diagnostics import Changes, Item, Level, diagnostics_message
+from valveflow_ros.ros.process import StopFlag, complain, show, usage, wants_help, with_place
+
+NAME = 'opcua_gateway'
+TABLE: tuple[Parameter, ...] = (
+    Parameter('mapping_file', '', '', 'Mapping file (YAML), such as config/opcua.yaml.'),
+    Parameter('diagnostics_period', 1.0, 's', 'Time from one /diagnostics to the next.',
+              0.1, 60.0),
+)  # fmt: skip
+# A clock that differs by more is told.
+_CLOCK_S = 1.0
+# What was wrong with a value is shown for so long.
+_SHOWN_S = 60.0
+_LOOK_S, _END_S, _OFFER_S = 0.02, 6.0, 60.0
+_LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_KINDS = {'double': 'Double', 'string': 'String', 'boolean': 'Boolean', 'uint8': 'Byte',
+          'uint32': 'UInt32', 'uint64': 'UInt64'}  # fmt: skip
+_TIME, _CAUSES = 'builtin_interfaces/Time', 'sequence<valveflow_msgs/DiagnosisCause>'
+_TROUBLE = tuple(name for name in Counts.__slots__ if name not in ('received', 'uncertain', 'bad'))
+
+
+class LoopThread:
+    """An event loop in a thread of its own."""
+
+    def __init__(self) -> None:
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
+
+    def start(self, work: Coroutine[Any, Any, Any]) -> Future[Any]:
+        """Begin something there."""
+        return asyncio.run_coroutine_threadsafe(work, self._loop)
+
+    def close(self) -> None:
+        """Cancel what runs, let it close its sessions, and end the thread."""
+
+        async def cancel() -> None:
+            others = asyncio.all_tasks() - {asyncio.current_task()}
+            for task in others:
+                task.cancel()
+            await asyncio.wait(others, timeout=_END_S) if others else None
+
+        with suppress(Exception):
+            self.start(cancel()).result(_END_S + 1.0)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(1.0)
+
+
+class GatewayUnit:
+    """One unit: its link in the loop's thread, its samples in the node's.
+
+    Parameters
+    ----------
+    node : Node
+    unit : UnitMapping
+    """
+
+    def __init__(self, node: Node, unit: UnitMapping) -> None:
+        self.unit = unit
+        self.name = f'{unit.namespace}/{NAME}'.lstrip('/')
+        self.sampler = Sampler(unit, time.time_ns())
+        self._told: queue.SimpleQueue[Callable[[Sampler], None]] = queue.SimpleQueue()
+        self.link = Link(unit, self._told.put, self._save if unit.backfill_directory else None)
+        self._publisher = node.create_publisher(
+            PlantSample, f'{unit.namespace}/{PLANT_SAMPLE}', QoSProfile(depth=1000)
+        )
+        self._before: dict[int, tuple[int, ...]] = {}
+        self._trouble_s: dict[int, float] = {}
+
+    def step(self, now_ns: int) -> None:
+        """Take what the link has told and publish what is due."""
+        with suppress(queue.Empty):
+            while True:
+                self._told.get_nowait()(self.sampler)
+        for signal, lost in list(self.link.state.overflows.items()):
+            self.sampler.counts[signal].lost = lost
+        for sample in self.sampler.due(now_ns):
+            self._publisher.publish(self._message(sample))
+
+    def items(self, now_s: float) -> list[Item]:
+        """Return the health of link and signals."""
+        items = [self._link_item(now_s)]
+        for signal, counts in self.sampler.counts.items():
+            items.append(self._signal_item(signal, counts, now_s))
+        return items
+
+    def _link_item(self, now_s: float) -> Item:
+        state, unit, sampler = self.link.state, self.unit, self.sampler
+        ahead = state.clock_ahead_s
+        for_s = counted(round(now_s - state.since_s), 'second')
+        if not (state.up or state.problem):
+            level, told = Level.WARN, f'Connecting to {unit.endpoint}.'
+        elif not state.up:
+            level, told = Level.ERROR, f'No link to {unit.endpoint} for {for_s}'
+            told += f': {state.problem}. '
+            told += f'Tried {counted(state.attempts, "time")}; it goes on trying.'
+        elif abs(ahead) > _CLOCK_S:
+            level = Level.WARN
+            told = (
+                f'The clock of {unit.endpoint} is {abs(ahead):.1f} s '
+                f'{"ahead of" if ahead > 0 else "behind"} this one: set both by NTP.'
+            )
+        else:
+            level, told = Level.OK, f'Connected to {unit.endpoint} for {for_s}.'
+        return Item('link', level, told, {
+            'samples': sampler.sent, 'samples_unconfirmed': sampler.unconfirmed,
+            'losses': state.losses, 'attempts': state.attempts,
+            'messages_lost': state.lost_messages, 'messages_sent_again': state.republished,
+            'server_clock_ahead_s': ahead, 'backfill': state.backfill,
+        })  # fmt: skip
+
+    def _signal_item(self, signal: int, counts: Counts, now_s: float) -> Item:
+        topic = SIGNALS[Signal(signal)].topic
+        values = {name: getattr(counts, name) for name in Counts.__slots__}
+        trouble = tuple(values[name] for name in _TROUBLE)
+        if trouble != self._before.setdefault(signal, trouble):
+            self._before[signal], self._trouble_s[signal] = trouble, now_s
+        elif any(trouble) and signal not in self._trouble_s:
+            self._trouble_s[signal] = now_s
+        if problem := self.link.state.nodes.get(signal):
+            return Item(f'signal {topic}', Level.ERROR, f'Not read: {problem}.', values)
+        if now_s - self._trouble_s.get(signal, -math.inf) < _SHOWN_S:
+            told = ', '.join(f'{n} {name}' for name, n in values.items() if n and name in _TROUBLE)
+            return Item(f'signal {topic}', Level.WARN, f'Since the start: {told}.', values)
+        if not self.link.state.up:
+            return Item(f'signal {topic}', Level.STALE, 'There is no link.', values)
+        if not counts.received:
+            return Item(f'signal {topic}', Level.WARN, 'Nothing came yet.', values)
+        return Item(f'signal {topic}', Level.OK, 'Values come.', values)
+
+    def _message(self, sample: Sample) -> PlantSample:
+        message = PlantSample(header=header(sample.time_ns, self.unit.tag))
+        for info, value, code in zip(SIGNALS, sample.values, sample.quality, strict=True):
+            setattr(message, info.topic, value)
+            if code is not None:
+                known = PlantSample.QUALITY_GOOD + code
+                setattr(message, f'{info.topic}_quality', known)
+        return message
+
+    def _save(self, parts: list[Readings]) -> str:
+        """Write the history of an outage; called in a thread of its own."""
+        start = time.strftime('%Y%m%dT%H%M%SZ', time.gmtime(int(parts[0].time_ns[0]) // NS_PER_S))
+        folder = self.unit.backfill_directory
+        assert folder is not None
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        path = folder / f'backfill_{self.unit.tag}_{start}.mcap'
+        signals = [node.signal for node in self.unit.nodes]
+        written = write_readings(parts, signals, path, prefix=self.unit.namespace, overwrite=True)
+        return f'{counted(written.messages, "value")} in {path}'
+
+
+class ResultsBridge:
+    """Brings what a unit's monitor publishes to the OPC UA server.
+
+    Parameters
+    ----------
+    node : Node
+    unit : UnitMapping
+    server : ResultsServer
+    start : callable
+        Begins a coroutine in the server's loop.
+    """
+
+    OBJECTS = ('characteristic', 'diagnosis', *(
+        f'alarms.{name}' for name in (ResidualAlarm.NAME, ShiftAlarm.NAME)
+    ))  # fmt: skip
+
+    def __init__(
+        self,
+        node: Node,
+        unit: UnitMapping,
+        server: ResultsServer,
+        start: Callable[[Coroutine[Any, Any, Any]], Any],
+    ) -> None:
+        self._node, self._tag, self._server, self._start = node, unit.tag, server, start
+        self._monitor = f'{unit.namespace}/{unit.monitor}'
+        self._present = True
+        for kind, name in ((FlowCharacteristic, 'characteristic'), (Diagnosis, 'diagnosis')):
+            node.create_subscription(
+                kind, f'{self._monitor}/{name}', partial(self._on_message, name), _LATCHED
+            )
+        node.create_subscription(Alarm, f'{self._monitor}/alarms', self._on_alarm, _LATCHED)
+
+    def look(self) -> None:
+        """Mark what is shown once the monitor has gone, and once it is back."""
+        present = self._node.count_publishers(f'{self._monitor}/characteristic') > 0
+        if present != self._present:
+            self._present = present
+            self._start(self._server.mark(self._tag, present))
+
+    def _on_message(self, name: str, message: Any) -> None:
+        self._present, time_ns = True, from_time(message.header.stamp)
+        self._start(self._server.update(self._tag, name, variables(message), time_ns))
+        if name == 'diagnosis' and message.verdict != Diagnosis.UNKNOWN:
+            values = {'State': message.verdict, 'PreviousState': 0, 'Value': math.nan,
+                      'Limit': math.nan, 'Unit': ''}  # fmt: skip
+            wrong = message.verdict != Diagnosis.NOTHING
+            severity = SEVERITY[Alarm.MEDIUM] if wrong else NO_CONDITION
+            event = AlarmEvent('diagnosis', time_ns, message.sentence, severity, values)
+            self._start(self._server.alarm(self._tag, event))
+
+    def _on_alarm(self, message: Alarm) -> None:
+        time_ns, name = from_time(message.header.stamp), f'alarms.{message.name}'
+        self._present = True
+        if name not in self.OBJECTS:
+            return
+        self._start(self._server.update(self._tag, name, variables(message), time_ns))
+        # What is only told again rings no bell.
+        if message.state == message.previous_state:
+            return
+        standing = message.state in (Alarm.UNACKNOWLEDGED, Alarm.ACKNOWLEDGED)
+        severity = SEVERITY.get(message.priority, NO_CONDITION) if standing else NO_CONDITION
+        values = {
+            'State': message.state, 'PreviousState': message.previous_state,
+            'Value': message.value, 'Limit': message.limit, 'Unit': message.unit,
+        }  # fmt: skip
+        event = AlarmEvent(message.name, time_ns, message.sentence, severity, values)
+        self._start(self._server.alarm(self._tag, event))
+
+
+def fields(kind: Any) -> Iterable[Field]:
+    """Yield the variables of a message type: its fields under their own names."""
+    for name, of in kind.get_fields_and_field_types().items():
+        if of == 'std_msgs/Header':
+            yield Field('stamp', 'DateTime')
+        elif of == _TIME:
+            yield Field(name, 'DateTime')
+        elif of == _CAUSES:
+            for inner in fields(DiagnosisCause):
+                if not inner.array:
+                    yield Field(f'{name}_{inner.name}', inner.kind, True)
+        else:
+            plain = of.removeprefix('sequence<').removesuffix('>')
+            yield Field(name, _KINDS[plain], plain != of)
+
+
+def variables(message: Any) -> dict[str, object]:
+    """Return the values of the variables that `fields` names; times in ns."""
+    values: dict[str, object] = {}
+    types = message.get_fields_and_field_types()
+    for name, of in types.items():
+        value = getattr(message, name)
+        if of == 'std_msgs/Header':
+            values['stamp'] = from_time(value.stamp)
+        elif of == _TIME:
+            values[name] = from_time(value)
+        elif of == _CAUSES:
+            for inner in fields(DiagnosisCause):
+                if not inner.array:
+                    values[f'{name}_{inner.name}'] = [getattr(c, inner.name) for c in value]
+        else:
+            values[name] = list(value) if of.startswith('sequence<') else value
+    return values
+
+
+def _units_offered(mapping: GatewayMapping) -> dict[str, dict[str, list[Field]]]:
+    kinds = {'characteristic': FlowCharacteristic, 'diagnosis': Diagnosis}
+    objects = {name: list(fields(kinds.get(name, Alarm))) for name in ResultsBridge.OBJECTS}
+    return {unit.tag: objects for unit in mapping.units}
+
+
+_ABOUT = """usage: opcua_gateway --ros-args -p mapping_file:=FILE
+
+Reads the signals of one or several units from OPC UA servers and publishes plant_sample; shows
+curve, alarms and diagnosis of the monitors as an OPC UA server where the file says so."""
+_EXAMPLE = 'ros2 run valveflow_ros opcua_gateway --ros-args -p mapping_file:=opcua.yaml'
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run until it is asked to end; return the exit status."""
+    if wants_help(args):
+        show(usage(_ABOUT, _EXAMPLE, TABLE))
+        return 0
+    stop = StopFlag().install()
+    try:
+        check_installed()
+        start_ros(args)
+        return _run(stop)
+    except ValveflowError as error:
+        return complain(NAME, str(error))
+    except Exception as error:  # noqa: BLE001 - a person gets a sentence, not a trace
+        return complain(NAME, f'failed unexpectedly: {with_place(error)}')
+    finally:
+        rclpy.try_shutdown()
+
+
+def _run(stop: StopFlag) -> int:
+    node = Node(NAME)
+    loop = LoopThread()
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    server: ResultsServer | None = None
+    try:
+        values = declare(node, TABLE)
+        log = node.get_logger()
+        for sentence in unknown_overrides(node, list(values)):
+            log.warning(f'{sentence} It is ignored.')
+        if not values['mapping_file']:
+            raise InputError('Name the mapping file: --ros-args -p mapping_file:=opcua.yaml.')
+        mapping = read_mapping_file(Path(str(values['mapping_file'])))
+        bridges = []
+        if mapping.server is not None:
+            offered = ResultsServer(mapping.server, _units_offered(mapping))
+            loop.start(offered.start()).result(_OFFER_S)
+            server = offered
+            bridges = [ResultsBridge(node, unit, offered, loop.start) for unit in mapping.units]
+            log.info(f'Curve, alarms and diagnosis are offered at {mapping.server.endpoint}.')
+        units = [GatewayUnit(node, unit) for unit in mapping.units]
+        for unit in units:
+            loop.start(unit.link.run())
+        period_s = float(str(values['diagnostics_period']))
+        _serve(node, executor, stop, units, bridges, period_s)
+    finally:
+        stop.last()
+        if server is not None:
+            with suppress(Exception):
+                loop.start(server.stop()).result(_END_S)
+        loop.close()
+        executor.shutdown(timeout_sec=0.5)
+        node.destroy_node()
+    return 0
+
+
+def _serve(
+    node: Node,
+    executor: SingleThreadedExecutor,
+    stop: StopFlag,
+    units: Sequence[GatewayUnit],
+    bridges: Sequence[ResultsBridge],
+    diagnostics_period_s: float,
+) -> None:
+    publisher = node.create_publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10))
+    changes = {unit.name: Changes() for unit in units}
+    log = node.get_logger()
+    next_s = 0.0
+    while not stop:
+        executor.spin_once(timeout_sec=_LOOK_S)
+        now_ns, now_s = time.time_ns(), time.monotonic()
+        for unit in units:
+            unit.step(now_ns)
+        if now_s < next_s:
+            continue
+        next_s = now_s + diagnostics_period_s
+        for bridge in bridges:
+            bridge.look()
+        for unit in units:
+            items = unit.items(now_s)
+            publisher.publish(diagnostics_message(items, unit.name, unit.unit.tag, now_ns))
+            fresh = (item for item in items if item.level != Level.STALE)
+            for item in changes[unit.name].pick(fresh, now_s):
+                told = f'{unit.unit.tag}, {item.name}: {item.sentence}'
+                # rclpy wants one severity for each place in the code.
+                if item.level == Level.OK:
+                    log.info(told)
+                elif item.level == Level.WARN:
+                    log.warning(told)
+                else:
+                    log.error(told)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
