@@ -251,6 +251,15 @@ def test_units_are_folders_and_logs_are_in_the_order_of_their_names(tmp_path):
     assert globbed == {'U1': ['2026-9', '2026-10']}
 
 
+def test_a_file_with_its_metadata_is_a_log_and_splits_are_one(tmp_path):
+    made(tmp_path, 'U1/2026-01.mcap', 'U2/a/a_0.mcap', 'U2/a/a_1.mcap', 'U3/b.csv', 'U3/c_0.mcap')
+    named = {'U1': ['2026-01.mcap'], 'U2/a': ['a_0.mcap', 'a_1.mcap'], 'U3': ['c_0.mcap']}
+    for folder, names in named.items():
+        text = f'rosbag2_bagfile_information:\n  relative_file_paths: [{", ".join(names)}]\n'
+        (tmp_path / folder / 'metadata.yaml').write_text(text)
+    assert told(read_fleet([tmp_path])) == {'U1': ['2026-01'], 'U2': ['a'], 'U3': ['b', 'c_0']}
+
+
 @pytest.mark.parametrize('mark', [',', ';', '\t'])
 def test_a_manifest_names_units_logs_and_options(mark, tmp_path):
     made(tmp_path, 'a/1.csv', 'a/2.csv', 'b/1.csv')

@@ -646,9 +646,9 @@ def _sentence(d: Diagnosis) -> str:
     if d.verdict == NAMED:
         drifts = d.disturbance is not None and d.disturbance.drift_mw is not None
         return ' '.join(c.sentence for c in d.causes) + (wander if drifts else '')
+    blind = [name for name, reason in d.rejected if 'cannot be judged' in reason]
+    but = f' Not judged, for want of what this record lacks: {listed(blind)}.' if blind else ''
     if d.verdict == NOTHING:
-        blind = [name for name, reason in d.rejected if 'cannot be judged' in reason]
-        but = f' Not judged, for want of what this record lacks: {listed(blind)}.' if blind else ''
         slow = '' if d.disturbance is None else 'a slow disturbance and '
         return (
             f'Of the {len(catalogue()) - len(blind)} causes that could be judged none was found: '
@@ -658,5 +658,5 @@ def _sentence(d: Diagnosis) -> str:
     besides = ''.join(f' Found besides: {c.sentence}' for c in d.causes)
     return (
         'Something is wrong that no cause of the catalogue explains; it depends on '
-        f'{" and ".join(d.unexplained_by)}{near}.' + wander + besides
+        f'{" and ".join(d.unexplained_by)}{near}.{but}' + wander + besides
     )

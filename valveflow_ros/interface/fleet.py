@@ -52,6 +52,10 @@ def connected(scheduler: str) -> Iterator[Any]:
     quiet = {'logging': {'distributed': 'critical', 'bokeh': 'critical'}}
     with dask.config.set(quiet), _silenced():
         if scheduler:
+            if not scheduler.rpartition(':')[2].isdigit():
+                raise UsageError(
+                    f"--scheduler '{scheduler}' names no port, as tcp://10.0.0.5:8786 does."
+                )
             try:
                 client = Client(scheduler, timeout=_WAIT_S, set_as_default=False)
             except ValueError as error:

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from valveflow_ros.errors import InputError, RecordingError, UsageError, ValveflowError, listed
 from valveflow_ros.interface.files import reason
 from valveflow_ros.interface.mapping import LogMapping, read_mapping
@@ -27,6 +29,7 @@ _NO_DIAGNOSIS = '--no-diagnosis'
 # The reference of a log is the curve before it, and a model would have to be hashed.
 _FILES = ('model_file', 'reference_file')
 _LONGEST_HEAD = 1 << 16
+_SPLIT = re.compile(r'_\d+\.(mcap|db3)(\.zstd)?$')
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,7 +226,7 @@ def _manifest(path: Path) -> list[tuple[int, dict[str, str]]] | None:
 
 def _logs_at(place: Path, skipped: Path | None) -> list[Path]:
     """Return the logs that a name stands for: itself, those in a folder, or those of a glob."""
-    if place.is_dir() and not (place / 'metadata.yaml').is_file():
+    if place.is_dir() and not _is_bag(place):
         found = []
         for entry in sorted(place.iterdir(), key=_in_order):
             if entry.name.startswith('.') or entry.resolve() == skipped:
@@ -241,6 +244,23 @@ def _logs_at(place: Path, skipped: Path | None) -> list[Path]:
     if not matched:
         raise RecordingError(place, 'cannot be opened (no such file or directory)')
     return [log for p in sorted(matched, key=_in_order) for log in _logs_at(p, skipped)]
+
+
+def _is_bag(folder: Path) -> bool:
+    """Tell whether a folder is one recording in splits, and not a folder of recordings.
+
+    `simulate` and `import` leave a `metadata.yaml` beside each single file too.
+    """
+    path = folder / 'metadata.yaml'
+    if not path.is_file():
+        return False
+    try:
+        content = yaml.safe_load(path.read_text(encoding='utf-8'))
+        named = {str(n) for n in content['rosbag2_bagfile_information']['relative_file_paths']}
+    except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError):
+        return True  # the reader says what is wrong with it
+    logs = {p.name for p in folder.iterdir() if p.suffix.lower() in SUFFIXES}
+    return not (logs - named) and all(_SPLIT.search(name) for name in named)
 
 
 def _in_order(path: Path) -> list[list[Any]]:

@@ -273,6 +273,13 @@ async def history(
         The server has no history, or cannot be reached; see `in_words`.
     """
     ids = [(node, await resolve(client, node)) for node in nodes]
+    for node, node_id in ids:  # of a node that is not there a server may give an empty history
+        try:
+            await client.get_node(node_id).read_node_class()
+        except Exception as error:  # noqa: BLE001 - with the name of the signal
+            raise DataError(
+                f'{SIGNALS[node.signal].topic}, {node.node}: {in_words(error)}.'
+            ) from None
     for part_ns in range(start_ns, end_ns, HISTORY_PART_NS):
         last_ns = min(part_ns + HISTORY_PART_NS, end_ns) - 1000
         changes: list[Change] = []

@@ -77,10 +77,12 @@ class Diagnosed:
 
 def diagnosis_page(data: Diagnosed) -> Page:
     """Return the report: the answer and its picture first, then the four steps."""
-    title = {
-        NAMED: 'Why simulation and measurement disagree',
-        NOTHING: 'Simulation and measurement agree',
-    }.get(data.diagnosis.verdict, 'Simulation and measurement disagree')
+    agree = 'Simulation and measurement agree'
+    if _drifts(data.diagnosis):
+        agree = 'No cause found, but the power drifts'
+    title = {NAMED: 'Why simulation and measurement disagree', NOTHING: agree}.get(
+        data.diagnosis.verdict, 'Simulation and measurement disagree'
+    )
     ranked = sorted(data.signatures, key=lambda s: -(s.share_before / max(s.share_chance, 1e-9)))
     sections = [
         _answer(data, ranked), _wrong(data, ranked), _why(data), _model(data), _proof(data),
@@ -94,11 +96,17 @@ def diagnosis_page(data: Diagnosed) -> Page:
     return Page(title, lead, sections, end_of_page, 'diagnose')
 
 
+def _drifts(d: Diagnosis) -> bool:
+    """Tell whether the power drifts over hours and days, which is no agreement."""
+    return d.disturbance is not None and d.disturbance.drift_mw is not None
+
+
 def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
     """Return the verdict with its doubts, what it is worth, and the one telling picture."""
     d = data.diagnosis
     said = text(d.sentence)
-    parts: list[str | Figure] = [paragraph(said, 'good') if d.verdict == NOTHING else notice(said)]
+    good = d.verdict == NOTHING and not _drifts(d)
+    parts: list[str | Figure] = [paragraph(said, 'good') if good else notice(said)]
     if d.not_told_apart:
         names = ' and '.join(text(n) for n in d.not_told_apart)
         doubt = f'These data do not tell apart: {names}.'

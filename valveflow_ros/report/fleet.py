@@ -184,7 +184,7 @@ def _units_table(stories: Sequence[UnitStory]) -> str:
         [
             _link(text(s.unit), UNITS, s.unit, REPORT),
             'not known' if s.change_mw is None else f'{signed(s.change_mw)} {s.output_unit}',
-            text(s.piece) or 'no change seen',
+            text(s.piece) or ('not compared' if s.change_mw is None else 'no change seen'),
             text(s.since) or '-',
             (text(', '.join(s.causes)) or 'not named') if s.moved else '-',
             text(', '.join(s.alarms)) or '-',

@@ -48,8 +48,8 @@ TABLE: tuple[Parameter, ...] = (
     Parameter('diagnostics_period', 1.0, 's', 'Time from one /diagnostics to the next.',
               0.1, 60.0),
 )  # fmt: skip
-# A clock that differs by more is told.
-_CLOCK_S = 1.0
+# A clock that differs by more is told; that of many servers stands still for up to a second.
+_CLOCK_S = 2.0
 # What was wrong with a value is shown for so long.
 _SHOWN_S = 60.0
 _LOOK_S, _END_S, _OFFER_S = 0.02, 6.0, 60.0
