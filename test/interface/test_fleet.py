@@ -315,7 +315,7 @@ def test_a_scheduler_that_is_not_there(plants, tmp_path, monkeypatch):
     monkeypatch.setattr(interface, '_WAIT_S', 1)
     with pytest.raises(RecordingError, match='no Dask scheduler answers there within 1 s'):
         vf.fleet([plants], tmp_path, scheduler='tcp://127.0.0.1:9')
-    with pytest.raises(ValveflowError, match='is no address'):
+    with pytest.raises(ValveflowError, match='names no port'):
         vf.fleet([plants], tmp_path, scheduler='nonsense://x')
 
 

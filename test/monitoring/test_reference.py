@@ -236,9 +236,16 @@ def test_curves_asked_for_one_after_another_are_one_judgement():
     assert told(alarm, (0.6,), (0.6,), (0.6,), every_s=60) == []
     assert told(alarm, (0.6,), begin_s=600) == [UNACKNOWLEDGED]
     calm = ShiftAlarm()
-    assert told(calm, (0.6,), CALM, (0.6,), (0.6,), every_s=60) == []
-    assert told(calm, (0.6,), begin_s=600) == []
+    assert told(calm, CALM, (0.6,), (0.6,), every_s=60) == []
+    assert told(calm, (0.6,), begin_s=500) == []
     assert told(calm, (0.6,), begin_s=720) == [UNACKNOWLEDGED]
+
+
+def test_a_clock_that_was_set_back_does_not_keep_a_shift_from_being_confirmed():
+    alarm = ShiftAlarm()
+    assert told(alarm, (0.6,), begin_s=86_400) == []
+    alarm.shift_time(-86_400 * NS_PER_S)
+    assert told(alarm, (0.6,), begin_s=600) == [UNACKNOWLEDGED]
 
 
 def test_what_the_last_curve_saw_outlives_a_restart():

@@ -45,7 +45,15 @@ from valveflow_ros.diagnosis.result import (
 )
 from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.diagnosis.search import Found, Progress, search, simplified
-from valveflow_ros.diagnosis.slow import NAMED_SHAPE, NO_SHAPE, Course, Drift, courses, drift
+from valveflow_ros.diagnosis.slow import (
+    LEAST_DRIFT_MW,
+    NAMED_SHAPE,
+    NO_SHAPE,
+    Course,
+    Drift,
+    courses,
+    drift,
+)
 from valveflow_ros.diagnosis.structure import Period, Structure, Wander, period, structure, wander
 from valveflow_ros.errors import DataError, listed
 from valveflow_ros.records import BoolArray, FloatArray, IntArray, SampleTable
@@ -175,6 +183,7 @@ _LEVELS = (
 )  # fmt: skip
 _SHAPES = {
     ('drift',): ('drift',), ('step',): ('step',), ('drift', 'step'): ('drift and step',),
+    ('drift', 'drift'): ('drift',), ('step', 'step'): ('two steps',),
     ('hidden',): ('there and back',),
 }  # fmt: skip
 # Log-likelihood by which another shape must be better than one name; than several, none.
@@ -254,9 +263,9 @@ class _Rest:
         """Return the slow wander of the power, a drift if it is one."""
         slow, course = self.drift, self.course
         if course is not None:
-            hours = self.drift.time_scale_s or self.wander.time_scale_s
+            scale_s = slow.time_scale_s if slow.there else self.wander.time_scale_s
             words = course_words(course, self.start_ns)
-            return Disturbance(course.rms_mw, hours, course.rms_mw, words)
+            return Disturbance(course.rms_mw, scale_s, course.rms_mw, words)
         if slow.there:
             return Disturbance(slow.rms_mw, slow.time_scale_s, slow.rms_mw)
         if self.wander.there:
@@ -401,7 +410,8 @@ def _course(found: Found) -> Course | None:
             found.near.pop(name, None)
             found.reasons[name] = _OF_SHAPE[best.name]
         found.model, _ = improve(found.task, found.model, 3)
-    if best.name == NO_SHAPE or best.score - tried[NO_SHAPE].score < _LEAST_SHAPE:
+    least_mw = LEAST_DRIFT_MW * found.task.grids.size
+    if best.score - tried[NO_SHAPE].score < _LEAST_SHAPE or best.rms_mw <= least_mw:
         return None
     return best
 
@@ -421,7 +431,7 @@ _OF_SHAPE = {
 
 def course_words(course: Course, start_ns: int) -> str:
     """Say how the power changes in time, in MW and UTC."""
-    mw = [f'{size:+.2g} MW' for size in course.mw]
+    mw = [f'{size:+.{1 if abs(size) >= 1.0 else 2}f} MW' for size in course.mw]
     at = [told(start_ns, s, _COURSE_STEP_S) for s in course.at_s]
     if course.name == 'drift':
         return f'evenly, {mw[0]} over the record'
@@ -431,7 +441,11 @@ def course_words(course: Course, start_ns: int) -> str:
         return f'evenly from about {at[0]} on, {mw[0]} by the end of the record'
     if course.name == 'exponential':
         hours = course.at_s[0] / 3600.0
-        return f'fast at first and then slower, by {mw[0]} with a time constant of {hours:.2g} h'
+        time = f'{hours:.0f} h' if hours < _DAYS_FROM_H else f'{hours / 24.0:.1f} days'
+        return (
+            f'fast at first and then slower, by {mw[0]} by the end of the record, with a time '
+            f'constant of {time}'
+        )
     if course.name == 'drift and step':
         return f'evenly, {mw[0]} over the record, and by {mw[1]} about {at[0]} besides'
     if course.name == 'drift and back':
@@ -442,6 +456,7 @@ def course_words(course: Course, start_ns: int) -> str:
 
 
 _COURSE_STEP_S = 3600
+_DAYS_FROM_H = 48.0
 
 
 def _dated(found: Found) -> Extended:
@@ -490,9 +505,9 @@ def _withdraw(found: Found, rest: _Rest) -> _Rest:
         if a.cause.slow and not _explained(found, a.name) > _FAR_MORE * slow.rms_mw**2:
             found.model = found.model.without(a.name)
             found.near.pop(a.name, None)
-            found.reasons[a.name] = (
-                'the power wanders slowly all the time, which would look the same'
-            )
+            found.reasons[a.name] = _OF_SHAPE[
+                NO_SHAPE if rest.course is None else rest.course.name
+            ]
     found.model, _ = improve(found.task, found.model, 3)
     # What these names had taken up belongs to the drift.
     return replace(rest, drift=drift(found.task, found.model))
@@ -626,13 +641,16 @@ def _verdict(found: Found, rest: _Rest, record_wrong: bool) -> tuple[str, bool]:
     return (NOTHING if rest.course is None else UNEXPLAINED), False
 
 
+_THE_TIME = 'the time'
+
+
 def _unexplained(rest: _Rest) -> tuple[str, ...]:
     course, structure = rest.course, rest.structure
     names = structure.variables if structure.there else ()
     if course is not None:
         # A large change in time shows in what goes along with it by chance, too.
         small = course.rms_mw**2 < structure.explained_mw2
-        names = (*names, 'the time') if small else ('the time',)
+        names = (*names, _THE_TIME) if small else (_THE_TIME,)
     return (*names, rest.period.words) if rest.period.there else names
 
 
@@ -656,6 +674,8 @@ def _sentence(d: Diagnosis) -> str:
         )
     near = f'; nearest: {", ".join(d.not_told_apart)}' if d.not_told_apart else ''
     besides = ''.join(f' Found besides: {c.sentence}' for c in d.causes)
+    if d.unexplained_by == (_THE_TIME,):
+        return f'{wander.strip()}{but}{besides}'
     return (
         'Something is wrong that no cause of the catalogue explains; it depends on '
         f'{" and ".join(d.unexplained_by)}{near}.{but}' + wander + besides

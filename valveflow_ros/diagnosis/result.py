@@ -91,7 +91,7 @@ class Disturbance:
         """Return it as a sentence for an operator."""
         hours = self.time_scale_s / 3600.0
         if self.shape:
-            return f'The power changes in time: {self.shape}. It has no cause in these signals.'
+            return f'The power changes in time: {self.shape}. Which cause makes it is not known.'
         if self.drift_mw is not None:
             length = 'days' if hours >= _DAYS_FROM_H else 'hours'
             return (

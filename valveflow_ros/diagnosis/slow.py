@@ -40,7 +40,7 @@ _MOST_ROWS = 500  # longer records are averaged over several sub-blocks
 _LEAST_ROWS = 40
 _SLOWEST_OF_NOISE_H = 2.0
 _LEAST_DRIFT_GAIN = 16.0
-_LEAST_DRIFT_MW = 0.05
+LEAST_DRIFT_MW = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +212,7 @@ class Drift:
     gain: float
     rms_mw: float
     time_scale_s: float
-    least_mw: float = _LEAST_DRIFT_MW
+    least_mw: float = LEAST_DRIFT_MW
 
     @property
     def there(self) -> bool:
@@ -248,7 +248,7 @@ def drift(task: Task, model: Extended) -> Drift:
     left = noise_mw2 * (wander - wander @ seen @ wander)
     unseen = float(np.trace(left) / k - left.mean())
     rms = float(np.sqrt(np.var(level) + unseen))
-    least_mw = _LEAST_DRIFT_MW * task.grids.size
+    least_mw = LEAST_DRIFT_MW * task.grids.size
     return Drift(best.restricted - none.restricted, rms, 3600.0 * best.hours, least_mw)
 
 
@@ -279,7 +279,7 @@ class Course:
     score : float
         Log-likelihood, less what its numbers cost.
     mw : tuple of float
-        Its sizes at the mean load, in MW.
+        Its sizes at the mean load, in MW; of an exponential what it came to by the end.
     at_s : tuple of float
         Its moments in s since the first row; of an exponential the time constant.
     rms_mw : float
@@ -431,4 +431,6 @@ def _course(
         np.zeros(len(found.hours)),
     )
     at_s = tuple(at for j in chosen for at in single[j].at_s)
+    if name == 'exponential':
+        sizes = made[-1:] - made[:1]
     return Course(name, score, tuple(sizes.tolist()), at_s, float(np.std(made)))

@@ -32,7 +32,8 @@ class HistorySource(Protocol):
     name : str
         What it is called in sentences and in the log: an address without a password.
     columns : mapping of Signal to str
-        The signals that it has, and what they are called there.
+        The signals that it has, and what they are called there, with the unit: an import that was
+        stopped goes on only where neither has changed.
     """
 
     @property
@@ -106,15 +107,15 @@ def import_history(
                 _save(file, source.read(begin_ns, min(begin_ns + _PART_NS, end_ns)))
         progress(0.9, 'writing')
         units = [{'topic': topic, 'unit': SIGNALS[s].unit} for s, topic in _topics(source)]
-        try:
-            written = write_readings(
-                map(_load, files), list(source.columns), path, overwrite=overwrite,
-                attachments={'import.json': json.dumps(
-                    {**json.loads(asked), 'signals': units}, indent=2
-                ).encode()},
-            )  # fmt: skip
-        except DataError:
-            raise DataError(f'{source.name} has no value in this period.') from None
+        if not any(len(_load(file)) for file in files):
+            shutil.rmtree(folder, ignore_errors=True)  # it may have some later
+            raise DataError(f'{source.name} has no value in this period.')
+        written = write_readings(
+            map(_load, files), list(source.columns), path, overwrite=overwrite,
+            attachments={'import.json': json.dumps(
+                {**json.loads(asked), 'signals': units}, indent=2
+            ).encode()},
+        )  # fmt: skip
     except OSError as error:
         raise RecordingError(folder, f'cannot be used for the work ({reason(error)})') from None
     shutil.rmtree(folder, ignore_errors=True)

@@ -377,6 +377,8 @@ _ANOTHER = 0.25
 _CLEAR = 2.0
 # Two pieces are one for that if they share so much of the shorter one.
 _OVERLAP = 0.5
+# Judgements are two if so many periods of the refits lie between them: one fit takes longer.
+_APART = 0.9
 _SHOWN = (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
 
 
@@ -424,11 +426,11 @@ class ShiftAlarm(Alarm):
         self.configure(settings)
         self.suppressed = False
         # A curve that was asked for soon after another stands on nearly the same data.
-        another = time_ns - self._seen_ns >= settings.real('refit_period') * NS_PER_S
+        another = time_ns - self._seen_ns >= _APART * settings.real('refit_period') * NS_PER_S
         if not self.active and self._confirmed(shift, self._seen if another else []):
             self.begin(time_ns)
         seen = [[p.u_from, p.u_to, p.shift_mw] for p in shift.pieces if p.moved]
-        if another or not (seen and self._seen):
+        if another or not self._seen:
             self._seen, self._seen_ns = seen, time_ns
         if self.active:
             self._follow(shift, settings)
@@ -467,6 +469,11 @@ class ShiftAlarm(Alarm):
             if abs(self._value - told.value) > surely:
                 return self._told_ns
         return super()._again_ns
+
+    def shift_time(self, step_ns: int) -> None:
+        """Follow a clock that was set back."""
+        super().shift_time(step_ns)
+        self._seen_ns += step_ns
 
     def forget(self) -> None:
         """Let the last judgement confirm nothing, as it was one against another reference."""

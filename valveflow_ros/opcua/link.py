@@ -103,8 +103,10 @@ class Link:
         self._confirmed_ns = 0
         self._heard_s = 0.0
         self._sequence = 0
+        self._ended = ''  # why the subscription is to be made anew
         self._session: Any = None
         self._held_back: list[tuple[list[Change], int]] | None = None
+        self._outages: list[tuple[int, int]] = []  # whose history is not saved yet
 
     async def run(self) -> None:
         """Connect, and connect again after every loss, until it is cancelled."""
@@ -142,7 +144,9 @@ class Link:
         state.up, state.since_s, state.attempts, state.problem = True, time.monotonic(), 0, ''
         away_ns = now_ns - gap_from_ns if gap_from_ns else 0
         if self._save is not None and away_ns > self._unit.lateness_ns:
-            saving = asyncio.create_task(self._backfill(client, gap_from_ns, now_ns))
+            self._outages.append((gap_from_ns, now_ns))
+        if self._outages:
+            saving = asyncio.create_task(self._backfill(client))
         try:
             await self._watch(client, 3.0 * silence_s + ANSWER_S)
         finally:
@@ -162,7 +166,7 @@ class Link:
             MaxNotificationsPerPublish=10_000,
             PublishingEnabled=True,
         )
-        self._sequence, self._heard_s = 0, time.monotonic()
+        self._sequence, self._heard_s, self._ended = 0, time.monotonic(), ''
         session = self._session = client.uaclient.session
 
         async def published(result: ua.PublishResult) -> None:
@@ -237,11 +241,12 @@ class Link:
         if any(isinstance(n, ua.StatusChangeNotification) for n in message.NotificationData or ()):
             # The server has ended the subscription; or asyncua says so itself of a lost link, and
             # that confirms nothing. What an old session still sends is no longer wanted.
-            self._session, self._heard_s = None, -math.inf
+            self._session, self._ended = None, 'the server has ended the subscription'
             return
         self._heard_s = time.monotonic()
         number = int(message.SequenceNumber)
         expected = self._sequence % 0xFFFFFFFF + 1
+        lost = max(0, number - expected - _MOST_REPUBLISHED)
         for missing in range(expected, min(number, expected + _MOST_REPUBLISHED)):
             try:
                 again = await session.republish(result.SubscriptionId, missing)
@@ -250,7 +255,12 @@ class Link:
                 self.state.republished += 1
                 self._deliver(again.NotificationData, now_ns, self._confirmed_ns)
             except Exception:  # noqa: BLE001 - it is lost, whatever the server said
-                self.state.lost_messages += 1
+                lost += 1
+        if lost:
+            # What changed in it is not known: a new subscription begins with every value.
+            self.state.lost_messages += lost
+            self._session, self._ended = None, 'a message of the server was lost'
+            return
         # A message without values, a keep-alive, has the number of the next one with values.
         self._sequence = number if message.NotificationData else max(self._sequence, number - 1)
         # Where the server has more to send at once, not all up to now is here yet.
@@ -293,8 +303,8 @@ class Link:
             now_s = time.monotonic()
             if client.state is not UaClientState.CONNECTED:
                 raise ConnectionError
-            if self._heard_s == -math.inf:
-                raise DataError('the server has ended the subscription')
+            if self._ended:
+                raise DataError(self._ended)
             if now_s - self._heard_s > longest_silence_s:
                 raise DataError(f'the server was silent for {longest_silence_s:.0f} s')
             if now_s - looked_s > _LOOK_S:
@@ -323,6 +333,8 @@ class Link:
         """
         found: list[Change] = []
         for signal, node_id in self._ids.items():
+            if signal in self.state.nodes:
+                continue  # it is not monitored: no later change would come
             start_ns = max(self._newest_ns.get(signal, gap_from_ns), now_ns - HISTORY_PART_NS)
             with contextlib.suppress(Exception):  # it has none: the gap stays bad
                 node = self._by_signal[signal]
@@ -331,17 +343,19 @@ class Link:
                 )
         return found
 
-    async def _backfill(self, client: Client, start_ns: int, end_ns: int) -> None:
-        """Read the history of an outage and have it saved."""
-        told = counted(round((end_ns - start_ns) / NS_PER_S), 'second')
-        try:
-            parts = [
-                part
-                async for part in history(client, self._unit.nodes, start_ns, end_ns)
-                if len(part)
-            ]
-            assert self._save is not None
-            saved = await asyncio.to_thread(self._save, parts) if parts else 'it has none'
-        except Exception as error:  # noqa: BLE001 - whatever it was is told
-            saved = in_words(error)
-        self.state.backfill = f'history of the last outage ({told}): {saved}'
+    async def _backfill(self, client: Client) -> None:
+        """Have the history of outages saved; one that is cut short stays to be read."""
+        assert self._save is not None
+        while self._outages:
+            start_ns, end_ns = self._outages[0]
+            told = counted(round((end_ns - start_ns) / NS_PER_S), 'second')
+            nodes = [n for n in self._unit.nodes if int(n.signal) not in self.state.nodes]
+            try:
+                parts = [
+                    part async for part in history(client, nodes, start_ns, end_ns) if len(part)
+                ]
+                saved = await asyncio.to_thread(self._save, parts) if parts else 'it has none'
+            except Exception as error:  # noqa: BLE001 - whatever it was is told
+                saved = in_words(error)
+            self._outages.pop(0)
+            self.state.backfill = f'history of the last outage ({told}): {saved}'

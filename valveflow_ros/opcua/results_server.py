@@ -19,6 +19,7 @@ from valveflow_ros.opcua.session import (
     load_key,
     to_datetime,
     uri_of,
+    valid,
 )
 
 NAMESPACE = 'urn:valveflow'
@@ -107,7 +108,7 @@ class ResultsServer:
         from asyncua.crypto.uacrypto import der_from_x509
 
         settings, security = self._settings, self._settings.security
-        trusted = [der_from_x509(load_certificate(path)) for path in security.trusted]
+        trusted = [der_from_x509(found) for found in valid(security.trusted)]
         self._server = server = Server(user_manager=_Readers(trusted, settings.user))
         await server.init()
         server.set_server_name('valveflow')

@@ -8,7 +8,7 @@ import asyncio
 import contextlib
 import logging
 import math
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncIterator, Iterable, Sequence
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from importlib.util import find_spec
@@ -133,6 +133,19 @@ def load_certificate(path: Path) -> Certificate:
     return found
 
 
+def valid(paths: Sequence[Path]) -> list[Certificate]:
+    """Return the certificates that are valid now; raises `RecordingError` where none is."""
+    found, problem = [], None
+    for path in paths:
+        try:
+            found.append(load_certificate(path))
+        except RecordingError as error:
+            problem = problem or error
+    if problem is not None and not found:
+        raise problem
+    return found
+
+
 def uri_of(certificate: Certificate) -> str:
     """Return the application URI of a certificate, empty if it names none."""
     from cryptography import x509
@@ -179,7 +192,7 @@ async def connected(endpoint: str, security: Security, user: User) -> AsyncItera
         assert security.certificate is not None
         assert security.private_key is not None
         own = load_certificate(security.certificate)
-        trusted = [load_certificate(path) for path in security.trusted]
+        trusted = valid(security.trusted)
         client.application_uri = uri_of(own) or client.application_uri
         key = await load_key(security.private_key, own)
         policy = getattr(security_policies, f'SecurityPolicy{security.policy}')
@@ -293,6 +306,13 @@ async def history(
         yield readings_of(changes)
 
 
+def _called(node: Node) -> str:
+    """Return a node with what turns its value into the monitor's unit."""
+    scale, offset = node.unit.scale, node.unit.offset
+    words = f' times {scale:g}' if scale != 1.0 else ''
+    return node.node + words + (f' plus {offset:g}' if offset else '')
+
+
 class OpcUaHistory:
     """The history of a unit's nodes, as a source for `valveflow import`.
 
@@ -306,7 +326,7 @@ class OpcUaHistory:
     def __init__(self, unit: UnitMapping, endpoint: str) -> None:
         self._unit, self._endpoint = unit, endpoint
         self.name = endpoint
-        self.columns: dict[Signal, str] = {node.signal: node.node for node in unit.nodes}
+        self.columns: dict[Signal, str] = {node.signal: _called(node) for node in unit.nodes}
 
     def read(self, start_ns: int, end_ns: int) -> list[Readings]:
         """Return the readings of a period, its end not included, in the monitor's units.

@@ -89,7 +89,8 @@ def story_of(unit: str, rows: Sequence[Row]) -> UnitStory:
             break
         changed.insert(0, row)
     named = dict.fromkeys(c['name'] for row in changed for c in row.get('causes') or ())
-    alarms = [a['name'] for a in last.get('alarms') or () if a['cleared'] is None]
+    judged = [row for row in rows if row.get('alarms') is not None]
+    alarms = [a['name'] for row in judged[-1:] for a in row['alarms'] if a['cleared'] is None]
     failures = [(row['log'], ' '.join(row['sentences'])) for row in rows if row['sentences']]
     piece = _moved(last, 'change') if changed else ''
     changes = [
@@ -151,11 +152,13 @@ def fleet_page(stories: Sequence[UnitStory]) -> Page:
     logs, failed = sum(s.logs for s in stories), sum(s.failed for s in stories)
     told = f'{counted(len(stories), "unit")}, {counted(logs, "log")}'
     told += f', {counted(failed, "log")} without a result.' if failed else '.'
+    alone = sum(s.change_mw is None for s in stories)
     answer = (
         f'{counted(len(less), "unit gives", "units give")} less power than in the first log, '
-        f'{counted(len(moved) - len(less), "unit gives", "units give")} more; of the others no '
-        'change is seen.'
+        f'{counted(len(moved) - len(less), "unit gives", "units give")} more; '
+        f'{counted(len(stories) - len(moved) - alone, "shows", "show")} no change'
     )
+    answer += f', and {alone} cannot be judged yet, for want of a second curve.' if alone else '.'
     sections = [Section('Which units lose power', [paragraph(answer), _units_table(ordered)])]
     if any(len(s.changes) > 1 for s in stories):
         sections.append(Section('When they changed', [changes_figure(ordered)]))
@@ -238,6 +241,8 @@ def unit_page(unit: str, rows: Sequence[Row]) -> Page:
     lead = paragraph(text(f'{counted(story.logs, "log")}, {story.failed} without a result.'),
                      'where')  # fmt: skip
     answer = 'No change against the first curve is seen.'
+    if story.change_mw is None:
+        answer = 'There is no second curve yet to tell a change by.'
     if story.moved:
         named = f'Causes named: {", ".join(story.causes)}.' if story.causes else 'No cause named.'
         answer = f'{story.piece}, since {story.since}. {named}'

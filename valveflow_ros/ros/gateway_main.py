@@ -230,7 +230,7 @@ class ResultsBridge:
             self._start(self._server.mark(self._tag, present))
 
     def _on_message(self, name: str, message: Any) -> None:
-        self._present, time_ns = True, from_time(message.header.stamp)
+        time_ns = from_time(message.header.stamp)
         self._start(self._server.update(self._tag, name, variables(message), time_ns))
         if name == 'diagnosis' and message.verdict != Diagnosis.UNKNOWN:
             values = {'State': message.verdict, 'PreviousState': 0, 'Value': math.nan,
@@ -242,7 +242,6 @@ class ResultsBridge:
 
     def _on_alarm(self, message: Alarm) -> None:
         time_ns, name = from_time(message.header.stamp), f'alarms.{message.name}'
-        self._present = True
         if name not in self.OBJECTS:
             return
         self._start(self._server.update(self._tag, name, variables(message), time_ns))
