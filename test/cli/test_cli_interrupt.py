@@ -20,7 +20,7 @@ SAID = 'valveflow: stopped; nothing was left half-written.\n'
 # Verbs that are done before anybody could press a key.
 AT_ONCE = {'completion', 'config'}
 TRIED = ('simulate', 'import', 'info', 'export', 'recover', 'identify', 'validate', 'compare',
-         'diagnose', 'loop', 'compensate', 'watch', 'monitor')  # fmt: skip
+         'diagnose', 'loop', 'compensate', 'watch', 'monitor', 'fleet')  # fmt: skip
 
 
 @pytest.fixture
@@ -63,6 +63,7 @@ def words_of(verb, logs, model, out):
         'compare': [verb, mcap, '-o', out / 'new'],
         'diagnose': [verb, mcap, '-o', out / 'new'],
         'monitor': [verb, mcap, '-o', out / 'new', '--no-diagnosis'],
+        'fleet': [verb, mcap, '-o', out / 'new', '--no-diagnosis'],
         'loop': [verb, csv, '-o', out / 'new', '--command', 'valve_opening_percent',
                  '--process', 'generated_power_mw'],
     }[verb]  # fmt: skip
@@ -92,6 +93,7 @@ def test_ctrl_c_in_every_part_of_a_verb(stopped_at, logs, identified, tmp_path, 
 
 @pytest.mark.parametrize(('verb', 'part'), [
     ('identify', 1), ('identify', 3), ('identify', 4), ('diagnose', 3), ('compare', 2),
+    ('fleet', 1),
 ])  # fmt: skip
 def test_ctrl_c_in_parts_of_long_verbs(stopped_at, logs, identified, tmp_path, verb, part):
     ran = stopped_at(part, signal.SIGINT, *words_of(verb, logs, identified, tmp_path))

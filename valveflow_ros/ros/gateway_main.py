@@ -229,7 +229,14 @@ class ResultsBridge:
             self._present = present
             self._start(self._server.mark(self._tag, present))
 
+    def _heard(self) -> None:
+        """Take a message as a sign that the monitor is back."""
+        if not self._present:
+            self._present = True
+            self._start(self._server.mark(self._tag, True))
+
     def _on_message(self, name: str, message: Any) -> None:
+        self._heard()
         time_ns = from_time(message.header.stamp)
         self._start(self._server.update(self._tag, name, variables(message), time_ns))
         if name == 'diagnosis' and message.verdict != Diagnosis.UNKNOWN:
@@ -244,6 +251,7 @@ class ResultsBridge:
         time_ns, name = from_time(message.header.stamp), f'alarms.{message.name}'
         if name not in self.OBJECTS:
             return
+        self._heard()
         self._start(self._server.update(self._tag, name, variables(message), time_ns))
         # What is only told again rings no bell.
         if message.state == message.previous_state:
