@@ -135,6 +135,15 @@ def _two_steps(x: FloatArray, rng: np.random.Generator) -> FloatArray:
     return np.asarray(share * (x >= a) + (1.0 - share) * (x >= b))
 
 
+def _two_changes(x: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Two changes that take hours each: S-shaped, mostly within 2 to 4 % of the record."""
+    a, b = rng.uniform(0.15, 0.4), rng.uniform(0.55, 0.85)
+    wide = rng.uniform(0.005, 0.015, 2)
+    share = rng.uniform(0.3, 0.7)
+    first, second = np.tanh((x - a) / wide[0]), np.tanh((x - b) / wide[1])
+    return np.asarray(0.5 * (share * first + (1.0 - share) * second))
+
+
 def _fouling(x: FloatArray, rng: np.random.Generator) -> FloatArray:
     return np.asarray(1.0 - np.exp(-x / rng.uniform(0.15, 0.3)))
 
@@ -162,6 +171,7 @@ def _random_walk(x: FloatArray, rng: np.random.Generator) -> FloatArray:
 SLOW: dict[str, Callable[[FloatArray, np.random.Generator], FloatArray]] = {
     'two steps': _two_steps, 'fouling': _fouling, 'late drift': _late_drift,
     'drift then wash': _wash, 'switching offset': _switching, 'random walk': _random_walk,
+    'two changes over hours': _two_changes,
 }  # fmt: skip
 _SLOW_SHARE = (0.01, 0.02)  # of the power
 

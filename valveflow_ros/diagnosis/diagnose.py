@@ -433,6 +433,8 @@ def course_words(course: Course, start_ns: int) -> str:
     """Say how the power changes in time, in MW and UTC."""
     mw = [f'{size:+.{1 if abs(size) >= 1.0 else 2}f} MW' for size in course.mw]
     at = [told(start_ns, s, _COURSE_STEP_S) for s in course.at_s]
+    if course.spread_s:
+        at[-1] += f', within about {course.spread_s / 3600.0:.0f} h' + ' each' * (len(at) > 1)
     if course.name == 'drift':
         return f'evenly, {mw[0]} over the record'
     if course.name == 'step':

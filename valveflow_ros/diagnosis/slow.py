@@ -15,7 +15,7 @@ coefficients and the noise's variance are known in closed form.
 
 A change of the power in time that is no wander has a shape: steps, a drift that begins late, an
 exponential. Shapes are added to the mean of the same process and compared by the likelihood, each
-number paid for.
+number paid for. A step takes place at once or within four hours.
 """
 
 from __future__ import annotations
@@ -262,6 +262,7 @@ _OF_WANDER = 2.0 * 2.0  # for its variance and its time scale, which are tried o
 _MOMENTS = 96
 _EDGE = 0.04  # of the record, at either end, in which nothing is seen to begin
 _APART = 2  # moments between two steps
+_SPREADS_H = (0.0, 4.0)  # within which a step takes place; two steps have the same
 _RATES = (0.08, 0.12, 0.18, 0.27, 0.4, 0.6)  # time constants in lengths of the record
 NO_SHAPE, NAMED_SHAPE = 'wander', 'named'
 
@@ -284,6 +285,8 @@ class Course:
         Its moments in s since the first row; of an exponential the time constant.
     rms_mw : float
         Root mean square about its mean over the record.
+    spread_s : float
+        Time that each of its steps takes, about `at_s`; 0 for at once.
     """
 
     name: str
@@ -291,6 +294,7 @@ class Course:
     mw: tuple[float, ...] = ()
     at_s: tuple[float, ...] = ()
     rms_mw: float = 0.0
+    spread_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,27 +305,38 @@ class _Shape:
     columns: FloatArray
     at_s: tuple[float, ...]
     numbers: int
+    spread_s: float = 0.0
 
 
 def _shapes(found: Levels) -> list[_Shape]:
-    """Return every shape of one column; steps first, in order of time."""
+    """Return every shape of one column; steps first, by their spread and in order of time."""
     t, load = found.hours, found.load
     span = float(t[-1] - t[0])
     moments = np.linspace(t[0] + _EDGE * span, t[-1] - _EDGE * span, _MOMENTS)
     even = (t - t[0]) / span
     after = t[:, None] >= moments
+    steps = [
+        _Shape('step', column * load, (3600.0 * float(at),), 3 if spread else 2, 3600.0 * spread)
+        for spread in _SPREADS_H
+        for column, at in zip(
+            np.clip((t[:, None] - moments) / max(spread, 1e-9) + 0.5, 0.0, 1.0).T,
+            moments, strict=True,
+        )
+    ]  # fmt: skip
     begins = np.maximum(t[:, None] - moments, 0.0) / (t[-1] - moments)
     ends = np.where(after, 0.0, (t[:, None] - t[0]) / (moments - t[0]))
     rates = span * np.array(_RATES)
     falls = 1.0 - np.exp(-(t[:, None] - t[0]) / rates)
-    return [
+    others = [
         _Shape(name, column * load, (3600.0 * float(at),), 2)
         for name, columns, when in (
-            ('step', after, moments), ('late drift', begins, moments),
-            ('drift and back', ends, moments), ('exponential', falls, rates),
+            ('late drift', begins, moments),
+            ('drift and back', ends, moments),
+            ('exponential', falls, rates),
         )
-        for column, at in zip(np.asarray(columns, dtype=np.float64).T, when, strict=True)
-    ] + [_Shape('drift', even * load, (), 1)]  # fmt: skip
+        for column, at in zip(columns.T, when, strict=True)
+    ]
+    return [*steps, *others, _Shape('drift', even * load, (), 1)]
 
 
 def courses(task: Task, model: Extended, names: Sequence[str]) -> dict[str, Course]:
@@ -365,7 +380,7 @@ def _scored(
     table = np.column_stack([found.power, found.free, columns])
     kinds = np.array([s.name for s in single])
     paid = PENALTY * np.array([s.numbers for s in single])
-    steps, drift_at = np.flatnonzero(kinds == 'step'), int(np.flatnonzero(kinds == 'drift')[0])
+    drift_at = int(np.flatnonzero(kinds == 'drift')[0])
     for lower, _, ratio in _wanders(found):
         white = solve_triangular(lower, table, lower=True)
         basis, _ = np.linalg.qr(white[:, 1 : 1 + p])
@@ -386,27 +401,29 @@ def _scored(
             mine = np.flatnonzero(kinds == name)
             j = int(mine[score[mine].argmax()])
             yield str(name), float(score[j]), (j,), toward[[j]] / size[j]
-        gain, a, b = _pairs(gram, toward, np.full(len(steps), drift_at), steps)
-        j = int(gain.argmax())
-        chosen = drift_at, int(steps[j])
-        yield 'drift and step', float(worth(gain)[j] - 3 * PENALTY), chosen, np.array([a[j], b[j]])
-        one, two = np.triu_indices(len(steps), _APART)
-        one, two = steps[one], steps[two]
-        gain, a, b = _pairs(gram, toward, one, two)
-        j = int(gain.argmax())
-        chosen = int(one[j]), int(two[j])
-        yield 'two steps', float(worth(gain)[j] - 4 * PENALTY), chosen, np.array([a[j], b[j]])
-        # The same two of equal size and opposite sign.
-        gain = (toward[one] - toward[two]) ** 2 / np.maximum(
-            gram[one, one] + gram[two, two] - 2.0 * gram[one, two], 1e-12
-        )
-        j = int(gain.argmax())
-        chosen = int(one[j]), int(two[j])
-        height = (toward[one[j]] - toward[two[j]]) / (
-            gram[one[j], one[j]] + gram[two[j], two[j]] - 2.0 * gram[one[j], two[j]]
-        )
-        sizes = np.array([height, -height])
-        yield 'there and back', float(worth(gain)[j] - 3 * PENALTY), chosen, sizes
+        for spread in range(len(_SPREADS_H)):
+            steps = np.arange(spread * _MOMENTS, (spread + 1) * _MOMENTS)
+            more = PENALTY * (spread > 0)
+            gain, a, b = _pairs(gram, toward, np.full(_MOMENTS, drift_at), steps)
+            j = int(gain.argmax())
+            chosen = drift_at, int(steps[j])
+            score = worth(gain) - 3 * PENALTY - more
+            yield 'drift and step', float(score[j]), chosen, np.array([a[j], b[j]])
+            one, two = steps[0] + np.array(np.triu_indices(_MOMENTS, _APART))
+            gain, a, b = _pairs(gram, toward, one, two)
+            j = int(gain.argmax())
+            chosen = int(one[j]), int(two[j])
+            score = worth(gain) - 4 * PENALTY - more
+            yield 'two steps', float(score[j]), chosen, np.array([a[j], b[j]])
+            # The same two of equal size and opposite sign.
+            square = np.maximum(gram[one, one] + gram[two, two] - 2.0 * gram[one, two], 1e-12)
+            apart = toward[one] - toward[two]
+            gain = apart**2 / square
+            j = int(gain.argmax())
+            chosen = int(one[j]), int(two[j])
+            sizes = apart[j] / square[j] * np.array([1.0, -1.0])
+            score = worth(gain) - 3 * PENALTY - more
+            yield 'there and back', float(score[j]), chosen, sizes
 
 
 def _pairs(
@@ -433,4 +450,5 @@ def _course(
     at_s = tuple(at for j in chosen for at in single[j].at_s)
     if name == 'exponential':
         sizes = made[-1:] - made[:1]
-    return Course(name, score, tuple(sizes.tolist()), at_s, float(np.std(made)))
+    spread_s = max(single[j].spread_s for j in chosen)
+    return Course(name, score, tuple(sizes.tolist()), at_s, float(np.std(made)), spread_s)
