@@ -319,6 +319,25 @@ def launching(bench: Bench) -> None:
         bench.check('The demo runs', line, plays)
 
 
+def units_of_a_host(bench: Bench) -> None:
+    """Launch: a list of units, each with its parameter file."""
+    for k in (1, 2):
+        given = {'unit_tag': f'U{k}', 'record_directory': f'{bench.folder}/u{k}'}
+        text = yaml.safe_dump({'/**': {'ros__parameters': given}})
+        (bench.folder / f'u{k}.yaml').write_text(text)
+    units = bench.folder / 'units.yaml'
+    rows = [{'namespace': f'/u{k}', 'params_file': f'u{k}.yaml'} for k in (1, 2)]
+    units.write_text(yaml.safe_dump(rows))
+    with bench.running(
+        'listening to', 'launch', 'valveflow_ros', 'units.launch.py', f'units:={units}'
+    ):
+        _until(lambda: bench.log.count('listening to') == 2, 'the second unit')
+        bench.says(
+            'Two units by a list of units, units.launch.py',
+            r'(/u1/valveflow_monitor\s+/u2/valveflow_monitor)', 'node', 'list',
+        )  # fmt: skip
+
+
 def _managed(bench: Bench) -> str:
     """Bring two units up and down as nav2_lifecycle_manager's `changeStateForAllNodes` does."""
     forth = [f'/unit_{k}/valveflow_monitor' for k in (1, 2)]
@@ -422,7 +441,7 @@ def main() -> int:
     os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 90 + 10)
     with tempfile.TemporaryDirectory(prefix='valveflow_jazzy_') as name:
         bench = Bench(Path(name))
-        for part in (parameters, topics, launching, read):
+        for part in (parameters, topics, launching, units_of_a_host, read):
             try:
                 part(bench)
             except NotSeenError as error:
