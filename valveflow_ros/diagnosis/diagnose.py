@@ -179,12 +179,12 @@ _FAR_MORE = 8.0
 _OWN_MISFIT = 0.004  # of the power's range
 # Causes that are a level of the power in time, and the shapes that are theirs, by their families.
 _LEVELS = (
-    'gain_drift', 'output_offset_drift', 'input_drift', 'gain_step', 'input_step', 'intervals',
+    'gain_drift', 'output_offset_drift', 'input_drift', 'gain_step', 'input_step', 'curve_step',
+    'intervals',
 )  # fmt: skip
 _SHAPES = {
     ('drift',): ('drift',), ('step',): ('step',), ('drift', 'step'): ('drift and step',),
-    ('drift', 'drift'): ('drift',), ('step', 'step'): ('two steps',),
-    ('hidden',): ('there and back',),
+    ('drift', 'drift'): ('drift',), ('hidden',): ('there and back',),
 }  # fmt: skip
 # Log-likelihood by which another shape must be better than one name; than several, none.
 _ANOTHER_SHAPE = 6.0
@@ -392,6 +392,8 @@ def _course(found: Found) -> Course | None:
     what they make together: a dated step and a drift can stand for nearly any slow change.
     """
     names = [name for name in found.model.names if name in _LEVELS]
+    if names == ['curve_step']:
+        names = []  # alone it is a matter of the load, too
     tried = courses(found.task, found.model, names)
     if not tried:
         return None
