@@ -10,6 +10,7 @@ import json
 import os
 import signal
 import socket
+from datetime import datetime, timedelta, timezone
 from types import SimpleNamespace
 
 import pytest
@@ -231,6 +232,45 @@ def test_what_a_monitor_says_is_read_by_opc_ua(processes, context, server, tmp_p
     asyncio.run(read())
     gateway.send_signal(signal.SIGINT)
     assert gateway.wait(20) == 0
+
+
+@pytest.mark.parametrize('readers', [['dcs', 'old'], ['old']], ids=str)
+def test_an_expired_certificate_of_a_reader_stops_nobody_else(
+    processes, server, tmp_path, readers
+):
+    from asyncua import Client, ua
+    from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
+
+    keys = {name: certificate(tmp_path, name) for name in ('gateway', 'dcs', 'stranger')}
+    keys['old'] = certificate(tmp_path, 'old', -1.0)
+    endpoint = f'opc.tcp://127.0.0.1:{free_port()}'
+    content = mapping(server.port, server={
+        'endpoint': endpoint,
+        'security': {'certificate': keys['gateway'][0], 'private_key': keys['gateway'][1],
+                     'trusted': [keys[name][0] for name in readers]},
+    })  # fmt: skip
+    gateway = start(processes, tmp_path, content)
+    wait_until(lambda: 'are offered at' in processes.output(gateway), 'the server')
+    told = processes.output(gateway)
+    day = f'{datetime.now(timezone.utc) - timedelta(days=1):%Y-%m-%d}'
+    assert f'{keys["old"][0]}: expired on {day}; the client that has it is refused.' in told
+    assert 'WARN' in told
+
+    async def connect(name):
+        client = Client(endpoint, timeout=10)
+        client.application_uri = f'urn:test:{name}'
+        await client.set_security(
+            SecurityPolicyBasic256Sha256, *keys[name], server_certificate=keys['gateway'][0]
+        )
+        async with client:
+            return await client.get_namespace_index('urn:valveflow')
+
+    for name in ('dcs', 'old', 'stranger'):
+        if name in readers and name != 'old':
+            assert asyncio.run(connect(name)) > 0
+        else:
+            with pytest.raises(ua.UaError):
+                asyncio.run(connect(name))
 
 
 def test_a_server_address_that_is_taken_is_told(processes, tmp_path):

@@ -129,25 +129,20 @@ def load_certificate(path: Path) -> Certificate:
     RecordingError
         It cannot be read, or its time is over or has not come.
     """
-    found, now = read_certificate(path), datetime.now(timezone.utc)
-    if found.not_valid_after_utc < now:
-        raise RecordingError(path, f'expired on {found.not_valid_after_utc:%Y-%m-%d}')
-    if found.not_valid_before_utc > now:
-        raise RecordingError(path, f'is not valid before {found.not_valid_before_utc:%Y-%m-%d}')
+    found = read_certificate(path)
+    if problem := not_valid(found):
+        raise RecordingError(path, problem)
     return found
 
 
-def valid(paths: Sequence[Path]) -> list[Certificate]:
-    """Return the certificates that are valid now; raises `RecordingError` where none is."""
-    found, problem = [], None
-    for path in paths:
-        try:
-            found.append(load_certificate(path))
-        except RecordingError as error:
-            problem = problem or error
-    if problem is not None and not found:
-        raise problem
-    return found
+def not_valid(certificate: Certificate) -> str:
+    """Return why a certificate is not valid now, empty if it is."""
+    now = datetime.now(timezone.utc)
+    if certificate.not_valid_after_utc < now:
+        return f'expired on {certificate.not_valid_after_utc:%Y-%m-%d}'
+    if certificate.not_valid_before_utc > now:
+        return f'is not valid before {certificate.not_valid_before_utc:%Y-%m-%d}'
+    return ''
 
 
 async def _server_certificate(endpoint: str, trusted: Sequence[Path]) -> Certificate:

@@ -349,7 +349,8 @@ def _run(stop: StopFlag) -> int:
         bridges = []
         if mapping.server is not None:
             offered = ResultsServer(mapping.server, _units_offered(mapping))
-            loop.start(offered.start()).result(_OFFER_S)
+            for sentence in loop.start(offered.start()).result(_OFFER_S):
+                log.warning(sentence)
             server = offered
             bridges = [ResultsBridge(node, unit, offered, loop.start) for unit in mapping.units]
             log.info(f'Curve, alarms and diagnosis are offered at {mapping.server.endpoint}.')
