@@ -128,8 +128,9 @@ def secured(keys):
 
 def secure(keys, port, own='gateway', trusted=('server',), **different):
     named = [keys[name][0] for name in trusted]
+    named = named[0] if len(named) == 1 else named
     security = {'policy': 'Aes256Sha256RsaPss', 'certificate': keys[own][0],
-                'private_key': keys[own][1], 'trusted': named[0] if len(named) == 1 else named}  # fmt: skip
+                'private_key': keys[own][1], 'trusted': named}  # fmt: skip
     return mapping(port, security={**security, **different})
 
 

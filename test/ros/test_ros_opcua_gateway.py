@@ -53,6 +53,7 @@ class Hearing:
         self._executor.add_node(self.node)
         self.samples: dict[str, list[PlantSample]] = {unit: [] for unit in units}
         self.health: dict[str, tuple[int, str]] = {}
+        self.values: dict[str, dict[str, str]] = {}
         for unit in units:
             self.node.create_subscription(
                 PlantSample, f'{unit}/plant_sample', self.samples[unit].append, 1000
@@ -62,6 +63,7 @@ class Hearing:
     def _on_health(self, message):
         for status in message.status:
             self.health[status.name] = status.level[0], status.message
+            self.values[status.name] = {pair.key: pair.value for pair in status.values}
 
     def spin(self):
         self._executor.spin_once(timeout_sec=0.05)
@@ -124,9 +126,21 @@ def test_samples_of_two_units_health_and_an_outage(processes, hearing, server, t
     assert hearing.last('/u2').valve_opening_quality == PlantSample.QUALITY_BAD
     hearing.until_told('u2/opcua_gateway: signal valve_opening', 'no such node')
     hearing.until_told('u1/opcua_gateway: link', 'Connected to opc.tcp://127.0.0.1')
+    power = 'u1/opcua_gateway: signal generated_power'
+    hearing.until_told(power, '150 MW, good, ')
+    # Unchanged: it stays good, and is older each time.
+    values = dict(hearing.values[power])
+    assert (values['value (MW)'], values['status']) == ('150', 'good')
+    hearing.until(
+        lambda: float(hearing.values[power]['age_s']) > float(values['age_s']) + 1.0, 'its age'
+    )
+    server.set('power', 151_000.0, status='UncertainSensorNotAccurate')
+    hearing.until_told(power, '151 MW, uncertain, ')
+    assert float(hearing.values[power]['age_s']) < 10.0
     server.set('power', 'text', kind='String')
     hearing.until_quality('/u1', PlantSample.QUALITY_BAD)
-    hearing.until_told('u1/opcua_gateway: signal generated_power', '1 wrong_type')
+    hearing.until_told(power, '1 wrong_type')
+    assert (hearing.values[power]['value (MW)'], hearing.values[power]['status']) == ('nan', 'bad')
     server.kill()
     hearing.until_told('u1/opcua_gateway: link', 'nobody listens there')
     hearing.until_quality('/u1', PlantSample.QUALITY_BAD, 'main_steam_pressure')
