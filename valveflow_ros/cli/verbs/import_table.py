@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import os
 from argparse import ArgumentParser, Namespace
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +16,7 @@ from valveflow_ros.cli.command import (
     add_mapping,
     columns,
     mapping_of,
+    time_ns,
 )
 from valveflow_ros.errors import DataError, InputError, UsageError
 
@@ -128,7 +128,7 @@ def _from_history(options: Namespace, console: Console) -> VerbResult:
     from valveflow_ros.interface.history_import import import_history
     from valveflow_ros.opcua.mapping import read_mapping_file
 
-    begin_ns, end_ns = _time_ns(options.begin), _time_ns(options.end)
+    begin_ns, end_ns = time_ns(options.begin), time_ns(options.end)
     if begin_ns >= end_ns:
         raise UsageError('--from must be before --to.')
     units = {unit.tag: unit for unit in read_mapping_file(options.mapping).units}
@@ -145,16 +145,6 @@ def _from_history(options: Namespace, console: Console) -> VerbResult:
         {'log': str(written.path), 'source': source.name, 'values': written.messages,
          'start_ns': begin_ns, 'end_ns': end_ns},
     )  # fmt: skip
-
-
-def _time_ns(text: str) -> int:
-    """Return a time in ns, in UTC where it names no zone."""
-    try:
-        moment = datetime.fromisoformat(text.replace('Z', '+00:00'))
-    except ValueError:
-        raise UsageError(f"'{text}' is no time such as 2026-01-31T06:00Z.") from None
-    moment = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
-    return round(moment.timestamp()) * 1_000_000_000
 
 
 def _imported(options: Namespace, mapping: LogMapping, console: Console) -> VerbResult:
