@@ -21,6 +21,7 @@ from valveflow_ros.errors import InputError, RecordingError, ValveflowError
 from valveflow_ros.interface import fleet as interface
 from valveflow_ros.interface.unit_logs import UnitLog, read_fleet, read_options
 from valveflow_ros.interface.unit_month import FleetTask, key_of, unit_month
+from valveflow_ros.report.words import duration
 
 pytest.importorskip('distributed')
 pytest.importorskip('pyarrow')
@@ -221,6 +222,29 @@ def test_logs_that_are_not_in_order_are_refused(ran, plants, tmp_path):
         "The log begins before '2026-10', which stands before it: name the logs of a unit in the "
         'order of time.'
     ]
+
+
+@pytest.mark.parametrize(('rows', 'overlaps'), [(0, False), (1, False), (2, True), (99, True)])
+def test_logs_that_overlap_are_refused_and_those_that_touch_are_not(
+    ran, plants, simulation, tmp_path, rows, overlaps
+):
+    """``rows`` of the one in front are in the next one too."""
+    frame = simulation.to_dataframe().iloc[::10]
+    first = frame.time.iloc[-rows] if rows else frame.time.iloc[-1] + pd.Timedelta(seconds=10)
+    log = tmp_path / 'next.csv'
+    frame.assign(time=frame.time - frame.time.iloc[0] + first).to_csv(log, index=False)
+    curve = 'units/007/2026-9/identify/characteristic.json'
+    shutil.copytree(ran.folder / 'units' / '007', tmp_path / 'units' / '007')
+    task = replace(task_of(ran, plants, before=curve, first=curve), folder=tmp_path)
+    row = unit_month(replace(task, of=replace(task.of, name='next', log=log)))
+    if overlaps:
+        seconds = (frame.time.iloc[-1] - first).total_seconds()
+        assert row['sentences'] == [
+            f"The log begins {duration(seconds)} before the end of '2026-9', which stands before "
+            'it: cut one, so that no row counts twice.'
+        ]
+    else:
+        assert (row['status'], row['sentences']) == ('done', [])
 
 
 # Which logs there are.

@@ -33,6 +33,7 @@ from valveflow_ros.interface.unit_logs import UnitLog
 from valveflow_ros.report.answer import explained
 from valveflow_ros.report.data import rejected
 from valveflow_ros.report.fleet import UNITS
+from valveflow_ros.report.words import duration
 from valveflow_ros.signals.units import in_unit
 
 LIBRARIES = ('numpy', 'numba', 'scipy')
@@ -198,14 +199,23 @@ def _judged(task: FleetTask) -> Row:
 
 
 def _check_order(log: Log, before: Characteristic | None, name: str) -> None:
-    """Refuse a log that begins before the one whose curve is its reference."""
+    """Refuse a log that begins before the end of the one whose curve is its reference.
+
+    The last row of one may be the first row of the next.
+    """
     if before is None or not len(log.readings):
         return
-    if int(log.readings.time_ns.min()) < before.source.window_start_ns:
-        earlier = Path(name).parent.parent.name
+    begin_ns, source = int(log.readings.time_ns.min()), before.source
+    earlier = Path(name).parent.parent.name
+    if begin_ns < source.window_start_ns:
         raise DataError(
             f"The log begins before '{earlier}', which stands before it: name the logs of a unit "
             'in the order of time.'
+        )
+    if begin_ns < source.window_end_ns:
+        raise DataError(
+            f'The log begins {duration((source.window_end_ns - begin_ns) / 1e9)} before the end '
+            f"of '{earlier}', which stands before it: cut one, so that no row counts twice."
         )
 
 
