@@ -218,7 +218,7 @@ def _schema() -> Any:
         'verdict': s,
         'causes': records(
             name=s, sentence=s, meaning=s, to_do=s, parameters=parameter, rmse_before=f,
-            rmse_after=f, reduction=f, p_value=f,
+            rmse_after=f, reduction=f, p_value=f, onset=at, onset_low=at, onset_high=at,
         ),
         'not_told_apart': pa.list_(s), 'unexplained_by': pa.list_(s),
         # alarms

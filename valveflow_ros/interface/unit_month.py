@@ -10,7 +10,7 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version as installed_version
 from pathlib import Path
@@ -30,6 +30,7 @@ from valveflow_ros.interface.logs import Log, open_log
 from valveflow_ros.interface.models import load_characteristic
 from valveflow_ros.interface.monitor import MonitorResult, monitor
 from valveflow_ros.interface.unit_logs import UnitLog
+from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.answer import explained
 from valveflow_ros.report.data import rejected
 from valveflow_ros.report.fleet import UNITS
@@ -39,6 +40,7 @@ from valveflow_ros.signals.units import in_unit
 LIBRARIES = ('numpy', 'numba', 'scipy')
 _ROW, _CURVE = 'row.json', 'characteristic.json'
 _BLOCK = 1 << 20
+DAY_NS = 86400 * NS_PER_S
 Row = dict[str, Any]
 
 
@@ -297,12 +299,24 @@ def _diagnosis_facts(found: DiagnosisResult) -> Row:
                 for name, p in cause['parameters'].items()
             ],
             **cause['gain'],
+            **_onset(cause['parameters'].values()),
         }
         for cause in content['causes']
     ]
     names = ('verdict', 'not_told_apart', 'unexplained_by', 'rmse_simulation', 'rmse_extended',
              'rmse_noise_floor')  # fmt: skip
     return {**{name: content[name] for name in names}, 'causes': causes}
+
+
+def _onset(parameters: Iterable[Mapping[str, Any]]) -> Row:
+    """Return when a cause set in, and the interval, in ns; None for one without a date."""
+    dated = next((p for p in parameters if 'origin_ns' in p), {})
+
+    def time_ns(days: float | None) -> int | None:
+        return None if days is None else int(dated['origin_ns']) + round(days * DAY_NS)
+
+    ends = {'onset': 'value', 'onset_low': 'low', 'onset_high': 'high'}
+    return {name: time_ns(dated.get(of)) for name, of in ends.items()}
 
 
 def _monitor_facts(found: MonitorResult) -> Row:

@@ -90,7 +90,8 @@ def run(options: Namespace, console: Console) -> VerbResult:
     if options.output is None:
         raise UsageError('Where to? Name the log with -o LOG.')
     check_log(options.output, overwrite=options.overwrite)
-    from valveflow_ros.interface.simulate import DEFAULT_START_NS, simulate
+    from valveflow_ros.interface.simulate import simulate
+    from valveflow_ros.plant.simulator import DEFAULT_START_NS
 
     start_ns = DEFAULT_START_NS if options.start is None else time_ns(options.start)
     console(0.0, 'simulating')
