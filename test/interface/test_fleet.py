@@ -18,6 +18,7 @@ import pytest
 
 import valveflow_ros as vf
 from valveflow_ros.errors import InputError, RecordingError, ValveflowError
+from valveflow_ros.interface import Progress
 from valveflow_ros.interface import fleet as interface
 from valveflow_ros.interface.unit_logs import UnitLog, read_fleet, read_options
 from valveflow_ros.interface.unit_month import FleetTask, key_of, unit_month
@@ -104,6 +105,25 @@ def test_the_data_set_has_a_row_for_each_log_with_what_the_files_say(ran):
     assert row.verdict == verdict
     assert row.versions['valveflow'] == vf.__version__
     assert 0.0 < row.monitor_s < row.task_s
+
+
+def test_what_is_under_way_is_told_before_the_first_log_is_done(ran, plants, client):
+    told = []
+
+    class Told(Progress):
+        def __call__(self, share, what):
+            told.append((share, what))
+
+        def say(self, sentence):
+            told.append(sentence)
+
+    address = client.scheduler.address
+    vf.fleet([plants / '007'], ran.folder, scheduler=address, options=WORDS, progress=Told())
+    bounded, begins, *rest = told
+    assert 'bounded to' in bounded
+    assert 'compiles first' in begins
+    assert rest == [(0.0, 'first 007 2026-9'), (0.5, '007 2026-9 done'), (1.0, '007 2026-10 done')]
+    vf.fleet([plants], ran.folder, scheduler=address, options=WORDS)  # the data set is of both
 
 
 def test_a_broken_log_costs_one_row_with_a_sentence(ran):
