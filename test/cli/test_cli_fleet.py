@@ -8,9 +8,9 @@ import json
 
 import pytest
 
-from valveflow_ros.interface import fleet as interface
-from valveflow_ros.interface.unit_logs import read_options
-from valveflow_ros.interface.unit_month import _diagnosis_facts
+from valveflow_ros.interface.fleets import fleet as interface
+from valveflow_ros.interface.fleets.unit_logs import read_options
+from valveflow_ros.interface.fleets.unit_month import _diagnosis_facts
 from valveflow_ros.report.fleet import fleet_page, story_of, unit_page
 
 DAY_NS = 86_400 * 10**9

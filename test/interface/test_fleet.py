@@ -19,9 +19,9 @@ import pytest
 import valveflow_ros as vf
 from valveflow_ros.errors import InputError, RecordingError, ValveflowError
 from valveflow_ros.interface import Progress
-from valveflow_ros.interface import fleet as interface
-from valveflow_ros.interface.unit_logs import UnitLog, read_fleet, read_options
-from valveflow_ros.interface.unit_month import FleetTask, key_of, unit_month
+from valveflow_ros.interface.fleets import fleet as interface
+from valveflow_ros.interface.fleets.unit_logs import UnitLog, read_fleet, read_options
+from valveflow_ros.interface.fleets.unit_month import FleetTask, key_of, unit_month
 from valveflow_ros.report.words import duration
 
 pytest.importorskip('distributed')
@@ -228,7 +228,7 @@ def test_what_may_go_better_is_tried_again(ran, plants, tmp_path, monkeypatch):
     def full(*_):
         raise MemoryError
 
-    monkeypatch.setattr('valveflow_ros.interface.unit_month.open_log', full)
+    monkeypatch.setattr('valveflow_ros.interface.fleets.unit_month.open_log', full)
     short = unit_month(replace(task_of(ran, plants), folder=tmp_path))
     assert short['sentences'] == ['There is not enough memory for this log on the worker.']
     assert not list(tmp_path.rglob('row.json'))

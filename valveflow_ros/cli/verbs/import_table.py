@@ -21,8 +21,8 @@ from valveflow_ros.cli.command import (
 from valveflow_ros.errors import DataError, InputError, UsageError
 
 if TYPE_CHECKING:
+    from valveflow_ros.interface.importing.table_import import TableImport
     from valveflow_ros.interface.mapping import LogMapping
-    from valveflow_ros.interface.table_import import TableImport
     from valveflow_ros.logs.tables.refusal import RefusedError, Remedy
 
 _DESCRIPTION = """\
@@ -90,8 +90,8 @@ def run(options: Namespace, console: Console) -> VerbResult:
         raise UsageError('Name the log to write with -o LOG.mcap, or add --dry-run to look only.')
     from valveflow_ros.interface import SILENT
     from valveflow_ros.interface.files import check_log
+    from valveflow_ros.interface.importing.table_import import TableImport
     from valveflow_ros.interface.mapping import LOOKING_ON, gather_refusals
-    from valveflow_ros.interface.table_import import TableImport
     from valveflow_ros.logs.tables.refusal import RefusedError
 
     if options.output is not None:
@@ -125,7 +125,7 @@ def _from_history(options: Namespace, console: Console) -> VerbResult:
 
     check_installed()
     from valveflow_ros.interface.files import check_log
-    from valveflow_ros.interface.history_import import import_history
+    from valveflow_ros.interface.importing.history_import import import_history
     from valveflow_ros.opcua.mapping import read_mapping_file
 
     begin_ns, end_ns = time_ns(options.begin), time_ns(options.end)
@@ -148,7 +148,7 @@ def _from_history(options: Namespace, console: Console) -> VerbResult:
 
 
 def _imported(options: Namespace, mapping: LogMapping, console: Console) -> VerbResult:
-    from valveflow_ros.interface.table_import import Spool, TableImport
+    from valveflow_ros.interface.importing.table_import import Spool, TableImport
 
     console(0.05, 'looking at the table')
     table = TableImport(options.table, mapping, console)

@@ -25,11 +25,11 @@ from valveflow_ros.curve.shift import Shift, ShiftLimits, judge_shift
 from valveflow_ros.errors import DataError, RecordingError, ValveflowError
 from valveflow_ros.interface.diagnose import DiagnosisResult, diagnose
 from valveflow_ros.interface.files import reason, write_texts
+from valveflow_ros.interface.fleets.unit_logs import UnitLog
 from valveflow_ros.interface.identify import Identification, identify
 from valveflow_ros.interface.logs import Log, open_log
 from valveflow_ros.interface.models import load_characteristic
 from valveflow_ros.interface.monitor import MonitorResult, monitor
-from valveflow_ros.interface.unit_logs import UnitLog
 from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.answer import explained
 from valveflow_ros.report.data import rejected

@@ -25,8 +25,14 @@ from valveflow_ros.errors import (
 )
 from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.files import check_folder, whole_file, write_texts
-from valveflow_ros.interface.unit_logs import UnitLog, read_fleet
-from valveflow_ros.interface.unit_month import LIBRARIES, FleetTask, Row, failed_row, unit_month
+from valveflow_ros.interface.fleets.unit_logs import UnitLog, read_fleet
+from valveflow_ros.interface.fleets.unit_month import (
+    LIBRARIES,
+    FleetTask,
+    Row,
+    failed_row,
+    unit_month,
+)
 from valveflow_ros.report.fleet import REPORT, UNITS, UnitStory, fleet_page, story_of, unit_page
 from valveflow_ros.report.page import plotly_script
 
