@@ -41,9 +41,9 @@ import pandas as pd
 
 import valveflow_ros as vf
 from benchmarks import study
-from valveflow_ros.interface.fleet import Chain, spread
-from valveflow_ros.interface.unit_logs import UnitLog, read_options
-from valveflow_ros.interface.unit_month import FleetTask, Row
+from valveflow_ros.interface.fleets.fleet import Chain, spread
+from valveflow_ros.interface.fleets.unit_logs import UnitLog, read_options
+from valveflow_ros.interface.fleets.unit_month import FleetTask, Row
 
 _DAYS = {'paper': 0.25, 'choked': 1.0}
 _VERBS = ('read_s', 'identify_s', 'diagnose_s', 'monitor_s')
@@ -93,7 +93,7 @@ def warmed(made: Any) -> None:
     from distributed import Client
 
     with Client(made, set_as_default=False) as client:
-        client.run(lambda: __import__('valveflow_ros.interface.unit_month') and None)
+        client.run(lambda: __import__('valveflow_ros.interface.fleets.unit_month') and None)
 
 
 def timed_fleet(logs: list[Path], out: Path, workers: int) -> dict[str, Any]:
@@ -315,7 +315,7 @@ PARTS = {'scheduling': part_scheduling, 'speed': part_speed, 'faults': part_faul
 
 
 def _frame(out: Path) -> Any:
-    from valveflow_ros.interface.fleet import FleetResult
+    from valveflow_ros.interface.fleets.fleet import FleetResult
 
     return FleetResult(out, (), 0, 0, 0).to_dataframe()
 

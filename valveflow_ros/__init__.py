@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from valveflow_ros.interface import Progress
     from valveflow_ros.interface.compare import compare, validate
     from valveflow_ros.interface.diagnose import diagnose
-    from valveflow_ros.interface.fleet import fleet
+    from valveflow_ros.interface.fleets.fleet import fleet
     from valveflow_ros.interface.identify import identify
     from valveflow_ros.interface.logs import open_log
     from valveflow_ros.interface.loop import judge_loop
@@ -38,7 +38,7 @@ __all__ = [
 _MODULES = {
     'compare': 'compare',
     'diagnose': 'diagnose',
-    'fleet': 'fleet',
+    'fleet': 'fleets.fleet',
     'identify': 'identify',
     'judge_loop': 'loop',
     'load_characteristic': 'models',

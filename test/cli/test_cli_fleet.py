@@ -8,8 +8,9 @@ import json
 
 import pytest
 
-from valveflow_ros.interface import fleet as interface
-from valveflow_ros.interface.unit_logs import read_options
+from valveflow_ros.interface.fleets import fleet as interface
+from valveflow_ros.interface.fleets.unit_logs import read_options
+from valveflow_ros.interface.fleets.unit_month import _diagnosis_facts
 from valveflow_ros.report.fleet import fleet_page, story_of, unit_page
 
 DAY_NS = 86_400 * 10**9
@@ -66,6 +67,45 @@ def test_a_change_lasts_since_the_first_month_that_shows_it_to_the_end():
     assert loses.alarms == ('residual',)
     assert loses.since == '1970-04-06 00:00 UTC (95 %: 1970-04-05 00:00 to 1970-04-07 00:00)'
     assert (nothing.change_mw, nothing.changes) == (None, ())
+
+
+def test_a_change_that_a_cause_dates_lasts_since_its_onset():
+    """The first cause with a date; the shift tells the same more widely."""
+    since = {f'shift_since{end}': (90 + k) * DAY_NS for k, end in ((5, ''), (1, '_low'),
+                                                                  (9, '_high'))}  # fmt: skip
+    onset = {'onset': 96 * DAY_NS, 'onset_low': 95 * DAY_NS, 'onset_high': 97 * DAY_NS}
+    undated = {'onset': None, 'onset_low': None, 'onset_high': None}
+    causes = [cause('stiction') | undated, cause('gain_step') | onset]
+    dated = story_of('U', [row(1), lost(3, -5.0, causes=causes, **since), lost(4, -5.0)])
+    assert dated.since == '1970-04-07 00:00 UTC (95 %: 1970-04-06 00:00 to 1970-04-08 00:00)'
+    assert dated.causes == ('stiction', 'gain_step')
+    # Of a later log a cause says nothing of when the change began.
+    later = story_of('U', [row(1), lost(3, -5.0, **since), lost(4, -5.0, causes=causes)])
+    assert later.since == '1970-04-06 00:00 UTC (95 %: 1970-04-02 00:00 to 1970-04-10 00:00)'
+    open_end = [cause('gain_step') | onset | {'onset_high': None}]
+    assert story_of('U', [row(1), lost(3, -5.0, causes=open_end)]).since == '1970-04-07 00:00 UTC'
+
+
+@pytest.mark.parametrize('known', [True, False])
+def test_the_onset_of_a_cause_is_a_time(known):
+    from types import SimpleNamespace
+
+    ends = {'low': 1.25, 'high': 1.75} if known else {'low': None, 'high': None}
+    size = {'value': 0.9, 'low': 0.8, 'high': 1.0, 'unit': ''}
+    onset = {'value': 1.5, 'unit': 'days', 'origin_ns': 10 * DAY_NS, **ends}
+    gain = {'rmse_before': 2.0, 'rmse_after': 1.0, 'reduction': 0.5, 'p_value': 0.0}
+    causes = [
+        {**cause(name), 'parameters': parameters, 'gain': gain}
+        for name, parameters in (('gain_step', {'g': size, 't': onset}), ('stiction', {'s': size}))
+    ]
+    names = ('verdict', 'not_told_apart', 'unexplained_by', 'rmse_simulation', 'rmse_extended',
+             'rmse_noise_floor')  # fmt: skip
+    content = dict.fromkeys(names) | {'causes': causes}
+    dated, undated = _diagnosis_facts(SimpleNamespace(to_json=lambda: content))['causes']
+    assert dated['onset'] == 11.5 * DAY_NS
+    between = (11.25 * DAY_NS, 11.75 * DAY_NS) if known else (None, None)
+    assert (dated['onset_low'], dated['onset_high']) == between
+    assert (undated['onset'], undated['onset_low'], undated['onset_high']) == (None,) * 3
 
 
 def test_the_overview_begins_with_what_loses_most():

@@ -38,6 +38,36 @@ def test_every_kind_of_log_holds_the_same(run, folder):
     assert (folder / 'bag' / 'metadata.yaml').is_file()
 
 
+def test_months_follow_one_another(run, folder):
+    """It begins when it is told to, in UTC where no zone is named; nothing else changes."""
+    for unit in ('paper', 'choked'):
+        times, logs = ['2026-02-01', '2026-03-01T06:00+02:00'], []
+        for k, time in enumerate(times):
+            name = folder / f'start-{unit}-{k}.csv'
+            ran = run('simulate', '-o', name, *SHORT, '--unit', unit, '--start', time)
+            assert ran.status == 0, ran.err
+            logs.append(read_table(name))
+        starts = [np.datetime64(int(log.time_ns[0]), 'ns') for log in logs]
+        assert starts == [np.datetime64('2026-02-01'), np.datetime64('2026-03-01T04:00')]
+        assert len(logs[0].time_ns) == len(logs[1].time_ns)
+
+
+@pytest.mark.parametrize(
+    ('time', 'sentence'),
+    [
+        ('soon', "'soon' is no time such as 2026-01-31T06:00Z."),
+        ('1969-01-01', 'A simulation must lie between the years 1970 and 2262.'),
+        ('9999-01-01', 'A simulation must lie between the years 1970 and 2262.'),
+    ],
+)
+@pytest.mark.parametrize('unit', ['paper', 'choked'])
+def test_a_start_that_cannot_be_meant(run, folder, unit, time, sentence):
+    name = folder / 'never.csv'
+    ran = run('simulate', '-o', name, *SHORT, '--unit', unit, '--start', time)
+    assert (ran.status, sentence in ran.err) == (2, True), ran.err
+    assert not name.exists()
+
+
 def test_truth_is_told_only_when_asked(run, folder):
     words = ['simulate', '-o', folder / 't.mcap', *SHORT, '--effect', 'gain_drift:g=0.02']
     ran = run(*words, '--truth', folder / 'truth.json')

@@ -18,9 +18,11 @@ import pytest
 
 import valveflow_ros as vf
 from valveflow_ros.errors import InputError, RecordingError, ValveflowError
-from valveflow_ros.interface import fleet as interface
-from valveflow_ros.interface.unit_logs import UnitLog, read_fleet, read_options
-from valveflow_ros.interface.unit_month import FleetTask, key_of, unit_month
+from valveflow_ros.interface import Progress
+from valveflow_ros.interface.fleets import fleet as interface
+from valveflow_ros.interface.fleets.unit_logs import UnitLog, read_fleet, read_options
+from valveflow_ros.interface.fleets.unit_month import FleetTask, key_of, unit_month
+from valveflow_ros.report.words import duration
 
 pytest.importorskip('distributed')
 pytest.importorskip('pyarrow')
@@ -103,6 +105,25 @@ def test_the_data_set_has_a_row_for_each_log_with_what_the_files_say(ran):
     assert row.verdict == verdict
     assert row.versions['valveflow'] == vf.__version__
     assert 0.0 < row.monitor_s < row.task_s
+
+
+def test_what_is_under_way_is_told_before_the_first_log_is_done(ran, plants, client):
+    told = []
+
+    class Told(Progress):
+        def __call__(self, share, what):
+            told.append((share, what))
+
+        def say(self, sentence):
+            told.append(sentence)
+
+    address = client.scheduler.address
+    vf.fleet([plants / '007'], ran.folder, scheduler=address, options=WORDS, progress=Told())
+    bounded, begins, *rest = told
+    assert 'bounded to' in bounded
+    assert 'compiles first' in begins
+    assert rest == [(0.0, 'first 007 2026-9'), (0.5, '007 2026-9 done'), (1.0, '007 2026-10 done')]
+    vf.fleet([plants], ran.folder, scheduler=address, options=WORDS)  # the data set is of both
 
 
 def test_a_broken_log_costs_one_row_with_a_sentence(ran):
@@ -207,7 +228,7 @@ def test_what_may_go_better_is_tried_again(ran, plants, tmp_path, monkeypatch):
     def full(*_):
         raise MemoryError
 
-    monkeypatch.setattr('valveflow_ros.interface.unit_month.open_log', full)
+    monkeypatch.setattr('valveflow_ros.interface.fleets.unit_month.open_log', full)
     short = unit_month(replace(task_of(ran, plants), folder=tmp_path))
     assert short['sentences'] == ['There is not enough memory for this log on the worker.']
     assert not list(tmp_path.rglob('row.json'))
@@ -221,6 +242,29 @@ def test_logs_that_are_not_in_order_are_refused(ran, plants, tmp_path):
         "The log begins before '2026-10', which stands before it: name the logs of a unit in the "
         'order of time.'
     ]
+
+
+@pytest.mark.parametrize(('rows', 'overlaps'), [(0, False), (1, False), (2, True), (99, True)])
+def test_logs_that_overlap_are_refused_and_those_that_touch_are_not(
+    ran, plants, simulation, tmp_path, rows, overlaps
+):
+    """``rows`` of the one in front are in the next one too."""
+    frame = simulation.to_dataframe().iloc[::10]
+    first = frame.time.iloc[-rows] if rows else frame.time.iloc[-1] + pd.Timedelta(seconds=10)
+    log = tmp_path / 'next.csv'
+    frame.assign(time=frame.time - frame.time.iloc[0] + first).to_csv(log, index=False)
+    curve = 'units/007/2026-9/identify/characteristic.json'
+    shutil.copytree(ran.folder / 'units' / '007', tmp_path / 'units' / '007')
+    task = replace(task_of(ran, plants, before=curve, first=curve), folder=tmp_path)
+    row = unit_month(replace(task, of=replace(task.of, name='next', log=log)))
+    if overlaps:
+        seconds = (frame.time.iloc[-1] - first).total_seconds()
+        assert row['sentences'] == [
+            f"The log begins {duration(seconds)} before the end of '2026-9', which stands before "
+            'it: cut one, so that no row counts twice.'
+        ]
+    else:
+        assert (row['status'], row['sentences']) == ('done', [])
 
 
 # Which logs there are.

@@ -15,7 +15,7 @@ import valveflow_ros as vf
 from valveflow_ros.cli.main import main
 from valveflow_ros.errors import DataError, RecordingError
 from valveflow_ros.interface import Progress
-from valveflow_ros.interface.history_import import import_history
+from valveflow_ros.interface.importing.history_import import import_history
 from valveflow_ros.records import NS_PER_S, Readings, Signal
 
 T0, HOUR_NS = 1_700_000_000 * NS_PER_S, 3600 * NS_PER_S

@@ -26,7 +26,7 @@ from opcua_server import (
 from valveflow_ros.opcua.link import Link
 from valveflow_ros.opcua.mapping import read_mapping_file
 from valveflow_ros.opcua.sampler import Sample, Sampler
-from valveflow_ros.opcua.session import check_installed
+from valveflow_ros.opcua.session import check_installed, history
 from valveflow_ros.records import SIGNALS, Quality
 
 pytestmark = pytest.mark.skipif(
@@ -126,9 +126,11 @@ def secured(keys):
     made.kill()
 
 
-def secure(keys, port, own='gateway', trusted='server', **different):
+def secure(keys, port, own='gateway', trusted=('server',), **different):
+    named = [keys[name][0] for name in trusted]
+    named = named[0] if len(named) == 1 else named
     security = {'policy': 'Aes256Sha256RsaPss', 'certificate': keys[own][0],
-                'private_key': keys[own][1], 'trusted': keys[trusted][0]}  # fmt: skip
+                'private_key': keys[own][1], 'trusted': named}  # fmt: skip
     return mapping(port, security={**security, **different})
 
 
@@ -180,18 +182,31 @@ def test_an_unknown_node_is_named_and_the_others_go_on(run, server):
     assert list(link.samples[-1].quality[:2]) == [Quality.BAD] * 2
 
 
-def test_an_encrypted_link_with_user_and_password(run, secured, keys, tmp_path):
+@pytest.mark.parametrize('trusted', [['server'], ['old', 'other', 'server']], ids=str)
+def test_an_encrypted_link_with_user_and_password(run, secured, keys, tmp_path, trusted):
     (tmp_path / 'password').write_text('secret\n')
-    content = secure(keys, secured.port)
+    content = secure(keys, secured.port, trusted=trusted)
     content['user'] = {'name': 'valveflow', 'password_file': 'password'}
     link = run(content)
     link.until_good()
 
 
+def test_an_expired_certificate_of_a_server_is_named_out_of_a_list(run, keys):
+    old = OpcUaServer(
+        free_port(), '--policy', 'Aes256Sha256RsaPss_SignAndEncrypt',
+        '--certificate', keys['old'][0], '--key', keys['old'][1],
+    )  # fmt: skip
+    link = run(secure(keys, old.port, trusted=['server', 'old']))
+    link.until_problem('old.der: expired on')
+    assert not link.link.state.up
+    old.kill()
+
+
 SECURITY = [
     ({'own': 'old'}, 'old.der: expired on'),
-    ({'trusted': 'old'}, 'old.der: expired on'),
-    ({'trusted': 'other'}, "does not have the one named as 'trusted'"),
+    ({'trusted': ['old']}, 'old.der: expired on'),
+    ({'trusted': ['other']}, "does not have the one named as 'trusted'"),
+    ({'trusted': ['other', 'old']}, "The server has none of the certificates named as 'trusted'"),
     ({'own': 'other'}, 'the server does not accept the user'),
     ({}, 'the server does not accept the user'),
     ({'policy': 'Basic256Sha256'}, 'does not offer this policy'),
@@ -250,6 +265,53 @@ def test_a_long_outage_is_bad_and_its_history_is_saved(run, server):
     values = [v for part in link.saved[0] for v in part.value[part.signal == 3]]
     assert 77.0 in values
     relay.close()
+
+
+@pytest.mark.parametrize('how', ['cut', 'hold'])
+def test_an_outage_stays_owed_across_a_second_loss(run, server, monkeypatch, how):
+    """The link is lost again while the history is read; it is read once more later."""
+    relay, read, asked = Relay(server.port), history, []
+
+    async def lost_meanwhile(client, nodes, start_ns, end_ns):
+        asked.append(start_ns)
+        if len(asked) == 1:
+            getattr(relay, how)()
+        async for part in read(client, nodes, start_ns, end_ns):
+            yield part
+
+    monkeypatch.setattr('valveflow_ros.opcua.link.history', lost_meanwhile)
+    link = run({**mapping(relay.port), 'lateness': 0.3})
+    link.until_good()
+    relay.cut()
+    link.until(lambda: link.samples[-1].quality[3] == Quality.BAD, 'a bad sample')
+    server.set('power', 66_000.0)
+    time.sleep(0.5)
+    server.set('power', 150_000.0)
+    relay.mend()
+    link.until(lambda: link.link.state.losses == 2, 'the second loss')
+    assert not link.saved
+    relay.mend()
+    link.until(lambda: link.saved, 'the history')
+    values = [v for part in link.saved[0] for v in part.value[part.signal == 3]]
+    assert 66.0 in values
+    assert asked[1] == asked[0]
+    relay.close()
+
+
+def test_a_server_without_history_is_asked_once(run):
+    server = OpcUaServer(free_port())
+    relay = Relay(server.port)
+    link = run({**mapping(relay.port), 'lateness': 0.3})
+    link.until_good()
+    relay.cut()
+    link.until(lambda: link.samples[-1].quality[3] == Quality.BAD, 'a bad sample')
+    relay.mend()
+    link.until(lambda: link.link.state.backfill, 'what came of it')
+    assert 'history of the last outage' in link.link.state.backfill
+    assert not link.link._outages
+    assert not link.saved
+    relay.close()
+    server.kill()
 
 
 def test_a_server_that_stops_answering_is_left(run, server):

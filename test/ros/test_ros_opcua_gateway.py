@@ -10,6 +10,7 @@ import json
 import os
 import signal
 import socket
+from datetime import datetime, timedelta, timezone
 from types import SimpleNamespace
 
 import pytest
@@ -52,6 +53,7 @@ class Hearing:
         self._executor.add_node(self.node)
         self.samples: dict[str, list[PlantSample]] = {unit: [] for unit in units}
         self.health: dict[str, tuple[int, str]] = {}
+        self.values: dict[str, dict[str, str]] = {}
         for unit in units:
             self.node.create_subscription(
                 PlantSample, f'{unit}/plant_sample', self.samples[unit].append, 1000
@@ -61,6 +63,7 @@ class Hearing:
     def _on_health(self, message):
         for status in message.status:
             self.health[status.name] = status.level[0], status.message
+            self.values[status.name] = {pair.key: pair.value for pair in status.values}
 
     def spin(self):
         self._executor.spin_once(timeout_sec=0.05)
@@ -123,9 +126,21 @@ def test_samples_of_two_units_health_and_an_outage(processes, hearing, server, t
     assert hearing.last('/u2').valve_opening_quality == PlantSample.QUALITY_BAD
     hearing.until_told('u2/opcua_gateway: signal valve_opening', 'no such node')
     hearing.until_told('u1/opcua_gateway: link', 'Connected to opc.tcp://127.0.0.1')
+    power = 'u1/opcua_gateway: signal generated_power'
+    hearing.until_told(power, '150 MW, good, ')
+    # Unchanged: it stays good, and is older each time.
+    values = dict(hearing.values[power])
+    assert (values['value (MW)'], values['status']) == ('150', 'good')
+    hearing.until(
+        lambda: float(hearing.values[power]['age_s']) > float(values['age_s']) + 1.0, 'its age'
+    )
+    server.set('power', 151_000.0, status='UncertainSensorNotAccurate')
+    hearing.until_told(power, '151 MW, uncertain, ')
+    assert float(hearing.values[power]['age_s']) < 10.0
     server.set('power', 'text', kind='String')
     hearing.until_quality('/u1', PlantSample.QUALITY_BAD)
-    hearing.until_told('u1/opcua_gateway: signal generated_power', '1 wrong_type')
+    hearing.until_told(power, '1 wrong_type')
+    assert (hearing.values[power]['value (MW)'], hearing.values[power]['status']) == ('nan', 'bad')
     server.kill()
     hearing.until_told('u1/opcua_gateway: link', 'nobody listens there')
     hearing.until_quality('/u1', PlantSample.QUALITY_BAD, 'main_steam_pressure')
@@ -231,6 +246,45 @@ def test_what_a_monitor_says_is_read_by_opc_ua(processes, context, server, tmp_p
     asyncio.run(read())
     gateway.send_signal(signal.SIGINT)
     assert gateway.wait(20) == 0
+
+
+@pytest.mark.parametrize('readers', [['dcs', 'old'], ['old']], ids=str)
+def test_an_expired_certificate_of_a_reader_stops_nobody_else(
+    processes, server, tmp_path, readers
+):
+    from asyncua import Client, ua
+    from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
+
+    keys = {name: certificate(tmp_path, name) for name in ('gateway', 'dcs', 'stranger')}
+    keys['old'] = certificate(tmp_path, 'old', -1.0)
+    endpoint = f'opc.tcp://127.0.0.1:{free_port()}'
+    content = mapping(server.port, server={
+        'endpoint': endpoint,
+        'security': {'certificate': keys['gateway'][0], 'private_key': keys['gateway'][1],
+                     'trusted': [keys[name][0] for name in readers]},
+    })  # fmt: skip
+    gateway = start(processes, tmp_path, content)
+    wait_until(lambda: 'are offered at' in processes.output(gateway), 'the server')
+    told = processes.output(gateway)
+    day = f'{datetime.now(timezone.utc) - timedelta(days=1):%Y-%m-%d}'
+    assert f'{keys["old"][0]}: expired on {day}; the client that has it is refused.' in told
+    assert 'WARN' in told
+
+    async def connect(name):
+        client = Client(endpoint, timeout=10)
+        client.application_uri = f'urn:test:{name}'
+        await client.set_security(
+            SecurityPolicyBasic256Sha256, *keys[name], server_certificate=keys['gateway'][0]
+        )
+        async with client:
+            return await client.get_namespace_index('urn:valveflow')
+
+    for name in ('dcs', 'old', 'stranger'):
+        if name in readers and name != 'old':
+            assert asyncio.run(connect(name)) > 0
+        else:
+            with pytest.raises(ua.UaError):
+                asyncio.run(connect(name))
 
 
 def test_a_server_address_that_is_taken_is_told(processes, tmp_path):

@@ -11,9 +11,11 @@ import re
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
+from valveflow_ros.errors import UsageError
 from valveflow_ros.interface import Progress
 from valveflow_ros.report.terminal.progress import Progress as ProgressLine
 
@@ -342,6 +344,16 @@ def write_results(
     files = {'files': {name: str(path) for name, path in done.files.items()}}
     kept = {'kept': dict(done.kept)} if done.kept else {}
     return VerbResult('\n'.join([text, *done.words]), {**data, **files, **kept})
+
+
+def time_ns(text: str) -> int:
+    """Return a time in ns, in UTC where it names no zone."""
+    try:
+        moment = datetime.fromisoformat(text.replace('Z', '+00:00'))
+    except ValueError:
+        raise UsageError(f"'{text}' is no time such as 2026-01-31T06:00Z.") from None
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
+    return round(moment.timestamp()) * 1_000_000_000
 
 
 def lines(*parts: str) -> str:

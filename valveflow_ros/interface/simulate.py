@@ -24,7 +24,7 @@ from valveflow_ros.interface.files import (
 )
 from valveflow_ros.interface.logs import Log, open_log
 from valveflow_ros.plant.historian import Historian
-from valveflow_ros.plant.simulator import SimulatedLog, simulate_parts
+from valveflow_ros.plant.simulator import DEFAULT_START_NS, SimulatedLog, simulate_parts
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.plant.thermal_plant import ThermalLog, simulate_thermal
 from valveflow_ros.plant.thermal_unit import KINDS, ThermalUnit, unit_of
@@ -165,6 +165,7 @@ def simulate(
     *,
     unit: str | ThermalUnit = PAPER,
     recording: str | Historian = '1s',
+    start_ns: int = DEFAULT_START_NS,
     progress: Progress = SILENT,
 ) -> Simulation:
     """Simulate a unit under load control and what its historian kept.
@@ -190,6 +191,8 @@ def simulate(
         'compressed' exception compression with values at their own times. Options follow as in
         ``compressed:resample_s=60,dropouts_per_day=2``: ``band_percent``, ``scan_low_s``,
         ``scan_high_s``, ``longest_s``, ``resample_s``, ``dropouts_per_day``, ``dropout_minutes``.
+    start_ns : int
+        Time of the first sample; it decides the time of day, taken as UTC.
     progress : Progress
 
     Raises
@@ -200,7 +203,7 @@ def simulate(
     if not isinstance(recording, Historian):
         recording = Historian.parse(recording)
     if unit != PAPER:
-        return _thermal(days, seed, effects, unit, recording, progress)
+        return _thermal(days, seed, effects, unit, recording, start_ns, progress)
     if recording != Historian():
         raise InputError(
             "The paper's unit is recorded once a second only. Choose another unit for the "
@@ -209,7 +212,7 @@ def simulate(
     specs = [e if isinstance(e, EffectSpec) else EffectSpec.parse(e) for e in effects]
     parts: list[SimulatedLog] = []
     # Day by day, which gives the same as all at once and can be watched.
-    for part in simulate_parts(days, seed, effects=specs):
+    for part in simulate_parts(days, seed, start_ns=start_ns, effects=specs):
         parts.append(part)
         progress(min(0.6, 0.6 * len(parts) / days), 'simulating')
     return Simulation(SimulatedLog.joined(parts), days, seed)
@@ -221,6 +224,7 @@ def _thermal(
     effects: Sequence[str | EffectSpec],
     unit: str | ThermalUnit,
     recording: Historian,
+    start_ns: int,
     progress: Progress,
 ) -> Simulation:
     """Simulate a unit that is not the paper's."""
@@ -229,6 +233,6 @@ def _thermal(
             known = ', '.join((PAPER, *KINDS))
             raise InputError(f"There is no unit '{unit}': use one of {known}.")
         unit = unit_of(unit)
-    data = simulate_thermal(days, seed, unit, recording, effects=effects)
+    data = simulate_thermal(days, seed, unit, recording, start_ns, effects)
     progress(0.6, 'simulating')
     return Simulation(data, days, seed)

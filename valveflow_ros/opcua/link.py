@@ -357,5 +357,9 @@ class Link:
                 saved = await asyncio.to_thread(self._save, parts) if parts else 'it has none'
             except Exception as error:  # noqa: BLE001 - whatever it was is told
                 saved = in_words(error)
+                try:
+                    await self._compare_clocks(client)
+                except Exception:  # noqa: BLE001 - not the history failed, but the link
+                    return
             self._outages.pop(0)
             self.state.backfill = f'history of the last outage ({told}): {saved}'

@@ -8,7 +8,7 @@ import asyncio
 import dataclasses
 import hmac
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from valveflow_ros.errors import DataError
 from valveflow_ros.opcua.mapping import Security, ServerSettings, User
@@ -17,10 +17,14 @@ from valveflow_ros.opcua.session import (
     in_words,
     load_certificate,
     load_key,
+    not_valid,
+    read_certificate,
     to_datetime,
     uri_of,
-    valid,
 )
+
+if TYPE_CHECKING:
+    from cryptography.x509 import Certificate
 
 NAMESPACE = 'urn:valveflow'
 # Severity of an event, 1 to 1000, by the priority of the alarm; without a standing condition 100.
@@ -51,11 +55,17 @@ class _Readers:
     """Lets in who has a trusted certificate, and the password where one is wanted; to read only.
 
     The certificate is that of the secure channel: what a client says of itself later, when it
-    makes the session, is up to the client.
+    makes the session, is up to the client. Its time is judged at each session. With None for the
+    certificates the link has none.
     """
 
-    def __init__(self, trusted: Iterable[bytes], user: User) -> None:
-        self._trusted, self._user = tuple(trusted), user
+    def __init__(self, trusted: Iterable[Certificate] | None, user: User) -> None:
+        from cryptography.hazmat.primitives.serialization import Encoding
+
+        self._trusted = (
+            None if trusted is None else {c.public_bytes(Encoding.DER): c for c in trusted}
+        )
+        self._user = user
 
     def get_user(
         self, _server: Any, username: Any = None, password: Any = None, certificate: Any = None
@@ -63,8 +73,10 @@ class _Readers:
         from asyncua.crypto.permission_rules import User as Role
         from asyncua.crypto.permission_rules import UserRole
 
-        if self._trusted and certificate not in self._trusted:
-            return None
+        if self._trusted is not None:
+            found = self._trusted.get(certificate)
+            if found is None or not_valid(found):
+                return None
         if self._user.name:
             told = password.decode() if isinstance(password, bytes) else str(password or '')
             same = hmac.compare_digest(told.encode(), self._user.password.encode())
@@ -94,8 +106,8 @@ class ResultsServer:
         self._events: dict[str, Any] = {}
         self._one = asyncio.Lock()
 
-    async def start(self) -> None:
-        """Listen.
+    async def start(self) -> list[str]:
+        """Listen; return what to warn of: clients whose certificates are not valid now.
 
         Raises
         ------
@@ -105,10 +117,14 @@ class ResultsServer:
             A certificate or key cannot be used.
         """
         from asyncua import Server, ua
-        from asyncua.crypto.uacrypto import der_from_x509
 
         settings, security = self._settings, self._settings.security
-        trusted = [der_from_x509(found) for found in valid(security.trusted)]
+        told, trusted = [], None
+        if not security.none:
+            trusted = [read_certificate(path) for path in security.trusted]
+            for path, found in zip(security.trusted, trusted, strict=True):
+                if problem := not_valid(found):
+                    told.append(f'{path}: {problem}; the client that has it is refused.')
         self._server = server = Server(user_manager=_Readers(trusted, settings.user))
         await server.init()
         server.set_server_name('valveflow')
@@ -133,6 +149,7 @@ class ResultsServer:
             await server.start()
         except OSError as error:
             raise DataError(f'{settings.endpoint} cannot be offered: {in_words(error)}.') from None
+        return told
 
     async def stop(self) -> None:
         """Close it."""

@@ -118,6 +118,7 @@ class Sampler:
         self._mapped = {int(node.signal) for node in unit.nodes}
         self._held = {signal: _Held() for signal in self._mapped}
         self.counts = {signal: Counts() for signal in sorted(self._mapped)}
+        self.newest: dict[int, Change] = {}  # by signal, as it came last
         self.patience_ns = self._least_patience_ns = unit.lateness_ns
         self.confirmed_ns = 0
         self._next_ns = (now_ns // unit.period_ns + 1) * unit.period_ns
@@ -146,6 +147,7 @@ class Sampler:
             elif time_ns < held.source_ns:
                 counts.went_back += 1
             held.source_ns = time_ns
+            self.newest[change.signal] = change._replace(source_ns=time_ns, quality=quality)
             held.add(time_ns, change.value, quality)
         self.confirmed_ns = max(self.confirmed_ns, confirmed_ns)
 

@@ -107,6 +107,20 @@ def in_words(error: BaseException) -> str:
     return f'{told} ({name})' if told else f'{name}: {" ".join(str(error).split())[:120]}'
 
 
+def read_certificate(path: Path) -> Certificate:
+    """Return a certificate, whatever its time; raises `RecordingError` if it cannot be read."""
+    from cryptography import x509
+
+    try:
+        data = path.read_bytes()
+        pem = data.lstrip().startswith(b'-----')
+        return (
+            x509.load_pem_x509_certificate(data) if pem else x509.load_der_x509_certificate(data)
+        )
+    except (OSError, ValueError):
+        raise RecordingError(path, 'is no certificate that can be read') from None
+
+
 def load_certificate(path: Path) -> Certificate:
     """Return a certificate that is valid now.
 
@@ -115,35 +129,49 @@ def load_certificate(path: Path) -> Certificate:
     RecordingError
         It cannot be read, or its time is over or has not come.
     """
-    from cryptography import x509
+    found = read_certificate(path)
+    if problem := not_valid(found):
+        raise RecordingError(path, problem)
+    return found
 
-    try:
-        data = path.read_bytes()
-        pem = data.lstrip().startswith(b'-----')
-        found = (
-            x509.load_pem_x509_certificate(data) if pem else x509.load_der_x509_certificate(data)
-        )
-    except (OSError, ValueError):
-        raise RecordingError(path, 'is no certificate that can be read') from None
+
+def not_valid(certificate: Certificate) -> str:
+    """Return why a certificate is not valid now, empty if it is."""
     now = datetime.now(timezone.utc)
-    if found.not_valid_after_utc < now:
-        raise RecordingError(path, f'expired on {found.not_valid_after_utc:%Y-%m-%d}')
-    if found.not_valid_before_utc > now:
-        raise RecordingError(path, f'is not valid before {found.not_valid_before_utc:%Y-%m-%d}')
-    return found
+    if certificate.not_valid_after_utc < now:
+        return f'expired on {certificate.not_valid_after_utc:%Y-%m-%d}'
+    if certificate.not_valid_before_utc > now:
+        return f'is not valid before {certificate.not_valid_before_utc:%Y-%m-%d}'
+    return ''
 
 
-def valid(paths: Sequence[Path]) -> list[Certificate]:
-    """Return the certificates that are valid now; raises `RecordingError` where none is."""
-    found, problem = [], None
-    for path in paths:
-        try:
-            found.append(load_certificate(path))
-        except RecordingError as error:
-            problem = problem or error
-    if problem is not None and not found:
-        raise problem
-    return found
+async def _server_certificate(endpoint: str, trusted: Sequence[Path]) -> Certificate:
+    """Return that one of the trusted certificates which the server has, valid now.
+
+    Of several the server is asked for its own. That answer is not protected and only chooses among
+    those that are trusted.
+
+    Raises
+    ------
+    RecordingError
+        It has expired, or cannot be read.
+    DataError
+        The server has none of them.
+    """
+    from asyncua import Client
+    from cryptography.hazmat.primitives.serialization import Encoding
+
+    if len(trusted) == 1:
+        return load_certificate(trusted[0])
+    asking = Client(endpoint, timeout=ANSWER_S)
+    told = await asyncio.wait_for(asking.connect_and_get_server_endpoints(), 2.0 * ANSWER_S)
+    theirs = {bytes(e.ServerCertificate) for e in told if e.ServerCertificate}
+    for path in trusted:
+        own = read_certificate(path).public_bytes(Encoding.DER)
+        # A server may send the chain of its certificate, its own first.
+        if any(chain.startswith(own) for chain in theirs):
+            return load_certificate(path)
+    raise DataError("The server has none of the certificates named as 'trusted'.")
 
 
 def uri_of(certificate: Certificate) -> str:
@@ -192,12 +220,12 @@ async def connected(endpoint: str, security: Security, user: User) -> AsyncItera
         assert security.certificate is not None
         assert security.private_key is not None
         own = load_certificate(security.certificate)
-        trusted = valid(security.trusted)
+        trusted = await _server_certificate(endpoint, security.trusted)
         client.application_uri = uri_of(own) or client.application_uri
         key = await load_key(security.private_key, own)
         policy = getattr(security_policies, f'SecurityPolicy{security.policy}')
         client.security_policy = policy(
-            trusted[0], own, key, getattr(MessageSecurityMode, security.mode)
+            trusted, own, key, getattr(MessageSecurityMode, security.mode)
         )
         client.uaclient.set_security(client.security_policy)
     if user.name:

@@ -112,12 +112,18 @@ def _same_side(row: Row, last: Row) -> bool:
 
 
 def _since(row: Row) -> str:
-    """Say when the change began: as the segments of the log show it, or with the log."""
-    for name in ('shift', 'change'):
-        if row.get(f'{name}_since'):
-            ends = [row[f'{name}_{key}'] for key in ('since_low', 'since_high')]
-            told = ' to '.join(moment(e)[:16] for e in ends)
-            return f'{moment(row[f"{name}_since"])[:16]} UTC (95 %: {told})'
+    """Say when the change began: as the diagnosis dates it, as the segments show it, or its log.
+
+    The onset of a cause is fitted to every row, and told more closely than a shift of segments.
+    """
+    dated: list[tuple[Row, str]] = [(cause, 'onset') for cause in row.get('causes') or ()]
+    dated += [(row, f'{name}_since') for name in ('shift', 'change')]
+    for of, name in dated:
+        if of.get(name):
+            ends = [of.get(f'{name}_{end}') for end in ('low', 'high')]
+            between = ' to '.join(moment(e)[:16] for e in ends if e)
+            told = f'{moment(of[name])[:16]} UTC'
+            return f'{told} (95 %: {between})' if all(ends) else told
     return f'before {moment(row["start"])[:16]} UTC'
 
 

@@ -34,7 +34,7 @@ from valveflow_ros.opcua.results_server import Alarm as AlarmEvent
 from valveflow_ros.opcua.sampler import Counts, Sample, Sampler
 from valveflow_ros.opcua.session import check_installed
 from valveflow_ros.parameters import Parameter
-from valveflow_ros.records import NS_PER_S, SIGNALS, Readings, Signal
+from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Readings, Signal
 from valveflow_ros.ros.declare import declare, unknown_overrides
 from valveflow_ros.ros.decoding import PLANT_SAMPLE, from_time
 from valveflow_ros.ros.domain import start_ros
@@ -118,11 +118,11 @@ class GatewayUnit:
         for sample in self.sampler.due(now_ns):
             self._publisher.publish(self._message(sample))
 
-    def items(self, now_s: float) -> list[Item]:
+    def items(self, now_s: float, now_ns: int) -> list[Item]:
         """Return the health of link and signals."""
         items = [self._link_item(now_s)]
         for signal, counts in self.sampler.counts.items():
-            items.append(self._signal_item(signal, counts, now_s))
+            items.append(self._signal_item(signal, counts, now_s, now_ns))
         return items
 
     def _link_item(self, now_s: float) -> Item:
@@ -150,10 +150,15 @@ class GatewayUnit:
             'server_clock_ahead_s': ahead, 'backfill': state.backfill,
         })  # fmt: skip
 
-    def _signal_item(self, signal: int, counts: Counts, now_s: float) -> Item:
-        topic = SIGNALS[Signal(signal)].topic
-        values = {name: getattr(counts, name) for name in Counts.__slots__}
-        trouble = tuple(values[name] for name in _TROUBLE)
+    def _signal_item(self, signal: int, counts: Counts, now_s: float, now_ns: int) -> Item:
+        topic, unit = SIGNALS[Signal(signal)].topic, SIGNALS[Signal(signal)].unit
+        numbers = {name: getattr(counts, name) for name in Counts.__slots__}
+        trouble = tuple(numbers[name] for name in _TROUBLE)
+        last, values = self.sampler.newest.get(signal), dict[str, object](numbers)
+        if last is not None:
+            status = Quality(last.quality).name.lower()
+            age_s = max(0.0, (now_ns - last.source_ns) / NS_PER_S)
+            values |= {f'value ({unit})': last.value, 'status': status, 'age_s': age_s}
         if trouble != self._before.setdefault(signal, trouble):
             self._before[signal], self._trouble_s[signal] = trouble, now_s
         elif any(trouble) and signal not in self._trouble_s:
@@ -161,13 +166,16 @@ class GatewayUnit:
         if problem := self.link.state.nodes.get(signal):
             return Item(f'signal {topic}', Level.ERROR, f'Not read: {problem}.', values)
         if now_s - self._trouble_s.get(signal, -math.inf) < _SHOWN_S:
-            told = ', '.join(f'{n} {name}' for name, n in values.items() if n and name in _TROUBLE)
+            told = ', '.join(
+                f'{n} {name}' for name, n in numbers.items() if n and name in _TROUBLE
+            )
             return Item(f'signal {topic}', Level.WARN, f'Since the start: {told}.', values)
         if not self.link.state.up:
             return Item(f'signal {topic}', Level.STALE, 'There is no link.', values)
-        if not counts.received:
+        if last is None:
             return Item(f'signal {topic}', Level.WARN, 'Nothing came yet.', values)
-        return Item(f'signal {topic}', Level.OK, 'Values come.', values)
+        told = f'{last.value:.6g} {unit}, {status}, {age_s:.1f} s old.'
+        return Item(f'signal {topic}', Level.OK, told, values)
 
     def _message(self, sample: Sample) -> PlantSample:
         message = PlantSample(header=header(sample.time_ns, self.unit.tag))
@@ -349,7 +357,8 @@ def _run(stop: StopFlag) -> int:
         bridges = []
         if mapping.server is not None:
             offered = ResultsServer(mapping.server, _units_offered(mapping))
-            loop.start(offered.start()).result(_OFFER_S)
+            for sentence in loop.start(offered.start()).result(_OFFER_S):
+                log.warning(sentence)
             server = offered
             bridges = [ResultsBridge(node, unit, offered, loop.start) for unit in mapping.units]
             log.info(f'Curve, alarms and diagnosis are offered at {mapping.server.endpoint}.')
@@ -392,7 +401,7 @@ def _serve(
         for bridge in bridges:
             bridge.look()
         for unit in units:
-            items = unit.items(now_s)
+            items = unit.items(now_s, now_ns)
             publisher.publish(diagnostics_message(items, unit.name, unit.unit.tag, now_ns))
             fresh = (item for item in items if item.level != Level.STALE)
             for item in changes[unit.name].pick(fresh, now_s):

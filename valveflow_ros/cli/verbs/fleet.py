@@ -66,7 +66,7 @@ def arguments(parser: ArgumentParser) -> None:
 def run(options: Namespace, console: Console) -> VerbResult:
     """Read what there is to do, do it, tell the outcome."""
     console(0.0, 'starting')
-    from valveflow_ros.interface.fleet import fleet
+    from valveflow_ros.interface.fleets.fleet import fleet
     from valveflow_ros.report.words import counted, signed
 
     words = [f'--params={options.params}'] if options.params else []

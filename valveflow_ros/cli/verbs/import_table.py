@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import os
 from argparse import ArgumentParser, Namespace
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,12 +16,13 @@ from valveflow_ros.cli.command import (
     add_mapping,
     columns,
     mapping_of,
+    time_ns,
 )
 from valveflow_ros.errors import DataError, InputError, UsageError
 
 if TYPE_CHECKING:
+    from valveflow_ros.interface.importing.table_import import TableImport
     from valveflow_ros.interface.mapping import LogMapping
-    from valveflow_ros.interface.table_import import TableImport
     from valveflow_ros.logs.tables.refusal import RefusedError, Remedy
 
 _DESCRIPTION = """\
@@ -90,8 +90,8 @@ def run(options: Namespace, console: Console) -> VerbResult:
         raise UsageError('Name the log to write with -o LOG.mcap, or add --dry-run to look only.')
     from valveflow_ros.interface import SILENT
     from valveflow_ros.interface.files import check_log
+    from valveflow_ros.interface.importing.table_import import TableImport
     from valveflow_ros.interface.mapping import LOOKING_ON, gather_refusals
-    from valveflow_ros.interface.table_import import TableImport
     from valveflow_ros.logs.tables.refusal import RefusedError
 
     if options.output is not None:
@@ -125,10 +125,10 @@ def _from_history(options: Namespace, console: Console) -> VerbResult:
 
     check_installed()
     from valveflow_ros.interface.files import check_log
-    from valveflow_ros.interface.history_import import import_history
+    from valveflow_ros.interface.importing.history_import import import_history
     from valveflow_ros.opcua.mapping import read_mapping_file
 
-    begin_ns, end_ns = _time_ns(options.begin), _time_ns(options.end)
+    begin_ns, end_ns = time_ns(options.begin), time_ns(options.end)
     if begin_ns >= end_ns:
         raise UsageError('--from must be before --to.')
     units = {unit.tag: unit for unit in read_mapping_file(options.mapping).units}
@@ -147,18 +147,8 @@ def _from_history(options: Namespace, console: Console) -> VerbResult:
     )  # fmt: skip
 
 
-def _time_ns(text: str) -> int:
-    """Return a time in ns, in UTC where it names no zone."""
-    try:
-        moment = datetime.fromisoformat(text.replace('Z', '+00:00'))
-    except ValueError:
-        raise UsageError(f"'{text}' is no time such as 2026-01-31T06:00Z.") from None
-    moment = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
-    return round(moment.timestamp()) * 1_000_000_000
-
-
 def _imported(options: Namespace, mapping: LogMapping, console: Console) -> VerbResult:
-    from valveflow_ros.interface.table_import import Spool, TableImport
+    from valveflow_ros.interface.importing.table_import import Spool, TableImport
 
     console(0.05, 'looking at the table')
     table = TableImport(options.table, mapping, console)

@@ -8,7 +8,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from valveflow_ros.cli.command import Console, VerbResult
+from valveflow_ros.cli.command import Console, VerbResult, time_ns
 from valveflow_ros.errors import InputError, UsageError
 from valveflow_ros.interface.files import check_log
 from valveflow_ros.report.terminal.text import number, whole
@@ -56,6 +56,10 @@ def arguments(parser: ArgumentParser) -> None:
         default=10.0, help='how many days of operation, such as 0.5 (default 10)',
     )  # fmt: skip
     parser.add_argument(
+        '--start', metavar='TIME',
+        help='time of the first row, such as 2026-02-01 or 2026-02-01T06:00Z (default 2023-11-15)',
+    )  # fmt: skip
+    parser.add_argument(
         '--seed', metavar='N', type=whole('a whole number', 0, None, '--seed 1'), default=1,
         help='the same seed gives the same log (default 1)',
     )  # fmt: skip
@@ -87,12 +91,14 @@ def run(options: Namespace, console: Console) -> VerbResult:
         raise UsageError('Where to? Name the log with -o LOG.')
     check_log(options.output, overwrite=options.overwrite)
     from valveflow_ros.interface.simulate import simulate
+    from valveflow_ros.plant.simulator import DEFAULT_START_NS
 
+    start_ns = DEFAULT_START_NS if options.start is None else time_ns(options.start)
     console(0.0, 'simulating')
     try:
         found = simulate(
             options.days, options.seed, options.effect,
-            unit=options.unit, recording=options.recording, progress=console,
+            unit=options.unit, recording=options.recording, start_ns=start_ns, progress=console,
         )  # fmt: skip
     except InputError as error:
         raise UsageError(str(error)) from None

@@ -10,7 +10,7 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version as installed_version
 from pathlib import Path
@@ -25,19 +25,22 @@ from valveflow_ros.curve.shift import Shift, ShiftLimits, judge_shift
 from valveflow_ros.errors import DataError, RecordingError, ValveflowError
 from valveflow_ros.interface.diagnose import DiagnosisResult, diagnose
 from valveflow_ros.interface.files import reason, write_texts
+from valveflow_ros.interface.fleets.unit_logs import UnitLog
 from valveflow_ros.interface.identify import Identification, identify
 from valveflow_ros.interface.logs import Log, open_log
 from valveflow_ros.interface.models import load_characteristic
 from valveflow_ros.interface.monitor import MonitorResult, monitor
-from valveflow_ros.interface.unit_logs import UnitLog
+from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.answer import explained
 from valveflow_ros.report.data import rejected
 from valveflow_ros.report.fleet import UNITS
+from valveflow_ros.report.words import duration
 from valveflow_ros.signals.units import in_unit
 
 LIBRARIES = ('numpy', 'numba', 'scipy')
 _ROW, _CURVE = 'row.json', 'characteristic.json'
 _BLOCK = 1 << 20
+DAY_NS = 86400 * NS_PER_S
 Row = dict[str, Any]
 
 
@@ -198,14 +201,23 @@ def _judged(task: FleetTask) -> Row:
 
 
 def _check_order(log: Log, before: Characteristic | None, name: str) -> None:
-    """Refuse a log that begins before the one whose curve is its reference."""
+    """Refuse a log that begins before the end of the one whose curve is its reference.
+
+    The last row of one may be the first row of the next.
+    """
     if before is None or not len(log.readings):
         return
-    if int(log.readings.time_ns.min()) < before.source.window_start_ns:
-        earlier = Path(name).parent.parent.name
+    begin_ns, source = int(log.readings.time_ns.min()), before.source
+    earlier = Path(name).parent.parent.name
+    if begin_ns < source.window_start_ns:
         raise DataError(
             f"The log begins before '{earlier}', which stands before it: name the logs of a unit "
             'in the order of time.'
+        )
+    if begin_ns < source.window_end_ns:
+        raise DataError(
+            f'The log begins {duration((source.window_end_ns - begin_ns) / 1e9)} before the end '
+            f"of '{earlier}', which stands before it: cut one, so that no row counts twice."
         )
 
 
@@ -287,12 +299,24 @@ def _diagnosis_facts(found: DiagnosisResult) -> Row:
                 for name, p in cause['parameters'].items()
             ],
             **cause['gain'],
+            **_onset(cause['parameters'].values()),
         }
         for cause in content['causes']
     ]
     names = ('verdict', 'not_told_apart', 'unexplained_by', 'rmse_simulation', 'rmse_extended',
              'rmse_noise_floor')  # fmt: skip
     return {**{name: content[name] for name in names}, 'causes': causes}
+
+
+def _onset(parameters: Iterable[Mapping[str, Any]]) -> Row:
+    """Return when a cause set in, and the interval, in ns; None for one without a date."""
+    dated = next((p for p in parameters if 'origin_ns' in p), {})
+
+    def time_ns(days: float | None) -> int | None:
+        return None if days is None else int(dated['origin_ns']) + round(days * DAY_NS)
+
+    ends = {'onset': 'value', 'onset_low': 'low', 'onset_high': 'high'}
+    return {name: time_ns(dated.get(of)) for name, of in ends.items()}
 
 
 def _monitor_facts(found: MonitorResult) -> Row:

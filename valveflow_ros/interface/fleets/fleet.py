@@ -25,13 +25,19 @@ from valveflow_ros.errors import (
 )
 from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.files import check_folder, whole_file, write_texts
-from valveflow_ros.interface.unit_logs import UnitLog, read_fleet
-from valveflow_ros.interface.unit_month import LIBRARIES, FleetTask, Row, failed_row, unit_month
+from valveflow_ros.interface.fleets.unit_logs import UnitLog, read_fleet
+from valveflow_ros.interface.fleets.unit_month import (
+    LIBRARIES,
+    FleetTask,
+    Row,
+    failed_row,
+    unit_month,
+)
 from valveflow_ros.report.fleet import REPORT, UNITS, UnitStory, fleet_page, story_of, unit_page
 from valveflow_ros.report.page import plotly_script
 
 DATA, PAGE = 'fleet.parquet', 'fleet.html'
-_WAIT_S = 10
+_WAIT_S, _SHOWN = 10, 4
 
 
 @contextmanager
@@ -103,6 +109,12 @@ def workers_words(client: Any) -> str:
         f'each bounded to {limits[0] / 1e9:.1f} GB of memory'
     )  # fmt: skip
     return f'{counted(len(workers), "worker")}, {bound}.'
+
+
+def _threads(client: Any) -> int:
+    """Return how many tasks the workers do at once."""
+    workers = client.scheduler_info(n_workers=-1)['workers'].values()
+    return sum(w['nthreads'] for w in workers)
 
 
 Chain = Generator[FleetTask, Row, None]
@@ -218,7 +230,7 @@ def _schema() -> Any:
         'verdict': s,
         'causes': records(
             name=s, sentence=s, meaning=s, to_do=s, parameters=parameter, rmse_before=f,
-            rmse_after=f, reduction=f, p_value=f,
+            rmse_after=f, reduction=f, p_value=f, onset=at, onset_low=at, onset_high=at,
         ),
         'not_told_apart': pa.list_(s), 'unexplained_by': pa.list_(s),
         # alarms
@@ -349,12 +361,20 @@ def fleet(
     anew = failed = 0
     with connected(scheduler) as client:
         progress.say(workers_words(client))
+        # The first of them, in the order in which the scheduler hands them out.
+        first = [f'{unit} {logs[0].name}' for unit, logs in units.items()][: _threads(client)]
+        if first:
+            progress.say(
+                'The workers begin. Where none has run before it compiles first, which takes '
+                'minutes; the next run does not.'
+            )
+            progress(0.0, f'first {listed(first[:_SHOWN])}')
         chains = [_chain(months, folder) for months in units.values()]
         for task, row in spread(client, unit_month, chains):
             unit, done = task.of.unit, done + 1
             anew, failed = anew + row['anew'], failed + (row['status'] == 'failed')
             rows[unit].append(row)
-            progress(done / total, f'{unit} {task.of.name}')
+            progress(done / total, f'{unit} {task.of.name} done')
             if len(rows[unit]) == len(units[unit]):
                 stories.append(_write_unit(folder, unit, rows.pop(unit)))
     for old in (folder / DATA).glob('unit=*'):
