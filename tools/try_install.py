@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Build the wheel and try it in empty environments: how long, how large, and does it work?
+"""Build the wheel and try it in empty environments: times, sizes, and whether it works.
 
     python -m tools.try_install [--keep] PYTHON...
 
