@@ -15,6 +15,7 @@
 # make study   how good curve, choice, segments, shifts, alarm and baselines are (hours)
 # make study-diagnosis   how often the diagnosis names the right cause, and none where there is none (hours)
 # make certify-partition   the exact partition of 305,633 samples against every break (minutes)
+# make docs    set-up, then the site: site/html, made by mkdocs in .venv-docs (Python 3.11 or later)
 # make lock    requirements.in -> requirements.lock (UPGRADE=1 takes newer versions)
 # make clean   remove everything the set-up made
 #
@@ -22,7 +23,7 @@
 
 SHELL := bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-opcua test test-versions test-slow lint format bench bench-gate mutation repeat torture study study-diagnosis certify-partition lock clean
+.PHONY: help setup demo demo-opcua test test-versions test-slow lint format bench bench-gate mutation repeat torture study study-diagnosis certify-partition docs lock clean
 
 export PYTHON
 ENV := source ./env.sh &&
@@ -103,10 +104,20 @@ study-diagnosis: setup
 certify-partition: setup
 	@$(ENV) python -m benchmarks.partition --certify --kinds valve --sizes 305633
 
+.venv-docs/.made: docs/requirements.txt
+	@.venv/bin/python -m venv .venv-docs
+	@.venv-docs/bin/python -m pip install --quiet -r docs/requirements.txt
+	@touch $@
+
+docs: setup .venv-docs/.made
+	@$(ENV) python -m docs.make_site
+	@NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build --quiet --strict
+	@echo 'The site is in site/html; to look at it: python3 -m http.server -d site/html'
+
 lock: setup
 	@$(ENV) uv pip compile --quiet --universal --python-version 3.10 --generate-hashes \
 	  --no-emit-index-url --custom-compile-command 'make lock' $(if $(UPGRADE),--upgrade) \
 	  --output-file requirements.lock requirements.in
 
 clean:
-	@rm -rf .venv build install log
+	@rm -rf .venv .venv-docs build install log site

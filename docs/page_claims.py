@@ -287,3 +287,21 @@ def measured() -> str:
     rows = [*_paper(), *_partition(), *_coverage(), *_rivals(), *_thermal(), *_alarm(),
             *_diagnosis(), *_loops(), *_speed(), *_fleet()]  # fmt: skip
     return table(('question', 'answer', 'measured by'), rows)
+
+
+def installed() -> str:
+    """Return what an installation of the wheel takes, by Python and set of libraries."""
+    names = ('numpy', 'scipy', 'pandas', 'numba')
+    kept = result('install')
+    rows = (
+        (
+            row['python'], ', '.join(row['versions'][name] for name in names),
+            f'{row["install_s"]:.0f} s', f'{row["size_mb"]} MB',
+            f'{row["first_identify_s"]:.0f} s', f'{row["second_identify_s"]:.1f} s',
+        )
+        for row in kept['results']
+    )  # fmt: skip
+    head = ('Python', 'NumPy, SciPy, pandas, Numba', 'installed in', 'size', 'first `identify`',
+            'second')  # fmt: skip
+    where = f'{kept["cpus"]} processors with a load average of {kept["load_average"]}'
+    return f'{table(head, rows)}\nMeasured on {where}.\n'

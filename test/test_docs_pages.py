@@ -14,7 +14,15 @@ from xml.etree import ElementTree
 
 import pytest
 
-from docs import make_pages, page_claims, page_effects, page_health, page_tables, picture_data
+from docs import (
+    make_pages,
+    make_site,
+    page_claims,
+    page_effects,
+    page_health,
+    page_tables,
+    picture_data,
+)
 from valveflow_ros.diagnosis.causes import catalogue as causes
 from valveflow_ros.parameters import TABLE
 from valveflow_ros.plant.effects import catalogue as effects
@@ -121,6 +129,28 @@ def test_every_page_is_reached_from_the_readme() -> None:
         names = (link.partition('#')[0] for link in _LINK.findall(page.read_text()))
         todo += [(page.parent / n).resolve() for n in names if n.endswith('.md')]
     assert set(PAGES) <= seen
+
+
+def test_every_page_is_in_the_navigation_of_the_site() -> None:
+    navigation = (ROOT / 'mkdocs.yml').read_text().partition('nav:\n')[2]
+    names = [str(page.relative_to(DOCS)) for page in DOCS.rglob('*.md')]
+    for name in (*names, *make_site.PROJECT):
+        assert re.search(rf'[ ]{re.escape(name)}$', navigation, re.M), name
+
+
+def test_links_and_blocks_are_turned_for_the_site() -> None:
+    text = '[a](../SECURITY.md) [b](../CHANGELOG.rst) [c](page.md)\n```sh jazzy\nls\n```\n'
+    turned = make_site.turned(text, '../')
+    assert turned == '[a](SECURITY.md) [b](CHANGELOG.md) [c](page.md)\n```sh\nls\n```\n'
+    assert '](../' not in make_site.turned((DOCS / 'index.md').read_text(), '../')
+
+
+def test_the_site_has_the_help_of_every_executable() -> None:
+    for module in make_site.EXECUTABLES.values():
+        assert (ROOT / 'valveflow_ros' / 'ros' / f'{module}_main.py').exists()
+    scripts = re.search(r"for name in \(('monitor'[^)]*)\)", (ROOT / 'setup.py').read_text())
+    assert scripts
+    assert set(make_site.EXECUTABLES) == set(re.findall(r"'(\w+)'", scripts[1]))
 
 
 def test_every_output_service_and_item_of_the_health_has_a_line() -> None:

@@ -20,7 +20,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from valveflow_ros.errors import DataError, InputError, RecordingError, UsageError, ValveflowError
+from valveflow_ros.errors import (
+    DataError,
+    InputError,
+    RecordingError,
+    UsageError,
+    ValveflowError,
+    listed,
+)
 
 if TYPE_CHECKING:
     from datetime import tzinfo
@@ -55,7 +62,7 @@ def check_installed() -> None:
     missing = [name for module, name in _NEEDS.items() if find_spec(module) is None]
     if missing:
         raise DataError(
-            f'The page needs {" and ".join(missing)}, not installed here: '
+            f'The page needs {listed(missing)}, not installed here: '
             f'pip install {" ".join(missing)}.'
         )
 

@@ -144,7 +144,7 @@ def parameter_file(values: Mapping[str, object]) -> str:
 
 def usage(about: str, example: str, rows: Iterable[Parameter]) -> str:
     """Return a page: what it does, an example, and every parameter with unit and default."""
-    lines = [about, '', 'Parameters are given as for any ROS 2 node:', f'  {example}', '']
+    lines = [about, '', 'example:', f'  {example}', '', 'parameters, given as for any node:']
     for row in rows:
         default = repr(row.default) if isinstance(row.default, str) else str(row.default).lower()
         unit = f' {row.unit}' if row.unit else ''

@@ -1,0 +1,84 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""The example in the --help of each verb works as it stands there."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from monitor_recording import recording
+from streams import needs_jit
+
+from benchmarks.refinery_loops import simulate_loop
+from valveflow_ros.cli.main import VERBS, main
+
+pytestmark = needs_jit
+# What the example itself does not say: a recording that grows is watched until Ctrl-C.
+MORE = {'watch': ['--once']}
+# A file that must be there afterwards.
+WRITTEN = {
+    'simulate': 'plant.mcap', 'identify': 'result/characteristic.json',
+    'diagnose': 'result/diagnosis.json', 'monitor': 'result/monitor.json',
+    'fleet': 'result/fleet.parquet', 'validate': 'checked/report.html',
+    'loop': 'result/loop.json', 'compare': 'result/comparison.json', 'compensate': 'table.csv',
+    'export': 'plant.csv', 'recover': 'whole.mcap', 'config': 'monitor.yaml',
+}  # fmt: skip
+
+
+def example(page: str) -> list[str]:
+    """Return the words of the first example; what stands behind two spaces is a remark."""
+    found = re.search(r'^example:\n  valveflow (.*)$', page, re.M)
+    assert found, page
+    return shlex.split(found[1].partition('  ')[0])
+
+
+@pytest.fixture(scope='module')
+def other_days(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp('other') / 'other.mcap'
+    assert main(['simulate', '-o', str(path), '--days', '0.4', '--seed', '2', '--quiet']) == 0
+    return path
+
+
+@pytest.fixture
+def plant(tmp_path: Path, logs: Path, identified: Path, other_days: Path) -> Path:
+    """Return a folder with every file that an example names."""
+    shutil.copy(logs / 'plant.mcap', tmp_path)
+    shutil.copy(logs / 'plant.csv', tmp_path / 'history.csv')
+    for name in ('other.mcap', 'other_days.mcap'):
+        shutil.copy(other_days, tmp_path / name)
+    whole = (logs / 'plant.mcap').read_bytes()
+    (tmp_path / 'broken.mcap').write_bytes(whole[: len(whole) // 2])
+    (tmp_path / 'result').mkdir()
+    shutil.copy(identified, tmp_path / 'result')
+    (tmp_path / 'plants' / 'U1').mkdir(parents=True)
+    shutil.copy(logs / 'plant.csv', tmp_path / 'plants' / 'U1' / '2026-01.csv')
+    recording(tmp_path / 'valveflow_recordings')
+    loop = simulate_loop(3, True)
+    times = pd.date_range('2026-01-05', periods=len(loop.command), freq='10s')
+    frame = pd.DataFrame({'time': times, 'FIC101.MV': loop.command, 'FIC101.PV': loop.response})
+    frame.to_csv(tmp_path / 'FIC101.csv', index=False)
+    return tmp_path
+
+
+@pytest.mark.parametrize('verb', [name for name, _, _ in VERBS])
+def test_the_example_of_a_verb_works(run, plant, monkeypatch, verb):
+    if verb == 'fleet':
+        for name in ('dask', 'distributed', 'pyarrow'):
+            pytest.importorskip(name)
+    if importlib.util.find_spec('plotly') is None:
+        pytest.skip('plotly is not installed')
+    monkeypatch.chdir(plant)
+    written = plant / WRITTEN[verb] if verb in WRITTEN else None
+    if written and verb not in ('identify',):
+        written.unlink(missing_ok=True)
+    ran = run(*example(run(verb, '--help').out), *MORE.get(verb, ()))
+    assert ran.status == 0, ran.err
+    assert ran.out
+    assert 'Traceback' not in ran.err
+    assert written is None or written.stat().st_size > 0
