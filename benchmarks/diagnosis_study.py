@@ -123,6 +123,16 @@ def covered(case: Case, found: Diagnosis) -> dict[str, list[float | bool]]:
     return out
 
 
+def wrong_sign(case: Case, found: Diagnosis) -> bool:
+    """Tell whether a bump was called a dent, or a dent a bump; either of both is not wrong."""
+    truth = [s.parameters['h_mw'] for s in case.effects if s.name == 'curve_shape']
+    told = [c.parameters['h_mw'] for c in found.causes if c.name == 'curve_shape']
+    return any(
+        float(h) * e.value < 0.0 and e.low * e.high > 0.0
+        for h, e in zip(truth, told, strict=False)
+    )
+
+
 def row_of(case: Case, days: float) -> dict[str, Any]:
     """Diagnose one plant and return what is counted."""
     about = {
@@ -143,6 +153,7 @@ def row_of(case: Case, days: float) -> dict[str, Any]:
         'right': _told(found, case.label)
         if case.kind == 'slow'
         else set(names) == set(case.names)
+        and not wrong_sign(case, found)
         and (found.verdict == 'unexplained') == (case.kind == 'outside'),
         'not_told_apart': list(found.not_told_apart),
         'unexplained_by': list(found.unexplained_by),
