@@ -152,6 +152,18 @@ def test_every_family_is_told_from_the_others(effect):
     assert names(found) == {effect.partition(':')[0]}
 
 
+@pytest.mark.parametrize('h_mw', [-2.0, 2.0])
+@pytest.mark.parametrize('seed', [3, 8])
+def test_a_bump_is_not_called_a_dent(h_mw, seed):
+    if os.environ.get('VALVEFLOW_SLOW') != '1':
+        pytest.skip('make test-slow runs it; make study-diagnosis does more')
+    found = diagnosed(f'curve_shape:h_mw={h_mw},u0=1425,width_u=150', seed=seed)
+    assert names(found) == {'curve_shape'}
+    height = found.causes[0].parameters['h_mw']
+    assert height.value * h_mw > 0.0 or height.low * height.high < 0.0
+    assert ('either' in found.causes[0].sentence) == (height.low * height.high < 0.0)
+
+
 @pytest.mark.parametrize(
     ('tempting', 'days'),
     [

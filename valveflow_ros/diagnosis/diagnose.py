@@ -13,6 +13,7 @@ import numpy as np
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import DAY_S, Active, Estimate, SentenceValues, told
 from valveflow_ros.diagnosis.causes import catalogue
+from valveflow_ros.diagnosis.causes.curve import either_bend_sentence
 from valveflow_ros.diagnosis.evidence import (
     LARGEST_P,
     Certainty,
@@ -44,7 +45,7 @@ from valveflow_ros.diagnosis.result import (
     NamedCause,
 )
 from valveflow_ros.diagnosis.screening import Screening
-from valveflow_ros.diagnosis.search import Found, Progress, search, simplified
+from valveflow_ros.diagnosis.search import Found, Progress, other_bend, search, simplified
 from valveflow_ros.diagnosis.slow import (
     LEAST_DRIFT_MW,
     NAMED_SHAPE,
@@ -303,6 +304,7 @@ def diagnose(
     found = search(task, start, progress, rough)
     progress(0.7, 'the sealed blocks')
     confirm(found)
+    found.bend = other_bend(found)
     found.model = _dated(found)
     progress(0.8, 'what is left')
     course = _course(found)
@@ -589,9 +591,15 @@ def _conclude(
     task, final = _final(found)
     progress(0.9, 'how sure it is')
     estimates = Certainty(task, final).intervals() if final.active else {}
+    sentences = {a.name: a.sentence(grids.start_ns, estimates[a.name]) for a in final.active}
+    if found.bend is not None and found.bend.name in sentences:
+        one = next(a.named() for a in final.active if a.name == found.bend.name)
+        other = found.bend.named()
+        sentences[found.bend.name] = either_bend_sentence(one, other)
+        estimates[found.bend.name] = _either(estimates[found.bend.name], other)
     causes = tuple(
         NamedCause(
-            a.name, a.sentence(grids.start_ns, estimates[a.name]), estimates[a.name], gain,
+            a.name, sentences[a.name], estimates[a.name], gain,
             a.cause.experiment, found.near.get(a.name, ()), a.extra, _meaning(task, final, a),
         )
         for a, gain in zip(final.active, gains, strict=True)
@@ -620,6 +628,14 @@ def _conclude(
         notes=(*notes(grids), *([rest.own_misfit] if rest.own_misfit else [])),
     )  # fmt: skip
     return replace(result, sentence=_sentence(result))
+
+
+def _either(estimates: dict[str, Estimate], other: dict[str, float]) -> dict[str, Estimate]:
+    """Return the estimates with intervals that hold the other possibility, too."""
+    return {
+        name: replace(e, low=min(e.low, other[name]), high=max(e.high, other[name]))
+        for name, e in estimates.items()
+    }
 
 
 def _verdict(found: Found, rest: _Rest, record_wrong: bool) -> tuple[str, bool]:

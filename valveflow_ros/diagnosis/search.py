@@ -168,6 +168,59 @@ def _rich(base: RegionalModel) -> RegionalModel:
     return base
 
 
+# A bump, or a dent beside it.
+#
+# With its knees free a curve with a bump equals one with other knees and a dent beside, but for
+# little. So a named bend is held against such ones of the other sign, each with knees of its own.
+
+_BESIDE = (-1.2, -0.7, 0.7, 1.2)  # of its half width
+_SIGN_TOLD = 10.0  # log-likelihood by which one sign must be better than the other
+
+
+def other_bend(found: Found) -> Active | None:
+    """Give `curve_shape` the better sign; return the other one if it cannot be ruled out.
+
+    Both are compared under one whitening, and each number of the curve is paid for.
+    """
+    task, model = found.task, found.model
+    bend = next((a for a in model.active if a.name == 'curve_shape'), None)
+    if bend is None:
+        return None
+    tried = []
+    for beside in _BESIDE:
+        h, centre, width = bend.values
+        turned = model.having(replace(bend, values=(-h, centre + beside * width, width)))
+        try:
+            tried.append(_settled_anew(task, turned, 1, 6))
+        except (TooFewSamplesError, np.linalg.LinAlgError):
+            continue
+    variance = task.cost(model) / max(int(task.rows.sum()), 1)
+
+    def worth(of: tuple[Task, Extended], on: Task) -> float:
+        return -on.cost(of[1]) / (2.0 * variance) - _EACH * of[1].base.size
+
+    if not tried:
+        return None
+    best = max(tried, key=lambda other: worth(other, task))
+    other_task, other, _ = settle(*best, rounds=2, steps=10)
+    own, others = (worth(of, other_task) for of in ((task, model), (other_task, other)))
+    turned_bend = next(a for a in other.active if a.name == 'curve_shape')
+    if turned_bend.values[0] * bend.values[0] >= 0.0:
+        return None
+    if others > own:
+        found.task, found.model = other_task, other
+        turned_bend = bend
+    return turned_bend if abs(others - own) < _SIGN_TOLD else None
+
+
+def _settled_anew(task: Task, model: Extended, rounds: int, steps: int) -> tuple[Task, Extended]:
+    """Return the model fitted again on a curve and regions of its own."""
+    if not task.fixed_dynamics:
+        base, _ = search_plain(_seen_through(task, model), _rich(model.base), _MOST)
+        model = replace(model, base=simplified(base))
+    return settle(task, model, rounds, steps)[:2]
+
+
 Progress = Callable[[float, str], None]
 
 _OF_FORM = {'exponent': 'the exponent', 'curve_shape': 'the curve'}
@@ -211,6 +264,8 @@ class Found:
         Number of causes tried.
     rough : Grids, optional
         The record with longer model rows, for screening.
+    bend : Active, optional
+        Where it cannot be told whether `curve_shape` is a bump or a dent, the other one.
     """
 
     task: Task
@@ -221,6 +276,7 @@ class Found:
     reasons: dict[str, str] = field(default_factory=dict)
     tried: int = 0
     rough: Grids | None = None
+    bend: Active | None = None
 
 
 _BY_CHANCE = 'the power does not follow it more closely than a slow wander would by chance'

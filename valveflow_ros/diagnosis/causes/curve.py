@@ -75,10 +75,21 @@ def _levels_under(base: RegionalModel, values: Values, scale: float) -> Regional
 
 def curve_shape_sentence(values: dict[str, float]) -> str:
     """Say it."""
+    return f'The curve has {_bend(values)} that straight pieces do not follow (overlap of valves).'
+
+
+def either_bend_sentence(one: dict[str, float], other: dict[str, float]) -> str:
+    """Say a bend that may be of either sign."""
     return (
-        f'The curve has a {"bump" if values["h_mw"] > 0.0 else "dent"} of '
-        f'{abs(values["h_mw"]):.2g} MW around u = {values["u0"]:.4g} that straight pieces do not '
-        'follow (overlap of valves).'
+        f'The curve has either {_bend(one)} or {_bend(other)}, which straight pieces do not '
+        'follow (overlap of valves); this record cannot tell which.'
+    )
+
+
+def _bend(values: dict[str, float]) -> str:
+    return (
+        f'a {"bump" if values["h_mw"] > 0.0 else "dent"} of '
+        f'{abs(values["h_mw"]):.2g} MW around u = {values["u0"]:.4g}'
     )
 
 
