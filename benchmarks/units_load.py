@@ -33,7 +33,7 @@ _SETTLE_S = 5.0
 
 
 def send(units: int) -> None:
-    """Send every unit a sample a second, until stdin ends."""
+    """Send every unit a sample a second."""
     import rclpy
     from rclpy.qos import qos_profile_sensor_data
     from valveflow_msgs.msg import PlantSample

@@ -82,6 +82,9 @@ def test_a_change_that_a_cause_dates_lasts_since_its_onset():
     # Of a later log a cause says nothing of when the change began.
     later = story_of('U', [row(1), lost(3, -5.0, **since), lost(4, -5.0, causes=causes)])
     assert later.since == '1970-04-06 00:00 UTC (95 %: 1970-04-02 00:00 to 1970-04-10 00:00)'
+    of_another_day = [cause('input_step') | onset | {'onset': 20 * DAY_NS}]
+    other = story_of('U', [row(1), lost(3, -5.0, causes=of_another_day, **since)])
+    assert other.since == later.since
     open_end = [cause('gain_step') | onset | {'onset_high': None}]
     assert story_of('U', [row(1), lost(3, -5.0, causes=open_end)]).since == '1970-04-07 00:00 UTC'
 

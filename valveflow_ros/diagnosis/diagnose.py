@@ -303,8 +303,8 @@ def diagnose(
     start = Extended(model if given else simplified(model))
     found = search(task, start, progress, rough)
     progress(0.7, 'the sealed blocks')
+    found.other_bend = other_bend(found)
     confirm(found)
-    found.bend = other_bend(found)
     found.model = _dated(found)
     progress(0.8, 'what is left')
     course = _course(found)
@@ -592,15 +592,17 @@ def _conclude(
     progress(0.9, 'how sure it is')
     estimates = Certainty(task, final).intervals() if final.active else {}
     sentences = {a.name: a.sentence(grids.start_ns, estimates[a.name]) for a in final.active}
-    if found.bend is not None and found.bend.name in sentences:
-        one = next(a.named() for a in final.active if a.name == found.bend.name)
-        other = found.bend.named()
-        sentences[found.bend.name] = either_bend_sentence(one, other)
-        estimates[found.bend.name] = _either(estimates[found.bend.name], other)
+    other = _other_bend(task, final, found)
+    if other:
+        one = next(a.named() for a in final.active if a.name == 'curve_shape')
+        values = {name: e.value for name, e in other.items()}
+        sentences['curve_shape'] = either_bend_sentence(one, values)
+        estimates['curve_shape'] = _either(estimates['curve_shape'], other)
     causes = tuple(
         NamedCause(
             a.name, sentences[a.name], estimates[a.name], gain,
-            a.cause.experiment, found.near.get(a.name, ()), a.extra, _meaning(task, final, a),
+            a.cause.experiment, found.near.get(a.name, ()), a.extra,
+            '' if other and a.name == 'curve_shape' else _meaning(task, final, a),
         )
         for a, gain in zip(final.active, gains, strict=True)
     )  # fmt: skip
@@ -630,12 +632,26 @@ def _conclude(
     return replace(result, sentence=_sentence(result))
 
 
-def _either(estimates: dict[str, Estimate], other: dict[str, float]) -> dict[str, Estimate]:
-    """Return the estimates with intervals that hold the other possibility, too."""
+def _other_bend(task: Task, final: Extended, found: Found) -> dict[str, Estimate]:
+    """Return the bend of the other sign on all blocks; empty where there is none to tell of."""
+    other = found.other_bend
+    if other is None or 'curve_shape' not in final.names:
+        return {}
+    for name in set(other.names) - set(final.names):
+        other = other.without(name)
+    other, _ = improve(task, other, _LAST_STEPS)
+    return Certainty(task, other).intervals()['curve_shape']
+
+
+def _either(one: dict[str, Estimate], other: dict[str, Estimate]) -> dict[str, Estimate]:
+    """Return the values of the one with intervals that hold those of both; NaN stays NaN."""
     return {
-        name: replace(e, low=min(e.low, other[name]), high=max(e.high, other[name]))
-        for name, e in estimates.items()
-    }
+        name: replace(
+            e, low=float(np.minimum(e.low, other[name].low)),
+            high=float(np.maximum(e.high, other[name].high)),
+        )
+        for name, e in one.items()
+    }  # fmt: skip
 
 
 def _verdict(found: Found, rest: _Rest, record_wrong: bool) -> tuple[str, bool]:

@@ -175,50 +175,70 @@ def _rich(base: RegionalModel) -> RegionalModel:
 
 _BESIDE = (-1.2, -0.7, 0.7, 1.2)  # of its half width
 _SIGN_TOLD = 10.0  # log-likelihood by which one sign must be better than the other
+_LEAST_BEND = 0.1  # of the height of the named one: less is none
 
 
-def other_bend(found: Found) -> Active | None:
-    """Give `curve_shape` the better sign; return the other one if it cannot be ruled out.
+def other_bend(found: Found) -> Extended | None:
+    """Give `curve_shape` the better sign; return the model of the other if it does nearly as well.
 
-    Both are compared under one whitening, and each number of the curve is paid for.
+    Both are settled alike and compared under the whitening of the better one; each number of the
+    curve is paid for.
     """
-    task, model = found.task, found.model
-    bend = next((a for a in model.active if a.name == 'curve_shape'), None)
+    bend = _bend(found.model)
     if bend is None:
         return None
-    tried = []
+    h, centre, width = bend.values
+    turned = []
     for beside in _BESIDE:
-        h, centre, width = bend.values
-        turned = model.having(replace(bend, values=(-h, centre + beside * width, width)))
+        model = found.model.having(replace(bend, values=(-h, centre + beside * width, width)))
         try:
-            tried.append(_settled_anew(task, turned, 1, 6))
+            tried = _settled_anew(found.task, model)
         except (TooFewSamplesError, np.linalg.LinAlgError):
             continue
-    variance = task.cost(model) / max(int(task.rows.sum()), 1)
-
-    def worth(of: tuple[Task, Extended], on: Task) -> float:
-        return -on.cost(of[1]) / (2.0 * variance) - _EACH * of[1].base.size
-
-    if not tried:
+        if _turned(tried[1], h):
+            turned.append(tried)
+    if not turned:
         return None
-    best = max(tried, key=lambda other: worth(other, task))
-    other_task, other, _ = settle(*best, rounds=2, steps=10)
-    own, others = (worth(of, other_task) for of in ((task, model), (other_task, other)))
-    turned_bend = next(a for a in other.active if a.name == 'curve_shape')
-    if turned_bend.values[0] * bend.values[0] >= 0.0:
+    least = min(turned, key=lambda tried: _advantage(found.task, found.model, tried[1]))
+    own_task, own, _ = settle(found.task, found.model, rounds=2, steps=10)
+    task, other, _ = settle(*least, rounds=2, steps=10)
+    if not _turned(other, h):
         return None
-    if others > own:
-        found.task, found.model = other_task, other
-        turned_bend = bend
-    return turned_bend if abs(others - own) < _SIGN_TOLD else None
+    better = _advantage(task, other, own)
+    if better > 0.0:
+        found.task, found.model = task, other
+        return own if better < _SIGN_TOLD else None
+    return other if _advantage(own_task, own, other) < _SIGN_TOLD else None
 
 
-def _settled_anew(task: Task, model: Extended, rounds: int, steps: int) -> tuple[Task, Extended]:
+def _advantage(task: Task, model: Extended, other: Extended) -> float:
+    """Return the log-likelihood by which a model is better than another, under its whitening."""
+    e = task.innovations(task.residual(model))
+    variance = float(e @ e) / len(e) * colour(task, e)
+    gain = (task.cost(other) - task.cost(model)) / (2.0 * variance)
+    return gain + _EACH * (other.base.size - model.base.size)
+
+
+def _settled_anew(task: Task, model: Extended) -> tuple[Task, Extended]:
     """Return the model fitted again on a curve and regions of its own."""
     if not task.fixed_dynamics:
         base, _ = search_plain(_seen_through(task, model), _rich(model.base), _MOST)
         model = replace(model, base=simplified(base))
-    return settle(task, model, rounds, steps)[:2]
+    return settle(task, model, rounds=1, steps=6)[:2]
+
+
+def _bend(model: Extended) -> Active | None:
+    return next((a for a in model.active if a.name == 'curve_shape'), None)
+
+
+def _turned(model: Extended, h: float) -> bool:
+    """Tell whether the bend of a model has the other sign than ``h``, on the curve."""
+    bend = _bend(model)
+    if bend is None:
+        return False
+    height, centre = bend.values[:2]
+    low, high = model.base.knots[0], model.base.knots[-1]
+    return bool(height * h < 0.0 and abs(height) > _LEAST_BEND * abs(h) and low < centre < high)
 
 
 Progress = Callable[[float, str], None]
@@ -264,8 +284,8 @@ class Found:
         Number of causes tried.
     rough : Grids, optional
         The record with longer model rows, for screening.
-    bend : Active, optional
-        Where it cannot be told whether `curve_shape` is a bump or a dent, the other one.
+    other_bend : Extended, optional
+        The model with the other one, where `curve_shape` may be a bump or a dent.
     """
 
     task: Task
@@ -276,7 +296,7 @@ class Found:
     reasons: dict[str, str] = field(default_factory=dict)
     tried: int = 0
     rough: Grids | None = None
-    bend: Active | None = None
+    other_bend: Extended | None = None
 
 
 _BY_CHANCE = 'the power does not follow it more closely than a slow wander would by chance'

@@ -20,6 +20,7 @@ number paid for. A step takes place at once or within four hours.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -317,7 +318,7 @@ def _shapes(found: Levels) -> list[_Shape]:
     after = t[:, None] >= moments
     steps = [
         _Shape('step', column * load, (3600.0 * float(at),), 3 if spread else 2, 3600.0 * spread)
-        for spread in _SPREADS_H
+        for spread in _SPREADS_H if spread <= 2.0 * _EDGE * span  # whole within the record
         for column, at in zip(
             np.clip((t[:, None] - moments) / max(spread, 1e-9) + 0.5, 0.0, 1.0).T,
             moments, strict=True,
@@ -401,15 +402,18 @@ def _scored(
             mine = np.flatnonzero(kinds == name)
             j = int(mine[score[mine].argmax()])
             yield str(name), float(score[j]), (j,), toward[[j]] / size[j]
-        for spread in range(len(_SPREADS_H)):
-            steps = np.arange(spread * _MOMENTS, (spread + 1) * _MOMENTS)
-            more = PENALTY * (spread > 0)
+        for steps in np.flatnonzero(kinds == 'step').reshape(-1, _MOMENTS):
+            spread_s = single[steps[0]].spread_s
+            more = PENALTY * (spread_s > 0.0)
+            between_s = single[steps[1]].at_s[0] - single[steps[0]].at_s[0]
+            # The second begins when the first is over: their sizes are what the power did.
+            apart = max(_APART, math.ceil(spread_s / between_s))
             gain, a, b = _pairs(gram, toward, np.full(_MOMENTS, drift_at), steps)
             j = int(gain.argmax())
             chosen = drift_at, int(steps[j])
             score = worth(gain) - 3 * PENALTY - more
             yield 'drift and step', float(score[j]), chosen, np.array([a[j], b[j]])
-            one, two = steps[0] + np.array(np.triu_indices(_MOMENTS, _APART))
+            one, two = steps[0] + np.array(np.triu_indices(_MOMENTS, apart))
             gain, a, b = _pairs(gram, toward, one, two)
             j = int(gain.argmax())
             chosen = int(one[j]), int(two[j])
@@ -417,11 +421,11 @@ def _scored(
             yield 'two steps', float(score[j]), chosen, np.array([a[j], b[j]])
             # The same two of equal size and opposite sign.
             square = np.maximum(gram[one, one] + gram[two, two] - 2.0 * gram[one, two], 1e-12)
-            apart = toward[one] - toward[two]
-            gain = apart**2 / square
+            less = toward[one] - toward[two]
+            gain = less**2 / square
             j = int(gain.argmax())
             chosen = int(one[j]), int(two[j])
-            sizes = apart[j] / square[j] * np.array([1.0, -1.0])
+            sizes = less[j] / square[j] * np.array([1.0, -1.0])
             score = worth(gain) - 3 * PENALTY - more
             yield 'there and back', float(score[j]), chosen, sizes
 

@@ -114,9 +114,14 @@ def _same_side(row: Row, last: Row) -> bool:
 def _since(row: Row) -> str:
     """Say when the change began: as the diagnosis dates it, as the segments show it, or its log.
 
-    The onset of a cause is fitted to every row, and told more closely than a shift of segments.
+    The onset of a cause is fitted to every row, and told more closely than a shift of segments. It
+    does not count outside the interval of the shift: another cause may be of another day.
     """
-    dated: list[tuple[Row, str]] = [(cause, 'onset') for cause in row.get('causes') or ()]
+    low, high = (row.get(f'shift_since_{end}') for end in ('low', 'high'))
+    dated: list[tuple[Row, str]] = [
+        (cause, 'onset') for cause in row.get('causes') or ()
+        if not (low and high and cause.get('onset')) or low <= cause['onset'] <= high
+    ]  # fmt: skip
     dated += [(row, f'{name}_since') for name in ('shift', 'change')]
     for of, name in dated:
         if of.get(name):

@@ -175,7 +175,8 @@ class GatewayUnit:
         if last is None:
             return Item(f'signal {topic}', Level.WARN, 'Nothing came yet.', values)
         told = f'{last.value:.6g} {unit}, {status}, {age_s:.1f} s old.'
-        return Item(f'signal {topic}', Level.OK, told, values)
+        level = Level.WARN if last.quality == Quality.BAD else Level.OK
+        return Item(f'signal {topic}', level, told, values)
 
     def _message(self, sample: Sample) -> PlantSample:
         message = PlantSample(header=header(sample.time_ns, self.unit.tag))

@@ -81,8 +81,8 @@ def curve_shape_sentence(values: dict[str, float]) -> str:
 def either_bend_sentence(one: dict[str, float], other: dict[str, float]) -> str:
     """Say a bend that may be of either sign."""
     return (
-        f'The curve has either {_bend(one)} or {_bend(other)}, which straight pieces do not '
-        'follow (overlap of valves); this record cannot tell which.'
+        'The curve has a bend that straight pieces do not follow (overlap of valves): '
+        f'{_bend(one)} and {_bend(other)} explain the record about equally well.'
     )
 
 
