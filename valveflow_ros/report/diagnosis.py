@@ -146,7 +146,7 @@ def _wrong(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
     ]
     if data.answers:
         parts.append(answer_figure(data.answers))
-    parts += [map_figure(m, data) for m in data.maps]
+    parts += [map_figure(m, data) for m in data.maps if m.shown_before or m.shown_after]
     return Section('1. What is wrong', parts)
 
 
@@ -366,17 +366,19 @@ def answer_figure(answers: Sequence[Answer]) -> Figure:
     """Return the mean residual around fast moves, opening and closing apart."""
     traces = []
     for a in answers:
-        way = f'{"opening" if a.up else "closing"}, {counted(a.moves, "move")}'
+        way = 'opening' if a.up else 'closing'
         for (name, _, dash), values in zip(_BOTH, (a.before, a.after), strict=True):
             traces.append(_marked(
                 rounded(a.time_s, 6), values, f'{name}, {way}', 'steady' if a.up else 'slope',
                 dash, '%{x:.0f} s<br>%{y:+.3~g} MW',
             ))  # fmt: skip
     chance = max(a.chance for a in answers)
+    moves = ' and '.join(f'{a.moves} {"opening" if a.up else "closing"}' for a in answers)
     return Figure(
         'fast-moves',
-        '<b>Mean residual around fast moves of the valve.</b> A slow or early answer shows here '
-        f'only. By chance a point lies within ±{plain(chance, 2)} MW.',
+        f'<b>Mean residual around fast moves of the valve</b> ({moves}). Only this picture shows '
+        'whether the unit answers late or early. By chance a point lies within '
+        f'±{plain(chance, 2)} MW.',
         'Mean residual from a minute before to five minutes after fast moves.', traces,
         {'xaxis': axis('time after the move (s)'), 'yaxis': axis('mean residual (MW)')},
         height=340,
