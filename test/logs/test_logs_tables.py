@@ -292,7 +292,8 @@ def test_a_missing_column_is_one_sentence_with_the_cure(tmp_path, columns, match
 def test_the_time_may_be_missing_too(tmp_path):
     path = csv(tmp_path, '1,2,3,4', header=HEADER.partition(',')[2])
     with pytest.raises(
-        InputError, match=r"no column was recognised as time; .*--column time=THEIRS, or say with --period "
+        InputError,
+        match=r'no column was recognised as time; .*--column time=THEIRS, or say with --period ',
     ):
         read_table(path)
 

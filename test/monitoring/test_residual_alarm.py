@@ -331,7 +331,7 @@ def test_what_stands_is_told_again_once_a_day(steps, state, begun):
         if state in (SHELVED, SUPPRESSED):
             assert change.sentence == first[1].sentence
         else:
-            assert change.sentence.startswith('It stands since 20')
+            assert change.sentence.startswith('Active since 20')
     assert alarm.last == again[-1][1]
 
 
@@ -344,7 +344,7 @@ def test_what_stands_is_told_again_once_a_day(steps, state, begun):
         ([(1.07, 1)], r'3\.2 MW more'),
         ([(-1.07, 1)], r'3\.2 MW less'),
         ([(1.07, 1), 'acknowledge'], r'^Acknowledged; .* 3\.2 MW more'),
-        ([(2.0, 1), 'shelve'], r'^Put aside until 20\d\d-\d\d-\d\d \d\d:\d\d UTC; '),
+        ([(2.0, 1), 'shelve'], r'^Shelved until 20\d\d-\d\d-\d\d \d\d:\d\d UTC; '),
         ([(2.0, 1), (NAN, 30)], r'could not be judged for 0\.5 min'),
         ([(0.0, 1), (NAN, 30), (0.0, 10)], r'^It can be judged again\.'),
     ],

@@ -354,7 +354,7 @@ def _introduce(options: argparse.Namespace, fault_ns: int) -> None:
         f'{moment(DEFAULT_START_NS)} UTC on, {speed}.',
         f'Hidden in it: from {moment(fault_ns)} on one of the valves gives up to '
         f'{-_FAULT_MW:g} MW less, whenever the load needs that valve. The monitor is not told.',
-        'To look on from another terminal (after: source env.sh): '
+        'To watch from another terminal (after: source env.sh): '
         f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]} valveflow watch',
         starting,
     ):
