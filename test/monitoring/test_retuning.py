@@ -183,7 +183,7 @@ def test_a_shorter_window_keeps_its_newest_rows():
 )
 def test_nothing_of_another_unit_is_used(changes):
     _, saved = saved_after(plant_table(3, N))
-    with pytest.raises(DataError, match='Nothing of it can be used'):
+    with pytest.raises(DataError, match='No part of it can be used'):
         carried(saved, changes)
 
 
@@ -294,7 +294,7 @@ def test_of_what_nothing_can_be_used_says_so(lost):
     _, saved = saved_after(plant_table(3, N))
     for key in lost:
         saved[key] = 'x'
-    with pytest.raises(DataError, match='Nothing of it can be used'):
+    with pytest.raises(DataError, match='No part of it can be used'):
         carried(saved, {})
 
 
