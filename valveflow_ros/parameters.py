@@ -207,13 +207,15 @@ _PLAUSIBLE = (
 _TIME_BASE = (
     Parameter('sample_period', 1.0, 's', 'Step of the sample table.', 0.01, 3600.0),
     Parameter('hold_limit', 10.0, 's',
-              'A value is held at most this long; older it is stale and the sample is bad.',
+              'A value is used for at most this time; then the signal is stale and the sample '
+              'is bad.',
               0.01, 86400.0),
     Parameter('lateness', 2.0, 's',
               'How long a row waits for slower topics before it is closed.', 0.0, 3600.0),
     Parameter('clock_jump', 15.0, 's',
-              'A stamp further ahead than this needs two more instants like it to be believed; '
-              'stamps further behind than this, twenty in a row, set aside the rows they passed.',
+              'A stamp further ahead than this is accepted after two more such times; after '
+              'twenty '
+              'stamps in a row further behind, the rows later than the new time are set aside.',
               1.0, 1e6),
     Parameter('window_days', 10.0, 'd', 'Length of the rolling window.', 0.02, 60.0),
 )  # fmt: skip
@@ -233,7 +235,7 @@ _MODEL = (
     Parameter('delay', 10.0, 's', 'Largest delay tau expected.', 0.0, 600.0),
     Parameter('block', 10.0, 's', 'Length of the means the segmenter works on.', 0.01, 7200.0),
     Parameter('longest_segment', 1800.0, 's',
-              'A segment that lasts longer is cut here and goes on without a transient.',
+              'A longer segment is divided here; the next part begins without a transient.',
               60.0, 864000.0),
     Parameter('steady_min', 120.0, 's', 'Shortest steady-state segment.', 0.0, 864000.0),
     Parameter('slope_min', 120.0, 's', 'Shortest slope-response segment.', 0.0, 864000.0),
@@ -251,11 +253,11 @@ _MODEL = (
               1.0, 1000.0),
     Parameter('temperature_spread_limit', 15.0, 'K',
               'Spread of the main steam temperature over the special samples (central 95 %) '
-              "beyond which the paper's condition of an unchanged temperature is flagged.",
+              'beyond which a warning says that the temperature was not constant.',
               0.1, 500.0),
     Parameter('model_file', '', '',
-              'An extended_model.json of valveflow diagnose: its causes are taken out of opening '
-              'and power before anything else; empty takes out nothing.'),
+              'An extended_model.json of valveflow diagnose: the effect of its causes is '
+              'removed from opening and power first; empty: nothing is removed.'),
 )  # fmt: skip
 
 _FIT = (
@@ -284,10 +286,10 @@ _ALARM = (
     Parameter('alarm_run_length', 30.0, 'd',
               'Mean time between false residual alarms; limits follow from the clean residual.',
               0.5, 3650.0, live=True),
-    Parameter('alarm_block', 60.0, 's', 'Time over which the alarm averages the residual at once.',
+    Parameter('alarm_block', 60.0, 's', 'Length of the means of the residual for the alarm.',
               1.0, 86400.0, live=True),
     Parameter('alarm_floor', 1.0, 'MW',
-              'Lasting shifts below this need not be found; in force from the next fit on, as '
+              'Smaller lasting shifts are not important; applies from the next fit on, like '
               'alarm_run_length and alarm_block.', 0.0, 1e4, live=True),
     Parameter('alarm_limit', 0.0, 'MW',
               'Fixed limit of the running mean of the residual; 0 leaves it to alarm_run_length.',
@@ -303,9 +305,9 @@ _ALARM = (
     Parameter('alarm_dead_band', 0.3, '', 'The return is judged at limit x (1 - dead band).',
               0.0, 0.9, live=True),
     Parameter('alarm_latch', True, '',
-              'An alarm stays until it has returned and was acknowledged.', live=True),
+              'An alarm stays until its condition has gone and it was acknowledged.', live=True),
     Parameter('alarm_shelve_time', 28800.0, 's',
-              'An alarm that was put aside comes back by itself after this time.',
+              'A shelved alarm comes back by itself after this time.',
               60.0, 604800.0, live=True),
     Parameter('alarm_suppress_time', 3600.0, 's',
               'The residual alarm is suppressed when it could not be judged for this long; it '
@@ -313,7 +315,7 @@ _ALARM = (
               'alarm_block, or at once if it changes.',
               1.0, 86400.0, live=True),
     Parameter('alarm_flood', 5, '',
-              'Most announcements of one alarm in ten minutes; more are counted and held back.',
+              'Most announcements of one alarm in ten minutes; more are counted and not sent.',
               1, 100, live=True),
 )  # fmt: skip
 

@@ -9,6 +9,7 @@ import pytest
 from logged import rewritten
 from monitor_recording import FLOAT64, Monitor, cdr, diagnosis, recording
 
+from valveflow_ros.interface.logs import open_log as open_whole_log
 from valveflow_ros.interface.logs import steps_of
 from valveflow_ros.interface.settings import settings_for
 from valveflow_ros.logs import open_log, read_table
@@ -164,3 +165,23 @@ def test_export_writes_what_a_monitor_said(run, logs, tmp_path):
     assert run('export', said, '-o', out, '--outputs', '--overwrite').status == 0
     none = run('export', logs / 'plant.csv', '-o', out, '--outputs').refused()
     assert 'holds nothing that a monitor said' in none
+
+
+def test_recover_says_what_it_cannot_see(run, logs, tmp_path):
+    """A byte that flips outside of the chunks costs no message, and is not called undamaged."""
+    content = bytearray((logs / 'plant.mcap').read_bytes())
+    content[-12] ^= 0x10
+    broken = tmp_path / 'a.mcap'
+    broken.write_bytes(content)
+    said = run('recover', broken, '-o', tmp_path / 'b.mcap').out
+    assert 'no chunk is damaged' in said
+    assert 'Metadata has no checksum: damage there is not seen.' in said
+    assert 'no damage' not in said
+
+
+def test_a_folder_named_by_a_dot_has_its_name(logs, tmp_path, monkeypatch):
+    home = tmp_path / 'unit7'
+    home.mkdir()
+    (home / 'plant.mcap').write_bytes((logs / 'plant.mcap').read_bytes())
+    monkeypatch.chdir(home)
+    assert open_whole_log('.').name == 'unit7'

@@ -106,7 +106,7 @@ class Desk:
 
 def held_in(change):
     """Return how many announcements a sentence says were held back."""
-    found = re.search(r'(\d+) announcements? of it', change.sentence)
+    found = re.search(r'(\d+) announcements? w', change.sentence)
     return int(found.group(1)) if found else 0
 
 

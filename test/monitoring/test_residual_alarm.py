@@ -331,7 +331,7 @@ def test_what_stands_is_told_again_once_a_day(steps, state, begun):
         if state in (SHELVED, SUPPRESSED):
             assert change.sentence == first[1].sentence
         else:
-            assert change.sentence.startswith('It stands since 20')
+            assert change.sentence.startswith('Active since 20')
     assert alarm.last == again[-1][1]
 
 
@@ -344,9 +344,9 @@ def test_what_stands_is_told_again_once_a_day(steps, state, begun):
         ([(1.07, 1)], r'3\.2 MW more'),
         ([(-1.07, 1)], r'3\.2 MW less'),
         ([(1.07, 1), 'acknowledge'], r'^Acknowledged; .* 3\.2 MW more'),
-        ([(2.0, 1), 'shelve'], r'^Put aside until 20\d\d-\d\d-\d\d \d\d:\d\d UTC; '),
+        ([(2.0, 1), 'shelve'], r'^Shelved until 20\d\d-\d\d-\d\d \d\d:\d\d UTC; '),
         ([(2.0, 1), (NAN, 30)], r'could not be judged for 0\.5 min'),
-        ([(0.0, 1), (NAN, 30), (0.0, 10)], r'^It can be judged again\.'),
+        ([(0.0, 1), (NAN, 30), (0.0, 10)], r'^The alarm can be judged again\.'),
     ],
 )
 def test_sentences_say_how_much_which_way_and_until_when(steps, words):
@@ -361,7 +361,7 @@ def test_where_the_residual_is_gone_it_still_says_how_far_it_was(share, words):
     _, told = lived(slow, (share, 1), 'restore', (0.0, DAY_S + 60))
     (_, first), (_, again) = told
     assert words in first.sentence
-    assert f'The unit gave {words} than the valve curve says; ' in again.sentence
+    assert f'The unit gave {words} than the valve curve says. ' in again.sentence
 
 
 def test_a_change_carries_its_numbers():

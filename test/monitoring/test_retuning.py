@@ -91,7 +91,7 @@ def test_segments_are_those_that_the_other_settings_find_in_the_same_rows(name):
     assert [s.end_ns for s in monitor.special_segments()] == [
         s.end_ns for s in fresh.special_segments()
     ]
-    assert f'{name} changed. Segments were found anew in {N} rows.' in sentence
+    assert f'{name} changed. Segments were found again in {N} rows.' in sentence
     numbers = [s.number for s in monitor.special_segments()]
     assert numbers == sorted(set(numbers))
     assert numbers[0] > max(s.number for s in before.special_segments())
@@ -155,7 +155,9 @@ def test_curve_reference_and_alarm_outlast_every_change_that_is_no_other_unit(ch
     assert sentence.startswith('Since the state was saved ')
     assert all(name in sentence and name in entry.text for name in changes)
     assert sentence.endswith('The curve, the reference and the alarms stay.')
-    assert ('The window of rows begins anew.' in sentence) == ('sample_period' in changes)
+    assert ('The window of rows is empty and fills again.' in sentence) == (
+        'sample_period' in changes
+    )
     # It goes on, with alarm and predictions.
     later = int(before.last_ns) + NS_PER_S
     events = feed_rows(monitor, plant_table(9, 400, start_ns=later))
@@ -181,7 +183,7 @@ def test_a_shorter_window_keeps_its_newest_rows():
 )
 def test_nothing_of_another_unit_is_used(changes):
     _, saved = saved_after(plant_table(3, N))
-    with pytest.raises(DataError, match='Nothing of it can be used'):
+    with pytest.raises(DataError, match='No part of it can be used'):
         carried(saved, changes)
 
 
@@ -189,7 +191,7 @@ def test_a_reference_over_an_axis_that_is_no_longer_asked_for_is_let_go():
     before = with_reference()
     monitor, sentence, _ = carried(from_bytes(to_bytes(before.snapshot())), {'axis': 'opening'})
     assert monitor.reference.curve is None
-    assert 'Let go: the reference.' in sentence
+    assert 'Discarded: the reference.' in sentence
     assert monitor.predicting == before.characteristic
 
 
@@ -230,7 +232,7 @@ def test_a_part_of_another_version_costs_that_part_alone(key, how):
     assert (monitor.reference.curve == before.reference.curve) == (key != 'reference')
     assert (monitor.characteristic == before.characteristic) == (key != 'force')
     assert (monitor.alarm.last == before.alarm.last) == (key != 'alarm')
-    assert ('Let go' in sentence) == (key not in ('segmenter', 'refits'))
+    assert ('Discarded' in sentence) == (key not in ('segmenter', 'refits'))
     assert monitor.predicting is not None
     feed_rows(monitor, plant_table(9, 100, start_ns=int(before.last_ns) + NS_PER_S))
     assert monitor.rows == before.rows + 100
@@ -274,7 +276,7 @@ def test_a_shift_alarm_of_another_version_costs_no_reference():
     saved['reference']['alarm'] = {'of': 'another version'}
     monitor, sentence, _ = carried(saved, {})
     assert same_curves(monitor, before)
-    assert 'Let go: the alarm on its shift.' in sentence
+    assert 'Discarded: the alarm on its shift.' in sentence
 
 
 def test_a_memory_of_the_predictor_of_another_version_costs_its_evidence_alone():
@@ -284,7 +286,7 @@ def test_a_memory_of_the_predictor_of_another_version_costs_its_evidence_alone()
     saved['diagnosing']['mismatch'] = {}
     monitor, sentence, _ = carried(saved, {})
     assert same_curves(monitor, before)
-    assert 'Let go' not in sentence
+    assert 'Discarded' not in sentence
 
 
 @pytest.mark.parametrize('lost', [('rows',), ('window', 'force', 'reference')])
@@ -292,7 +294,7 @@ def test_of_what_nothing_can_be_used_says_so(lost):
     _, saved = saved_after(plant_table(3, N))
     for key in lost:
         saved[key] = 'x'
-    with pytest.raises(DataError, match='Nothing of it can be used'):
+    with pytest.raises(DataError, match='No part of it can be used'):
         carried(saved, {})
 
 

@@ -51,7 +51,7 @@ def history() -> History:
     curves += [curve(k, 4 * k + 4, KNOTS, lowered) for k in (3, 4)]
     states = (
         (1, AlarmState.SUPPRESSED, 'It cannot be judged.'),
-        (2, AlarmState.NORMAL, 'It can be judged again.'),
+        (2, AlarmState.NORMAL, 'The alarm can be judged again.'),
         (14, AlarmState.UNACKNOWLEDGED, 'The unit gives 6 MW less & it <lasts>.'),
         (15, AlarmState.ACKNOWLEDGED, 'Acknowledged.'),
         (20, AlarmState.NORMAL, 'The unit follows the curve.'),

@@ -23,7 +23,7 @@ BARS = {
     'stands, nobody acknowledged': AlarmState.UNACKNOWLEDGED,
     'stands, acknowledged': AlarmState.ACKNOWLEDGED,
     'gone, nobody acknowledged': AlarmState.RETURNED_UNACKNOWLEDGED,
-    'put aside': AlarmState.SHELVED,
+    'shelved': AlarmState.SHELVED,
     'cannot be judged': AlarmState.SUPPRESSED,
     'out of service': AlarmState.OUT_OF_SERVICE,
 }

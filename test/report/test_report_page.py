@@ -62,7 +62,7 @@ def test_the_drawing_library_inside_is_the_installed_one():
 
 def test_the_answer_comes_first_with_its_numbers(report):
     words = words_of(report)
-    assert words.index('The answer') < words.index('The moments that carry it')
+    assert words.index('The answer') < words.index('The special segments')
     for part in (
         '2 pieces', 'from 800 to 1500', '100 to 195 MW', '0.2000 ± 0.0012', '−60.0 ± 1.0',
         '800.0 to 1200.0', '1189 to 1211', '4.0 times less', '11.50 ± 0.40', '3.25 ± 0.30',
@@ -181,7 +181,7 @@ def test_what_endangers_the_answer_stands_beside_it(make):
         source=replace(c.source, temperature_spread_k=31.0, temperature_flag=True),
     )  # fmt: skip
     words = words_of(identification_report(data))
-    answer = words[: words.index('The moments that carry it')]
+    answer = words[: words.index('The special segments')]
     for part in ('31.0 K', 'does not rise', 'Not refined.', 'does not raise the power'):
         assert part in answer
 

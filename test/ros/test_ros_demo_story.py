@@ -82,12 +82,21 @@ def test_a_diagnosis_is_told_in_full_once(capsys: pytest.CaptureFixture[str]) ->
     for hours in (9, 20):
         story.on_diagnosis(diagnosis(FAULT + hours * HOUR, 'curve_step', sentence='It bends.'))
     assert [line[18:] for line in lines(capsys)] == [
-        'diagnosis of the data until then: nothing found',
+        'diagnosis of the data so far: nothing found',
         '--- the fault begins; no curve so far ---',
-        'diagnosis of the data until then: nothing found; 3 h of them are with the fault',
-        'diagnosis of the data until then: named curve_step. It bends.',
-        'diagnosis of the data until then: named curve_step, as before',
+        'diagnosis of the data so far: nothing found; 3 h of them are with the fault',
+        'diagnosis of the data so far: named curve_step. It bends.',
+        'diagnosis of the data so far: named curve_step, as before',
     ]
+
+
+def test_the_times_of_the_lines_never_go_back(capsys: pytest.CaptureFixture[str]) -> None:
+    story = Story(FAULT)
+    story.on_alarm(alarm(FAULT + 5 * HOUR, 1))
+    story.on_diagnosis(diagnosis(FAULT + 3 * HOUR))
+    begins, raised, late = lines(capsys)
+    assert begins[:16] < raised[:16] == late[:16]
+    assert late.endswith(f'(at {moment(FAULT + 3 * HOUR)})')
 
 
 def test_an_alarm_before_the_fault_is_not_its_alarm(capsys: pytest.CaptureFixture[str]) -> None:

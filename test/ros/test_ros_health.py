@@ -431,7 +431,10 @@ def after(values: list[float], shelved: bool = False) -> Item:
 def test_diagnostics_tell_the_state_that_no_announcement_told() -> None:
     item = after([2.0, 0.0] * 5 + [2.0])
     assert (item.level, item.values['State']) == (Level.ERROR, 'unacknowledged')
-    assert (item.values['Occurrences'], item.values['Announcements held back']) == (6, 4)
+    assert (
+        item.values['Occurrences'],
+        item.values['Announcements suppressed by alarm_flood'],
+    ) == (6, 4)
 
 
 def test_diagnostics_tell_of_shelf_and_suppression() -> None:

@@ -259,7 +259,7 @@ def test_an_alarm_is_put_aside_and_taken_back_and_the_recording_repeats(
     (raised,) = (a for a in listener.alarms if a.name == 'curve_shift' and a.occurrence)
     assert raised.first_out == 'curve_shift'
     answer = listener.trigger('shelve_alarms')
-    assert (answer.success, 'put aside for 8 h' in answer.message) == (True, True)
+    assert (answer.success, 'shelved for 8 h' in answer.message) == (True, True)
     listener.until(lambda: Alarm.SHELVED in states(listener), 'the shelf')
     assert not listener.trigger('acknowledge_alarms').success
     assert listener.trigger('unshelve_alarms').success

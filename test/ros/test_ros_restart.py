@@ -175,7 +175,7 @@ def test_what_a_service_confirmed_survives_a_kill_that_follows_at_once(
     before = 'from before, alarm residual, acknowledged'
     plant.until(lambda: before in processes.output(second), 'the alarm of before')
     told = processes.output(second)
-    assert 'Since the state was saved steady_min changed. Segments were found anew in ' in told
+    assert 'Since the state was saved steady_min changed. Segments were found again in ' in told
     late: list[Alarm] = []
     plant.node.create_subscription(Alarm, f'{MONITOR}/alarms', late.append, LATCHED)
     plant.until(lambda: [a for a in late if a.occurrence], 'the standing alarm')
@@ -183,7 +183,7 @@ def test_what_a_service_confirmed_survives_a_kill_that_follows_at_once(
     assert not [a for a in late if a.state not in (Alarm.ACKNOWLEDGED, Alarm.NORMAL)]
     answer = operate('residual', 'shelve')
     assert answer.success
-    assert answer.message.startswith('The alarm residual is put aside for 8 h; then it comes back')
+    assert answer.message.startswith('The alarm residual is shelved for 8 h; then it comes back')
     plant.until(lambda: plant.listeners() - known, 'the new listener')
     plant.play(21000, 21100)
     plant.quiet(1.0)

@@ -866,7 +866,7 @@ def test_a_run_with_other_parameters_goes_on_in_a_new_recording_and_says_what_it
         assert kinds == [JournalKind.RESUMED, JournalKind.SETTINGS]
         told = (
             Level.OK,
-            'Since the state was saved steady_min changed. Segments were found anew in 0 rows. '
+            'Since the state was saved steady_min changed. Segments were found again in 0 rows. '
             'The reference and the alarms stay.',
         )
         assert (told in logged) == (folder is None)
@@ -937,7 +937,7 @@ def test_a_state_of_another_version_is_used_where_it_fits_and_the_rest_is_told(h
     assert ours.continues
     assert found.monitor.reference.curve == CURVE
     assert logged == [(
-        Level.WARN, 'The saved state is of another version. Let go: the last diagnosis. The '
+        Level.WARN, 'The saved state is of another version. Discarded: the last diagnosis. The '
         'reference and the alarms stay.',
     )]  # fmt: skip
 

@@ -233,7 +233,7 @@ def add_mapping(parser: ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--constant', action='append', default=[], metavar='NAME=VALUE[:UNIT]',
-        help='a signal that was not logged and hardly changes',
+        help='a signal that is not in the log and hardly changes',
     )  # fmt: skip
     add_table(parser, 'column')
 

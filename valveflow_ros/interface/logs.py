@@ -272,9 +272,8 @@ def open_log(
         return look(said)
 
     contents = gather_refusals(path, look, mapping, again)
-    return replace(
-        _understood(path.name, contents, mapping, progress), source=path, mapping=mapping
-    )
+    name = path.resolve().name if path.name in ('', '..') else path.name
+    return replace(_understood(name, contents, mapping, progress), source=path, mapping=mapping)
 
 
 def read_covariate(log: Log, name: str, said: str) -> Series:

@@ -403,15 +403,15 @@ class Alarm(AlarmStateMachine, ABC):
         """Return the sentence, with what shelf and suppression have to do with it."""
         until_ns = self.shelved_until_ns
         if until_ns is not None:
-            return f'Put aside until {_utc(until_ns)}; new alarms are not hidden by that.'
+            return f'Shelved until {_utc(until_ns)}; new alarms are not hidden.'
         if state == AlarmState.SUPPRESSED:
-            return f'{self._blind()} What the alarm was is kept until then.'
+            return f'{self._blind()} The alarm keeps its state meanwhile.'
         if previous == state:
-            return f'It stands since {_utc(self.raised_ns)}. {sentence}'
+            return f'Active since {_utc(self.raised_ns)}. {sentence}'
         if previous == AlarmState.SHELVED:
-            return f'No longer put aside. {sentence}'
+            return f'No longer shelved. {sentence}'
         if previous == AlarmState.SUPPRESSED:
-            return f'It can be judged again. {sentence}'
+            return f'The alarm can be judged again. {sentence}'
         return sentence
 
     def _first_out(self) -> str:
@@ -434,7 +434,7 @@ def _missed(count: int) -> str:
     if count <= 0:
         return ''
     return (
-        f'It comes and goes: {count} announcement{"" if count == 1 else "s"} of it '
+        f'The alarm comes and goes: {count} announcement{"" if count == 1 else "s"} '
         f'{"was" if count == 1 else "were"} held back.'
     )
 

@@ -329,8 +329,8 @@ class ResidualAlarm(Alarm):
             return Content(value, _LIMIT, '', _sentence(state, shift_mw))
         side = 'more' if self._left_mw > 0.0 else 'less'
         sentence = (
-            f'The unit gave {abs(self._left_mw):.1f} MW {side} than the valve curve says; at the '
-            'openings since then the residual does not show it, and does not show that it is over.'
+            f'The unit gave {abs(self._left_mw):.1f} MW {side} than the valve curve says. The '
+            'openings since then do not show whether the difference is still there.'
         )
         return Content(value, _LIMIT, '', sentence)
 
@@ -347,14 +347,14 @@ def _sentence(state: AlarmState, shift_mw: float) -> str:
     side = 'more' if shift_mw > 0.0 else 'less'
     known = abs(shift_mw) > 0.0
     if state == AlarmState.UNACKNOWLEDGED and not known:
-        return 'The unit has left its valve curve; there is no residual to tell by how much.'
+        return 'The unit does not follow its valve curve; the difference in MW is not known.'
     if state == AlarmState.UNACKNOWLEDGED:
         return (
-            f'The unit gives {abs(shift_mw):.1f} MW {side} than the valve curve says, and it '
-            'lasts: check what changed, or re-identify.'
+            f'The unit gives {abs(shift_mw):.1f} MW {side} than the valve curve says, and this '
+            'continues: check what changed, or identify again.'
         )
     if state == AlarmState.ACKNOWLEDGED and not known:
-        return 'Acknowledged; there is no residual to tell yet.'
+        return 'Acknowledged; the difference in MW is not known yet.'
     if state == AlarmState.ACKNOWLEDGED:
         return f'Acknowledged; the unit still gives {abs(shift_mw):.1f} MW {side} than expected.'
     if state == AlarmState.RETURNED_UNACKNOWLEDGED:
@@ -520,7 +520,7 @@ class ShiftAlarm(Alarm):
         self._ranges += [(p.u_from, p.u_to) for p in shift.pieces if p.moved]
 
     def _content(self, state: AlarmState) -> Content:
-        sentence = self._sentence or 'No piece of the curve is known to have moved.'
+        sentence = self._sentence or 'No piece of the curve is known to have changed.'
         cleared = AlarmState.RETURNED_UNACKNOWLEDGED, AlarmState.NORMAL
         if state == AlarmState.ACKNOWLEDGED or (self._before, state) == cleared:
             sentence = f'Acknowledged. {sentence}'

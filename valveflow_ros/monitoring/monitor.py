@@ -47,7 +47,7 @@ _PARTS = {
     'force': 'the curve', 'reference': 'the reference', 'diagnosing': 'the last diagnosis',
     'alarm': 'the residual alarm', 'part of reference': 'the alarm on its shift',
 }  # fmt: skip
-MIXED = 'The rows of this fit are from before and since something went wrong; the next are not.'
+MIXED = 'This fit used rows from before and after the onset of a fault; the next fit does not.'
 
 
 class Monitor(Memory):
@@ -329,14 +329,14 @@ class Monitor(Memory):
         Raises
         ------
         DataError
-            Nothing of it can be used.
+            No part of it can be used.
         """
         changed = self.settings.changes(then)
         depends = max((parameter(n).depends for n in changed), default=Depends.NOTHING)
         lost = {'window'} if depends == Depends.ROWS else set()
         parts = self._usable(saved, lost)
         if depends == Depends.ALL or 'rows' in lost or {'window', 'force', 'reference'} <= lost:
-            raise DataError('Nothing of it can be used.')
+            raise DataError('No part of it can be used.')
         if 'window' in lost:
             parts['window']['seen'] = parts['rows']
         self.restore(parts)
@@ -512,13 +512,13 @@ class Monitor(Memory):
         """Say what changed since a state was saved, and what of it was let go."""
         told = f'Since the state was saved {listed(names)} changed.' if names else ''
         if 'window' in lost:
-            told += ' The window of rows begins anew.'
+            told += ' The window of rows is empty and fills again.'
         elif 'window_days' in names:
             told += f' The window has {counted(len(self._window), "row")} now.'
         elif 'segmenter' in lost:
-            told += f' Segments were found anew in {counted(len(self._window), "row")}.'
+            told += f' Segments were found again in {counted(len(self._window), "row")}.'
         if gone := [words for key, words in _PARTS.items() if key in lost]:
-            told += f' Let go: {listed(gone)}.'
+            told += f' Discarded: {listed(gone)}.'
         there = {
             'force': self.characteristic, 'reference': self.reference.curve,
             'diagnosing': self.diagnosing.last,
@@ -537,10 +537,13 @@ class Monitor(Memory):
         if since_ns is None:
             return ''
         if not since_ns:
-            return 'Something is wrong, and since when is not known: it may mix what was and is.'
+            return (
+                'Something is wrong and its onset is not known: this curve may mix data from '
+                'before and after.'
+            )
         return (
-            f'Provisional: something is wrong since {minute(since_ns)}, and this is the plant '
-            'since then. The alarms are judged by the reference.'
+            f'Provisional: something is wrong since {minute(since_ns)}, and this curve '
+            'is from the data since then. The alarms are judged by the reference.'
         )
 
     def _diagnosed_since(self) -> int:

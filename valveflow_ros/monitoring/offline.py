@@ -28,7 +28,7 @@ from valveflow_ros.signals.align import Aligned, Aligner
 
 Progress = Callable[[float, str], None]
 _ALARM_ACTIONS = {JournalKind[action.name]: action for action in AlarmAction}
-CLOCK_BACK = 'The clock went back; the rows it had passed are set aside.'
+CLOCK_BACK = 'The clock went back; the rows later than the new time are set aside.'
 
 
 def _quiet(_share: float, _what: str) -> None:

@@ -100,9 +100,9 @@ def form_words(c: Characteristic) -> str:
     if c.axis != OPENING:
         return ''
     return (
-        f'The knees of this valve stand at fixed openings: the power follows {mine} with c = '
-        f'{decimals(c.offset_mw, 1)} MW. On stretches held out that form errs by '
-        f'{plain(form.rmse_mw, 2)} MW and {form.other} by {plain(form.rmse_other_mw, 2)} MW '
+        f'The breakpoints of this valve are at fixed openings: the power follows {mine} with c = '
+        f'{decimals(c.offset_mw, 1)} MW. On held-out data the error of this form is '
+        f'{plain(form.rmse_mw, 2)} MW, that of {form.other} {plain(form.rmse_other_mw, 2)} MW '
         f'(log-likelihood {form.log_likelihood_gain:+.0f}).'
     )
 
@@ -135,7 +135,8 @@ def answer_words(data: Identified) -> str:
         f'{percent(explained(data))} of the variance of the power in '
         f'{counted(c.source.steady, "steady-state segment")} and '
         f'{counted(c.source.slope_response, "slope-response segment")} '
-        f'({counted(c.source.samples, "sample")}), and leaves a typical difference of '
+        f'({counted(c.source.samples, "sample")}). The typical difference between curve and '
+        'samples is '
         f'{plain(c.residuals.rmse_mw, 2)} MW.'
     )
     told = [text(doubt(data))]
@@ -143,13 +144,14 @@ def answer_words(data: Identified) -> str:
         limit = plain(data.settings.real('temperature_spread_limit'))
         told.append(
             f'The main steam temperature spread over {plain(c.source.temperature_spread_k, 3)} K '
-            f'in the special segments (limit {limit} K). The method assumes it unchanged: part '
-            'of what looks like the valve may be the temperature.'
+            f'in the special segments (limit {limit} K). The method assumes a constant one: part '
+            'of what the curve shows may come from the temperature.'
         )
     if any(p.slope <= 0.0 for p in c.pieces):
         told.append(
-            'A piece does not rise, so the curve has no inverse there and cannot be compensated '
-            'as it stands. A flat end is ordinary; a falling piece elsewhere is not.'
+            'On one piece the power does not rise with u, so the curve has no inverse there '
+            'and cannot be '
+            'compensated. A flat upper end is normal; a falling piece elsewhere is not.'
         )
     told += [text(n) for n in (held_words(c.held), *c.notes)]
     form = form_words(data.characteristic)
@@ -164,13 +166,13 @@ def _bends(c: Characteristic) -> str:
     steep = max(c.pieces, key=lambda p: p.slope)
     flat = min(c.pieces, key=lambda p: p.slope)
     said = (
-        f' The valve moves the unit most between u = {level(steep.u_from, 0)} and '
+        f' The power rises most between u = {level(steep.u_from, 0)} and '
         f'{level(steep.u_to, 0)} ({plain(steep.slope, 3)} MW per unit of u)'
     )
     there = f'between {level(flat.u_from, 0)} and {level(flat.u_to, 0)}'
     if flat.slope <= 0.0:
         return f'{said}; {there} opening further <b>does not raise the power</b>.'
-    weak = ': there it hardly answers' if flat.slope < _FLAT * steep.slope else ''
+    weak = ': there the valve hardly changes the power' if flat.slope < _FLAT * steep.slope else ''
     times = plain(steep.slope / flat.slope, 2)
     return f'{said}, and {times} times less {there} ({plain(flat.slope, 3)}){weak}.'
 
@@ -354,7 +356,8 @@ def choice_figure(choice: Choice, chosen: int) -> Figure:
 
 def _choice_caption(choice: Choice, chosen: int) -> str:
     words = (
-        '<b>Look for the elbow.</b> Above, what the best curve of J pieces leaves unexplained '
+        '<b>Look for the sharpest bend.</b> Above, the squared error of the best curve of J '
+        'pieces '
         '(on a logarithmic axis); each point is the exact optimum. Below, how sharply that line '
         'turns at J, eq. (24) of the paper: after the sharpest turn another piece gains little. '
     )

@@ -125,8 +125,8 @@ def opening_figure(data: Identified) -> Figure | None:
     ]  # fmt: skip
     caption = (
         '<b>How many MW one percent of opening gives.</b> The same curve against the opening of '
-        f'the valve, at the middle pressure of the record, {middle:.3g} MPa'
-        + (', and at those that nine tenths of it lie between.' if wide else '.')
+        f'the valve, at the median pressure of the record, {middle:.3g} MPa'
+        + (', and at its 5 % and 95 % quantiles.' if wide else '.')
     )
     words = f'Power against the valve opening at {middle:.3g} MPa.'
     layout = {'xaxis': axis('valve opening (%)'), 'yaxis': axis('generated power (MW)')}
@@ -136,12 +136,13 @@ def opening_figure(data: Identified) -> Figure | None:
 def _caption(data: Identified) -> str:
     c = data.characteristic
     parts = [
-        '<b>The curve should run through the middle of the cloud.</b> Colour: samples in '
-        'special segments, the stronger the more there are.'
+        '<b>The curve should run through the middle of the samples.</b> Colour: density of the '
+        'samples in special segments.'
     ]
     if data.at_pressure:
         parts.append(
-            f'The valve has its knees at fixed openings; all is shown{data.at_pressure}, at '
+            'The breakpoints of this valve are at fixed openings; the power is '
+            f'shown{data.at_pressure}, at '
             'other pressures the power goes with their ratio to the power '
             f'{data.characteristic.pressure_scale_exponent:.3g}.'
         )
@@ -163,7 +164,8 @@ def _caption(data: Identified) -> str:
     if c.pieces != c.partition_pieces:
         parts.append(
             'The dashed <span class="key raw">line</span> is the exact partition before the '
-            'dynamics were fitted with it; where it leaves the curve, ramps had bent it.'
+            'dynamics were fitted too; where it differs from the curve, the lag on ramps had '
+            'shifted it.'
         )
     return ' '.join(parts)
 

@@ -179,9 +179,10 @@ def coverage_figure(data: Identified) -> Figure | None:
     }  # fmt: skip
     share = percent(len(data.special) / len(known), 2)
     caption = (
-        '<b>Every piece needs blue.</b> How long the unit ran at each u; blue, the part inside '
+        '<b>Every piece needs special segments.</b> How long the unit ran at each u; blue, the '
+        'part in '
         f'special segments, {share} of all. Dotted, the breakpoints. Where there is '
-        'little blue the curve has little to stand on: more data at that load would help.'
+        'little blue, more data at that load would make the curve more certain.'
     )
     words = (
         f'Hours by u from {plain(float(edges[0]))} to {plain(float(edges[-1]))}; '

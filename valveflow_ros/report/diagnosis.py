@@ -54,8 +54,8 @@ from valveflow_ros.report.words import (
 )
 
 _HOW = (
-    'Means of bins with equally many minutes. A model that is right stays in the band, here and '
-    'below: that is how far chance reaches in one of a hundred records.'
+    'Means of bins with equally many minutes. A correct model stays in the band, here and '
+    'below: chance alone leaves the band in one of a hundred records.'
 )
 
 
@@ -120,9 +120,9 @@ def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
                 f'<b>{text(c.name)}</b>: {known}<b>What to do:</b> {text(c.to_do)}'
             ))  # fmt: skip
     parts.append(paragraph(
-        'On blocks of time that nothing was fitted to, the simulation misses the measured '
+        'On held-out data, the simulation differs from the measured '
         f'power by {level(d.rmse_simulation, 2)} MW, the extended model by '
-        f'{level(d.rmse_extended, 2)} MW; noise alone makes about '
+        f'{level(d.rmse_extended, 2)} MW; noise alone gives about '
         f'{level(d.rmse_noise_floor, 2)} MW.'
     ))  # fmt: skip
     if ranked:
@@ -146,7 +146,7 @@ def _wrong(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
     ]
     if data.answers:
         parts.append(answer_figure(data.answers))
-    parts += [map_figure(m, data) for m in data.maps]
+    parts += [map_figure(m, data) for m in data.maps if m.shown_before or m.shown_after]
     return Section('1. What is wrong', parts)
 
 
@@ -167,7 +167,7 @@ def _why(data: Diagnosed) -> Section:
     if d.disturbance:
         parts.append(paragraph(text(d.disturbance.sentence)))
     if d.rejected:
-        said = 'Other causes that were tried or could not be, and why they are not named:'
+        said = 'Other causes, and why they are not named:'
         parts.append(paragraph(said) + bullets(
             f'<b>{text(n)}</b>: {text(reason)}' for n, reason in d.rejected
         ))  # fmt: skip
@@ -201,8 +201,8 @@ def _proof(data: Diagnosed) -> Section:
     ]
     parts: list[str | Figure] = [
         paragraph(
-            'Every fifth block of the record was sealed: nothing was fitted to it, and it was '
-            'opened once. Root mean square difference there, of means over '
+            'Every fifth block of the record was held out: nothing was fitted to it, and it was '
+            'used once. Root mean square difference there, of means over '
             f'{duration(d.mean_s)}:'
         ),
         table(['model', 'MW'], rows),
@@ -216,8 +216,9 @@ def _proof(data: Diagnosed) -> Section:
         ]  # fmt: skip
         parts += [
             paragraph(
-                'What each cause is worth there; p is the chance of such a gain if the cause were '
-                'absent, with the number of causes tried in it:'
+                'What each cause gains there; p is the probability of such a gain by chance, '
+                'corrected for the '
+                'number of causes tried:'
             ),
             table(['cause', 'before (MW)', 'after (MW)', 'smaller by', 'p'], rows),
         ]
@@ -366,17 +367,19 @@ def answer_figure(answers: Sequence[Answer]) -> Figure:
     """Return the mean residual around fast moves, opening and closing apart."""
     traces = []
     for a in answers:
-        way = f'{"opening" if a.up else "closing"}, {counted(a.moves, "move")}'
+        way = 'opening' if a.up else 'closing'
         for (name, _, dash), values in zip(_BOTH, (a.before, a.after), strict=True):
             traces.append(_marked(
                 rounded(a.time_s, 6), values, f'{name}, {way}', 'steady' if a.up else 'slope',
                 dash, '%{x:.0f} s<br>%{y:+.3~g} MW',
             ))  # fmt: skip
     chance = max(a.chance for a in answers)
+    moves = ' and '.join(f'{a.moves} {"opening" if a.up else "closing"}' for a in answers)
     return Figure(
         'fast-moves',
-        '<b>Mean residual around fast moves of the valve.</b> A slow or early answer shows here '
-        f'only. By chance a point lies within ±{plain(chance, 2)} MW.',
+        f'<b>Mean residual around fast moves of the valve</b> ({moves}). Only this picture shows '
+        'whether the unit answers late or early. By chance a point lies within '
+        f'±{plain(chance, 2)} MW.',
         'Mean residual from a minute before to five minutes after fast moves.', traces,
         {'xaxis': axis('time after the move (s)'), 'yaxis': axis('mean residual (MW)')},
         height=340,
@@ -397,7 +400,7 @@ def segments_figure(segments: Sequence[SegmentGain]) -> Figure:
     ]  # fmt: skip
     return Figure(
         'segments',
-        f'<b>Special segments inside the sealed blocks.</b> {better} of {len(segments)} are '
+        f'<b>Special segments in the held-out blocks.</b> {better} of {len(segments)} are '
         'predicted better by the extended model.',
         f'{counted(len(segments), "segment")}, {better} of them predicted better.', traces,
         {'xaxis': time_axis(), 'yaxis': axis('RMSE (MW)')}, height=340,

@@ -208,7 +208,7 @@ _STATES = {
     AlarmState.UNACKNOWLEDGED: ('stands, nobody acknowledged', 'steady', 'diamond'),
     AlarmState.ACKNOWLEDGED: ('stands, acknowledged', 'chosen', 'circle'),
     AlarmState.RETURNED_UNACKNOWLEDGED: ('gone, nobody acknowledged', 'notice-rule', 'square'),
-    AlarmState.SHELVED: ('put aside', 'slope', 'triangle-up'),
+    AlarmState.SHELVED: ('shelved', 'slope', 'triangle-up'),
     AlarmState.SUPPRESSED: ('cannot be judged', 'data-soft', 'x'),
     AlarmState.OUT_OF_SERVICE: ('out of service', 'muted', 'cross'),
 }

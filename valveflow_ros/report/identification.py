@@ -72,7 +72,7 @@ def identification_page(data: Identified) -> Page:
         ]),
         *([shift] if (shift := shift_section(data)) else []),
         *history_sections(data.history),
-        Section('The moments that carry it', [f for f in evidence if f]),
+        Section('The special segments', [f for f in evidence if f]),
         _choice(c),
         _dynamics(c),
         Section('The data', [

@@ -160,6 +160,7 @@ class Story:
         self._fault_ns = fault_ns
         self._fault_told = False
         self._last_curve = self._cause = ''
+        self._last_told_ns = 0
         self._occurrences: dict[str, int] = {}
         self._raised_ns: list[int] = []
         self._named: list[str] = []
@@ -222,7 +223,7 @@ class Story:
         elif self._fault_told:
             hours = (until_ns - self._fault_ns) / _HOUR_NS
             told += f'; {hours:.0f} h of them are with the fault'
-        self._tell(until_ns, f'diagnosis of the data until then: {told}')
+        self._tell(until_ns, f'diagnosis of the data so far: {told}')
 
     def outcome(self) -> str:
         """Return how the fault was met, in a sentence."""
@@ -246,7 +247,11 @@ class Story:
         self._tell(self._fault_ns, f'--- the fault begins; {known} ---')
 
     def _tell(self, time_ns: int, words: str) -> None:
-        tell(f'{moment(time_ns)}  {words}')
+        """Print one line; the times of the lines never go back."""
+        if time_ns < self._last_told_ns:
+            words += f' (at {moment(time_ns)})'
+        self._last_told_ns = max(time_ns, self._last_told_ns)
+        tell(f'{moment(self._last_told_ns)}  {words}')
 
 
 class Watch(Node):
@@ -349,7 +354,7 @@ def _introduce(options: argparse.Namespace, fault_ns: int) -> None:
         f'{moment(DEFAULT_START_NS)} UTC on, {speed}.',
         f'Hidden in it: from {moment(fault_ns)} on one of the valves gives up to '
         f'{-_FAULT_MW:g} MW less, whenever the load needs that valve. The monitor is not told.',
-        'To look on from another terminal (after: source env.sh): '
+        'To watch from another terminal (after: source env.sh): '
         f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]} valveflow watch',
         starting,
     ):

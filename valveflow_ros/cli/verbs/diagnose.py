@@ -47,7 +47,7 @@ def arguments(parser: ArgumentParser) -> None:
     add_analysis(parser)
     parser.add_argument(
         '--model', metavar='FILE', type=Path,
-        help='characteristic.json or extended_model.json of an earlier log, to be held against '
+        help='characteristic.json or extended_model.json of an earlier log, to compare with '
         'this one; found anew without it',
     )  # fmt: skip
     parser.add_argument(

@@ -87,7 +87,9 @@ def run(options: Namespace, console: Console) -> VerbResult:
         return _from_history(options, console)
     mapping = mapping_of(options)
     if options.output is None and not options.dry_run:
-        raise UsageError('Name the log to write with -o LOG.mcap, or add --dry-run to look only.')
+        raise UsageError(
+            'Name the log to write with -o LOG.mcap, or add --dry-run to write nothing.'
+        )
     from valveflow_ros.interface import SILENT
     from valveflow_ros.interface.files import check_log
     from valveflow_ros.interface.importing.table_import import TableImport

@@ -45,10 +45,12 @@ def run(options: Namespace, console: Console) -> VerbResult:
     lost = (
         f'{counted(report.damaged_chunks, "place")} damaged and left out'
         if report.damaged_chunks
-        else f'no damage was found{" beyond that" if report.warnings else ""}'
+        else f'no {"other " if report.warnings else ""}chunk is damaged'
     )
     text = (
-        f'Kept {counted(report.messages, "message")} in {counted(report.chunks, "chunk")}; {lost}.'
+        f'Kept {counted(report.messages, "message")} in {counted(report.chunks, "chunk")}; '
+        f'{lost}. '
+        'Index and summary were written anew. Metadata has no checksum: damage there is not seen.'
         f'\nRead {count(report.bytes_read)} bytes, wrote {count(report.bytes_written)} '
         f'to {report.out}.'
     )

@@ -143,9 +143,10 @@ def curve_step_sentence(values: SentenceValues) -> str:
     """Say it."""
     full = max(values['u_from'], values['u_to'])  # at once where the one is not below the other
     return (
-        f'From {values.onset} the curve lacks part of its course: '
-        f'{values["s_mw"]:+.2g} MW above u = {full:.4g}, nothing below '
-        f'{values["u_from"]:.4g} (a valve that sticks, or another order of opening).'
+        f'From {values.onset} the curve is {abs(values["s_mw"]):.2g} MW '
+        f'{"lower" if values["s_mw"] < 0.0 else "higher"} above u = {full:.4g} and unchanged '
+        'below '
+        f'u = {values["u_from"]:.4g} (a valve that sticks, or another order of opening).'
     )
 
 

@@ -40,8 +40,8 @@ def backlash_starts(screening: Screening) -> Sequence[Start]:
 def backlash_sentence(values: dict[str, float]) -> str:
     """Say it."""
     return (
-        f'The plug hangs loosely behind the position sensor: it moves only after a slack of '
-        f'{values["w_percent"]:.2g} % of opening is taken up.'
+        'There is backlash between the position sensor and the plug: at each reversal the plug '
+        f'stays still for the first {values["w_percent"]:.2g} % of opening.'
     )
 
 

@@ -157,19 +157,19 @@ class Matcher:
         no_time: bool,
     ) -> RefusedError:
         """Return one error for everything that could not be decided."""
-        columns = {info.topic: info.column for info in SIGNALS}
         times = [TIME] if no_time else []
         topics = [SIGNALS[s].topic for s in absent] + missing + times
         parts = [*several]
         if topics:
-            lacking = [*absent.values(), *(columns[topic] for topic in missing), *times]
-            told = ', '.join(f"'{name}'" for name in lacking)
+            told = [f"there is no {self.what} '{theirs}'" for theirs in absent.values()]
+            if unknown := ' or '.join(missing + times):
+                told.append(f'no {self.what} was recognised as {unknown}')
             unit = '' if topics == [TIME] else '[:unit]'
             options = ' '.join(f'--column {name}={THEIRS}{unit}' for name in topics)
             constant = ', or give --constant NAME=VALUE for what hardly changes'
             apart = f', or say with --period {_PERIOD} how far apart the rows are' if times else ''
             parts.append(
-                f'there is no {self.what} {told}; the {self.what}s are: {self._have()}. Name '
+                f'{", ".join(told)}; the {self.what}s are: {self._have()}. Name '
                 f'yours with {options}{constant if missing else ""}{apart}'
             )
         return RefusedError(

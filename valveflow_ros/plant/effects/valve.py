@@ -22,7 +22,7 @@ def install_backlash(values: Values, hooks: Hooks) -> None:
 
 BACKLASH = Effect(
     'backlash',
-    'The plug hangs loosely on the stem whose position is measured.',
+    'There is backlash between the measured stem and the plug.',
     (Parameter('w_percent', 0.6, '%', 'Full width of the slack.', 0.0, 20.0),),
     install_backlash,
 )

@@ -25,7 +25,7 @@ ALARM_STATES = (
     'ALARM, not acknowledged',
     'ALARM, acknowledged',
     'gone by itself, not acknowledged',
-    'put aside for a time',
+    'shelved for a time',
     'cannot be judged now',
     'out of service',
 )

@@ -371,7 +371,7 @@ def fit_item(monitor: Monitor, worker: FitWorker, last_fit_s: float | None) -> I
             'fit',
             Level.WARN,
             f'The main steam temperature spread over {curve.source.temperature_spread_k:.1f} K; '
-            'the method assumes an unchanged one, so the curve is to be doubted.',
+            'the method assumes a constant one, so the curve may be wrong.',
             values,
         )
     weak = weaknesses(curve)
@@ -399,7 +399,12 @@ def alarm_item(monitor: Monitor) -> Item:
         sentence = 'The residual cannot be judged, so no alarm can come (suppressed).'
         return Item('alarm', Level.WARN, sentence, values)
     if alarm.standing:
-        return Item('alarm', Level.WARN, f'The alarm waits to be cleared ({words}).', values)
+        return Item(
+            'alarm',
+            Level.WARN,
+            f'The condition has gone; acknowledge the alarm to clear it ({words}).',
+            values,
+        )
     return Item('alarm', Level.OK, 'No alarm.', values)
 
 
@@ -412,7 +417,7 @@ def _count_values(alarm: Alarm) -> dict[str, object]:
     until_ns = alarm.shelved_until_ns
     return {
         'Occurrences': alarm.occurrence,
-        'Announcements held back': alarm.held,
+        'Announcements suppressed by alarm_flood': alarm.held,
         'Shelved until (s since 1970)': None if until_ns is None else until_ns // 10**9,
     }
 
@@ -422,8 +427,8 @@ def reference_item(monitor: Monitor) -> Item:
     reference = monitor.reference
     if reference.curve is None:
         sentence = (
-            'There is no reference yet: a curve becomes it when nothing was wrong for '
-            'reference_after behind it, or by ~/set_reference.'
+            'There is no reference yet: a curve becomes the reference if nothing was wrong during '
+            'reference_after before it, or by ~/set_reference.'
         )
         return Item('reference', Level.OK, sentence)
     shift = reference.shift
@@ -495,7 +500,9 @@ def model_item(monitor: Monitor) -> Item:
     if diagnosing.sentence:
         return Item('model', Level.WARN, diagnosing.sentence, values)
     if not diagnosing.misfit.name:
-        return Item('model', Level.OK, 'Not judged yet: that takes a day with a curve.', values)
+        return Item(
+            'model', Level.OK, 'Not judged yet: this needs a curve and a day of data.', values
+        )
     return Item('model', Level.OK, 'The model fits.', values)
 
 

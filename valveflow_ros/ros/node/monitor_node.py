@@ -73,16 +73,16 @@ _ALARM_SERVICES = {
     'acknowledge_alarms': (AlarmAction.ACKNOWLEDGE, 'The alarm is acknowledged.'),
     'shelve_alarms': (
         AlarmAction.SHELVE,
-        'The standing alarms are put aside for {:g} h; then they come back by themselves if their '
-        'cause is still there. New alarms are not hidden.',
+        'The standing alarms are shelved for {:g} h; then they come back by themselves if their '
+        'condition is still present. New alarms are not hidden.',
     ),
-    'unshelve_alarms': (AlarmAction.UNSHELVE, 'The alarms are no longer put aside.'),
+    'unshelve_alarms': (AlarmAction.UNSHELVE, 'The alarms are no longer shelved.'),
 }
 _ONE_ALARM = {
     AlarmAction.ACKNOWLEDGE: 'The alarm {} is acknowledged.',
-    AlarmAction.SHELVE: 'The alarm {} is put aside for {:g} h; then it comes back by itself if '
-    'its cause is still there.',
-    AlarmAction.UNSHELVE: 'The alarm {} is no longer put aside.',
+    AlarmAction.SHELVE: 'The alarm {} is shelved for {:g} h; then it comes back by itself if '
+    'its condition is still present.',
+    AlarmAction.UNSHELVE: 'The alarm {} is no longer shelved.',
 }
 
 
