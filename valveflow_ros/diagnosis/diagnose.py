@@ -558,7 +558,9 @@ def _meaning(task: Task, model: Extended, cause: Active) -> str:
         return f'{where} it changes nothing, at other loads up to {most:.2g} MW.'
     if not level:
         return f'{where} it moves the power by up to {reach:.2g} MW.'
-    return f'{where} it is {abs(level):.2g} MW {"more" if level > 0.0 else "less"}.'
+    said = f'{where} it is {abs(level):.2g} MW {"more" if level > 0.0 else "less"}'
+    drifts = cause.cause.slow and onset is None and not cause.extra and cause.name != 'diurnal'
+    return f'{said} at the end of the record than at its beginning.' if drifts else f'{said}.'
 
 
 def _worth(

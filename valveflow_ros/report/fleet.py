@@ -206,8 +206,9 @@ def _units_table(stories: Sequence[UnitStory]) -> str:
         ]
         for s in stories
     ]
-    head = ['unit', 'change, mean', 'piece that changed most', 'since', 'causes named since then',
-            'alarms at the end', 'logs done']  # fmt: skip
+    head = ['unit', 'change, mean', 'piece that changed most', 'since',
+            'causes named since then (perhaps only a part)', 'alarms at the end',
+            'logs done']  # fmt: skip
     return table(head, rows, sentences=True)
 
 

@@ -63,6 +63,10 @@ def arguments(parser: ArgumentParser) -> None:
     add_mapping(parser)
 
 
+_NONE = 'No unit is seen to have changed.'
+_NOT_JUDGED = 'No unit can be judged yet: a change needs two logs with a curve.'
+
+
 def run(options: Namespace, console: Console) -> VerbResult:
     """Read what there is to do, do it, tell the outcome."""
     console(0.0, 'starting')
@@ -86,12 +90,13 @@ def run(options: Namespace, console: Console) -> VerbResult:
          ', '.join(s.causes) or 'not named']
         for s in moved
     ]  # fmt: skip
+    judged = any(s.change_mw is not None for s in found.stories)
     content = found.to_json()
     text = lines(
         f'{counted(len(found.stories), "unit")}: {counted(found.anew, "log")} done now, '
         f'{found.unchanged} unchanged, {found.failed} without a result.',
-        columns(rows, ['unit that changed', 'mean', 'since', 'causes']) if rows
-        else 'No unit is seen to have changed.',
+        columns(rows, ['unit that changed', 'mean', 'since', 'named (perhaps only a part)'])
+        if rows else _NONE if judged else _NOT_JUDGED,
         *(f'{s.unit} {log}: {why}' for s in found.stories for log, why in s.failures[:3]),
         f'Wrote {" and ".join(content["files"].values())}.',
     )  # fmt: skip

@@ -59,10 +59,10 @@ TO_DO = {
         'inputs are masked for long is `SUPPRESSED` and guards nothing.'
     ),
     'gain_drift': (
-        'Plan for it: erosion and deposits in the blading, a heater that loses efficiency, '
-        'leaking extractions. Compare with the heat rate. A recalibrated power meter goes the '
-        'other way at once: ask for its protocol. Set a new reference only after the reason is '
-        'known.'
+        'If the power falls: erosion and deposits in the blading, a heater that loses '
+        'efficiency, leaking extractions; compare with the heat rate and plan for it. If it '
+        'rises: a drift of the power transducer, cleaner blading, colder cooling water. Set a '
+        'new reference only after the reason is known.'
     ),
     'gain_step': (
         'Ask what happened at the time named: a feed water heater or an extraction in or out '

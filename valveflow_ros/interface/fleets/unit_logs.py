@@ -161,8 +161,10 @@ def read_fleet(
         for other in logs:
             if other.name == name:
                 raise InputError(
-                    f"Unit '{unit}' has two logs of one name, {other.log} and {log}: give two "
-                    'units two names, or rename one of the logs.'
+                    f'{log} was given twice.'
+                    if other.log.resolve() == log.resolve()
+                    else f"Unit '{unit}' has two logs of one name, {other.log} and {log}: give "
+                    'two units two names, or rename one of the logs.'
                 )
         logs.append(UnitLog(unit, name, log, how))
 
