@@ -106,7 +106,7 @@ certify-partition: setup
 
 .venv-docs/.made: docs/requirements.txt
 	@.venv/bin/python -m venv .venv-docs
-	@.venv-docs/bin/python -m pip install --quiet -r docs/requirements.txt
+	@.venv-docs/bin/python -m pip install --quiet --require-hashes --only-binary :all: -r docs/requirements.txt
 	@touch $@
 
 docs: setup .venv-docs/.made

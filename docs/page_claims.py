@@ -136,13 +136,13 @@ _MONITOR = {
 def _diagnosis() -> list[tuple[str, str, str]]:
     rows = []
     for name, question in (
-        ('diagnosis_hidden_14000_14011_5d', 'one hidden effect: named, and no other'),
-        ('diagnosis_null_14000_14149_5d', 'nothing wrong: nothing named'),
+        ('diagnosis_hidden_18000_18005_5d', 'one hidden effect: named, and no other'),
+        ('diagnosis_null_17000_17149_5d', 'nothing wrong: nothing named'),
         (
-            'diagnosis_slow_14000_14009_5d',
+            'diagnosis_slow_17000_17009_5d',
             'a slow change of 1 to 2 % in a shape that no cause has (two steps, fouling, late '
-            'drift, drift then wash, random walk; an offset that switches may be named): told as '
-            'a change in time, and nothing named',
+            'drift, drift then wash, random walk, two changes over hours; an offset that switches may be '
+            'named): told as a change in time, and nothing named',
         ),
         ('diagnosis_confounded_14000_14003_5d', 'two causes that look alike'),
         ('diagnosis_pair_14000_14003_5d', 'two causes at once: both named'),
@@ -245,7 +245,7 @@ def results() -> str:
         for key in ('units', 'with_alarm', 'standing_at_the_end')
     )
     hidden, null = (
-        result(f'diagnosis_{n}_5d') for n in ('hidden_14000_14011', 'null_14000_14149')
+        result(f'diagnosis_{n}_5d') for n in ('hidden_18000_18005', 'null_17000_17149')
     )
     valves = result('refinery_valves')['measured']['per_valve']['verdict']
     lost = result('torture_kill9')['measured']['most_lost_s']
@@ -269,9 +269,9 @@ def results() -> str:
         _row('one hidden effect, 2 to 3 times the smallest that can be seen, five days',
              f'named, and no other, in {hidden["right"]} of {hidden["records"]}; another name '
              f'with confidence in {hidden["named_with_confidence_wrongly"]}',
-             'diagnosis_hidden_14000_14011_5d'),
+             'diagnosis_hidden_18000_18005_5d'),
         _row('nothing hidden, five days', f'nothing named in {null["right"]} of {null["records"]}',
-             'diagnosis_null_14000_14149_5d'),
+             'diagnosis_null_17000_17149_5d'),
         _row('sticking valves of a refinery, from command and process value (real data)',
              f'{valves["found"] * valves["sticky"]:.0f} of {valves["sticky"]} found, '
              f'{valves["falsely_named"] * valves["sound"]:.0f} of {valves["sound"]} sound ones '

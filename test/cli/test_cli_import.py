@@ -116,7 +116,7 @@ def test_what_is_odd_is_said_with_the_option_that_helps(
     [
         (rows(), mapped('main_steam_temperature', 'TS'), 1, 'main_steam_temperature=TS:K'),
         (rows(), mapped('generated_power', 'MW'), 1, 'generated_power=MW:kW'),
-        (rows(), [], 1, "no column 'main_steam_temperature_degc'"),
+        (rows(), [], 1, 'no column was recognised as main_steam_temperature'),
         (rows(), ['--column', 'time=Clock', *OPTIONS[2:]], 1, "no column 'Clock'"),
         (rows(), [*OPTIONS[:2], '--column', 'valve_opening=VALVE'], 1, "no column 'VALVE'"),
         (rows(), ['--column', 'time=Spare', *OPTIONS[2:]], 1, 'holds no time'),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from logged import values
 
-from valveflow_ros.interface import table_import
+from valveflow_ros.interface.importing import table_import
 from valveflow_ros.logs import open_log
 from valveflow_ros.logs.tables import file
 from valveflow_ros.records import Signal

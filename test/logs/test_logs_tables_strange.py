@@ -276,8 +276,8 @@ def repeated(path, names, n):
 @pytest.mark.parametrize(
     ('names', 'why'),
     [
-        (('a', 'b', 'c', 'time'), "no column 'valve_opening_percent'"),
-        (('a', 'b'), "no column 'valve_opening_percent'"),
+        (('a', 'b', 'c', 'time'), 'no column was recognised as valve_opening'),
+        (('a', 'b'), 'no column was recognised as valve_opening'),
         (WIDE, 'has 20000000 rows that unpack to 800 MB'),
         (LONG, 'has 20000000 rows that unpack to'),
     ],
