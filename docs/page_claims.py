@@ -141,8 +141,8 @@ def _diagnosis() -> list[tuple[str, str, str]]:
         (
             'diagnosis_slow_17000_17009_5d',
             'a slow change of 1 to 2 % in a shape that no cause has (two steps, fouling, late '
-            'drift, drift then wash, random walk, two changes over hours; an offset that switches may be '
-            'named): told as a change in time, and nothing named',
+            'drift, drift then wash, random walk, two changes over hours; an offset that switches '
+            'may be named): told as a change in time, and nothing named',
         ),
         ('diagnosis_confounded_14000_14003_5d', 'two causes that look alike'),
         ('diagnosis_pair_14000_14003_5d', 'two causes at once: both named'),

@@ -70,7 +70,8 @@ def test_an_index_without_a_name_is_the_time(run, tmp_path, frame, kind):
 
 def test_an_index_without_a_name_that_counts_is_no_time(run, tmp_path, frame):
     frame.reset_index(drop=True).to_csv(tmp_path / 'a.csv')
-    assert 'no column was recognised as time' in run('import', tmp_path / 'a.csv', '--dry-run').refused()
+    sentence = run('import', tmp_path / 'a.csv', '--dry-run').refused()
+    assert 'no column was recognised as time' in sentence
 
 
 @pytest.mark.parametrize('said', ['60s', '1min', '60', '1 min', '60000ms'])
