@@ -92,7 +92,9 @@ class Chromium:
         if self._session:
             message['sessionId'] = self._session
         os.write(self._out, json.dumps(message).encode() + b'\0')
-        while True:
+        until = time.monotonic() + _LONGEST_S
+        # Events go on coming where the answer does not.
+        while time.monotonic() < until:
             got = self._receive()
             if got.get('id') != self._number:
                 self._keep(got)
@@ -100,6 +102,7 @@ class Chromium:
                 raise RuntimeError(f'{method}: {got["error"]["message"]}')
             else:
                 return dict(got['result'])
+        raise RuntimeError(f'{method}: no answer within {_LONGEST_S:.0f} s')
 
     def _receive(self) -> dict[str, Any]:
         until = time.monotonic() + _LONGEST_S
