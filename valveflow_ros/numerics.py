@@ -17,7 +17,8 @@ import numpy as np
 from valveflow_ros.records import FloatArray
 
 # No fastmath: it lets NaN disappear and reorders the sums that tests compare.
-JIT: dict[str, Any] = {'cache': True, 'nogil': True}
+# No wrapper for calls from C: nobody makes such calls, and each takes time to compile.
+JIT: dict[str, Any] = {'cache': True, 'nogil': True, 'no_cfunc_wrapper': True}
 
 _Function = TypeVar('_Function', bound=Callable[..., Any])
 
@@ -38,7 +39,25 @@ def output_size(output: FloatArray) -> float:
 
 def jit(function: _Function) -> _Function:
     """Compile a loop over arrays, keeping its type for the checker."""
-    return cast(_Function, _fresh(numba.njit(**JIT)(function)))
+    return cast(_Function, _prepared(numba.njit(**JIT)(function)))
+
+
+def _prepared(compiled: Any) -> Any:
+    """Compile a function once for `f(x, 0)` and `f(x, n)`, and keep no outdated result.
+
+    numba takes a constant in a call for a type of its own, and compiles the callee, and all that
+    it calls, again for each.
+    """
+    call = getattr(compiled, 'get_call_template', None)
+    if call is None:  # NUMBA_DISABLE_JIT
+        return compiled
+
+    def get_call_template(args: Any, kws: dict[str, Any]) -> Any:
+        whole: Any = numba.types.unliteral
+        return call(tuple(map(whole, args)), {name: whole(kind) for name, kind in kws.items()})
+
+    compiled.get_call_template = get_call_template
+    return _fresh(compiled)
 
 
 def _fresh(compiled: Any) -> Any:
@@ -93,7 +112,7 @@ _KERNEL_JIT: dict[str, Any] = {**JIT, 'error_model': 'numpy'}
 
 def kernel(function: _Function) -> _Function:
     """Compile a loop made for SIMD: like `jit`, with IEEE division."""
-    return cast(_Function, _fresh(numba.njit(**_KERNEL_JIT)(function)))
+    return cast(_Function, _prepared(numba.njit(**_KERNEL_JIT)(function)))
 
 
 # Not callable from Python, which saves compiling a wrapper for each.
@@ -101,7 +120,6 @@ _INLINED_JIT: dict[str, Any] = {
     **_KERNEL_JIT,
     'forceinline': True,
     'no_cpython_wrapper': True,
-    'no_cfunc_wrapper': True,
 }
 
 
@@ -111,7 +129,7 @@ def inlined(function: _Function) -> _Function:
     A call that hands over records of arrays costs more than a short loop does:
     every array is passed as seven numbers and its reference count goes up and down.
     """
-    return cast(_Function, _fresh(numba.njit(**_INLINED_JIT)(function)))
+    return cast(_Function, _prepared(numba.njit(**_INLINED_JIT)(function)))
 
 
 # Plain threads for kernels that release the interpreter lock.
