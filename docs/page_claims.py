@@ -264,7 +264,7 @@ def results() -> str:
              f'{20 * sum(s["units"] for s in physics)} days on units built from physics',
              next(iter(_MONITOR))),
         _row('an effect of three times its default size begins on day 10',
-             f'alarm in {found} of {tried} runs, still standing on day 20 in {stood} of these',
+             f'an alarm in {found} of {tried} runs; in {stood} of these it still stands on day 20',
              list(_MONITOR)[1]),
         _row('one hidden effect, 2 to 3 times the smallest that can be seen, five days',
              f'named, and no other, in {hidden["right"]} of {hidden["records"]}; another name '

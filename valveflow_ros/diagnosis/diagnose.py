@@ -46,6 +46,7 @@ from valveflow_ros.diagnosis.result import (
 )
 from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.diagnosis.search import Found, Progress, other_bend, search, simplified
+from valveflow_ros.diagnosis.since_model import Change, since_model
 from valveflow_ros.diagnosis.slow import (
     LEAST_DRIFT_MW,
     NAMED_SHAPE,
@@ -300,7 +301,8 @@ def diagnose(
     grids, rough = record.grids(bad), record.grids(bad, rough=True)
     _moves(grids)
     task = Task(grids, grids.open_rows, np.zeros(ORDER), given)
-    start = Extended(model if given else simplified(model))
+    since = since_model(task, model) if given else None
+    start = Extended(model if given else simplified(model)) if since is None else since.changed
     found = search(task, start, progress, rough)
     progress(0.7, 'the sealed blocks')
     found.other_bend = other_bend(found)
@@ -310,7 +312,7 @@ def diagnose(
     course = _course(found)
     rest = replace(_look_again(found), course=course, start_ns=found.task.grids.start_ns)
     rest = _withdraw(found, rest)
-    return _conclude(record, found, rest, wrong, progress)
+    return _conclude(record, found, rest, wrong, since, progress)
 
 
 def diagnose_form(
@@ -585,8 +587,9 @@ def _worth(
 
 
 def _conclude(
-    record: Record, found: Found, rest: _Rest, wrong: tuple[Fault, ...], progress: Progress
-) -> Diagnosis:
+    record: Record, found: Found, rest: _Rest, wrong: tuple[Fault, ...], since: Change | None,
+    progress: Progress,
+) -> Diagnosis:  # fmt: skip
     grids = found.task.grids
     models = steps(found)
     gains = gains_of(found, models)
@@ -610,23 +613,26 @@ def _conclude(
     )  # fmt: skip
     raw = record.grids(np.zeros(record.table.values.shape, dtype=bool)) if wrong else None
     outside = actuator_cause(found) + record_causes(raw, found, wrong)
-    verdict, dropped = _verdict(found, rest, bool(outside))
+    earlier = () if since is None else (since.cause(found.task, models[0]),)
+    verdict, dropped = _verdict(found, rest, bool(earlier + outside))
     near = tuple(dict.fromkeys(n for c in causes for n in c.not_told_apart))
     if verdict == UNEXPLAINED:
         near = tuple(dict.fromkeys((*(c.name for c in causes), *near)))
     causes = () if dropped else causes
     unexplained = _unexplained(rest)
-    before, after = (rmse(found.task, m, grids.sealed_rows) for m in (models[0], models[-1]))
+    simulation = models[0] if since is None else since.given
+    extended = models[0] if dropped else models[-1]
+    before, after = (rmse(found.task, m, grids.sealed_rows) for m in (simulation, extended))
     explained = rest.structure.explained_mw2 if rest.structure.there else 0.0
     result = Diagnosis(
-        verdict=verdict, sentence='', causes=causes + outside,
+        verdict=verdict, sentence='', causes=earlier + causes + outside,
         not_told_apart=near, experiments=_experiments(causes),
         disturbance=rest.disturbance,
         unexplained_by=unexplained, rejected=tuple(found.reasons.items()),
-        rmse_simulation=before, rmse_extended=before if dropped else after,
+        rmse_simulation=before, rmse_extended=after,
         rmse_noise_floor=noise_floor(found.task, models[-1], explained),
-        segments=by_segment(found.task, models[0], models[-1], record.spans_ns),
-        simulation=models[0], extended=models[0] if dropped else models[-1],
+        segments=by_segment(found.task, simulation, models[-1], record.spans_ns),
+        simulation=simulation, extended=extended,
         final=final.without_causes() if dropped else final,
         reference=grids.reference, mean_s=grids.mean_s,
         notes=(*notes(grids), *([rest.own_misfit] if rest.own_misfit else [])),

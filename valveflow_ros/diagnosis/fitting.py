@@ -310,9 +310,7 @@ def level_tangents(task: Task, model: Extended) -> FloatArray:
     return np.column_stack(columns)
 
 
-def _levels_along(
-    before: RegionalModel, after: RegionalModel, scale: float = 1.0
-) -> RegionalModel:
+def levels_along(before: RegionalModel, after: RegionalModel, scale: float = 1.0) -> RegionalModel:
     """Move the levels with the curve, so that the regions change at the same u as before.
 
     A level that stays while the curve moves by a MW costs more than most causes gain. Where the
@@ -338,7 +336,7 @@ def _stepped(task: Task, model: Extended, step: FloatArray) -> Extended | None:
     packed[delays] = np.clip(packed[delays], 0.0, 600.0)
     packed[lags] = np.clip(packed[lags], np.log(0.1 * task.grids.step_s), np.log(3600.0))
     scale = float(np.median(task.grids.scale))
-    moved = replace(model, base=_levels_along(model.base, model.base.unpack(packed), scale))
+    moved = replace(model, base=levels_along(model.base, model.base.unpack(packed), scale))
     for (c, k), by in zip(_slots(model), step[len(free) :], strict=True):
         moved = _shifted(moved, c, k, float(by))
     knots = moved.base.knots

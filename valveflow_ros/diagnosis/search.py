@@ -314,12 +314,12 @@ def search(task: Task, start: Extended, progress: Progress, rough: Grids | None 
         if why := cause.hindered(task.grids):
             found.reasons[name] = f'cannot be judged: {why}'
             barred.add(name)
-    if task.grids.form.scaled and not task.fixed_dynamics:
-        # They were found with the form, in the same record: one is its number, the other what
-        # straight pieces leave of valves in sequence.
+    if task.grids.form.scaled:
+        # They were found with the form, in this record or in that of the model given: one is its
+        # number, the other what straight pieces leave of valves in sequence.
         for name, what in _OF_FORM.items():
             found.reasons[name] = (
-                f'cannot be judged: {what} of p^m F(V) + c was found from this record'
+                f'cannot be judged: {what} of p^m F(V) + c was itself found from a record'
             )
             barred.add(name)
     found.tried = len(every) - len(barred)

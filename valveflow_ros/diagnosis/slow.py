@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
@@ -88,6 +88,23 @@ def levels(
         load that was wanted, the opening what it took.
     """
     grids = task.grids
+    here = answer(grids, model)
+    inputs = [here]
+    if careful:
+        inputs += [grids.means(grids.u), grids.means(grids.pressure)]
+    free = [hat for x in inputs for hat in _hats(x, rows)]
+    usual = float(np.mean(here[rows]))
+    beside = [deviation(grids, name) * here / usual for name in grids.covariates]
+    found = half_hours(task, model, rows, [*free, *beside])
+    columns = found.free[:, len(free) :]
+    return replace(found, free=_basis(found.free[:, : len(free)])), columns
+
+
+def half_hours(
+    task: Task, model: Extended, rows: BoolArray, columns: Sequence[FloatArray]
+) -> Levels:
+    """Return means over sub-blocks of some rows, ``free`` those of columns (m,) as they are."""
+    grids = task.grids
     sub = grids.sub // max(1, -(-grids.subs // _MOST_ROWS))
     here = answer(grids, model)
     count = np.bincount(sub[rows], minlength=int(sub[-1]) + 1)
@@ -97,18 +114,12 @@ def levels(
         total = np.bincount(sub[rows], x[rows], minlength=len(count))
         return np.asarray(total[kept] / count[kept])
 
-    usual = float(np.mean(here[rows]))
-    inputs = [here]
-    if careful:
-        inputs += [grids.means(grids.u), grids.means(grids.pressure)]
-    free = [mean(hat) for x in inputs for hat in _hats(x, rows)]
     time_h = (np.arange(len(here)) + 0.5) * grids.mean_s / 3600.0
-    found = Levels(
-        mean(time_h), mean(task.residual(model)), mean(here) / usual,
-        _basis(np.column_stack(free)), float(count[kept].mean()) / count[kept],
+    free = np.array([mean(column) for column in columns]).T.reshape(len(kept), len(columns))
+    return Levels(
+        mean(time_h), mean(task.residual(model)), mean(here) / float(np.mean(here[rows])),
+        free, float(count[kept].mean()) / count[kept],
     )  # fmt: skip
-    columns = [mean(deviation(grids, name) * here / usual) for name in grids.covariates]
-    return found, np.array(columns).T.reshape(len(kept), len(columns))
 
 
 def deviation(grids: Grids, name: str) -> FloatArray:
@@ -170,12 +181,52 @@ def _fits(found: Levels, column: FloatArray | None = None) -> Iterator[tuple[_Fi
         yield fit, more
 
 
-def _wanders(found: Levels) -> Iterator[tuple[FloatArray, float, float]]:
+def _wanders(found: Levels, most_h: float = math.inf) -> Iterator[tuple[FloatArray, float, float]]:
     """Yield the factor of the covariance of every wander tried, its time scale and variance."""
-    for hours in _TIME_SCALES_H:
+    for hours in (h for h in _TIME_SCALES_H if h <= most_h):
         wander = _covariance(found, hours)
         for ratio in (0.0, *_RATIOS) if hours == _TIME_SCALES_H[0] else _RATIOS:
             yield cho_factor(np.diag(found.noise) + ratio * wander, lower=True)[0], hours, ratio
+
+
+@dataclass(frozen=True, slots=True)
+class Regression:
+    """Coefficients (p,), their covariance (p, p), and the log-likelihood, beside a wander."""
+
+    likelihood: float
+    coefficients: FloatArray
+    covariance: FloatArray
+
+
+def regressions(found: Levels, choices: Sequence[Sequence[int]]) -> list[Regression]:
+    """Regress the power on some of the free columns, each time under the wander that suits best.
+
+    The wander forgets within a fourth of the record: one that lasts longer would be the change of
+    the whole record that is looked for.
+
+    Parameters
+    ----------
+    choices : sequence of sequence of int
+        The columns of each regression; none of them is a wander alone.
+    """
+    best: list[Regression | None] = [None] * len(choices)
+    k = len(found.power)
+    most_h = float(np.ptp(found.hours)) / 4.0
+    for lower, _, _ in _wanders(found, most_h):
+        white = solve_triangular(lower, np.column_stack([found.power, found.free]), lower=True)
+        level = -float(np.log(np.diag(lower)).sum())
+        for i, columns in enumerate(choices):
+            basis, size = np.linalg.qr(white[:, [1 + j for j in columns]])
+            toward = basis.T @ white[:, 0]
+            rest = white[:, 0] - basis @ toward
+            cost = float(rest @ rest)
+            likelihood = level - 0.5 * k * float(np.log(cost / k))
+            known = best[i]
+            if known is None or likelihood > known.likelihood:
+                back = np.linalg.inv(size)
+                variance = cost / (k - len(columns))
+                best[i] = Regression(likelihood, back @ toward, variance * back @ back.T)
+    return [one for one in best if one is not None]
 
 
 def covariate_gain(task: Task, model: Extended, name: str) -> float:

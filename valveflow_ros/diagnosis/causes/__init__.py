@@ -31,6 +31,11 @@ TO_DO = {
         'look for a tag that is stamped at the server and one that is stamped at the source. '
         'Then import the record again: no maintenance of the valve is needed.'
     ),
+    'curve_change': (
+        'Ask what was done to valve, controller and turbine since the model was found. If it was '
+        'meant, find a new curve and go on with it; if not, have the valves looked at that open '
+        'where the power changed most.'
+    ),
     'curve_shape': (
         'A bump where two valves overlap is a matter of their cams or of the table in the '
         'controller: hold its place against the lift diagram. A dent means too little overlap. '
@@ -58,6 +63,11 @@ TO_DO = {
         'its last value. The rows are masked, so the curve stays right; but a monitor whose '
         'inputs are masked for long is `SUPPRESSED` and guards nothing.'
     ),
+    'gain_change': (
+        'Compare the heat rate with that of the time of the model. If the power fell: blading, '
+        'heaters, an open bypass, or the scale of the power meter. If it was meant, find a new '
+        'curve and go on with it.'
+    ),
     'gain_drift': (
         'If the power falls: erosion and deposits in the blading, a heater that loses '
         'efficiency, leaking extractions; compare with the heat rate and plan for it. If it '
@@ -69,6 +79,11 @@ TO_DO = {
         'for good, work on the power meter, its current transformers or its scale. If it was '
         'meant, ask for a new curve (`~/refit`) and set a new reference; if not, look for a '
         'bypass that is open.'
+    ),
+    'input_change': (
+        'Look into the calibration logs of pressure and position since the model was found, and '
+        'check both transmitters against a second instrument. If the new reading is right, find '
+        'a new curve; if it is wrong, have it corrected.'
     ),
     'input_drift': (
         'Check pressure and position transmitters against a second instrument; a drift of a per '
@@ -85,6 +100,10 @@ TO_DO = {
         'falls on the same hours. Nothing is broken if it is meant; the monitor should be told, '
         'or the alarm shelved while it lasts. A valve that should be shut and is not shows here '
         'too.'
+    ),
+    'offset_change': (
+        'Check the zero of the power transducer, and whether auxiliary load or an extraction is '
+        'on that was off when the model was found.'
     ),
     'output_offset_drift': (
         'Check the zero of the power transducer and whether auxiliary load was moved between '

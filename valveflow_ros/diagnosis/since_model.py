@@ -1,0 +1,273 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""What changed between the log that a given model was found in and the record.
+
+Means of half an hour of what the model leaves, held as it is, are regressed on what would have
+changed: the power per flow, the reading of the input, the zero of the power, or the curve, as hats
+of the load. Each is fitted beside a slow wander (`slow`), each number paid for. The name of a
+single change stands only where it tells as much as the hats and clearly more than the others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from valveflow_ros.curve.regional_model import RegionalModel
+from valveflow_ros.diagnosis.cause import Estimate
+from valveflow_ros.diagnosis.evidence import sealed_gain
+from valveflow_ros.diagnosis.extended import Extended, answer, drive
+from valveflow_ros.diagnosis.fitting import Task, levels_along
+from valveflow_ros.diagnosis.result import NamedCause
+from valveflow_ros.diagnosis.slow import PENALTY, Regression, half_hours, regressions
+from valveflow_ros.errors import short
+from valveflow_ros.records import FloatArray
+
+CURVE = 'curve_change'
+_HATS = 5
+_ROUNDS = 3
+_SECANT = 0.004
+_TOLD = 10.0  # log-likelihood by which one change must be better than another
+_BETTER = 6.0  # by which the hats must be better than one change, and one change than none
+# Of the largest power: two curves of one healthy unit differ by about so much. A smaller change is
+# none, and the interval of a larger one is no narrower.
+_LEAST_SHARE = 0.0025
+_EXPLAINED = 0.5  # of the square of a change, by which it must lower that of the residual
+_LOW, _HIGH = 0.05, 0.95  # quantiles of the load at which a change of the curve is told
+_FULL_LOAD = 0.9
+_Z95 = 1.959963984540054
+
+
+def _more_power(base: RegionalModel, g: float) -> RegionalModel:
+    factor = 1.0 + g
+    offset = None if base.offset_mw is None else factor * base.offset_mw
+    return replace(base, left=factor * base.left, right=factor * base.right, offset_mw=offset)
+
+
+def _more_input(base: RegionalModel, g: float) -> RegionalModel:
+    return replace(base, knots=base.knots / (1.0 + g))
+
+
+def _more_offset(base: RegionalModel, b_mw: float) -> RegionalModel:
+    if base.offset_mw is not None:
+        return replace(base, offset_mw=base.offset_mw + b_mw)
+    return replace(base, left=base.left + b_mw, right=base.right + b_mw)
+
+
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """A change of one number: how it acts on a model, and how it is told."""
+
+    act: Callable[[RegionalModel, float], RegionalModel]
+    parameter: str
+    unit: str
+    sentence: str
+    most: float
+
+
+_KINDS = {
+    'gain_change': _Kind(
+        _more_power, 'g', '',
+        'Since the model given was found the same flow gives {change} power at every load alike',
+        0.5,
+    ),
+    'input_change': _Kind(
+        _more_input, 'g', '',
+        'Since the model given was found the same reading of opening and pressure passes {change} '
+        'steam',
+        0.5,
+    ),
+    'offset_change': _Kind(
+        _more_offset, 'b_mw', 'MW',
+        'Since the model given was found the power is {change} at every load', math.inf,
+    ),
+}  # fmt: skip
+_BEFORE = 'it changed before this record begins'
+_EXPERIMENT = (
+    'An hour on the flat end of the curve and an hour at low load: a change of the input vanishes '
+    'on the flat end, one of the offset is the same at both.'
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What changed since the log of the model given.
+
+    Attributes
+    ----------
+    name : str
+        'gain_change', 'input_change', 'offset_change' or 'curve_change'.
+    given, changed : Extended
+        The model as given, and with the change.
+    parameters : dict
+        By name, with 95 % intervals.
+    sentence, meaning : str
+    near : tuple of str
+        Changes of one number that do nearly as well.
+    """
+
+    name: str
+    given: Extended
+    changed: Extended
+    parameters: dict[str, Estimate]
+    sentence: str
+    meaning: str = ''
+    near: tuple[str, ...] = ()
+
+    def cause(self, task: Task, plain: Extended) -> NamedCause:
+        """Return it as a cause, with its gain on the sealed blocks.
+
+        Parameters
+        ----------
+        plain : Extended
+            With a curve found anew, which stands for a change of the curve.
+        """
+        after = plain if self.name == CURVE else self.changed
+        gain = sealed_gain(task, self.given, after, len(_KINDS) + 1)
+        experiment = _EXPERIMENT if self.near else ''
+        return NamedCause(
+            self.name, self.sentence, self.parameters, gain, experiment, self.near,
+            meaning=self.meaning,
+        )  # fmt: skip
+
+
+def since_model(task: Task, base: RegionalModel) -> Change | None:
+    """Return what changed since a model was found; None if nothing did, or it cannot be told.
+
+    Parameters
+    ----------
+    task : Task
+        Only its open blocks are looked at.
+    base : RegionalModel
+        The model given, held as it is.
+    """
+    given = Extended(base)
+    here = answer(task.grids, given)
+    hats = _hats(here[task.rows])
+    found = half_hours(
+        task, given, task.rows, [np.interp(here, hats, row) for row in np.eye(_HATS)]
+    )
+    if not found.enough:
+        return None
+    none, curve = regressions(found, [(), range(_HATS)])
+    fits = {name: _one(task, base, name) for name in _KINDS}
+    score = {name: fit.likelihood - PENALTY for name, (_, fit) in fits.items()}
+    best = max(score, key=lambda name: score[name])
+    by_hats = curve.likelihood - _HATS * PENALTY
+    near = tuple(n for n in score if n != best and score[best] - score[n] < _TOLD)
+    least = _LEAST_SHARE * float(np.quantile(task.grids.power[task.rows], 0.99))
+    value, fit = fits[best]
+    changed = Extended(_levels_as_fit(task, base, _KINDS[best].act(base, value)))
+    moved = answer(task.grids, changed) - here
+    by_curve = by_hats - score[best] > _BETTER
+    if near or by_curve:
+        means = found.free @ curve.coefficients
+    else:
+        means = half_hours(task, given, task.rows, [moved]).free[:, 0]
+    there = max(by_hats, score[best]) - none.likelihood > _BETTER
+    if not there or not _explains(means, found.power, least):
+        return None
+    at = here[task.rows]
+    if near or by_curve:
+        return _curve_change(given, curve, at, hats, () if by_curve else (best, *near), least)
+    return _change(best, given, changed, value, fit, at, moved[task.rows], least)
+
+
+def _explains(moved: FloatArray, left: FloatArray, least: float) -> bool:
+    """Tell whether a change is large, and makes what is left smaller, not a wander beside it."""
+    size = float(np.mean(moved**2))
+    less = float(np.mean(left**2) - np.mean((left - moved) ** 2))
+    return size > least**2 and less > _EXPLAINED * size
+
+
+def _hats(here: FloatArray) -> FloatArray:
+    low, high = np.quantile(here, (0.01, 0.99)).tolist()
+    return np.linspace(low, high, _HATS)
+
+
+def _one(task: Task, base: RegionalModel, name: str) -> tuple[float, Regression]:
+    """Fit a change of one number; return its value and the last regression."""
+    kind, value = _KINDS[name], 0.0
+    for _ in range(_ROUNDS):
+        model = Extended(kind.act(base, value))
+        found = half_hours(task, model, task.rows, [_column(task, model, name, value)])
+        (fit,) = regressions(found, [(0,)])
+        value = float(np.clip(value + fit.coefficients[0], -kind.most, kind.most))
+    return value, fit
+
+
+def _column(task: Task, model: Extended, name: str, value: float) -> FloatArray:
+    """Return how the prediction moves with the number of a change, (m,)."""
+    grids = task.grids
+    if name == 'offset_change':
+        return np.ones(len(grids.power))
+    if name == 'gain_change':
+        return answer(grids, model) / (1.0 + value)
+    driven = drive(grids, model)
+    up, down = (
+        answer(grids, model, replace(driven, u=driven.u * (1.0 + step)))
+        for step in (_SECANT, -_SECANT)
+    )
+    return (up - down) / (2.0 * _SECANT * (1.0 + value))
+
+
+def _levels_as_fit(task: Task, base: RegionalModel, changed: RegionalModel) -> RegionalModel:
+    """Return the changed model with regions that meet at the MW or at the u that they met at."""
+    return min(
+        (changed, levels_along(base, changed, _scale(task))),
+        key=lambda model: task.cost(Extended(model)),
+    )
+
+
+def _scale(task: Task) -> float:
+    grids = task.grids
+    return float(np.mean(grids.scale[grids.usable > 0]))
+
+
+def _change(
+    name: str, given: Extended, changed: Extended, value: float, fit: Regression,
+    here: FloatArray, moved: FloatArray, least: float,
+) -> Change:  # fmt: skip
+    kind = _KINDS[name]
+    alike = least * abs(value) / float(np.sqrt(np.mean(moved**2)))
+    error = math.hypot(_Z95 * math.sqrt(fit.covariance[0, 0]), alike)
+    low, high = value - error, value + error
+    sign = 'more' if value > 0.0 else 'less'
+    unit, factor = ('MW', 1.0) if kind.unit else ('%', 100.0)
+    size, *ends = (f'{factor * abs(x):.3g}' for x in (value, *sorted((low, high), key=abs)))
+    said = kind.sentence.format(change=f'{size} {unit} {sign}')
+    sentence = f'{said} (95 % interval {ends[0]} to {ends[1]} {unit}); {_BEFORE}.'
+    full = float(np.quantile(here, _FULL_LOAD))
+    by = float(np.mean(moved[here >= full]))
+    meaning = f'At full load (from {full:.0f} MW on) it is {abs(by):.2g} MW ' + (
+        'more.' if by > 0.0 else 'less.'
+    )
+    return Change(
+        name, given, changed, {kind.parameter: Estimate(value, low, high, kind.unit)},
+        sentence, meaning,
+    )  # fmt: skip
+
+
+def _curve_change(
+    given: Extended, fit: Regression, here: FloatArray, hats: FloatArray, near: tuple[str, ...],
+    least: float,
+) -> Change:  # fmt: skip
+    parameters, told = {}, []
+    for name, share in (('low_load_mw', _LOW), ('high_load_mw', _HIGH)):
+        load = float(np.quantile(here, share))
+        row = np.array([np.interp(load, hats, one) for one in np.eye(_HATS)])
+        value = float(row @ fit.coefficients)
+        error = math.hypot(_Z95 * math.sqrt(float(row @ fit.covariance @ row)), least)
+        parameters[name] = Estimate(value, value - error, value + error, 'MW')
+        told.append(
+            f'by {value:+.2g} MW (95 % interval {value - error:+.2g} to {value + error:+.2g} MW) '
+            f'at {short(load)} MW'
+        )
+    sentence = (
+        f'Since the model given was found the power at the same opening and pressure has changed, '
+        f'{" and ".join(told)}; {_BEFORE}.'
+    )
+    return Change(CURVE, given, given, parameters, sentence, near=near)
