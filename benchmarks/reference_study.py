@@ -74,7 +74,7 @@ def rows_of(seed: int, kind: str, days: float) -> list[dict[str, Any]]:
         sizes = {k: e for c in since for k, e in c.parameters.items()}
         row = {
             'kind': kind, 'seed': seed, 'change': what, 'size': round(size, 4),
-            'named': [c.name for c in found.causes], 'near': near,
+            'verdict': found.verdict, 'named': [c.name for c in found.causes], 'near': near,
             'sizes': {k: [e.value, e.low, e.high] for k, e in sizes.items()},
             'rmse_mw': [round(r, 3) for r in (found.rmse_simulation, found.rmse_extended)],
             'cpu_s': round(time.process_time() - begin, 1),
@@ -97,7 +97,8 @@ def summary_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
             'records': len(mine),
             'right': sum(r['right'] for r in mine),
             'as_curve_change': sum(r['wider'] and not r['right'] for r in mine),
-            'silent': sum(not r['named'] for r in mine),
+            'silent': sum(r['verdict'] == 'nothing' for r in mine),
+            'unexplained': sum(r['verdict'] == 'unexplained' for r in mine),
             'intervals_hold': f'{sum(sum(r["holds"]) for r in mine)} of '
             f'{sum(len(r["holds"]) for r in mine)}',
             'other_names': sorted(n for r in mine for n in r['others']),

@@ -481,15 +481,11 @@ def _dated(found: Found) -> Extended:
 def _own_misfit(found: Found, left: Structure) -> str:
     """Say what the form of the model leaves, where that is too little to be something else.
 
-    A smooth area curve is no straight pieces and a turbine no single lag. That shows in records of
-    days, as little as it is, and is no fault of a unit whose model was found from the same record.
+    A smooth area curve is no straight pieces and a turbine no single lag, and from means over a
+    minute the lag is not known. That shows in records of days, as little as it is, and is no fault.
     """
     task = found.task
-    if (
-        task.fixed_dynamics
-        or not left.there
-        or not (task.grids.form.scaled or task.grids.blur.words)
-    ):
+    if not left.there or not (task.grids.form.scaled or task.grids.blur.words):
         return ''
     size = float(np.sqrt(left.explained_mw2))
     power = task.grids.power[task.grids.scored]
