@@ -482,7 +482,7 @@ def _own_misfit(found: Found, left: Structure) -> str:
     """Say what the form of the model leaves, where that is too little to be something else.
 
     A smooth area curve is no straight pieces and a turbine no single lag, and from means over a
-    minute the lag is not known. That shows in records of days, as little as it is, and is no fault.
+    minute the lag is not known. Little as it is, that shows in records of days. It is no fault.
     """
     task = found.task
     if not left.there or not (task.grids.form.scaled or task.grids.blur.words):
