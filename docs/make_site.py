@@ -47,6 +47,12 @@ def turned(text: str, folder: str) -> str:
     return _FENCE.sub(r'\1', text)
 
 
+def changes(text: str) -> str:
+    """Return a changelog, which is written in reStructuredText, as Markdown."""
+    text = re.sub(r'^\^+\n(.+)\n\^+$', r'# \1', text, flags=re.M)
+    return re.sub(r'^(\S.*)\n-+$', r'## \1\n', text, flags=re.M).replace('``', '`')
+
+
 def verbs() -> str:
     """Return what every verb and every executable says of itself."""
     environment = {**os.environ, 'COLUMNS': '100'}
@@ -108,7 +114,7 @@ def main() -> int:
     pages = {
         'reference/verbs.md': verbs(), 'reference/python.md': interface(),
         'studies.md': studies(), 'gallery.md': gallery(),
-        'CHANGELOG.md': f'```text\n{(ROOT / "CHANGELOG.rst").read_text()}```\n',
+        'CHANGELOG.md': changes((ROOT / 'CHANGELOG.rst').read_text()),
         **{name: turned((ROOT / name).read_text(), 'docs/') for name in PROJECT},
     }  # fmt: skip
     for path in sorted((ROOT / 'docs').rglob('*.md')):

@@ -145,6 +145,11 @@ def test_links_and_blocks_are_turned_for_the_site() -> None:
     assert '](../' not in make_site.turned((DOCS / 'index.md').read_text(), '../')
 
 
+def test_the_changelog_has_headings_and_lists_on_the_site():
+    text = '^^^^\nPart\n^^^^\n\nNext\n----\n* ``a`` is\n  new.\n* b\n'
+    assert make_site.changes(text) == '# Part\n\n## Next\n\n* `a` is\n  new.\n* b\n'
+
+
 def test_the_site_has_the_help_of_every_executable() -> None:
     for module in make_site.EXECUTABLES.values():
         assert (ROOT / 'valveflow_ros' / 'ros' / f'{module}_main.py').exists()

@@ -307,6 +307,7 @@ def diagnose(
     progress(0.7, 'the sealed blocks')
     found.other_bend = other_bend(found)
     confirm(found)
+    _withdraw_small(found)
     found.model = _dated(found)
     progress(0.8, 'what is left')
     course = _course(found)
@@ -484,17 +485,40 @@ def _own_misfit(found: Found, left: Structure) -> str:
     A smooth area curve is no straight pieces and a turbine no single lag, and from means over a
     minute the lag is not known. Little as it is, that shows in records of days. It is no fault.
     """
-    task = found.task
-    if not left.there or not (task.grids.form.scaled or task.grids.blur.words):
-        return ''
-    size = float(np.sqrt(left.explained_mw2))
-    power = task.grids.power[task.grids.scored]
-    if not size < _OWN_MISFIT * float(np.ptp(np.quantile(power, (0.005, 0.995)))):
+    size = float(np.sqrt(left.explained_mw2)) if left.there else 0.0
+    if not 0.0 < size < _own_size(found.task):
         return ''
     return (
         f'Straight pieces and the dynamics of the model leave {size:.2g} MW (root mean square) '
         f'that depends on {" and ".join(left.variables)}.'
     )
+
+
+def _withdraw_small(found: Found) -> None:
+    """Take back names that explain no more than a model of another record may be off.
+
+    Only beside a given model, where its form or the recording is known to leave so much.
+    """
+    least = _own_size(found.task)
+    if not found.task.fixed_dynamics or not least:
+        return
+    for name in found.model.names:
+        if _explained(found, name) < least**2:
+            found.model, _ = improve(found.task, found.model.without(name), 3)
+            found.near.pop(name, None)
+            found.evidence.pop(name, None)
+            found.reasons[name] = (
+                f'it explains less than {least:.2g} MW, by which a model found in another record '
+                'may be off'
+            )
+
+
+def _own_size(task: Task) -> float:
+    """Return what the form of the model or the recording may leave, MW; 0 where neither does."""
+    if not (task.grids.form.scaled or task.grids.blur.words):
+        return 0.0
+    power = task.grids.power[task.grids.scored]
+    return _OWN_MISFIT * float(np.ptp(np.quantile(power, (0.005, 0.995))))
 
 
 def _withdraw(found: Found, rest: _Rest) -> _Rest:

@@ -32,9 +32,12 @@ _ROUNDS = 3
 _SECANT = 0.004
 _TOLD = 10.0  # log-likelihood by which one change must be better than another
 _BETTER = 6.0  # by which the hats must be better than one change, and one change than none
-# Of the largest power: two curves of one healthy unit differ by about so much. A smaller change is
-# none, and the interval of a larger one is no narrower.
+# Two curves of one healthy unit differ by about this share of the largest power, and where weather
+# moves the unit from day to day by as much as it does so. A smaller change is none, and the
+# interval of a larger one is no narrower.
 _LEAST_SHARE = 0.0025
+_OF_DAYS = 2.0
+_LEAST_DAYS = 3
 _EXPLAINED = 0.5  # of the square of a change, by which it must lower that of the residual
 _LOW, _HIGH = 0.05, 0.95  # quantiles of the load at which a change of the curve is told
 _FULL_LOAD = 0.9
@@ -158,27 +161,42 @@ def since_model(task: Task, base: RegionalModel) -> Change | None:
     best = max(score, key=lambda name: score[name])
     by_hats = curve.likelihood - _HATS * PENALTY
     near = tuple(n for n in score if n != best and score[best] - score[n] < _TOLD)
-    least = _LEAST_SHARE * float(np.quantile(task.grids.power[task.rows], 0.99))
     value, fit = fits[best]
     changed = Extended(_levels_as_fit(task, base, _KINDS[best].act(base, value)))
     moved = answer(task.grids, changed) - here
-    by_curve = by_hats - score[best] > _BETTER
-    if near or by_curve:
-        means = found.free @ curve.coefficients
-    else:
-        means = half_hours(task, given, task.rows, [moved]).free[:, 0]
+    alone = half_hours(task, given, task.rows, [moved]).free[:, 0]
+    by_curve = found.free @ curve.coefficients
+    least = max(
+        _LEAST_SHARE * float(np.quantile(task.grids.power[task.rows], 0.99)),
+        _OF_DAYS * _spread_of_days(found.power - by_curve, found.hours),
+    )
+    # What it leaves to the hats must be more than two curves of one unit differ by.
+    whole = by_hats - score[best] > _BETTER and _rms(by_curve - alone) > least
     there = max(by_hats, score[best]) - none.likelihood > _BETTER
-    if not there or not _explains(means, found.power, least):
+    if not there or not _explains(by_curve if whole or near else alone, found.power, least):
         return None
     at = here[task.rows]
-    if near or by_curve:
-        return _curve_change(given, curve, at, hats, () if by_curve else (best, *near), least)
+    if whole or near:
+        return _curve_change(given, curve, at, hats, () if whole else (best, *near), least)
     return _change(best, given, changed, value, fit, at, moved[task.rows], least)
+
+
+def _spread_of_days(left: FloatArray, hours: FloatArray) -> float:
+    """Return the standard deviation of the means of days; 0 of fewer than three."""
+    day = (hours // 24.0).astype(int)
+    count = np.bincount(day)
+    full = count >= 0.5 * count.max()
+    means = np.bincount(day, left)[full] / count[full]
+    return float(np.std(means, ddof=1)) if len(means) >= _LEAST_DAYS else 0.0
+
+
+def _rms(x: FloatArray) -> float:
+    return float(np.sqrt(np.mean(x**2)))
 
 
 def _explains(moved: FloatArray, left: FloatArray, least: float) -> bool:
     """Tell whether a change is large, and makes what is left smaller, not a wander beside it."""
-    size = float(np.mean(moved**2))
+    size = _rms(moved) ** 2
     less = float(np.mean(left**2) - np.mean((left - moved) ** 2))
     return size > least**2 and less > _EXPLAINED * size
 

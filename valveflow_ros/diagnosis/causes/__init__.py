@@ -64,9 +64,9 @@ TO_DO = {
         'inputs are masked for long is `SUPPRESSED` and guards nothing.'
     ),
     'gain_change': (
-        'Compare the heat rate with that of the time of the model. If the power fell: blading, '
-        'heaters, an open bypass, or the scale of the power meter. If it was meant, find a new '
-        'curve and go on with it.'
+        'First ask whether the cooling water was as warm then. If it was, and the power fell: '
+        'blading, heaters, an open bypass, or the scale of the power meter. If the change was '
+        'meant, find a new curve and go on with it.'
     ),
     'gain_drift': (
         'If the power falls: erosion and deposits in the blading, a heater that loses '
