@@ -14,6 +14,7 @@ from log_files import START_NS, same_readings, same_tables, wander
 
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.logs import open_log, read_table, write_table
+from valveflow_ros.logs.tables.refusal import RefusedError, Remedy
 from valveflow_ros.records import SIGNALS, Quality, SampleTable, Signal, table_to_readings
 
 HEADER = ','.join(['time', *(info.column for info in SIGNALS[:4])])
@@ -173,10 +174,10 @@ def test_the_order_of_rows(tmp_path):
     newest_first = read_table(csv(tmp_path, *rows(3, 2, 2, 1)))
     assert newest_first.time_ns.tolist() == [10**9, 2 * 10**9, 2 * 10**9, 3 * 10**9]
     assert newest_first.columns['generated_power_mw'].tolist() == [603, 602, 601, 600]
-    assert newest_first.notes == ('The rows stood newest first and were sorted.',)
+    assert newest_first.notes == ('The rows were newest first; they were sorted.',)
     mixed = read_table(csv(tmp_path, *rows(3, 1, 2, 1)))
     assert mixed.columns['generated_power_mw'].tolist() == [601, 603, 602, 600]
-    assert mixed.notes == ('The rows stood not in the order of time and were sorted.',)
+    assert mixed.notes == ('The rows were not in the order of time; they were sorted.',)
     repeated = read_table(csv(tmp_path, *rows(1, 1, 2)))
     assert repeated.columns['generated_power_mw'].tolist() == [600, 601, 602]
     assert repeated.notes == ()
@@ -287,6 +288,19 @@ def test_a_missing_column_is_one_sentence_with_the_cure(tmp_path, columns, match
     with pytest.raises(InputError, match=match) as caught:
         read_table(path, columns)
     assert '--column' in str(caught.value) or 'there are' in str(caught.value)
+
+
+def test_the_only_column_in_a_unit_of_a_missing_signal_is_proposed(tmp_path):
+    header = 'TIME,10LBA_PT01 [bar],10MAX_ZT01 [%],10LBA_TT01 [C],10MKA_P [MW]'
+    path = csv(tmp_path, '2026-01-01 00:00:00,160,80,538,290', header=header)
+    with pytest.raises(RefusedError) as caught:
+        read_table(path, {})
+    assert caught.value.remedies == (Remedy('column', 'generated_power=10MKA_P [MW]'),)
+    assert "'10MKA_P [MW]' alone" in str(caught.value)
+    # Of two nothing is proposed; what the others were taken for is told.
+    path = csv(tmp_path, '2026-01-01 00:00:00,160,80,538,290,3', header=f'{header},20MKA_P [MW]')
+    with pytest.raises(InputError, match=r'10LBA_PT01 \[bar\] \(main_steam_pressure\).*THEIRS'):
+        read_table(path, {})
 
 
 def test_the_time_may_be_missing_too(tmp_path):

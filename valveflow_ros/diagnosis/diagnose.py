@@ -301,8 +301,10 @@ def diagnose(
     grids, rough = record.grids(bad), record.grids(bad, rough=True)
     _moves(grids)
     task = Task(grids, grids.open_rows, np.zeros(ORDER), given)
-    since = since_model(task, model) if given else None
-    start = Extended(model if given else simplified(model)) if since is None else since.changed
+    since = since_model(task, model) if given else ''
+    start = Extended(model if given else simplified(model))
+    if isinstance(since, Change):
+        start = since.changed
     found = search(task, start, progress, rough)
     progress(0.7, 'the sealed blocks')
     found.other_bend = other_bend(found)
@@ -607,7 +609,7 @@ def _worth(
 
 
 def _conclude(
-    record: Record, found: Found, rest: _Rest, wrong: tuple[Fault, ...], since: Change | None,
+    record: Record, found: Found, rest: _Rest, wrong: tuple[Fault, ...], since: Change | str,
     progress: Progress,
 ) -> Diagnosis:  # fmt: skip
     grids = found.task.grids
@@ -633,14 +635,15 @@ def _conclude(
     )  # fmt: skip
     raw = record.grids(np.zeros(record.table.values.shape, dtype=bool)) if wrong else None
     outside = actuator_cause(found) + record_causes(raw, found, wrong)
-    earlier = () if since is None else (since.cause(found.task, models[0]),)
+    changed, alike = (since, '') if isinstance(since, Change) else (None, since)
+    earlier = () if changed is None else (changed.cause(found.task, models[0]),)
     verdict, dropped = _verdict(found, rest, bool(earlier + outside))
     near = tuple(dict.fromkeys(n for c in causes for n in c.not_told_apart))
     if verdict == UNEXPLAINED:
         near = tuple(dict.fromkeys((*(c.name for c in causes), *near)))
     causes = () if dropped else causes
     unexplained = _unexplained(rest)
-    simulation = models[0] if since is None else since.given
+    simulation = models[0] if changed is None else changed.given
     extended = models[0] if dropped else models[-1]
     before, after = (rmse(found.task, m, grids.sealed_rows) for m in (simulation, extended))
     explained = rest.structure.explained_mw2 if rest.structure.there else 0.0
@@ -655,7 +658,7 @@ def _conclude(
         simulation=simulation, extended=extended,
         final=final.without_causes() if dropped else final,
         reference=grids.reference, mean_s=grids.mean_s,
-        notes=(*notes(grids), *([rest.own_misfit] if rest.own_misfit else [])),
+        notes=tuple(note for note in (*notes(grids), rest.own_misfit, alike) if note),
     )  # fmt: skip
     return replace(result, sentence=_sentence(result))
 

@@ -137,8 +137,8 @@ class Change:
         )  # fmt: skip
 
 
-def since_model(task: Task, base: RegionalModel) -> Change | None:
-    """Return what changed since a model was found; None if nothing did, or it cannot be told.
+def since_model(task: Task, base: RegionalModel) -> Change | str:
+    """Return what changed since a model was found, or in a sentence that nothing is known to have.
 
     Parameters
     ----------
@@ -154,7 +154,9 @@ def since_model(task: Task, base: RegionalModel) -> Change | None:
         task, given, task.rows, [np.interp(here, hats, row) for row in np.eye(_HATS)]
     )
     if not found.enough:
-        return None
+        return (
+            'The record is too short to tell whether the unit changed since the model was found.'
+        )
     none, curve = regressions(found, [(), range(_HATS)])
     fits = {name: _one(task, base, name) for name in _KINDS}
     score = {name: fit.likelihood - PENALTY for name, (_, fit) in fits.items()}
@@ -174,7 +176,16 @@ def since_model(task: Task, base: RegionalModel) -> Change | None:
     whole = by_hats - score[best] > _BETTER and _rms(by_curve - alone) > least
     there = max(by_hats, score[best]) - none.likelihood > _BETTER
     if not there or not _explains(by_curve if whole or near else alone, found.power, least):
-        return None
+        size = _rms(by_curve)
+        why = (
+            f'Two records of one healthy unit may differ by {least:.2g} MW, also by the weather.'
+            if size <= least
+            else 'That cannot be told from a slow wander of the power.'
+        )
+        return (
+            f'Over the loads seen the record as a whole differs from the model given by '
+            f'{size:.2g} MW (root mean square). {why}'
+        )
     at = here[task.rows]
     if whole or near:
         return _curve_change(given, curve, at, hats, () if whole else (best, *near), least)
@@ -281,8 +292,8 @@ def _curve_change(
         error = math.hypot(_Z95 * math.sqrt(float(row @ fit.covariance @ row)), least)
         parameters[name] = Estimate(value, value - error, value + error, 'MW')
         told.append(
-            f'by {value:+.2g} MW (95 % interval {value - error:+.2g} to {value + error:+.2g} MW) '
-            f'at {short(load)} MW'
+            f'by {value:+.2g} MW or {100.0 * value / load:+.2g} % (95 % interval '
+            f'{value - error:+.2g} to {value + error:+.2g} MW) at {short(load)} MW'
         )
     sentence = (
         f'Since the model given was found the power at the same opening and pressure has changed, '

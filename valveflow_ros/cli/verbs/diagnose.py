@@ -104,11 +104,11 @@ def _text(found: DiagnosisResult) -> str:
         for key, e in c.parameters.items()
     ]
     blind = 'cannot be judged'
-    judged = [
-        f'  {name}: {why.removeprefix(blind).removeprefix(": ").strip()}'
-        for name, why in d.rejected
-        if why.startswith(blind)
-    ]
+    unjudged: dict[str, list[str]] = {}
+    for name, why in d.rejected:
+        if why.startswith(blind):
+            unjudged.setdefault(why.removeprefix(blind).lstrip(': '), []).append(name)
+    judged = [f'  {", ".join(names)}: {why}' for why, names in unjudged.items()]
     return lines(
         f'{found.data.source}: {VERDICT_WORDS[d.verdict]}. {d.sentence}',
         *(advice(c.name, c.meaning, c.to_do) for c in d.causes),

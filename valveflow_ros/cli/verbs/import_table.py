@@ -193,6 +193,7 @@ def _written(options: Namespace, table: TableImport) -> Path:
 def _understood(table: TableImport) -> list[str]:
     """Return what a person should check before trusting the log."""
     from valveflow_ros.report.words import count, counted, duration, moment, plain
+    from valveflow_ros.signals.units import DIFFERENCES
 
     first, last = table.span_ns
     sources, gaps = table.sources(), table.gaps
@@ -209,6 +210,8 @@ def _understood(table: TableImport) -> list[str]:
             rows.append(['(constant)', s.topic, 'as you said', '', plain(s.low), s.unit, ''])
             continue
         taken = f'from {s.written_unit}' if s.written_unit != s.unit else ''
+        if s.topic == 'main_steam_pressure' and not s.air and s.written_unit not in DIFFERENCES:
+            taken = f'{taken or s.unit}, absolute'
         lost = f'{counted(s.missing, "value")} missing' if s.missing else ''
         span = f'{plain(s.low)} to {plain(s.high)}'
         rows.append([s.column, s.topic, s.ground or '', taken, span, s.unit, lost])

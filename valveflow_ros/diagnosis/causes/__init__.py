@@ -32,9 +32,10 @@ TO_DO = {
         'Then import the record again: no maintenance of the valve is needed.'
     ),
     'curve_change': (
-        'Ask what was done to valve, controller and turbine since the model was found. If it was '
-        'meant, find a new curve and go on with it; if not, have the valves looked at that open '
-        'where the power changed most.'
+        'If both changes are about the same share of the power, ask first for the cooling water, '
+        'heaters, extractions and the power meter. If they are not, ask what was done to valves '
+        'and controller, and have the valves looked at that open where the power changed most. '
+        'If the change was meant, find a new curve and go on with it.'
     ),
     'curve_shape': (
         'A bump where two valves overlap is a matter of their cams or of the table in the '

@@ -9,12 +9,14 @@ import zoneinfo
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 from valveflow_ros.errors import InputError
 from valveflow_ros.logs.tables.file import Heading
 from valveflow_ros.logs.tables.refusal import THEIRS, RefusedError, Remedy
 from valveflow_ros.logs.tables.words import (
     CLEAR,
+    DIMENSIONS,
     EXACT,
     LIKELY,
     TAG,
@@ -144,9 +146,38 @@ class Matcher:
                 remedies.append(choosing(info.topic, names[0]))
             elif info.required and info.signal not in spared:
                 missing.append(info.topic)
+        self._propose(missing, several, remedies, chosen)
         if absent or several or missing or no_time:
-            raise self._refusal(absent, several, missing, remedies, no_time)
+            raise self._refusal(absent, several, missing, remedies, no_time, chosen)
         return chosen
+
+    def _propose(
+        self,
+        missing: list[str],
+        several: list[str],
+        remedies: list[Remedy],
+        chosen: Mapping[Signal, Chosen],
+    ) -> None:
+        """Move from the missing what one column alone could be by its unit."""
+        for info in SIGNALS:
+            only = self._only_in_unit_of(info.signal, chosen) if info.topic in missing else None
+            if only is not None:
+                missing.remove(info.topic)
+                several.append(
+                    f"no {self.what} was recognised as {info.topic}, but '{only}' alone is in a "
+                    f'unit of it: if that is it, add {option(info.topic, only)}'
+                )
+                remedies.append(choosing(info.topic, only))
+
+    def _only_in_unit_of(self, signal: Signal, chosen: Mapping[Signal, Chosen]) -> str | None:
+        """Return the only column left that is in a unit of a signal; None if there is none."""
+        taken = {*self._taken, *(c.place for c in chosen.values())}
+        found = [
+            name for k, name in enumerate(self.names)
+            if k not in taken and name and (unit := self.unit_of(k)) is not None
+            and unit.dimension == DIMENSIONS[signal]
+        ]  # fmt: skip
+        return found[0] if len(found) == 1 else None
 
     def _refusal(
         self,
@@ -155,6 +186,7 @@ class Matcher:
         missing: list[str],
         remedies: list[Remedy],
         no_time: bool,
+        chosen: Mapping[Signal, Chosen],
     ) -> RefusedError:
         """Return one error for everything that could not be decided."""
         times = [TIME] if no_time else []
@@ -169,7 +201,7 @@ class Matcher:
             constant = ', or give --constant NAME=VALUE for what hardly changes'
             apart = f', or say with --period {_PERIOD} how far apart the rows are' if times else ''
             parts.append(
-                f'{", ".join(told)}; the {self.what}s are: {self._have()}. Name '
+                f'{", ".join(told)}; the {self.what}s are: {self._have(chosen)}. Name '
                 f'yours with {options}{constant if missing else ""}{apart}'
             )
         return RefusedError(
@@ -185,8 +217,12 @@ class Matcher:
             [Remedy('column', f'{name}={THEIRS}')],
         )
 
-    def _have(self) -> str:
-        return ', '.join(name for name in self.names[:40])
+    def _have(self, chosen: Mapping[Signal, Chosen] = MappingProxyType({})) -> str:
+        known = {c.place: SIGNALS[signal].topic for signal, c in chosen.items()}
+        return ', '.join(
+            f'{name} ({known[k]})' if k in known and name != known[k] else name
+            for k, name in enumerate(self.names[:40])
+        )
 
     def unit_of(self, place: int) -> Spelling | None:
         """Return the unit that the file names for a column."""

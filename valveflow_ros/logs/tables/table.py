@@ -175,7 +175,7 @@ def open_table(
 def order_note(newest_first: bool) -> str:
     """Return the sentence for rows that had to be sorted."""
     kind = 'newest first' if newest_first else 'not in the order of time'
-    return f'The rows stood {kind} and were sorted.'
+    return f'The rows were {kind}; they were sorted.'
 
 
 def _ordered(raw: RawTable, notes: list[str]) -> RawTable:
