@@ -263,8 +263,9 @@ _MODEL = (
 _FIT = (
     Parameter('max_pieces', 10, '', 'Largest number of pieces tried, R_max of the paper.', 1, 20),
     Parameter('selection_rule', 'prediction_error', '',
-              'How the number of pieces is chosen: a knee must lower the whitened prediction '
-              "error by enough (needs refine), or by the paper's turning angle, eq. (24).",
+              'How the number of pieces is chosen: a breakpoint must lower the whitened '
+              "prediction error by enough (needs refine), or by the paper's turning angle, "
+              'eq. (24).',
               choices=('prediction_error', 'paper')),
     Parameter('min_piece_share', 0.01, '',
               'Smallest share of the special samples in a piece.', 0.0, 0.2),

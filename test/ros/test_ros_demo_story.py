@@ -53,7 +53,7 @@ def test_one_fault_is_one_story(capsys: pytest.CaptureFixture[str]) -> None:
         story.on_curve(curve(T0 + 4 * k * HOUR, [u + k for u in KNEES]))
     story.reached(FAULT - 1)
     told = lines(capsys)
-    assert told == ['2023-11-15 04:00  first curve: 4 pieces, knees at u = 1251, 1601, 1901']
+    assert told == ['2023-11-15 04:00  first curve: 4 pieces, breakpoints at u = 1251, 1601, 1901']
     for k in range(5):
         at = FAULT + (1 + 6 * k) * HOUR
         story.on_alarm(alarm(at, k + 1))

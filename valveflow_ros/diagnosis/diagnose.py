@@ -362,7 +362,7 @@ def diagnose_form(
     return replace(result, sentence=_sentence(result))
 
 
-_AT_OPENINGS = ' The knees of this valve stand at fixed openings.'
+_AT_OPENINGS = ' The breakpoints of this valve are at fixed openings.'
 
 
 def _moves(grids: Grids) -> None:

@@ -260,8 +260,8 @@ def shifted(likely: dict[int, float], by: int) -> dict[int, float]:
 def evidence_words(pieces: int, likely: dict[int, float]) -> str:
     """Say on what evidence the joint fit took its number of pieces."""
     words = (
-        f'J = {pieces} was taken by what each knee gains in the whitened prediction error of all '
-        f'rows (at least {KNEE_GAIN:g} in log-likelihood)'
+        f'J = {pieces} was taken by what each breakpoint gains in the whitened prediction error '
+        f'of all rows (at least {KNEE_GAIN:g} in log-likelihood)'
     )
     if pieces in likely:
         percent = 100.0 * likely[pieces]

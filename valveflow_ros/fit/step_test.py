@@ -414,7 +414,7 @@ def _characteristic(
         gaps = zip(line.knots[1:-1].tolist(), line.knot_error.tolist(), strict=True)
         intervals = tuple(interval(knot, error) for knot, error in gaps)
     else:
-        why = 'There are too few levels to look for knees: each is a knot.'
+        why = 'There are too few levels to look for breakpoints: each level is one.'
         intervals = tuple((math.nan, math.nan) for _ in pieces[1:])
     return Characteristic(
         pressure_exponent=settings.real('pressure_exponent'),

@@ -43,7 +43,9 @@ class Curve:
     def __post_init__(self) -> None:
         """Refuse what is no rising curve."""
         if len(self.knots) != len(self.slopes) + 1 or len(self.slopes) != len(self.intercepts):
-            raise InputError('A curve of J pieces needs J + 1 knots, J slopes and J intercepts.')
+            raise InputError(
+                'A curve of J pieces needs J + 1 ends of pieces, J slopes and J intercepts.'
+            )
         if not (np.all(np.diff(self.knots) > 0.0) and np.all(self.slopes > 0.0)):
             raise InputError('The knots of a simulated curve must increase and its slopes be > 0.')
 

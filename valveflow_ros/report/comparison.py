@@ -269,7 +269,7 @@ def _tuning(data: Compared) -> Section:
         'Each was learnt from the first 70 % of the data learnt from and run freely over the '
         'rest; the one with the smallest error there was fitted again to everything (of the '
         'sparse ones the sparsest within 1 % of the best). The Hammerstein model has as many '
-        f'pieces as the proposed curve, and began at several sets of knots. Chosen: '
+        f'pieces as the proposed curve, and began at several sets of breakpoints. Chosen: '
         f'{h.noise}, {_order(len(h.model.b), len(h.model.denominator))}.'
     )
     candidates = table(['candidate', '', 'mean squared error (MW²)'], rows)

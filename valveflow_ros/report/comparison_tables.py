@@ -125,8 +125,8 @@ def errors_table(data: Compared) -> str:
                 *('' if last else decimals(float(c.knots[j + 1]), 1) for c in (line, truth)),
             ])  # fmt: skip
     head = [
-        'method', 'piece', 'slope', 'true slope', 'intercept (MW)', 'true intercept (MW)', 'knee',
-        'true knee',
+        'method', 'piece', 'slope', 'true slope', 'intercept (MW)', 'true intercept (MW)',
+        'breakpoint', 'true breakpoint',
     ]  # fmt: skip
     told = table(head, rows, caption="As in the paper's Table IV.") if rows else ''
     rows = [
@@ -138,7 +138,7 @@ def errors_table(data: Compared) -> str:
     ]  # fmt: skip
     head = [
         'method', 'curve, rms (MW)', 'curve, largest (MW)', 'largest slope error',
-        'largest knee error', 'largest intercept error (MW)',
+        'largest breakpoint error', 'largest intercept error (MW)',
     ]  # fmt: skip
     return told + table(head, rows, caption='Errors against the truth, where the curve is known.')
 

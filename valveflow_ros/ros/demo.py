@@ -186,7 +186,9 @@ class Story:
         knees = ', '.join(f'{u:.0f}' for u in message.breakpoints[1:-1])
         before = self._last_curve.partition(',')[0]
         pieces = counted(message.pieces, 'piece')
-        self._last_curve = f'{pieces}, {f"knees at u = {knees}" if knees else "no knee"}'
+        self._last_curve = (
+            f'{pieces}, {f"breakpoints at u = {knees}" if knees else "no breakpoint"}'
+        )
         self.curves.append(message)
         if len(self.curves) == 1:
             self._tell(time_ns, f'first curve: {self._last_curve}')
@@ -483,7 +485,8 @@ def _compare(found: FlowCharacteristic) -> None:
         f'The last curve before the fault (data until {moment(from_time(found.window_end))}), '
         'and the truth, which only the simulated plant knows:'
     )
-    tell('  piece   slope, 95 % [MW per % MPa^(9/8)]     true     knee found (95 %)     true')
+    head = '  piece   slope, 95 % [MW per % MPa^(9/8)]'
+    tell(f'{head:<47}{"true":<9}{"breakpoint (95 %)":<22}true')
     for k in range(max(found.pieces, len(true.slopes))):
         slope = knee = ''
         if k < found.pieces:

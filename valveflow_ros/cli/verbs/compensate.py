@@ -89,8 +89,8 @@ def run(options: Namespace, console: Console) -> VerbResult:
         # Its knees stand at other powers at each pressure.
         if len(pressures) > 1:
             raise UsageError(
-                'The knees of this curve stand at fixed openings, and at another power for each '
-                'pressure: make one table for each --pressure.'
+                'The breakpoints of this curve are at fixed openings, and at another power for '
+                'each pressure: make one table for each --pressure.'
             )
         if not pressures and math.isnan(curve.reference_pressure_mpa):
             raise UsageError(

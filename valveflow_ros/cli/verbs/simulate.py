@@ -152,7 +152,7 @@ def _paper_lines(log: SimulatedLog) -> list[str]:
     lines = [
         f'  curve    {counted(len(curve.slopes), "piece")}, slopes '
         + ', '.join(plain(float(k)) for k in curve.slopes)
-        + ', knots '
+        + ', ends of pieces at u = '
         + ', '.join(plain(float(k)) for k in curve.knots),
     ]
     for k, region in enumerate(log.unit.regions):

@@ -27,7 +27,7 @@ def apply_exponent(
         u_true = u (p / mean p)^dm
 
     Under sliding pressure the curve takes up most of it: only the pressure's departure
-    from its line over the load tells. Where the knees stand at fixed openings it is the flow
+    from its line over the load tells. Where the breakpoints are at fixed openings it is the flow
     itself that is multiplied.
     """
     log = np.log(np.maximum(grids.pressure, 1e-6))

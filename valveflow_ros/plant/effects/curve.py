@@ -29,7 +29,7 @@ def install_curve_shape(values: Values, hooks: Hooks) -> None:
 
 CURVE_SHAPE = Effect(
     'curve_shape',
-    'The curve has a bump between its knots.',
+    'The curve has a bump between its breakpoints.',
     (
         Parameter('h_mw', 1.5, 'MW', 'Height of the bump.', -50.0, 50.0),
         Parameter('u0', 1425.0, '% MPa^(9/8)', 'Its centre.', 0.0, 1e5),

@@ -234,7 +234,7 @@ def _curve(frame: Frame, width: int, rows: int, unicode: bool) -> list[Line]:
     if now is not None:
         canvas.mark(*now, '●')
     marks = {0: f'{high[1]:.0f} MW', rows - 1: f'{low[1]:.0f} MW'}
-    legend = f'u ({input_unit_plain(curve.exponent)})   o knee' + ('   ● now' if now else '')
+    legend = f'u ({input_unit_plain(curve.exponent)})   o breakpoint' + ('   ● now' if now else '')
     first, end = f'{low[0]:.0f}', f'{high[0]:.0f}'
     room = width - _MARGIN - len(first) - len(end)
     axis = f'{first}{cut(legend, max(0, room - 4)):^{max(0, room)}}{end}'

@@ -114,7 +114,7 @@ def line_of(event: Event) -> tuple[Level, str] | None:
     if isinstance(event, CurveAdopted):
         curve = event.characteristic
         knees = ', '.join(f'{u:.0f}' for u in curve.breakpoints[1:-1])
-        knees = f'knees at u = {knees}' if knees else 'no knee'
+        knees = f'breakpoints at u = {knees}' if knees else 'no breakpoint'
         return Level.OK, (
             f'new curve {curve.model_id}: {counted(len(curve.pieces), "piece")}, '
             f'{knees}, '
