@@ -213,9 +213,9 @@ _TIME_BASE = (
     Parameter('lateness', 2.0, 's',
               'How long a row waits for slower topics before it is closed.', 0.0, 3600.0),
     Parameter('clock_jump', 15.0, 's',
-              'A stamp further ahead than this is accepted after two more such times; after '
-              'twenty '
-              'stamps in a row further behind, the rows later than the new time are set aside.',
+              'A stamp further ahead than this is used only after two more stamps have confirmed '
+              'it. If twenty stamps in a row are further behind than this, the clock was set '
+              'back: rows later than the new time are set aside.',
               1.0, 1e6),
     Parameter('window_days', 10.0, 'd', 'Length of the rolling window.', 0.02, 60.0),
 )  # fmt: skip
