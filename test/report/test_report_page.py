@@ -204,6 +204,20 @@ def test_confidence_and_support_stand_in_the_page(make):
     assert 'more than 99.9 %' in confidence_table(replace(choice, confidence={2: 1.0}))
 
 
+def test_a_number_of_pieces_that_is_not_certain_is_said_with_the_curve(make):
+    data = make()
+    curve = data.characteristic
+    chosen = len(curve.pieces)
+    likely = {chosen: 0.66, chosen + 1: 0.3, chosen + 2: 0.04}
+    unsure = replace(curve, choice=replace(curve.choice, confidence=likely))
+    assert (
+        f'The number of pieces is not certain: {chosen} has a probability of 66.0 %, '
+        f'{chosen + 1} of 30.0 %. The 95 % intervals'
+    ) in words_of(identification_report(make(characteristic=unsure)))
+    sure = replace(curve, choice=replace(curve.choice, confidence={chosen: 0.96, 9: 0.04}))
+    assert 'is not certain' not in words_of(identification_report(make(characteristic=sure)))
+
+
 def test_no_segment_and_no_value_still_make_a_page(make):
     base = make()
     table = base.table.part(0, 40)

@@ -137,7 +137,7 @@ def answer_words(data: Identified) -> str:
         f'{counted(c.source.slope_response, "slope-response segment")} '
         f'({counted(c.source.samples, "sample")}). The typical difference between curve and '
         'samples is '
-        f'{plain(c.residuals.rmse_mw, 2)} MW.'
+        f'{plain(c.residuals.rmse_mw, 2)} MW. {pieces_doubt(c)}'
     )
     told = [text(doubt(data))]
     if c.source.temperature_flag:
@@ -302,6 +302,7 @@ _KEPT = {
     'dynamics are known',
 }
 _LEAST_SHOWN = 0.005  # probability of a number of pieces worth a row
+_DOUBTFUL = 0.05  # probability of another number of pieces that makes the chosen one uncertain
 # Mantissas of the ticks, the coarsest first.
 _STEPS = (
     [1.0, 2.0, 5.0],
@@ -410,6 +411,20 @@ def confidence_table(choice: Choice) -> str:
     )
     rows = [[str(j), _percent(p)] for j, p in likely.items()]
     return words + table(['number of pieces J', 'probability'], rows)
+
+
+def pieces_doubt(c: Characteristic) -> str:
+    """Say which numbers of pieces are nearly as probable as the chosen one; empty if none is."""
+    likely = {j: p for j, p in c.choice.confidence.items() if p >= _DOUBTFUL}
+    likely.pop(len(c.pieces), None)
+    if not likely:
+        return ''
+    chosen = _percent(c.choice.confidence[len(c.pieces)])
+    others = ', '.join(f'{j} of {_percent(p)}' for j, p in likely.items())
+    return (
+        f'The number of pieces is not certain: {len(c.pieces)} has a probability of {chosen}, '
+        f'{others}. The 95 % intervals of the breakpoints hold if it is right.'
+    )
 
 
 def _percent(share: float) -> str:

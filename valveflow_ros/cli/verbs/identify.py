@@ -119,7 +119,13 @@ def _data(found: Identification) -> dict[str, Any]:
 
 
 def _text(found: Identified) -> str:
-    from valveflow_ros.report.answer import doubt, explained, form_words, temperature_words
+    from valveflow_ros.report.answer import (
+        doubt,
+        explained,
+        form_words,
+        pieces_doubt,
+        temperature_words,
+    )
     from valveflow_ros.report.data import rejected
     from valveflow_ros.report.words import counted, held_words, moment, percent, plain
 
@@ -129,6 +135,7 @@ def _text(found: Identified) -> str:
         f'The flow characteristic has {counted(len(c.pieces), "piece")} and explains '
         f'{percent(explained(found))} of the variance of the power.',
         doubt(found),
+        pieces_doubt(c),
         form_words(c),
         _pieces(found),
         _breakpoints(found.shown),
