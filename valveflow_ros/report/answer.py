@@ -27,10 +27,12 @@ from valveflow_ros.report.words import (
     decimals,
     duration,
     held_words,
+    input_name,
     input_unit,
     interval,
     is_known,
     level,
+    per_input,
     percent,
     plain,
     span,
@@ -127,10 +129,10 @@ def opening_gain(data: Identified, piece: Piece) -> tuple[float, float]:
 def answer_words(data: Identified) -> str:
     """Return the paragraph an engineer would tell a colleague, and what endangers it."""
     c = data.shown
-    ends, values = c.breakpoints, c.values()
+    ends, values, m = c.breakpoints, c.values(), c.pressure_exponent
     words = (
         f'The flow characteristic has <b>{counted(len(c.pieces), "piece")}</b> and is known for '
-        f'u from {span(ends[0], ends[-1])} {input_unit(c.pressure_exponent)}, that is from '
+        f'{input_name(m)} from {span(ends[0], ends[-1])} {input_unit(m)}, that is from '
         f'{span(values[0], values[-1])} MW{data.at_pressure}.{_bends(c)} It explains '
         f'{percent(explained(data))} of the variance of the power in '
         f'{counted(c.source.steady, "steady-state segment")} and '
@@ -161,13 +163,14 @@ def answer_words(data: Identified) -> str:
 
 def _bends(c: Characteristic) -> str:
     """Say what the shape means for control."""
+    u, per = input_name(c.pressure_exponent), per_input(c.pressure_exponent)
     if len(c.pieces) == 1:
-        return f' It is straight: {plain(c.pieces[0].slope)} MW per unit of u everywhere.'
+        return f' It is straight: {plain(c.pieces[0].slope)} {per} everywhere.'
     steep = max(c.pieces, key=lambda p: p.slope)
     flat = min(c.pieces, key=lambda p: p.slope)
     said = (
-        f' The power rises most between u = {level(steep.u_from, 0)} and '
-        f'{level(steep.u_to, 0)} ({plain(steep.slope, 3)} MW per unit of u)'
+        f' The power rises most between {u} = {level(steep.u_from, 0)} and '
+        f'{level(steep.u_to, 0)} ({plain(steep.slope, 3)} {per})'
     )
     there = f'between {level(flat.u_from, 0)} and {level(flat.u_to, 0)}'
     if flat.slope <= 0.0:
@@ -180,6 +183,7 @@ def _bends(c: Characteristic) -> str:
 def pieces_table(data: Identified) -> str:
     """Return one row a piece."""
     c = data.shown
+    m, u = c.pressure_exponent, input_name(c.pressure_exponent)
     rows = []
     for k, piece in enumerate(c.pieces):
         gain, pressure = opening_gain(data, piece)
@@ -192,8 +196,8 @@ def pieces_table(data: Identified) -> str:
             count(piece.samples), *_rests(c, k),
         ])  # fmt: skip
     head = [
-        'piece', f'u ({input_unit(c.pressure_exponent)})', f'power{data.at_pressure} (MW)',
-        'slope ± standard error (MW per unit of u)', 'intercept ± standard error (MW)',
+        'piece', f'{u} ({input_unit(m)})', f'power{data.at_pressure} (MW)',
+        f'slope ± standard error ({per_input(m)})', 'intercept ± standard error (MW)',
         'MW per 1 % of opening', 'samples', *(['rests on'] if c.support else []),
     ]  # fmt: skip
     return table(head, rows)
@@ -222,7 +226,8 @@ def breakpoints_table(c: Characteristic) -> str:
         )
     ]
     unit = input_unit(c.pressure_exponent)
-    return table(['break&shy;point', f'u ({unit})', '95 % interval', 'power (MW)'], rows)
+    u = input_name(c.pressure_exponent)
+    return table(['break&shy;point', f'{u} ({unit})', '95 % interval', 'power (MW)'], rows)
 
 
 def temperature_words(c: Characteristic) -> str:

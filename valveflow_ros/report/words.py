@@ -200,6 +200,16 @@ def input_unit(value: float) -> str:
     return f'% MPa<sup>{exponent(value) if math.isfinite(value) else "m"}</sup>'
 
 
+def input_name(value: float) -> str:
+    """Return what the curve is a function of: 'u', or 'opening' with the exponent 0."""
+    return 'opening' if value == 0.0 else 'u'
+
+
+def per_input(value: float) -> str:
+    """Return the unit of a slope, in words."""
+    return 'MW per %' if value == 0.0 else 'MW per unit of u'
+
+
 def input_unit_plain(value: float) -> str:
     """Return the unit of u as plain text: '% MPa^(9/8)'; of an exponent not known, '% MPa^m'."""
     if not math.isfinite(value):

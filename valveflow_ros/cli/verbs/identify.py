@@ -155,7 +155,15 @@ def _text(found: Identified) -> str:
 
 def _pieces(found: Identified) -> str:
     from valveflow_ros.report.answer import opening_gain
-    from valveflow_ros.report.words import count, input_unit_plain, plain, span, with_error
+    from valveflow_ros.report.words import (
+        count,
+        input_name,
+        input_unit_plain,
+        per_input,
+        plain,
+        span,
+        with_error,
+    )
 
     c = found.shown
     rows = []
@@ -172,14 +180,15 @@ def _pieces(found: Identified) -> str:
                 count(piece.samples),
             ]
         )
-    unit = input_unit_plain(c.pressure_exponent)
-    head = ['piece', f'u ({unit})', f'slope{found.at_pressure} (MW per u)', 'intercept (MW)',
+    m = c.pressure_exponent
+    head = ['piece', f'{input_name(m)} ({input_unit_plain(m)})',
+            f'slope{found.at_pressure} ({per_input(m)})', 'intercept (MW)',
             'MW per 1 % opening', 'samples']  # fmt: skip
     return columns(rows, head)
 
 
 def _breakpoints(c: Characteristic) -> str:
-    from valveflow_ros.report.words import interval, level
+    from valveflow_ros.report.words import input_name, interval, level
 
     rows = [
         [level(piece.u_to, 1), f'{interval(low, high)}', f'{level(float(value), 1)} MW']
@@ -187,7 +196,8 @@ def _breakpoints(c: Characteristic) -> str:
             c.pieces[:-1], c.breakpoint_intervals, c.values()[1:-1], strict=True
         )
     ]
-    return columns(rows, ['breakpoint u', '95 % interval', 'power']) if rows else ''
+    head = [f'breakpoint {input_name(c.pressure_exponent)}', '95 % interval', 'power']
+    return columns(rows, head) if rows else ''
 
 
 def _dynamics(c: Characteristic) -> str:
