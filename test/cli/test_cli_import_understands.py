@@ -55,6 +55,16 @@ def test_a_german_export_needs_no_option(run, german, tmp_path):
     assert told['signals'][3]['words'] == {'I/O Timeout': 1}
 
 
+def test_a_table_in_local_time_is_told_in_local_time(run, german, tmp_path):
+    log = tmp_path / 'x.mcap'
+    said = run('import', german, '-o', log, '--time-zone', 'Europe/Berlin').out
+    assert ' UTC,' not in said
+    assert 'CET' in said or 'CEST' in said
+    assert said.rstrip().endswith(
+        'add --time-zone Europe/Berlin to identify and diagnose to see local times.'
+    )
+
+
 def test_a_dry_run_shows_the_same_and_writes_nothing(run, german, tmp_path):
     wet = run('import', german, '-o', tmp_path / 'x.mcap').out.splitlines()
     dry = run('import', german, '--dry-run').out.splitlines()
