@@ -36,7 +36,7 @@ def test_the_answer_says_what_to_do(diagnosed):
     first, second = (diagnosed / 'printed').read_text().splitlines()[:2]
     assert first == f'plant.parquet: cause found. {content["sentence"]}'
     assert cause['to_do']
-    assert second == f'spikes: What to do: {cause["to_do"]}'
+    assert second == f'spikes. What to do: {cause["to_do"]}'
 
 
 def test_the_json_is_the_contract(diagnosed):

@@ -70,7 +70,7 @@ def test_each_diagnosis_is_told_with_its_time_and_each_cause_once(
     assert told[first + 4 : first + 7] == [
         'Last.',
         'gain_step: It is 3 MW less. What to do: Look at the meter.',
-        'spikes: What to do: Mend the wire.',
+        'spikes. What to do: Mend the wire.',
     ]
 
 

@@ -152,16 +152,18 @@ class Evidence:
         told = []
         if not self.gain > LEAST_GAIN:
             told.append(
-                f'it gains {self.gain:.1f} in log-likelihood on blocks it was not fitted to, '
-                f'{LEAST_GAIN:.0f} are asked for'
+                'it explains held-out blocks only a little better '
+                f'(log-likelihood {self.gain:+.1f}, {LEAST_GAIN:.0f} needed)'
             )
         if not self.wald > self.least_wald:
             told.append(
-                f'its size is uncertain (Wald statistic {self.wald:.1f}, '
-                f'{self.least_wald:.0f} are asked for)'
+                f'its size is too uncertain (Wald statistic {self.wald:.1f}, '
+                f'{self.least_wald:.0f} needed)'
             )
         if not self.sign > LEAST_SIGN:
-            told.append(f'too few blocks agree (t = {self.sign:.1f})')
+            told.append(
+                f'it helps in too few blocks (t = {self.sign:.1f}, {LEAST_SIGN:.1f} needed)'
+            )
         return '; '.join(told)
 
 

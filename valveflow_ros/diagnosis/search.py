@@ -375,7 +375,7 @@ def _add(found: Found, barred: set[str]) -> bool:
             if other is not rival:
                 by = other.score - rival.score
                 found.reasons[other.added.name] = (
-                    f'{name} explains the data better, by {by:.1f} in log-likelihood'
+                    f'{name} explains the data better (log-likelihood {by:+.1f})'
                 )
         if rival.added.cause.of_model and not found.task.fixed_dynamics:
             _absorb(found, rival)

@@ -115,9 +115,9 @@ def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
         parts.append(notice(doubt))
     for c in d.causes:
         if c.to_do:
-            known = f'{text(c.meaning)} ' if c.meaning else ''
+            known = f': {text(c.meaning)}' if c.meaning else '.'
             parts.append(paragraph(
-                f'<b>{text(c.name)}</b>: {known}<b>What to do:</b> {text(c.to_do)}'
+                f'<b>{text(c.name)}</b>{known} <b>What to do:</b> {text(c.to_do)}'
             ))  # fmt: skip
     parts.append(paragraph(
         'On held-out data, the simulation differs from the measured '

@@ -265,6 +265,6 @@ def advice(name: str, meaning: str, to_do: str) -> str:
 
     The arguments are those of a cause in ``diagnosis.json``.
     """
-    known = [meaning, f'What to do: {to_do}' if to_do else '']
-    told = ' '.join(part for part in known if part)
-    return f'{name}: {told}' if told else ''
+    to_do = f'What to do: {to_do}' if to_do else ''
+    told = f'{meaning} {to_do}'.strip()
+    return f'{name}{":" if meaning else "."} {told}' if told else ''

@@ -78,8 +78,8 @@ TO_DO = {
     'gain_step': (
         'Ask what happened at the time named: a feed water heater or an extraction in or out '
         'for good, work on the power meter, its current transformers or its scale. If it was '
-        'meant, ask for a new curve (`~/refit`) and set a new reference; if not, look for a '
-        'bypass that is open.'
+        'meant, find a new curve (in the node: `~/refit`) and set a new reference; if not, look '
+        'for a bypass that is open.'
     ),
     'input_change': (
         'Look into the calibration logs of pressure and position since the model was found, and '
@@ -93,7 +93,7 @@ TO_DO = {
     ),
     'input_step': (
         'Look into the calibration log of pressure and position at the time named. If the new '
-        'reading is the right one, ask for a new curve and set a new reference. If it is the '
+        'reading is the right one, find a new curve and set a new reference. If it is the '
         'wrong one, have it corrected: the load controller works with the same reading.'
     ),
     'intervals': (

@@ -19,6 +19,7 @@ from valveflow_ros.report.terminal.frame import (
     HealthView,
     SampleView,
 )
+from valveflow_ros.report.words import advice as advice_of
 
 CURVE = 'valveflow_msgs/msg/FlowCharacteristic'
 PREDICTION = 'valveflow_msgs/msg/Prediction'
@@ -171,7 +172,7 @@ def decoded(
         causes = tuple(str(cause['name']) for cause in fields['causes'])
         said = str(fields['sentence']).strip()
         advice = tuple(
-            f'{cause["name"]}: {cause["meaning"]} What to do: {cause["to_do"]}'.replace('  ', ' ')
+            advice_of(str(cause['name']), str(cause['meaning']), str(cause['to_do']))
             for cause in fields['causes']
             if cause.get('to_do')  # recordings of earlier versions do not have it
         )
