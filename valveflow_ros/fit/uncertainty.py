@@ -15,6 +15,9 @@ from valveflow_ros.numerics import gram
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
 _MOST_BLOCKS = 60
+# Weather and the load of a day last longer than the blocks above: the errors of the final fit are
+# also taken from this many long blocks.
+_LONG_BLOCKS = 10
 # Directions of the scaled normal matrix below this are rounding, some of them negative.
 _SINGULAR = 1e-12
 _LEAST_IN_BLOCK_S = 500.0
@@ -50,15 +53,15 @@ def covariance_of(
     model: RegionalModel,
     free: BoolArray,
     ar: FloatArray,
-    with_levels: bool = True,
+    final: bool = True,
 ) -> Certainty:
-    """Return how sure the packed parameters are, and the levels unless they are held.
+    """Return how sure the packed parameters are.
 
     The inverse normal matrix, widened where sums of scores over blocks vary
-    more than independent innovations would let them. The levels count as
-    parameters, by differences: time constants and delays lean on them.
+    more than independent innovations would let them. In the final fit long blocks count too,
+    and the levels are parameters, by differences: time constants and delays depend on them.
     """
-    packed, levels = len(free), len(model.levels) if with_levels else 0
+    packed, levels = len(free), len(model.levels) if final else 0
     residual, jacobian, weight = problem.tangents(model, also=levels)
     if levels:
         _level_tangents(problem, model, jacobian[:, packed:])
@@ -71,11 +74,15 @@ def covariance_of(
     inverse = np.linalg.pinv(sums[:-1, :-1] / np.outer(scale, scale), _SINGULAR, hermitian=True)
     inverse = inverse / np.outer(scale, scale)
     variance = float(sums[-1, -1]) / max(rows - len(inverse), 1)
-    robust = inverse @ gram(scores) @ inverse
+    robust = np.diag(inverse @ gram(scores) @ inverse)
+    if final:
+        long = np.array([part.sum(axis=0) for part in np.array_split(scores, _LONG_BLOCKS)])
+        long_robust = np.diag(inverse @ gram(long) @ inverse)
+        robust = np.maximum(robust, long_robust * (_LONG_BLOCKS / (_LONG_BLOCKS - 1)))
     plain = inverse * variance
     # Few blocks make the robust form noisy; it may widen, never narrow.
     diagonal = np.maximum(np.diag(plain), 1e-300)
-    widen = np.sqrt(np.maximum(1.0, np.diag(robust) / diagonal))
+    widen = np.sqrt(np.maximum(1.0, robust / diagonal))
     covariance = np.zeros((len(free), len(free)))
     covariance[np.ix_(moved, moved)] = plain * np.outer(widen, widen)
     dead = np.flatnonzero(free & ~moved)
@@ -120,7 +127,7 @@ def bend_certainty(problem: Problem, model: RegionalModel, ar: FloatArray) -> Fl
     j = model.pieces
     free = np.zeros(len(model.pack()), dtype=bool)
     free[: j + 1] = True
-    covariance = covariance_of(problem, model, free, ar, with_levels=False).covariance
+    covariance = covariance_of(problem, model, free, ar, final=False).covariance
     # A value that no row moves is not known, and no bend at it is certain.
     covariance = np.nan_to_num(covariance[: j + 1, : j + 1], nan=1e12)
     width = np.diff(model.knots)
