@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Files, without ROS: recordings in MCAP, tables in CSV and Parquet, repair."""
+"""Reads, writes and repairs log files without ROS: MCAP recordings and tables."""
 
 from valveflow_ros.logs.contents import LogContents, LoggedMessage, TopicInfo
 from valveflow_ros.logs.mcap.cdr import Decoder

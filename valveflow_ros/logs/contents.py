@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a log holds, from whatever kind of file it came."""
+"""Contents of a log, in the same form for every kind of file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from valveflow_ros.records import IntArray, Readings, Signal
 
 
 class LoggedMessage(NamedTuple):
-    """A message as it stands in a recording."""
+    """A raw message of a recording."""
 
     topic: str
     type: str
@@ -32,13 +32,13 @@ class TopicInfo:
     name, type : str
         Its name and ``package/msg/Type``.
     count : int
-        Intact messages.
+        Number of intact messages.
     signal : Signal or None
-        What it stands for, if it is read as an input.
+        The input that it carries; None if it is not read as an input.
     definition : str
-        The ros2msg text of its type, empty if the file has none.
+        The ros2msg text of its type; empty if the file has none.
     type_hash : str
-        RIHS01 hash, empty if the file has none.
+        RIHS01 hash; empty if the file has none.
     """
 
     name: str
@@ -59,40 +59,40 @@ def no_messages(topics: Collection[str] | None) -> Iterator[LoggedMessage]:
 
 @dataclass(frozen=True, slots=True)
 class LogContents:
-    """What a log holds.
+    """Contents of a log.
 
     Attributes
     ----------
     path : str
-        Where it was read.
+        The file or folder that was read.
     readings : Readings
-        The five inputs in the order of their log times, those of equal time in
-        the order of the file, in the units of the file.
+        The five inputs in the order of their log times, in the units of the file.
+        Readings of equal log time keep the order of the file.
     log_time_ns : int64 (n,)
-        When each reading was received; for tables its own time.
+        Time at which each reading was received; for tables the time of the reading.
     topics : dict[str, TopicInfo]
         Every topic; empty for tables.
     signals : dict[Signal, str]
         Which topic or column each signal comes from.
     warnings : tuple of str
-        Sentences a user should see.
+        Sentences to show to the user.
     attachments : dict[str, bytes]
-        Files inside the file.
+        Attached files by name.
     metadata : dict[str, dict[str, str]]
-        Named notes inside the file.
+        Metadata records by name.
     start_ns, end_ns : int or None
         First and last log time of any message.
     damaged_chunks : int
-        Places where something was lost.
+        Number of places where data were lost.
     messages : callable
-        Gives the raw messages of some or of all topics in the order of their log times; see
-        `iter_messages`.
+        Yields the raw messages of the given topics (None for all) in the order of their log
+        times; see `iter_messages`.
     units : dict[Signal, str]
-        The unit the log names for a signal, as a table's column does.
+        The unit that the log states for a signal, for example in the head of a column.
     grounds : dict[Signal, str]
-        Why a column was taken for a signal, where that had to be found out.
+        Why a column was assigned to a signal, if the names alone did not decide it.
     understood : list of str
-        Sentences about what had to be found out.
+        Sentences about what was inferred from the data.
     """
 
     path: str
@@ -112,10 +112,10 @@ class LogContents:
     understood: list[str] = field(default_factory=list)
 
     def iter_messages(self, topics: Collection[str] | None = None) -> Iterator[LoggedMessage]:
-        """Yield raw messages in the order of their log times, read anew from the file.
+        """Yield raw messages in the order of their log times, reading the file again.
 
-        Latched messages that a recorder repeated at the head of a later split
-        come once.
+        A latched message that a recorder repeated at the start of a later split
+        is yielded once.
 
         Parameters
         ----------
@@ -127,21 +127,21 @@ class LogContents:
         InputError
             If a topic is not in the log.
         RecordingError
-            If the file cannot be read any more.
+            If the file can no longer be read.
         """
         for topic in topics or ():
             self._topic(topic)
         return self.messages(topics)
 
     def decoder(self, topic: str) -> Decoder:
-        """Return a decoder for a topic by the definition in the file itself.
+        """Return a decoder for a topic that uses the definition stored in the file.
 
         Raises
         ------
         InputError
             If the topic is not in the log.
         RecordingError
-            If its definition is missing or not understood.
+            If its definition is missing or cannot be parsed.
         """
         info = self._topic(topic)
         return Decoder(info.type, info.definition)

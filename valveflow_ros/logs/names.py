@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Which topic or column stands for which signal."""
+"""Assigns topics and columns to signals by name."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from valveflow_ros.records import SIGNALS, ByteArray, Quality, Signal
 FLOAT64 = 'std_msgs/msg/Float64'
 PLANT_SAMPLE = 'valveflow_msgs/msg/PlantSample'
 PLANT_SAMPLE_TOPIC = 'plant_sample'
-# Its codes of quality, from 0, which stands where the sender did not set one.
+# Quality codes 0 to 3 of a PlantSample; 0 means that the sender did not set the code.
 _CODES = (Quality.BAD, Quality.GOOD, Quality.UNCERTAIN, Quality.BAD)
-# Of recordings made before there was a code for that.
+# Codes 0 to 2 in older recordings, which had no code for an unset quality.
 _EARLIER = (Quality.GOOD, Quality.UNCERTAIN, Quality.BAD)
 _EARLIER_GOOD = re.compile(r'QUALITY_GOOD\s*=\s*0\b')
 
@@ -48,24 +48,24 @@ def signals_of(names: Iterable[str]) -> set[Signal]:
 
 
 def last_part(topic: str) -> str:
-    """Return the part of a topic behind its last slash."""
+    """Return the part of a topic after its last slash."""
     return topic.rsplit('/', 1)[-1]
 
 
 def has_earlier_codes(definition: str) -> bool:
-    """Return True for the ros2msg text of a PlantSample in which 0 meant a good value."""
+    """Return True if code 0 means a good value in this ros2msg text of a PlantSample."""
     return _EARLIER_GOOD.search(definition) is not None
 
 
 def qualities(definition: str = '') -> ByteArray:
-    """Return the `Quality` of each code in a PlantSample, shape (256,).
+    """Return the `Quality` of each quality code of a PlantSample, shape (256,).
 
     Parameters
     ----------
     definition : str
-        The ros2msg text that a recording has of it; empty for that of now.
+        The ros2msg text in the recording; empty for the current definition.
     """
-    # A code that is not known says at least that all is not well.
+    # Unknown codes count as bad.
     found = np.full(256, int(Quality.BAD), dtype=np.uint8)
     codes = _EARLIER if has_earlier_codes(definition) else _CODES
     found[: len(codes)] = codes
@@ -73,12 +73,12 @@ def qualities(definition: str = '') -> ByteArray:
 
 
 class TopicChoice:
-    """Chooses among the topics of a recording.
+    """Selects the topics of a recording that are read as inputs.
 
     Parameters
     ----------
     wanted : mapping of str to str
-        Contract name (or ``plant_sample``) to the topic that is to stand for it.
+        The topic to use for a contract name (or ``plant_sample``).
 
     Raises
     ------
@@ -94,7 +94,7 @@ class TopicChoice:
         self._wanted_topics = {_rooted(topic) for topic in wanted.values()}
 
     def may_matter(self, topic: str, type_name: str) -> bool:
-        """Tell whether a topic may turn out to be chosen."""
+        """Return True if `signals` or `plant_sample` may select the topic."""
         if type_name == FLOAT64:
             return last_part(topic) in _TOPICS or _rooted(topic) in self._wanted_topics
         if type_name == PLANT_SAMPLE:
@@ -103,19 +103,19 @@ class TopicChoice:
         return False
 
     def signals(self, types: Mapping[str, str], path: str) -> dict[str, Signal]:
-        """Return the Float64 topics to be read and what each stands for.
+        """Return the Float64 topics to read and the signal of each.
 
         Parameters
         ----------
         types : mapping of str to str
-            Every topic of the recording and its type.
+            Type of every topic of the recording.
         path : str
-            The recording, for the sentence.
+            The recording, for error messages.
 
         Raises
         ------
         InputError
-            If two topics could stand for one signal, or a wanted topic is not there.
+            If several topics match a signal, or a wanted topic is missing or of another type.
         """
         chosen: dict[str, Signal] = {}
         for info in SIGNALS:
@@ -129,14 +129,14 @@ class TopicChoice:
         return chosen
 
     def plant_sample(self, types: Mapping[str, str], path: str) -> str | None:
-        """Return the topic of stamped samples, if there is one; raises like `signals`."""
+        """Return the topic of PlantSample messages, None if absent; raises like `signals`."""
         if self._stamped is not None:
             return _present(self._stamped, PLANT_SAMPLE_TOPIC, PLANT_SAMPLE, types, path)
         return _only(PLANT_SAMPLE_TOPIC, PLANT_SAMPLE, types, path)
 
 
 def misfits(types: Mapping[str, str]) -> list[str]:
-    """Return a clause for each topic that has an input's name and another type."""
+    """Return a clause for each topic that has the name of an input but not its type."""
     return [
         f"the topic '{topic}' is of type {type_name or 'unknown'} where {FLOAT64} is needed"
         for topic, type_name in types.items()

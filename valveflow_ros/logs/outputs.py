@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a monitor said in a recording, as tables: one a kind, one row a message."""
+"""Tables of the monitor's outputs in a recording: one table per kind, one row per message."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ OUTPUTS = {
 _TIME = 'builtin_interfaces/msg/Time'
 _HEADER = 'std_msgs/msg/Header'
 _STATUS = 'diagnostic_msgs/msg/DiagnosticStatus'
-_ROWS = 20_000  # at a time, in memory
+_ROWS = 20_000  # in memory at a time
 
 
 def outputs_in(log: LogContents) -> list[str]:
-    """Return the kinds of `OUTPUTS` a recording holds; raises `DataError` if it holds none."""
+    """Return the kinds of `OUTPUTS` in a recording; raises `DataError` if there are none."""
     there = {topic.type for topic in log.topics.values() if topic.count}
     found = [kind for kind, name in OUTPUTS.items() if name in there]
     if not found:
@@ -44,16 +44,16 @@ def outputs_in(log: LogContents) -> list[str]:
 
 
 def write_outputs(log: LogContents, kind: str, path: Path) -> int:
-    """Write the messages of one kind as CSV or Parquet, by the suffix; return the rows.
+    """Write the messages of one kind as CSV or Parquet (by suffix); return the number of rows.
 
-    Columns are the fields of the message, ``time`` (UTC) and ``unit_tag`` of its header, and the
-    topic. Health has a row for each status. An array is a list in Parquet and JSON in CSV; a time
-    of zero, and in CSV a number that is not known, is an empty cell.
+    The columns are ``time`` (UTC) and ``unit_tag`` of the header, the topic, and the fields of
+    the message. Health has one row per status. An array is a list in Parquet and JSON in CSV.
+    A time of zero is an empty cell; in CSV a number that is not finite is an empty cell, too.
 
     Raises
     ------
     RecordingError
-        A definition is missing in the recording, or a message does not fit it.
+        If the recording lacks a definition, or a message does not match it.
     """
     topics = [t for t in log.topics.values() if t.type == OUTPUTS[kind] and t.count]
     types = parse_all(topics[0].type, topics[0].definition)
@@ -78,14 +78,14 @@ def _names(fields: list[Field]) -> list[str]:
 def _rows(
     log: LogContents, topics: list[str], fields: list[Field], types: dict[str, Fields]
 ) -> Iterator[list[Any]]:
-    """Yield the values of each row in the order of `_names`; a time is a `_Time`."""
+    """Yield the values of each row in the order of `_names`; times are of type `_Time`."""
     decoders = {topic: log.decoder(topic) for topic in topics}
     own = [f for f in fields if f.type != _HEADER]
     for message in log.iter_messages(topics):
         content = decoders[message.topic].decode(message.data)
         header = content['header']
         head = [_plain(header['stamp'], _TIME, types), header['frame_id'], message.topic]
-        # Of health each status is a row.
+        # Health has one row per status.
         for part in content['status'] if message.type == OUTPUTS['health'] else [content]:
             yield head + [_plain(part[f.name], f.type, types, bool(f.array)) for f in own]
 
@@ -95,7 +95,7 @@ class _Time(int):
 
 
 def _plain(value: Any, kind: str, types: dict[str, Fields], array: bool = False) -> Any:
-    """Return a field's value with times as `_Time`, that of zero as None."""
+    """Return a field's value with times as `_Time`, and a time of zero as None."""
     if array and not isinstance(value, bytes):
         return [_plain(v, kind, types) for v in value]
     if kind == _TIME:
@@ -118,7 +118,7 @@ def _cell(value: Any) -> Any:
 
 
 def _finite(value: Any) -> Any:
-    """Replace what JSON does not know."""
+    """Replace numbers that are not finite by None: JSON cannot hold them."""
     if isinstance(value, dict):
         return {k: _finite(v) for k, v in value.items()}
     if isinstance(value, list):

@@ -1,10 +1,10 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A file that is being written: it carries its own name only when it is whole.
+"""A file that is being written and gets its final name only when it is complete.
 
-It is written as ``NAME.mcap.part``, locked as long as its writer lives, and
-renamed when finished, so whoever finds a ``.part`` without a lock knows that
-its writer died.
+It is written as ``NAME.mcap.part``, which is locked as long as its writer lives,
+and renamed when it is finished. A ``.part`` file without a lock therefore belongs
+to a writer that died.
 """
 
 from __future__ import annotations
@@ -31,51 +31,51 @@ class AlteredError(OSError):
 
 
 class Writable(Protocol):
-    """What a recording is written to."""
+    """Interface of the file to which a recording is written."""
 
     def write(self, data: bytes) -> int:
-        """Append bytes and return how many were taken; raises `OSError`."""
+        """Append bytes and return how many were written; raises `OSError`."""
 
     def sync(self) -> None:
-        """Bring everything to the disk; raises `OSError`."""
+        """Flush all data to disk; raises `OSError`."""
 
     def check(self, size: int) -> None:
-        """See that the file still has its name and ``size`` bytes; raises `AlteredError`."""
+        """Check that the file still has its name and ``size`` bytes; raises `AlteredError`."""
 
     def check_content(self, size: int, crc: int) -> None:
         """Read ``size`` bytes back; raises `AlteredError` if they have another CRC-32."""
 
     @property
     def touched(self) -> bool:
-        """Return True if somebody may have written into the file since `write` last did."""
+        """Return True if another program may have written to the file since the last `write`."""
 
     path: Path
 
     def publish(self) -> None:
-        """Give the file its own name, ``path``; raises `OSError`."""
+        """Rename the file to its final name, ``path``; raises `OSError`."""
 
     def close(self) -> None:
-        """Let go of the file, finished or not."""
+        """Close the file, finished or not."""
 
     def discard(self) -> None:
-        """Let go of an unfinished file and remove it: nothing worth keeping is in it."""
+        """Close and remove an unfinished file."""
 
 
 class PartFile:
-    """The real thing; see `Writable`.
+    """A file on disk; see `Writable`.
 
     Parameters
     ----------
     path : Path
-        The name of the finished file.
+        The final name of the file.
     replace : bool
-        Take the place of an unlocked ``.part`` that a dead writer left, and at the end of a file
-        of the finished one's name.
+        Replace an unlocked ``.part`` file that a dead writer left, and on `publish` a file that
+        has the final name.
 
     Raises
     ------
     OSError
-        `FileExistsError` if the ``.part`` stands there already.
+        `FileExistsError` if the ``.part`` file already exists.
     """
 
     def __init__(self, path: Path, replace: bool = False) -> None:
@@ -88,24 +88,24 @@ class PartFile:
         self._changed_ns = 0
 
     def write(self, data: bytes) -> int:
-        """Append bytes and return how many were taken."""
+        """Append bytes and return how many were written."""
         taken = os.write(self._descriptor, data)
         self._changed_ns = os.fstat(self._descriptor).st_mtime_ns
         return taken
 
     def sync(self) -> None:
-        """Bring everything to the disk."""
+        """Flush all data to disk."""
         os.fdatasync(self._descriptor)
 
     def check(self, size: int) -> None:
-        """See that the file still has its name and ``size`` bytes.
+        """Check that the file still has its name and ``size`` bytes.
 
         Raises
         ------
         AlteredError
-            It has not; the text continues a sentence that begins with its name.
+            If not; the text continues a sentence that begins with the file's name.
         OSError
-            It cannot be found out.
+            If this cannot be determined.
         """
         self._check_name(self.part)
         if os.fstat(self._descriptor).st_size != size:
@@ -122,50 +122,50 @@ class PartFile:
 
     @property
     def touched(self) -> bool:
-        """Return True if somebody may have written into the file since `write` last did.
+        """Return True if another program may have written to the file since the last `write`.
 
-        Once for each change: a file system may put the time of a write right afterwards.
+        Each change is reported once; a file system that sets the time late causes a false one.
         """
         changed_ns = os.fstat(self._descriptor).st_mtime_ns
         touched, self._changed_ns = changed_ns != self._changed_ns, changed_ns
         return touched
 
     def publish(self) -> None:
-        """Give the file its own name, durably.
+        """Rename the file to its final name, durably.
 
         Raises
         ------
         FileExistsError
-            Somebody else's file has that name and is not to be replaced.
+            If another file has that name and must not be replaced.
         AlteredError, OSError
-            As `check`; it cannot be done.
+            As in `check`, or if the file cannot be renamed.
         """
         os.fsync(self._descriptor)
         self._check_name(self.part)
         if not self._replace and os.path.lexists(self.path):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.path))
         os.replace(self.part, self.path)
-        # Between the two somebody may have put another file there.
+        # Another program may have replaced the file since the first check.
         self._check_name(self.path)
         sync_folder(self.path.parent)
 
     def close(self) -> None:
-        """Let go of the file and its lock."""
+        """Close the file and release its lock."""
         descriptor, self._descriptor = self._descriptor, -1
         if descriptor >= 0:
-            # It is gone whatever the system answers, and `sync` has told of errors before.
+            # The descriptor is closed in any case, and `sync` has reported write errors before.
             with suppress(OSError):
                 os.close(descriptor)
 
     def discard(self) -> None:
-        """Let go of the file and remove it; another file of its name stays."""
+        """Close and remove the file; a different file with its name is kept."""
         with suppress(OSError):
             self._check_name(self.part)
             self.part.unlink()
         self.close()
 
     def _check_name(self, path: Path) -> None:
-        """Raise `AlteredError` unless ``path`` names the file that is open."""
+        """Raise `AlteredError` unless ``path`` is the name of the open file."""
         try:
             named = path.lstat()
         except (FileNotFoundError, NotADirectoryError):
@@ -175,16 +175,16 @@ class PartFile:
 
 
 def _made(part: Path) -> int:
-    """Return a descriptor of a new file that is locked.
+    """Create and lock a file and return its descriptor.
 
-    Between making and locking somebody may look whether it is a leftover, and even take it for an
-    empty one and remove it: then it is made again.
+    Before it is locked, another process may take it for the empty file of a dead writer and
+    remove it. In this case it is created again.
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
     for left in reversed(range(_TRIES)):
         descriptor = os.open(part, flags, FILE_MODE)
         try:
-            # The umask may have taken rights away; nothing may have added any.
+            # The umask may have removed permissions.
             os.fchmod(descriptor, FILE_MODE)
             fcntl.flock(descriptor, fcntl.LOCK_EX if left else fcntl.LOCK_EX | fcntl.LOCK_NB)
             if os.fstat(descriptor).st_nlink:
@@ -198,7 +198,7 @@ def _made(part: Path) -> int:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[PartFile]:
-    """Give a file to be written and published; whatever fails meanwhile, nothing of it stays."""
+    """Yield a file to write and publish; it is removed if anything fails before that."""
     make_folder(path.parent)
     out = PartFile(path, replace=True)
     try:
@@ -209,7 +209,7 @@ def new_file(path: Path) -> Iterator[PartFile]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Bring a folder's names to the disk."""
+    """Flush the directory entries of a folder to disk."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)
@@ -218,7 +218,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder, and those above it, that only its owner can enter; one that exists stays."""
+    """Create a folder and its parents with access for the owner only, where they are missing."""
     for missing in reversed([folder, *folder.parents]):
         if not os.path.isdir(missing):
             try:
@@ -230,16 +230,16 @@ def make_folder(folder: Path) -> None:
 
 
 def is_held(part: Path) -> bool:
-    """Tell whether a living writer holds a ``.part``."""
+    """Return True if a living writer holds a ``.part`` file."""
     with taken(part) as free:
         return not free
 
 
 @contextmanager
 def taken(part: Path) -> Iterator[bool]:
-    """Hold a ``.part`` that no living writer holds, so that nobody else takes it up meanwhile.
+    """Lock a ``.part`` file of a dead writer, so that only one process recovers it.
 
-    Gives False if one does, or if the file is gone by now.
+    Yields False if a living writer holds it, or if it has just been removed.
     """
     descriptor = os.open(part, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW)
     try:
@@ -254,7 +254,7 @@ def taken(part: Path) -> Iterator[bool]:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Put a small file in place at once: it is the old one or the new one, never half."""
+    """Write a small file atomically: a reader sees the old content or the new one."""
     temporary = path.with_name(f'.{path.name}.{os.getpid()}.{threading.get_ident()}.tmp')
     flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW
     descriptor = os.open(temporary, flags, FILE_MODE)
@@ -275,9 +275,9 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 def mark_of(path: Path) -> tuple[int, ...] | None:
-    """Return by what a file is known again without reading it; None if that is not found out.
+    """Return numbers that change when a file is changed or replaced; None if it has none.
 
-    Of what a link leads to, and of the link.
+    For a link they describe both the target and the link.
     """
     try:
         found, link = path.stat(), path.lstat()

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Opens any log: a recording, a folder of one, or a historian's table."""
+"""Opens any log: a recording, the folder of a recording, or a table from a historian."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def open_log(
     absent: Collection[str] = (),
     table: TableOptions = AS_SEEN,
 ) -> LogContents:
-    """Return what a log holds.
+    """Return the contents of a log.
 
     Parameters
     ----------
@@ -46,18 +46,18 @@ def open_log(
         An ``.mcap`` file in any state, a ``.db3`` file or folder of rosbag2, a ``.csv``,
         ``.xlsx`` or ``.parquet`` table.
     columns : mapping of str to str, optional
-        Contract name to the topic or column that is to stand for it.
+        The topic or column to use for a contract name.
     absent : collection of str
-        Contract names that a table need not have.
+        Contract names that a table may lack.
     table : TableOptions
-        What a table does not say itself.
+        What the user says about a table.
 
     Raises
     ------
     RecordingError
         If nothing can be read.
     InputError
-        If it is not clear which topic or column stands for a signal.
+        If it is unclear which topic or column holds a signal.
     """
     place = Path(path)
     names = dict(columns or {})
@@ -84,7 +84,7 @@ def open_log(
 
 
 def _files_of(folder: Path) -> tuple[list[Path], list[str]]:
-    """Return the splits of a folder in their order, and sentences about the choice."""
+    """Return the splits of a folder in their order, and warnings about their selection."""
     with os_errors(folder, 'cannot be opened'):
         names = {entry.name for entry in folder.iterdir()}
     found = recording_files(folder)
@@ -111,15 +111,15 @@ def _files_of(folder: Path) -> tuple[list[Path], list[str]]:
 
 
 def _stem(name: str) -> str:
-    """Return the name of a split without its ``_number`` and suffix; other names are their own."""
+    """Return the name of a split without its suffix and its number, if it has one."""
     whole = name.split('.mcap')[0]
     stem, line, number = whole.rpartition('_')
     return stem + line if line and number.isdecimal() else whole
 
 
 def _listed(folder: Path) -> list[str]:
-    """Return the file names of `metadata.yaml`; what it says beyond that is in the files."""
-    # Whatever is wrong with it, the files say themselves what they hold.
+    """Return the file names in `metadata.yaml`; its other content is in the files, too."""
+    # An unreadable one is ignored, since the files themselves describe their content.
     try:
         with Source.open(folder / METADATA_NAME) as source:
             raw = source.read(0, min(source.size, MAX_METADATA_BYTES))
@@ -135,5 +135,5 @@ def _listed(folder: Path) -> list[str]:
     if mode in ('file', 'message'):
         problem = f'is compressed {mode} by {mode} by rosbag2, which is not read here'
         raise RecordingError(folder, f"{problem}; rewrite it with 'ros2 bag convert'")
-    # Only names within the folder count, whatever path is written there.
+    # Only the file name is used, so that nothing outside of the folder is read.
     return [Path(str(name)).name for name in names if name] if isinstance(names, list) else []

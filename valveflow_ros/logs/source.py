@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Opens a file for reading without being caught by what is not a file."""
+"""Opens regular files for reading, and refuses FIFOs, devices and folders."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BUFFER_BYTES = 1 << 20
 
 @contextmanager
 def os_errors(path: object, problem: str) -> Iterator[None]:
-    """Turn an `OSError` into a `RecordingError`: the problem, and what the system says of it."""
+    """Turn an `OSError` into a `RecordingError` with the problem and the system's reason."""
     try:
         yield
     except OSError as error:
@@ -29,7 +29,7 @@ def os_errors(path: object, problem: str) -> Iterator[None]:
 
 
 def printable(name: str) -> str:
-    """Return a file's name as it may stand in a sentence: a line break would end that."""
+    """Return a file's name with ``?`` for what cannot be printed, such as a line break."""
     return ''.join(letter if letter.isprintable() else '?' for letter in name)
 
 
@@ -48,8 +48,8 @@ class Source:
         Raises
         ------
         RecordingError
-            If it is absent, unreadable, empty, or not a regular file. A FIFO
-            or a device is never waited for.
+            If it is absent, unreadable, empty, or not a regular file. The call
+            does not block on a FIFO or a device.
         """
         name = str(path)
         try:
@@ -102,12 +102,12 @@ MIB = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Bounds a reader keeps to, whatever a file claims.
+    """Limits that a reader keeps, whatever sizes a file claims.
 
-    The work bounds grow with the file, because an honest file of a plant
-    compresses at most some ten times: ``work_floor_bytes + work_per_byte * size``
-    may be decompressed in all, and ``failed_floor_bytes + failed_per_byte * size``
-    in vain.
+    The limits on work grow with the file size, because data of a plant are
+    compressed about ten times at most. ``work_floor_bytes + work_per_byte * size``
+    bytes may be decompressed in total, and ``failed_floor_bytes + failed_per_byte *
+    size`` bytes without a usable result.
     """
 
     record_bytes: int = 64 * MIB
@@ -125,11 +125,11 @@ DEFAULT_LIMITS = Limits()
 
 
 class OverBudgetError(Exception):
-    """A file costs more work than its size justifies; never leaves the package."""
+    """A file needs more work than its size justifies; caught within the package."""
 
 
 class Budget:
-    """Counts the bytes a file makes the reader work through."""
+    """Counts the bytes that the reader processes for a file."""
 
     __slots__ = ('failed_left', 'left')
 
@@ -138,13 +138,13 @@ class Budget:
         self.failed_left = limits.failed_floor_bytes + limits.failed_per_byte * file_bytes
 
     def spend(self, size: int) -> None:
-        """Count work before it is done; raises `OverBudgetError` when nothing is left."""
+        """Count work before it is done; raises `OverBudgetError` beyond the limit."""
         self.left -= size
         if self.left < 0:
             raise OverBudgetError
 
     def spend_in_vain(self, size: int) -> None:
-        """Count work that turned out to be in vain."""
+        """Count work without a usable result; raises `OverBudgetError` beyond the limit."""
         self.failed_left -= size
         if self.failed_left < 0:
             raise OverBudgetError

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Bags that rosbag2 wrote with sqlite3 (``.db3``), read as the same messages in MCAP."""
+"""Reads bags that rosbag2 wrote with sqlite3 (``.db3``) through a temporary MCAP file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _NO_SEND_TIME = 'A bag in sqlite3 has no times of sending: values stand when the
 
 
 class _Copy:
-    """The messages of a copy, which is removed together with this."""
+    """The messages of a temporary copy, which is removed together with this object."""
 
     def __init__(self, folder: str, messages: Messages) -> None:
         self._messages = messages
@@ -35,17 +35,17 @@ class _Copy:
 
 
 def read_bag(paths: list[Path], name: str, columns: Mapping[str, str]) -> LogContents:
-    """Return what ``.db3`` files, the splits of one bag, hold together.
+    """Return the contents of ``.db3`` files, which are the splits of one bag.
 
-    They are copied into an MCAP file below the folder for temporary files, so that everything
-    else is read as it always is; it is removed with the result.
+    They are copied to a temporary MCAP file, which is read like any other recording and removed
+    together with the result.
 
     Raises
     ------
     RecordingError
-        A file is no such bag, or holds nothing that can be read.
+        If a file is not a complete bag, or there is no message in any of them.
     InputError
-        The choice of topics is not clear.
+        If it is unclear which topic holds a signal.
     """
     folder = tempfile.mkdtemp(prefix='valveflow-')
     try:
@@ -61,9 +61,9 @@ def read_bag(paths: list[Path], name: str, columns: Mapping[str, str]) -> LogCon
 
 
 def _copy(path: Path, writer: RecordingWriter) -> int:
-    """Write the messages of one file in the order of their times; return how many there were."""
+    """Write the messages of one file in the order of their times; return their number."""
     with Source.open(path):
-        pass  # it is a regular file
+        pass  # raises unless it is a regular file
     count = 0
     try:
         uri = f'file:{quote(str(path.resolve()))}?mode=ro'
@@ -82,7 +82,7 @@ def _copy(path: Path, writer: RecordingWriter) -> int:
 
 
 def _topics(bag: sqlite3.Connection, writer: RecordingWriter) -> Iterator[tuple[int, str]]:
-    """Add the topics of a bag to a recording; yield the number and the name of each."""
+    """Add the topics of a bag to a recording; yield the id and the name of each."""
     texts: dict[str, str] = {}
     if bag.execute("SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'").fetchone():
         texts = dict(bag.execute(
@@ -96,6 +96,6 @@ def _topics(bag: sqlite3.Connection, writer: RecordingWriter) -> Iterator[tuple[
             continue
         try:
             writer.add_topic(topic, kind, definition=texts.get(kind))
-        except RecordingError:  # a type that is not known here, and not told either
+        except RecordingError:  # the type is unknown, and the bag has no definition of it
             writer.add_topic(topic, kind, definition='')
         yield number, topic

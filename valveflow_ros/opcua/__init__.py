@@ -1,3 +1,3 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""OPC UA: the mapping of nodes to signals, the link to a server, its history, and a server."""
+"""OPC UA: mapping of nodes to signals, client with history access, and server of results."""

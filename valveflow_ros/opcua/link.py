@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A link to an OPC UA server: subscription, reconnection, the history of outages."""
+"""Client connection to an OPC UA server: subscription, reconnection, history of outages."""
 
 from __future__ import annotations
 
@@ -33,33 +33,33 @@ if TYPE_CHECKING:
     from asyncua import Client, ua
 
 FIRST_PAUSE_S = 0.2
-# The clocks are compared, and nodes that were not there looked for, every so many seconds.
+# Period in s of the comparison of clocks, and of the search for missing nodes.
 _LOOK_S, _NODES_S = 5.0, 30.0
-# So many messages that were lost on the way are asked for again.
+# Maximum number of lost messages that are requested again.
 _MOST_REPUBLISHED = 100
 _OVERFLOW = 0x480  # StatusCode: info type DataValue, bit Overflow
 
 
 @dataclass
 class LinkState:
-    """How the link is, for `/diagnostics`; written by the link's thread, read by any.
+    """State of the link for `/diagnostics`; written by its thread, read by any thread.
 
     Attributes
     ----------
     up, since_s : bool, float
-        Whether it is up, and since when by a clock that never goes back.
+        Whether the link is up, and the monotonic time of the last change.
     problem : str
-        Why it is not up, empty before the first attempt.
+        Why it is not up; empty before the first attempt.
     attempts, losses : int
-        Attempts since it was up, and how often it was lost.
+        Attempts to connect since it was up, and number of losses.
     lost_messages, republished : int
-        Messages of the server that are missing in its numbering, and those sent again.
+        Messages missing by their sequence numbers, and those received on request.
     clock_ahead_s : float
-        How far the server's clock is ahead of this machine's; NaN: not known.
+        Server's clock minus this machine's clock; NaN if unknown.
     nodes : dict of int to str
-        Problem of a signal's node, by signal.
+        Problem with the node of a signal, by signal.
     backfill : str
-        What came of the last outage's history.
+        Result of reading the history of the last outage.
     """
 
     up: bool = False
@@ -76,17 +76,17 @@ class LinkState:
 
 
 class Link:
-    """Keeps a unit's subscription alive for as long as it runs.
+    """Maintains the subscription of a unit while `run` is active.
 
     Parameters
     ----------
     unit : UnitMapping
     tell : callable
-        Takes, in order, what is to be done with the unit's `Sampler`, which may live in another
-        thread.
+        Called with functions to apply, in order, to the unit's `Sampler`, which may belong to
+        another thread.
     save : callable, optional
-        Is called with the readings of an outage, part by part in the order of time, in a thread of
-        its own; returns what to tell of it.
+        Called in a separate thread with the readings of an outage, in parts in time order;
+        returns a clause about the result.
     """
 
     def __init__(
@@ -103,13 +103,13 @@ class Link:
         self._confirmed_ns = 0
         self._heard_s = 0.0
         self._sequence = 0
-        self._ended = ''  # why the subscription is to be made anew
+        self._ended = ''  # why the subscription must be created again
         self._session: Any = None
         self._held_back: list[tuple[list[Change], int]] | None = None
         self._outages: list[tuple[int, int]] = []  # whose history is not saved yet
 
     async def run(self) -> None:
-        """Connect, and connect again after every loss, until it is cancelled."""
+        """Connect, and reconnect after every loss, until the task is cancelled."""
         state, pause_s = self.state, FIRST_PAUSE_S
         while True:
             try:
@@ -117,7 +117,7 @@ class Link:
                     self._unit.endpoint, self._unit.security, self._unit.user
                 ) as client:
                     await self._serve(client)
-            except Exception as error:  # noqa: BLE001 - whatever it was: told, and tried again
+            except Exception as error:  # noqa: BLE001 - every failure is reported and retried
                 state.problem = in_words(error)
             if state.up:
                 state.up, state.since_s, pause_s = False, time.monotonic(), FIRST_PAUSE_S
@@ -154,14 +154,14 @@ class Link:
                 saving.cancel()
 
     async def _subscribe(self, client: Client) -> float:
-        """Make the subscription; return how long the server may be silent, in s."""
+        """Create the subscription; return the longest silence of the server in s."""
         from asyncua import ua
 
         unit = self._unit
         wanted = ua.CreateSubscriptionParameters(
             RequestedPublishingInterval=1000.0 * unit.publishing_interval_s,
             RequestedLifetimeCount=max(30, math.ceil(60.0 / unit.publishing_interval_s)),
-            # With 1, the server confirms each interval that nothing changed.
+            # With 1, the server sends a keep-alive in each interval without changes.
             RequestedMaxKeepAliveCount=1,
             MaxNotificationsPerPublish=10_000,
             PublishingEnabled=True,
@@ -170,7 +170,7 @@ class Link:
         session = self._session = client.uaclient.session
 
         async def published(result: ua.PublishResult) -> None:
-            # A session that could not be closed may still speak.
+            # An old session that could not be closed may still send messages.
             if session is self._session:
                 await self._published(result, session)
 
@@ -181,7 +181,7 @@ class Link:
         return float(made.RevisedPublishingInterval * max(1, made.RevisedMaxKeepAliveCount)) / 1e3
 
     async def _monitor(self, client: Client, subscription: int, signals: list[int]) -> None:
-        """Let the server monitor nodes; what it refuses is told, and the others go on."""
+        """Let the server monitor nodes; refused nodes are reported, the others are used."""
         from asyncua import ua
 
         def request(signal: int, dead_band: bool) -> ua.MonitoredItemCreateRequest:
@@ -226,7 +226,7 @@ class Link:
                 name = result.StatusCode.name
                 if result.StatusCode.is_good():
                     state.nodes.pop(signal, None)
-                elif dead_band and 'Filter' in name:  # it has no dead bands for this node
+                elif dead_band and 'Filter' in name:  # no dead band supported for this node
                     again.append(signal)
                 else:
                     node = self._by_signal[signal].node
@@ -234,13 +234,13 @@ class Link:
             known = again
 
     async def _published(self, result: ua.PublishResult, session: Any) -> None:
-        """Take a message of the server; those missing before it are asked for again."""
+        """Process a message of the server; request missing messages before it again."""
         from asyncua import ua
 
         now_ns, message = time.time_ns(), result.NotificationMessage
         if any(isinstance(n, ua.StatusChangeNotification) for n in message.NotificationData or ()):
-            # The server has ended the subscription; or asyncua says so itself of a lost link, and
-            # that confirms nothing. What an old session still sends is no longer wanted.
+            # The server has ended the subscription, or asyncua reports a lost link in this way.
+            # Neither confirms a time. Later messages of this session are ignored.
             self._session, self._ended = None, 'the server has ended the subscription'
             return
         self._heard_s = time.monotonic()
@@ -254,16 +254,16 @@ class Link:
                     raise DataError('It is empty.')
                 self.state.republished += 1
                 self._deliver(again.NotificationData, now_ns, self._confirmed_ns)
-            except Exception:  # noqa: BLE001 - it is lost, whatever the server said
+            except Exception:  # noqa: BLE001 - after any failure the message is lost
                 lost += 1
         if lost:
-            # What changed in it is not known: a new subscription begins with every value.
+            # The lost changes are unknown; a new subscription begins with all current values.
             self.state.lost_messages += lost
             self._session, self._ended = None, 'a message of the server was lost'
             return
-        # A message without values, a keep-alive, has the number of the next one with values.
+        # A keep-alive has no values; its number is that of the next message with values.
         self._sequence = number if message.NotificationData else max(self._sequence, number - 1)
-        # Where the server has more to send at once, not all up to now is here yet.
+        # If the server has more notifications, the changes up to now are not complete.
         confirmed_ns = self._confirmed_ns if result.MoreNotifications else now_ns
         self._deliver(message.NotificationData or [], now_ns, confirmed_ns)
 
@@ -295,7 +295,7 @@ class Link:
         self._tell(lambda sampler: sampler.take(changes, confirmed_ns))
 
     async def _watch(self, client: Client, longest_silence_s: float) -> None:
-        """Return or raise when the link is lost."""
+        """Raise when the link is lost; compare the clocks and look for missing nodes meanwhile."""
         from asyncua.client.ua_client import UaClientState
 
         looked_s = nodes_s = -_NODES_S
@@ -326,17 +326,17 @@ class Link:
         self.state.clock_ahead_s = (server_ns - middle_ns) / NS_PER_S
 
     async def _gap(self, client: Client, gap_from_ns: int, now_ns: int) -> list[Change]:
-        """Return the history of a gap, or of its end, as far as the server has one.
+        """Return the history of a gap, or of its last hour, as far as the server has it.
 
-        Each signal begins at its last value from before, so that one which did not change since
-        has a value too.
+        Each signal begins with its last value before the gap, so that an unchanged signal has a
+        value, too.
         """
         found: list[Change] = []
         for signal, node_id in self._ids.items():
             if signal in self.state.nodes:
-                continue  # it is not monitored: no later change would come
+                continue  # not monitored, so later changes would not arrive
             start_ns = max(self._newest_ns.get(signal, gap_from_ns), now_ns - HISTORY_PART_NS)
-            with contextlib.suppress(Exception):  # it has none: the gap stays bad
+            with contextlib.suppress(Exception):  # without a history the gap stays bad
                 node = self._by_signal[signal]
                 found += await asyncio.wait_for(
                     read_history(client, node, node_id, start_ns, now_ns), ANSWER_S
@@ -344,7 +344,7 @@ class Link:
         return found
 
     async def _backfill(self, client: Client) -> None:
-        """Have the history of outages saved; one that is cut short stays to be read."""
+        """Read and save the history of outages; an interrupted one is read again later."""
         assert self._save is not None
         while self._outages:
             start_ns, end_ns = self._outages[0]
@@ -355,11 +355,11 @@ class Link:
                     part async for part in history(client, nodes, start_ns, end_ns) if len(part)
                 ]
                 saved = await asyncio.to_thread(self._save, parts) if parts else 'it has none'
-            except Exception as error:  # noqa: BLE001 - whatever it was is told
+            except Exception as error:  # noqa: BLE001 - every failure is reported
                 saved = in_words(error)
                 try:
                     await self._compare_clocks(client)
-                except Exception:  # noqa: BLE001 - not the history failed, but the link
+                except Exception:  # noqa: BLE001 - the link failed, not the history
                     return
             self._outages.pop(0)
             self.state.backfill = f'history of the last outage ({told}): {saved}'

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The mapping file: which OPC UA nodes are which signals, and how the servers are reached."""
+"""Reads the mapping file: OPC UA nodes of the signals, and how to connect to the servers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from valveflow_ros.signals.units import UNITS, Unit, unit_of
 
 POLICIES = ('Basic256Sha256', 'Aes256Sha256RsaPss', 'None')
 
-# What may stand at the top of the file, for all units, and within a unit, for that one.
+# Keys that are valid at the top of the file for all units, and within a unit for that unit.
 LINK: tuple[Parameter, ...] = (
     Parameter('endpoint', '', '', 'Address of the server, opc.tcp://host:port/path.'),
     Parameter('period', 1.0, 's', 'Time from one plant_sample to the next.', 0.05, 3600.0),
@@ -65,7 +65,7 @@ _NAMESPACE = re.compile(r'(/[A-Za-z_]\w*)*')
 
 @dataclass(frozen=True, slots=True)
 class Security:
-    """How a link is protected; paths are absolute."""
+    """Security settings of a connection; paths are absolute."""
 
     policy: str
     mode: str
@@ -75,13 +75,13 @@ class Security:
 
     @property
     def none(self) -> bool:
-        """Return True if nothing is signed nor encrypted."""
+        """Return True if messages are neither signed nor encrypted."""
         return self.policy == 'None'
 
 
 @dataclass(frozen=True, slots=True)
 class User:
-    """Whom the session is for; nobody if both names are empty."""
+    """User of a session; anonymous if neither name nor certificate is given."""
 
     name: str = ''
     password: str = ''
@@ -91,7 +91,7 @@ class User:
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """A node of the server that is a signal; ``unit`` turns its value into the monitor's."""
+    """A node with a signal; ``unit`` converts its value to the monitor's unit."""
 
     signal: Signal
     node: str
@@ -101,7 +101,7 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class UnitMapping:
-    """One unit: where its samples go, and where its values come from; times in ns."""
+    """One unit: the target of its samples and the source of its values; times in ns or s."""
 
     namespace: str
     tag: str
@@ -121,7 +121,7 @@ class UnitMapping:
 
 @dataclass(frozen=True, slots=True)
 class ServerSettings:
-    """The server that shows curve, alarms and diagnosis."""
+    """Settings of the server for curve, alarms and diagnosis."""
 
     endpoint: str
     security: Security
@@ -130,7 +130,7 @@ class ServerSettings:
 
 @dataclass(frozen=True, slots=True)
 class GatewayMapping:
-    """A whole mapping file."""
+    """Content of a mapping file."""
 
     units: tuple[UnitMapping, ...]
     server: ServerSettings | None
@@ -142,9 +142,9 @@ def read_mapping_file(path: str | Path) -> GatewayMapping:
     Raises
     ------
     RecordingError
-        It cannot be read, or a file that it names cannot.
+        If it, or a file that it names, cannot be read.
     InputError
-        Something in it cannot be used; the sentence says where and why.
+        If something in it is invalid; the message says where and why.
     """
     path = Path(path).expanduser()
     try:
@@ -159,7 +159,7 @@ def read_mapping_file(path: str | Path) -> GatewayMapping:
 
 
 class _Reader:
-    """Turns what YAML gave into records; remembers the file for the sentences."""
+    """Converts the YAML content to records; stores the path for error messages."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -229,7 +229,7 @@ class _Reader:
                 raise self._error(
                     here, f"'{values['node']}' is no node id such as ns=2;s=HV101.ZT"
                 )
-            # A gauge pressure taken for an absolute one is never guessed, so units are named.
+            # The unit is required, so that a gauge pressure is not taken as absolute.
             if not values['unit']:
                 units = ', '.join(UNITS[known[topic]])
                 raise self._error(here, f"'unit' must be named, such as {units}")

@@ -24,7 +24,7 @@ _LIVE_DAYS, _PART_S = 1.0, 6 * 3600.0
 
 
 async def serve(port: int, hours: float, seed: int) -> None:
-    """Offer the plant: hours of history up to now, then a row a second, until it is cancelled."""
+    """Serve the plant: ``hours`` of history, then one row per second, until it is cancelled."""
     from asyncua import Server, ua
 
     server = Server()

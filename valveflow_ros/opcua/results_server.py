@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""An OPC UA server that shows curve, alarms and diagnosis, to be read only. Knows asyncua."""
+"""A read-only OPC UA server with curve, alarms and diagnosis. Requires asyncua."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from cryptography.x509 import Certificate
 
 NAMESPACE = 'urn:valveflow'
-# Severity of an event, 1 to 1000, by the priority of the alarm; without a standing condition 100.
+# Severity of an event, 1 to 1000, by the priority of the alarm; 100 if no condition is active.
 SEVERITY, NO_CONDITION = {1: 300, 2: 600, 3: 900}, 100
 _EVENT_FIELDS = {'State': 'Byte', 'PreviousState': 'Byte', 'Value': 'Double', 'Limit': 'Double',
                  'Unit': 'String'}  # fmt: skip
 
 
 class Field(NamedTuple):
-    """A variable: name, OPC UA type ('Double', 'DateTime' as ns, ...), and whether an array."""
+    """A variable: name, OPC UA type ('Double', 'DateTime' in ns, ...), True for an array."""
 
     name: str
     kind: str
@@ -42,7 +42,7 @@ class Field(NamedTuple):
 
 
 class Alarm(NamedTuple):
-    """What an event tells; values of `Alarm.msg`."""
+    """Content of an event, with the values of `Alarm.msg`."""
 
     name: str
     time_ns: int
@@ -52,11 +52,11 @@ class Alarm(NamedTuple):
 
 
 class _Readers:
-    """Lets in who has a trusted certificate, and the password where one is wanted; to read only.
+    """Accepts clients with a trusted certificate and, if required, the password; read-only.
 
-    The certificate is that of the secure channel: what a client says of itself later, when it
-    makes the session, is up to the client. Its time is judged at each session. With None for the
-    certificates the link has none.
+    The certificate of the secure channel is checked, not the one that a client states when it
+    creates the session. Its validity period is checked for each session. None for ``trusted``
+    means a connection without certificates.
     """
 
     def __init__(self, trusted: Iterable[Certificate] | None, user: User) -> None:
@@ -86,14 +86,14 @@ class _Readers:
 
 
 class ResultsServer:
-    """The server; all calls belong into one event loop.
+    """The server; all calls must be made in one event loop.
 
     Parameters
     ----------
     settings : ServerSettings
     units : mapping of str to mapping of str to sequence of Field
-        By the tag of the unit: its objects, such as ``characteristic`` and ``alarms.residual``,
-        and their variables. The id of a variable is ``ns=N;s=TAG.OBJECT.FIELD``.
+        Objects by unit tag, such as ``characteristic`` and ``alarms.residual``, and their
+        variables. The id of a variable is ``ns=N;s=TAG.OBJECT.FIELD``.
     """
 
     def __init__(
@@ -107,14 +107,14 @@ class ResultsServer:
         self._one = asyncio.Lock()
 
     async def start(self) -> list[str]:
-        """Listen; return what to warn of: clients whose certificates are not valid now.
+        """Start the server; return warnings about client certificates that are not valid now.
 
         Raises
         ------
         DataError
-            The address is taken or is not this machine's.
+            If the address is in use or does not belong to this machine.
         RecordingError
-            A certificate or key cannot be used.
+            If a certificate or key cannot be used.
         """
         from asyncua import Server, ua
 
@@ -152,14 +152,14 @@ class ResultsServer:
         return told
 
     async def stop(self) -> None:
-        """Close it."""
+        """Stop the server."""
         if self._server is not None:
             await self._server.stop()
 
     async def update(
         self, tag: str, name: str, values: Mapping[str, object], time_ns: int
     ) -> None:
-        """Write the variables of an object; times are in ns, a number that is absent is NaN."""
+        """Write the variables of an object; times are in ns, a missing number is NaN."""
         from asyncua import ua
 
         async with self._one:
@@ -188,7 +188,7 @@ class ResultsServer:
             await generator.trigger(to_datetime(alarm.time_ns), alarm.sentence)
 
     async def mark(self, tag: str, present: bool) -> None:
-        """Mark what is known of a unit: good, or the last usable value after its monitor ended."""
+        """Set the status of a unit's values: good, or last usable value if its monitor ended."""
         from asyncua import ua
 
         code = ua.StatusCodes.Good if present else ua.StatusCodes.UncertainLastUsableValue
@@ -203,7 +203,7 @@ class ResultsServer:
     async def _write(self, node: Any, data: Any) -> None:
         from asyncua import ua
 
-        # As the server itself: for clients the variables are not writable.
+        # Written inside the server, because clients must not write the variables.
         await self._server.iserver.aspace.write_attribute_value(
             node.nodeid, ua.AttributeIds.Value, data
         )
@@ -249,14 +249,14 @@ def _id(index: int, text: str) -> Any:
 
 
 async def read_results(endpoint: str, security: Security, names: Sequence[str]) -> list[Any]:
-    """Return variables of such a server by name, such as ``U1.characteristic.status``.
+    """Return variables of a results server by name, such as ``U1.characteristic.status``.
 
-    One that has no value yet is None.
+    A variable without a value is None.
 
     Raises
     ------
     Exception
-        The server cannot be reached or refuses; see `in_words`.
+        If the server cannot be reached or refuses; see `in_words`.
     """
     async with connected(endpoint, security, User()) as client:
         index = await client.get_namespace_index(NAMESPACE)

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""From changes of single values to one sample a period; no clock, no link: time is an argument."""
+"""Turns changes of single values into one sample per period; the time is always an argument."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from typing import NamedTuple
 from valveflow_ros.opcua.mapping import UnitMapping
 from valveflow_ros.records import N_SIGNALS, NS_PER_S, Quality
 
-# How far a source timestamp may be ahead of this machine's clock.
+# Maximum lead of a source timestamp over this machine's clock.
 AHEAD_NS = NS_PER_S
-# More periods than these are not sent at once after this process stood still.
+# Maximum number of periods sent at once after this process was suspended.
 _MOST_DUE = 600
 
 
 class Change(NamedTuple):
-    """A value as the server sent it, in the monitor's unit.
+    """A value sent by the server, converted to the monitor's unit.
 
-    ``source_ns`` is 0 where the server gave no time. ``value`` is NaN where there is no number;
-    ``problem`` is then 'wrong_type' or 'not_finite', or empty if the server itself said bad.
+    ``source_ns`` is 0 if the server gave no time. ``value`` is NaN if there is no number.
+    ``problem`` is 'wrong_type' or 'not_finite', or empty if the value is valid or marked as bad.
     """
 
     signal: int
@@ -35,7 +35,7 @@ class Change(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """One sample: values in the monitor's units, NaN where bad; qualities, None: not mapped."""
+    """A sample: values in the monitor's units, NaN if bad; qualities, None if not mapped."""
 
     time_ns: int
     values: Sequence[float]
@@ -44,21 +44,21 @@ class Sample(NamedTuple):
 
 @dataclass(slots=True)
 class Counts:
-    """What came for one signal.
+    """Counters of one signal.
 
     Attributes
     ----------
     received, lost : int
-        Changes that came, and overflows of the server's queue, each at least one change lost.
+        Changes received, and overflows of the server's queue (each loses at least one change).
     uncertain, bad : int
-        Changes with that StatusCode.
+        Changes with this StatusCode.
     wrong_type, not_finite : int
         Values that are no number, NaN or infinite; used as bad.
     future : int
-        Source timestamps more than `AHEAD_NS` ahead; the value counts from its receipt, as
+        Source timestamps more than `AHEAD_NS` ahead; the value is used from its receipt, as
         uncertain.
     went_back, without_time : int
-        Source timestamps before the one before them, and absent ones.
+        Source timestamps earlier than the previous one, and missing ones.
     """
 
     received: int = 0
@@ -77,7 +77,7 @@ _BAD = (math.nan, int(Quality.BAD))
 
 @dataclass(slots=True)
 class _Held:
-    """A signal: the value that counts now, and those that count from later on."""
+    """The values of a signal: the current one, and those that are valid from later times."""
 
     now: tuple[float, int] = _BAD
     later: deque[tuple[int, float, int]] = field(default_factory=deque)
@@ -96,7 +96,7 @@ class _Held:
 
 
 class Sampler:
-    """Holds the values of a unit and gives its samples, period by period.
+    """Stores the values of a unit and returns its samples, period by period.
 
     Parameters
     ----------
@@ -106,11 +106,11 @@ class Sampler:
 
     Notes
     -----
-    A period is closed when the server has confirmed a time after its end: by values, or by saying
-    that nothing changed (keep-alive). Its sample holds the newest value of each signal whose
-    source timestamp is not after that end, which is its stamp. So a value is repeated as good
-    only as long as the server answers. A period that is not confirmed within the patience is sent
-    as bad. Stamps are whole multiples of the period and never go back.
+    A period is complete when the server has confirmed a time not before its end, by values or by
+    a keep-alive. Its sample has the newest value of each signal with a source timestamp not after
+    this end, which is the stamp of the sample. A value is therefore repeated as good only while
+    the server responds. A period that is not confirmed within ``patience_ns`` is sent as bad.
+    Stamps are whole multiples of the period and never decrease.
     """
 
     def __init__(self, unit: UnitMapping, now_ns: int) -> None:
@@ -118,18 +118,18 @@ class Sampler:
         self._mapped = {int(node.signal) for node in unit.nodes}
         self._held = {signal: _Held() for signal in self._mapped}
         self.counts = {signal: Counts() for signal in sorted(self._mapped)}
-        self.newest: dict[int, Change] = {}  # by signal, as it came last
+        self.newest: dict[int, Change] = {}  # last change by signal
         self.patience_ns = self._least_patience_ns = unit.lateness_ns
         self.confirmed_ns = 0
         self._next_ns = (now_ns // unit.period_ns + 1) * unit.period_ns
         self.sent = self.unconfirmed = 0
 
     def keep_alive(self, seconds: float) -> None:
-        """Take how long the server may be silent while nothing changes."""
+        """Set the time for which the server may be silent while nothing changes."""
         self.patience_ns = max(self._least_patience_ns, round(1.5 * seconds * NS_PER_S))
 
     def take(self, changes: Iterable[Change], confirmed_ns: int) -> None:
-        """Take changes in the order of their arrival; the server has confirmed that time."""
+        """Add changes in order of arrival, and set the time that the server has confirmed."""
         for change in changes:
             held, counts = self._held[change.signal], self.counts[change.signal]
             counts.received += 1
@@ -152,14 +152,14 @@ class Sampler:
         self.confirmed_ns = max(self.confirmed_ns, confirmed_ns)
 
     def lose(self) -> None:
-        """Take that the link is lost: no value counts after what was confirmed last."""
+        """Handle a lost link: all values are bad after the last confirmed time."""
         for held in self._held.values():
             held.add(self.confirmed_ns, *_BAD)
 
     def restore(self, history: Iterable[Change], now_ns: int) -> None:
-        """Take the history of the gap, by signal in the order of time, before `take` goes on.
+        """Add the history of a gap, in time order for each signal, before `take` continues.
 
-        A signal without any stays bad until now.
+        A signal without history stays bad until now.
         """
         found = set()
         for change in history:

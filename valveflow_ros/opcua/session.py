@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A session with an OPC UA server: certificates, values, history, errors in words."""
+"""A session with an OPC UA server: certificates, values, history, error messages."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from cryptography.x509 import Certificate
 
 EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
-# An answer is waited for so long; a server that keeps silent for longer is gone.
+# Maximum wait for a response; a server that is silent for longer is considered lost.
 ANSWER_S = 4.0
-# Values of so much time are read from a history at once: each takes about a kilobyte meanwhile.
+# Duration of history that is read at once; a value needs about 1 kB of memory meanwhile.
 HISTORY_PART_NS = 3600 * NS_PER_S
 _REFUSED_CERTIFICATE = 'the server does not accept the certificate of the gateway'
 WORDS = {
@@ -47,17 +47,17 @@ WORDS = {
 
 
 def check_installed() -> None:
-    """Return if asyncua is there; raises `DataError`."""
+    """Check that asyncua is installed and silence its log; raises `DataError` if it is not."""
     if find_spec('asyncua') is None:
         raise DataError('OPC UA needs asyncua, not installed here: pip install asyncua.')
-    # It logs each lost link with a traceback; what matters is told in sentences.
+    # It logs each lost link with a traceback; we report such errors in sentences.
     log = logging.getLogger('asyncua')
     log.addHandler(logging.NullHandler())
     log.propagate = False
 
 
 def to_ns(moment: datetime | None) -> int:
-    """Return a time in ns since the epoch, 0 for none or one before it."""
+    """Return a time in ns since the epoch; 0 for None or a time before the epoch."""
     if moment is None:
         return 0
     aware = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
@@ -65,7 +65,7 @@ def to_ns(moment: datetime | None) -> int:
 
 
 def to_datetime(time_ns: int) -> datetime:
-    """Return a time as OPC UA takes it, in UTC."""
+    """Return a time in ns as the datetime in UTC that OPC UA needs."""
     return EPOCH + timedelta(microseconds=time_ns // 1000)
 
 
@@ -87,7 +87,7 @@ def change_of(node: Node, data: ua.DataValue, received_ns: int) -> Change:
 
 
 def in_words(error: BaseException) -> str:
-    """Return why a link failed, without a period at its end."""
+    """Return the reason of a failed connection, without a final period."""
     if isinstance(error, ValveflowError):
         return str(error).rstrip('.')
     name = type(error).__name__
@@ -108,7 +108,7 @@ def in_words(error: BaseException) -> str:
 
 
 def read_certificate(path: Path) -> Certificate:
-    """Return a certificate, whatever its time; raises `RecordingError` if it cannot be read."""
+    """Return a certificate, valid now or not; raises `RecordingError` if it cannot be read."""
     from cryptography import x509
 
     try:
@@ -127,7 +127,7 @@ def load_certificate(path: Path) -> Certificate:
     Raises
     ------
     RecordingError
-        It cannot be read, or its time is over or has not come.
+        If it cannot be read, has expired or is not valid yet.
     """
     found = read_certificate(path)
     if problem := not_valid(found):
@@ -136,7 +136,7 @@ def load_certificate(path: Path) -> Certificate:
 
 
 def not_valid(certificate: Certificate) -> str:
-    """Return why a certificate is not valid now, empty if it is."""
+    """Return why a certificate is not valid now; empty if it is."""
     now = datetime.now(timezone.utc)
     if certificate.not_valid_after_utc < now:
         return f'expired on {certificate.not_valid_after_utc:%Y-%m-%d}'
@@ -146,17 +146,17 @@ def not_valid(certificate: Certificate) -> str:
 
 
 async def _server_certificate(endpoint: str, trusted: Sequence[Path]) -> Certificate:
-    """Return that one of the trusted certificates which the server has, valid now.
+    """Return the trusted certificate that the server has and that is valid now.
 
-    Of several the server is asked for its own. That answer is not protected and only chooses among
-    those that are trusted.
+    With several trusted certificates, the server is asked for its own one. The response is not
+    protected, so it only selects one of the trusted certificates.
 
     Raises
     ------
     RecordingError
-        It has expired, or cannot be read.
+        If it is not valid now or cannot be read.
     DataError
-        The server has none of them.
+        If the server has none of them.
     """
     from asyncua import Client
     from cryptography.hazmat.primitives.serialization import Encoding
@@ -168,14 +168,14 @@ async def _server_certificate(endpoint: str, trusted: Sequence[Path]) -> Certifi
     theirs = {bytes(e.ServerCertificate) for e in told if e.ServerCertificate}
     for path in trusted:
         own = read_certificate(path).public_bytes(Encoding.DER)
-        # A server may send the chain of its certificate, its own first.
+        # A server may send its certificate chain, which begins with its own certificate.
         if any(chain.startswith(own) for chain in theirs):
             return load_certificate(path)
     raise DataError("The server has none of the certificates named as 'trusted'.")
 
 
 def uri_of(certificate: Certificate) -> str:
-    """Return the application URI of a certificate, empty if it names none."""
+    """Return the application URI of a certificate; empty if it has none."""
     from cryptography import x509
 
     try:
@@ -205,9 +205,9 @@ async def connected(endpoint: str, security: Security, user: User) -> AsyncItera
     Raises
     ------
     ValveflowError
-        A certificate or key cannot be used, or has expired.
+        If a certificate or key cannot be used, or has expired.
     Exception
-        Whatever asyncua raises where the server cannot be reached or refuses; see `in_words`.
+        Any exception of asyncua if the server cannot be reached or refuses; see `in_words`.
     """
     from asyncua import Client
     from asyncua.crypto import security_policies
@@ -240,7 +240,7 @@ async def connected(endpoint: str, security: Security, user: User) -> AsyncItera
     except asyncio.TimeoutError:
         if security.none:
             raise
-        # So servers act to whom the first encrypted message means nothing.
+        # Servers do not respond if they cannot decrypt the first message.
         raise DataError(
             f'no answer within {ANSWER_S:g} s: the server does not offer this policy, does not '
             "accept the certificate, or does not have the one named as 'trusted'"
@@ -259,7 +259,7 @@ async def resolve(client: Client, node: Node) -> ua.NodeId:
     Raises
     ------
     DataError
-        The server does not know the namespace, or the id is of no known form.
+        If the server does not know the namespace, or the id has no valid form.
     """
     from asyncua import ua
 
@@ -280,12 +280,12 @@ async def resolve(client: Client, node: Node) -> ua.NodeId:
 async def read_history(
     client: Client, node: Node, node_id: ua.NodeId, start_ns: int, end_ns: int
 ) -> list[Change]:
-    """Return the values of a node's history in the order of time, ends included.
+    """Return the history of a node in time order, including both end points.
 
     Raises
     ------
     Exception
-        The server has none, or cannot be reached; see `in_words`.
+        If the server has no history or cannot be reached; see `in_words`.
     """
     values = await client.get_node(node_id).read_raw_history(
         to_datetime(start_ns), to_datetime(end_ns), return_bounds=False
@@ -295,7 +295,7 @@ async def read_history(
 
 
 def readings_of(changes: Iterable[Change]) -> Readings:
-    """Return changes as readings in the order of time; bad ones are NaN."""
+    """Return changes as readings in time order; bad values are NaN."""
     rows = sorted((c.source_ns, c.signal, c.value, c.quality) for c in changes)
     found = Readings.of([(t, s, v, q) for t, s, v, q in rows])
     return replace(found, value=np.where(found.quality == Quality.BAD, np.nan, found.value))
@@ -304,17 +304,17 @@ def readings_of(changes: Iterable[Change]) -> Readings:
 async def history(
     client: Client, nodes: Iterable[Node], start_ns: int, end_ns: int
 ) -> AsyncIterator[Readings]:
-    """Yield the history of nodes in parts of an hour, ends included once.
+    """Yield the history of nodes in parts of an hour; ``end_ns`` itself is excluded.
 
     Raises
     ------
     DataError
-        A node is not there.
+        If a node does not exist, or has no history that can be read.
     Exception
-        The server has no history, or cannot be reached; see `in_words`.
+        If the server cannot be reached; see `in_words`.
     """
     ids = [(node, await resolve(client, node)) for node in nodes]
-    for node, node_id in ids:  # of a node that is not there a server may give an empty history
+    for node, node_id in ids:  # servers may return an empty history for a missing node
         try:
             await client.get_node(node_id).read_node_class()
         except Exception as error:  # noqa: BLE001 - with the name of the signal
@@ -335,7 +335,7 @@ async def history(
 
 
 def _called(node: Node) -> str:
-    """Return a node with what turns its value into the monitor's unit."""
+    """Return a node's id with the conversion of its value to the monitor's unit."""
     scale, offset = node.unit.scale, node.unit.offset
     words = f' times {scale:g}' if scale != 1.0 else ''
     return node.node + words + (f' plus {offset:g}' if offset else '')
@@ -348,7 +348,7 @@ class OpcUaHistory:
     ----------
     unit : UnitMapping
     endpoint : str
-        In place of the unit's own.
+        Replaces the endpoint of the unit.
     """
 
     def __init__(self, unit: UnitMapping, endpoint: str) -> None:
@@ -357,12 +357,12 @@ class OpcUaHistory:
         self.columns: dict[Signal, str] = {node.signal: _called(node) for node in unit.nodes}
 
     def read(self, start_ns: int, end_ns: int) -> list[Readings]:
-        """Return the readings of a period, its end not included, in the monitor's units.
+        """Return the readings of a period, without its end, in the monitor's units.
 
         Raises
         ------
         DataError
-            The server has no such node or no history, or cannot be reached.
+            If the server has no such node or no history, or cannot be reached.
         """
 
         async def parts() -> list[Readings]:
@@ -371,5 +371,5 @@ class OpcUaHistory:
 
         try:
             return asyncio.run(parts())
-        except Exception as error:  # noqa: BLE001 - whatever it was: in words
+        except Exception as error:  # noqa: BLE001 - every failure is reported
             raise DataError(f'{self._endpoint}: {in_words(error)}.') from None

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The only folder that knows ROS: node, replay, simulated plant, conversions."""
+"""The only package that imports ROS: node, replay, simulated plant, conversions."""
 
 import sys
 from functools import partial
@@ -9,7 +9,7 @@ from importlib.util import find_spec
 
 from valveflow_ros.errors import ValveflowError
 
-# `colcon build` without it finds no msg/ and succeeds; the nodes cannot run then.
+# `colcon build` without these options finds no msg/ and succeeds, but the nodes cannot run.
 _NOT_BUILT = (
     'The message package valveflow_msgs is not found. In the workspace: colcon build --base-paths '
     'src src/valveflow_ros/msg, then source install/setup.bash.'
@@ -17,7 +17,7 @@ _NOT_BUILT = (
 
 
 def _start(executable: str, module: str) -> int:
-    """Run an executable of ``ros2 run``; return the exit status."""
+    """Run the executable of a ``ros2 run`` command; return the exit status."""
     try:
         if find_spec('valveflow_msgs') is None:
             raise ValveflowError(_NOT_BUILT)

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The table of parameters as ROS parameters: declared, described, and checked together."""
+"""Declares, describes and checks the parameters of the table as ROS parameters."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from valveflow_ros.parameters import (
     parameter,
 )
 
-# What ROS itself puts among the parameters of every node.
+# Parameters that ROS itself adds to every node.
 _SIM_TIME = 'use_sim_time'
 _FOREIGN = (_SIM_TIME, 'start_type_description_service')
 _FOREIGN_PREFIX = 'qos_overrides.'
@@ -30,11 +30,11 @@ _DEEPEST = 1_000_000
 
 
 def descriptor(row: Parameter) -> ParameterDescriptor:
-    """Describe a parameter to `ros2 param describe` and the like."""
+    """Return the descriptor of a parameter, for tools such as `ros2 param describe`."""
     found = ParameterDescriptor(
         name=row.name,
         description=f'{row.sentence} Unit: {row.unit}.' if row.unit else row.sentence,
-        # 30 is to be as good as 30.0; `in_type` knows what is meant.
+        # Accept 30 for 30.0; `in_type` converts it.
         dynamic_typing=True,
     )
     limits = [f'One of {", ".join(row.choices)}.'] if row.choices else []
@@ -52,16 +52,16 @@ def descriptor(row: Parameter) -> ParameterDescriptor:
 
 
 def declare(node: Node, table: Iterable[Parameter] = TABLE) -> dict[str, object]:
-    """Declare parameters and return the values given for them, checked one by one.
+    """Declare parameters and return their given values, each of them checked.
 
     Raises
     ------
     ParameterError
-        A value does not fit its row.
+        If a value does not match its row in the table.
     """
     values: dict[str, object] = {}
     for row in table:
-        # The table judges first, with its own sentence; then ROS learns the range too.
+        # The table checks first, for its own messages; ROS gets the range afterwards.
         loose = ParameterDescriptor(dynamic_typing=True)
         value = _checked(row, node.declare_parameter(row.name, row.default, loose).value)
         node.set_parameters([RosParameter(row.name, value=value)])
@@ -71,7 +71,7 @@ def declare(node: Node, table: Iterable[Parameter] = TABLE) -> dict[str, object]
 
 
 def in_type(wanted: Iterable[RosParameter]) -> list[RosParameter]:
-    """Return parameters with the types of the table; what does not fit stays as it is."""
+    """Return parameters converted to the types of the table; invalid ones are unchanged."""
     found = []
     for item in wanted:
         with contextlib.suppress(ParameterError):
@@ -81,7 +81,7 @@ def in_type(wanted: Iterable[RosParameter]) -> list[RosParameter]:
 
 
 def stands(node: Node, wanted: RosParameter) -> bool:
-    """Return True if a parameter has this value, as most of a loaded file have."""
+    """Return True if a parameter already has this value, as most in a loaded file do."""
     if not node.has_parameter(wanted.name):
         return False
     now = node.get_parameter(wanted.name)
@@ -96,7 +96,7 @@ def _checked(row: Parameter, value: object) -> Value:
 
 
 def unknown_overrides(node: Node, known: Iterable[str] = PARAMETERS) -> list[str]:
-    """Return a sentence for each parameter that was given and does not exist."""
+    """Return a sentence for each given parameter that does not exist."""
     given: Mapping[str, object] = getattr(node, '_parameter_overrides', {})
     names = set(known) | set(_FOREIGN)
     sentences = []
@@ -114,7 +114,7 @@ _POLICIES = {'history': ('keep_last', 'keep_all'), 'reliability': ('reliable', '
 
 
 def check_qos_overrides(node: Node, topics: Mapping[str, Iterable[str]]) -> list[str]:
-    """Return a sentence for each override of a quality of service that is for none of our topics.
+    """Return a sentence for each QoS override that is for none of our topics.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def check_qos_overrides(node: Node, topics: Mapping[str, Iterable[str]]) -> list
     Raises
     ------
     ParameterError
-        One has a value that cannot be used.
+        If an override has an invalid value.
     """
     given: Mapping[str, RosParameter] = getattr(node, '_parameter_overrides', {})
     known = {
@@ -156,12 +156,12 @@ def changed(settings: Settings, wanted: Iterable[RosParameter], *, running: bool
     settings : Settings
     wanted : iterable of Parameter
     running : bool
-        Whether only live parameters may change.
+        True if only live parameters may change.
 
     Raises
     ------
     ParameterError
-        One may not be changed now, does not fit its row, or is at odds with another.
+        If a parameter may not be changed now, is invalid, or conflicts with another one.
     """
     values = {}
     for item in wanted:

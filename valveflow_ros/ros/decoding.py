@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Messages as the engine's records: readings from input topics, lines of the journal."""
+"""Converts messages to the engine's records: readings of inputs, lines of the journal."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ Row = tuple[int, int, float, int]
 PLANT_SAMPLE = 'plant_sample'
 _STAMP = {b'\x00\x01': struct.Struct('<iI'), b'\x00\x00': struct.Struct('>iI')}
 _VALUE = {b'\x00\x01': struct.Struct('<d'), b'\x00\x00': struct.Struct('>d')}
-_HEAD = 4  # bytes before the data in which a message says how it is encoded
+_HEAD = 4  # bytes of encapsulation before the data, which give the encoding
 
 
 @dataclass(frozen=True, slots=True)
 class InputTopic:
-    """A topic of the contract that the monitor listens to."""
+    """A topic of the contract to which the monitor subscribes."""
 
     name: str
     message_type: type
@@ -40,7 +40,7 @@ class InputTopic:
     signals: tuple[Signal, ...]
 
 
-# The optional signal comes first, so that it is there when the required ones are complete.
+# The optional signal comes first, so that it is known when the required ones are complete.
 _IN_ORDER = tuple(sorted(SIGNALS, key=lambda info: info.required))
 INPUTS: tuple[InputTopic, ...] = (
     *(
@@ -59,7 +59,7 @@ INPUT_ORDER = {topic.name: k for k, topic in enumerate(INPUTS)}
 
 
 def header_time_ns(data: bytes) -> int:
-    """Return the stamp of a message that begins with a header, 0 if it cannot be read."""
+    """Return the stamp of a message that begins with a header; 0 if it cannot be read."""
     layout = _STAMP.get(data[:2])
     if layout is None or len(data) < _HEAD + layout.size:
         return 0
@@ -78,7 +78,7 @@ def journal_entry(data: bytes) -> JournalEntry:
     Raises
     ------
     ValueError
-        The bytes are no line of a journal.
+        If the bytes are no line of a journal.
     """
     try:
         message = deserialize_message(data, JournalMessage)
@@ -91,19 +91,19 @@ def journal_entry(data: bytes) -> JournalEntry:
             text=message.text,
         )
     except Exception as error:
-        # rclpy raises whatever the middleware's C++ gave it.
+        # rclpy passes on many kinds of exceptions from the middleware.
         raise ValueError(str(error)) from error
 
 
 class Decoder:
-    """Turns the bytes of an input into readings.
+    """Converts the bytes of an input message to readings.
 
     Parameters
     ----------
     settings : Settings
-        The unit in which each plain topic is sent.
+        Gives the unit in which each plain topic is sent.
     definition : str
-        The ros2msg text of a recorded PlantSample; empty for that of now.
+        The ros2msg text of a recorded PlantSample; empty for the current definition.
     """
 
     def __init__(self, settings: Settings, definition: str = '') -> None:
@@ -115,7 +115,7 @@ class Decoder:
             self._read[info.topic] = _float_reader(info.signal, unit)
 
     def time_ns(self, name: str, data: bytes, otherwise_ns: int) -> int:
-        """Return a message's own time: its header if it has one."""
+        """Return the stamp of a message with a header, otherwise ``otherwise_ns``."""
         return header_time_ns(data) if name == PLANT_SAMPLE else otherwise_ns
 
     def rows(self, name: str, data: bytes, time_ns: int) -> list[Row]:
@@ -124,12 +124,12 @@ class Decoder:
         Raises
         ------
         ValueError
-            The bytes are no message of this topic's type.
+            If the bytes are no message of this topic's type.
         """
         return self._read[name](data, time_ns)
 
     def recorded(self, name: str, data: bytes, publish_time_ns: int) -> list[Row]:
-        """Return the readings in a recorded message as the live run took them."""
+        """Return the readings in a recorded message as in the live run."""
         time_ns = self.time_ns(name, data, publish_time_ns)
         if time_ns <= 0:
             return []
@@ -157,7 +157,7 @@ def _sample(data: bytes) -> PlantSample:
     try:
         return deserialize_message(data, PlantSample)
     except Exception as error:
-        # rclpy raises whatever the middleware's C++ gave it.
+        # rclpy passes on many kinds of exceptions from the middleware.
         raise ValueError('no valveflow_msgs/PlantSample') from error
 
 
@@ -178,12 +178,12 @@ def _sample_reader(quality: Sequence[int]) -> Callable[[bytes, int], list[Row]]:
 
 
 def with_todays_codes(data: bytes) -> bytes:
-    """Return a PlantSample in whose codes of quality 0 was good, with those of now.
+    """Convert a PlantSample with earlier quality codes (0 is good) to the current codes.
 
     Raises
     ------
     ValueError
-        The bytes are no PlantSample.
+        If the bytes are no PlantSample.
     """
     sample = _sample(data)
     for info in _IN_ORDER:
@@ -193,14 +193,14 @@ def with_todays_codes(data: bytes) -> bytes:
 
 
 def plausible_units(signal: Signal, settings: Settings, sent: float) -> list[str]:
-    """Return the units in which ``sent`` would be a possible value of ``signal``."""
+    """Return the units in which ``sent`` would be a plausible value of ``signal``."""
     low, high = plausible_range(signal, settings)
     named = {unit: name for name, unit in UNITS[signal].items()}  # each unit once
     return [name for unit, name in named.items() if low <= sent * unit.scale + unit.offset <= high]
 
 
 def plausible_range(signal: Signal, settings: Settings) -> tuple[float, float]:
-    """Return the lowest and highest value believed, in the engine's unit."""
+    """Return the lowest and highest plausible value, in the engine's unit."""
     opening = Signal.VALVE_OPENING
     topic = SIGNALS[opening if signal == Signal.VALVE_COMMAND else signal].topic
     return settings.real(f'{topic}_low'), settings.real(f'{topic}_high')

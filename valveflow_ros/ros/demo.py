@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The demo: a simulated plant and the monitor as two real processes, and what comes of it."""
+"""The demo: runs a simulated plant and the monitor as two processes and shows the results."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from valveflow_ros.ros.process import Parser, StopFlag, complain, with_place
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _HOUR_NS = 3600 * 10**9
 _FAULT, _FAULT_MW = 'curve_step', -12.0
-_FAULT_FROM = 0.5  # share of the run after which the fault begins
+_FAULT_FROM = 0.5  # fraction of the run after which the fault begins
 _MONITOR = '/valveflow_monitor'
 _DAYS = 3.0
 _LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -58,7 +58,7 @@ _VERDICTS = {
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the description of the command line."""
+    """Return the command-line parser."""
     made = Parser(
         prog='python -m valveflow_ros.ros.demo',
         description='Run a simulated plant and the monitor as two ROS 2 processes, switch a '
@@ -82,7 +82,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def ros_arguments(parameters: Mapping[str, object]) -> list[str]:
-    """Return parameters as they follow a node's command."""
+    """Return parameters as ROS arguments of a command."""
     words = ['--ros-args']
     for name, value in parameters.items():
         text = str(value).lower() if isinstance(value, bool) else str(value)
@@ -96,13 +96,13 @@ def tell(line: str) -> None:
 
 
 def moment(time_ns: int) -> str:
-    """Return a time as the monitor's own sentences write it."""
+    """Return a time in the format of the monitor's sentences."""
     at = _EPOCH + timedelta(microseconds=time_ns // 1000)
     return at.strftime('%Y-%m-%d %H:%M')
 
 
 class Process:
-    """A module of ours as a process of its own, with its output in the file ``name.log``."""
+    """A module of this package in its own process, with its output in the file ``name.log``."""
 
     def __init__(
         self, name: str, module: str, parameters: Mapping[str, object], folder: Path
@@ -110,7 +110,7 @@ class Process:
         self.name, self.log = name, folder / f'{name}.log'
         command = [sys.executable, '-m', f'valveflow_ros.ros.{module}', *ros_arguments(parameters)]
         with self.log.open('wb') as out:
-            # Ctrl-C comes to the demo alone, which then ends the others in order.
+            # Ctrl-C reaches only the demo, which then ends the other processes in order.
             self._process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True
             )
@@ -131,7 +131,7 @@ class Process:
         return lines[-1] if lines else f'it said nothing (see {self.log})'
 
     def end(self) -> int:
-        """Ask it to end, wait, and return its exit status; doing it again changes nothing."""
+        """Ask the process to end, wait, and return its exit status; may be called again."""
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
             try:
@@ -144,16 +144,16 @@ class Process:
 
 
 class Story:
-    """Tells what is worth a line of what the monitor says.
+    """Prints the important messages of the monitor.
 
-    A fault of one valve shows only while that valve is at work, so its alarm comes and goes with
-    the load, and a monitor learns a curve anew every few hours. The first of each is told in
-    full; of the others, that they came.
+    A fault of one valve has an effect only while this valve is in use, so its alarm comes and
+    goes with the load, and the monitor fits a new curve every few hours. The first alarm and
+    curve are described in full, the others briefly or only if something has changed.
 
     Parameters
     ----------
     fault_ns : int
-        When the hidden fault begins.
+        Time at which the hidden fault begins.
     """
 
     def __init__(self, fault_ns: int) -> None:
@@ -169,11 +169,11 @@ class Story:
 
     @property
     def alarms_of_fault(self) -> list[int]:
-        """Return when the alarm came after the fault had begun, each time."""
+        """Return the times of all alarms after the start of the fault, in ns."""
         return [time_ns for time_ns in self._raised_ns if time_ns >= self._fault_ns]
 
     def on_curve(self, message: FlowCharacteristic) -> None:
-        """Tell of the first curve, or of one with another number of pieces."""
+        """Print the first curve, or a curve with another number of pieces."""
         time_ns = from_time(message.window_end)
         if message.status != FlowCharacteristic.FRESH:
             if message.cause not in ('', self._cause) and not self.curves:
@@ -196,12 +196,12 @@ class Story:
             self._tell(time_ns, f'new curve: {self._last_curve}')
 
     def on_alarm(self, message: Alarm) -> None:
-        """Tell that an alarm came, and how the first one went on."""
+        """Print a new alarm, and the state changes of the first one."""
         time_ns, state = from_time(message.header.stamp), message.state
         goes_on = len(self._raised_ns) == 1 and message.previous_state != Alarm.SUPPRESSED
         if state == Alarm.UNACKNOWLEDGED:
             self.reached(time_ns)
-            # One that could not be judged for a while and stands again is not a new one.
+            # An alarm that was suppressed and is active again is not a new one.
             if message.occurrence == self._occurrences.get(message.name):
                 return
             self._occurrences[message.name] = message.occurrence
@@ -211,7 +211,7 @@ class Story:
             self._tell(time_ns, _STATES[state])
 
     def on_diagnosis(self, message: Diagnosis) -> None:
-        """Tell of a diagnosis."""
+        """Print a diagnosis."""
         if message.verdict == Diagnosis.UNKNOWN and not message.model_id:
             return
         self.diagnoses.append(message)
@@ -228,7 +228,7 @@ class Story:
         self._tell(until_ns, f'diagnosis of the data so far: {told}')
 
     def outcome(self) -> str:
-        """Return how the fault was met, in a sentence."""
+        """Return a sentence about the alarms on the fault."""
         told = self.alarms_of_fault
         if not told:
             return 'The fault raised no alarm.'
@@ -238,7 +238,7 @@ class Story:
         return f'{began}; the first alarm came {hours:.1f} h later{more}.'
 
     def reached(self, time_ns: int) -> None:
-        """Tell that the fault begins, once the plant has come so far."""
+        """Print that the fault begins, once the plant has reached that time."""
         if self._fault_told or time_ns < self._fault_ns:
             return
         self._fault_told = True
@@ -249,7 +249,7 @@ class Story:
         self._tell(self._fault_ns, f'--- the fault begins; {known} ---')
 
     def _tell(self, time_ns: int, words: str) -> None:
-        """Print one line; the times of the lines never go back."""
+        """Print one line; the times of the lines never decrease."""
         if time_ns < self._last_told_ns:
             words += f' (at {moment(time_ns)})'
         self._last_told_ns = max(time_ns, self._last_told_ns)
@@ -257,7 +257,7 @@ class Story:
 
 
 class Watch(Node):
-    """Listens to the monitor and acknowledges alarms."""
+    """Subscribes to the monitor and acknowledges its alarms."""
 
     def __init__(self, story: Story) -> None:
         super().__init__('valveflow_demo')
@@ -276,7 +276,7 @@ class Watch(Node):
         self._diagnose = self.create_client(Trigger, f'{_MONITOR}/diagnose')
 
     def work(self) -> None:
-        """Acknowledge an alarm that somebody has had time to read."""
+        """Acknowledge an alarm after a short delay."""
         if self._acknowledge_at_s is None or time.monotonic() < self._acknowledge_at_s:
             return
         if self._acknowledge.service_is_ready():
@@ -285,7 +285,7 @@ class Watch(Node):
             future.add_done_callback(self._on_answer)
 
     def ask_for_diagnosis(self) -> None:
-        """Have the monitor diagnose all that it has seen; the health says when it has done so."""
+        """Request a diagnosis of all data; the health messages show when it has finished."""
         self.asked = True
         self._diagnose.call_async(Trigger.Request())
 
@@ -369,12 +369,12 @@ def _commands(
     """Return name, module and parameters of both processes."""
     monitor: dict[str, object] = {
         'unit_tag': 'demo', 'record_directory': folder / 'recordings',
-        # Shown anew each time, in the plant's time.
+        # Each demo starts without a saved state, and uses the plant's time.
         'keep_state': False, 'use_sim_time': True,
         'refit_period': 14400.0, 'refit_segments': 0,
-        # Here a night is over before a diagnosis is.
+        # A night takes less time here than a diagnosis.
         'diagnosis_hour': -1,
-        # The plant does not wait for the disk; neither does a demo for a slow one.
+        # The simulated plant runs fast and does not wait for the disk.
         'record_flush': 1.0,
     }  # fmt: skip
     fault = f'{_FAULT}:s_mw={_FAULT_MW:g},t0_days={_FAULT_FROM * options.days:.6g}'
@@ -392,7 +392,7 @@ def _follow(
     plant: Process,
     stop: StopFlag,
 ) -> None:
-    """Listen until the plant has ended, all of it was diagnosed, and nothing is left to do."""
+    """Listen until the plant has ended, its data were diagnosed, and the monitor is idle."""
     quiet, seen, samples = 0, 0, -1
     ended_s: float | None = None
     while not stop and quiet < _QUIET_LOOKS:
@@ -461,7 +461,7 @@ def _conclude(watch: Watch, story: Story, folder: Path, fault_ns: int, days: flo
 
 
 def told_in_the_end(missing: Sequence[str], days: float) -> str:
-    """Return the last line: all is there and the replay agreed, or what is missing."""
+    """Return the last line of the demo: success, or what is missing."""
     if not missing:
         return 'All came out, and the replay was identical to the recording, byte for byte.'
     enough = f' {_DAYS:g} days (--days) are enough for that.' if days < _DAYS else ''
@@ -469,7 +469,7 @@ def told_in_the_end(missing: Sequence[str], days: float) -> str:
 
 
 def _run(what: str, module: str, *arguments: str) -> bool:
-    """Run a command of ours to its end; show its last line."""
+    """Run a command of this package to its end and print its last line."""
     tell(f'{what} ...')
     command = [sys.executable, '-m', f'valveflow_ros.{module}', *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -479,7 +479,7 @@ def _run(what: str, module: str, *arguments: str) -> bool:
 
 
 def _compare(found: FlowCharacteristic) -> None:
-    """Tell the curve that was found beside the one of the simulated plant."""
+    """Print the fitted curve next to the true curve of the simulated plant."""
     true = UnitDescription().curve
     tell(
         f'The last curve before the fault (data until {moment(from_time(found.window_end))}), '
@@ -503,7 +503,7 @@ def _compare(found: FlowCharacteristic) -> None:
 def main(args: Sequence[str] | None = None) -> int:
     """Run the demo; return the exit status."""
     options = parser().parse_args(args)
-    # A domain of its own: two demos, or a demo beside a plant, do not meet.
+    # Use a separate ROS domain, so that the demo does not interfere with others or a plant.
     os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 101 + 1)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     stop = StopFlag().install()
@@ -513,7 +513,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return complain('demo', str(error))
     except OSError as error:
         return complain('demo', f'{error.filename or options.output}: {error.strerror}')
-    except Exception as error:  # noqa: BLE001 - a person gets a sentence, not a trace
+    except Exception as error:  # noqa: BLE001 - print a sentence instead of a traceback
         return complain('demo', f'failed unexpectedly: {with_place(error)}')
     if stop:
         tell('Stopped; nothing is left running.')

@@ -1,12 +1,12 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Entering the ROS domain: transport, security, and being discovered early.
+"""Joins the ROS domain: transport, security and early discovery.
 
-Fast DDS (2.14) announces a participant before it reads its own sockets. Whoever is on the same
-host answers within a millisecond, the answer is lost, and the next one comes after the period of
-3 s: about half of all neighbours are discovered that late. So the monitor enters the domain as
-soon as it can, as five participants with a node that does nothing, while compiler and libraries
-load. Then it continues as the one that has discovered most neighbours.
+Fast DDS (2.14) announces a participant before it reads its own sockets. Participants on the same
+host answer within a millisecond, the answer is lost, and the next one comes after the period of
+3 s. About half of all neighbours are discovered that late. The monitor therefore joins the domain
+as early as possible, as five participants with an idle node each, while compiler and libraries
+load. It then continues with the participant that has discovered the most neighbours.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def start_ros(args: Sequence[str] | None) -> None:
     Raises
     ------
     ValveflowError
-        ROS could not be started, or security cannot be had.
+        If ROS could not be started, or required security is not available.
     """
     choose_transport()
     check_security(args)
@@ -47,40 +47,40 @@ def _initialise(args: Sequence[str] | None) -> None:
             args=None if args is None else list(args),
             signal_handler_options=SignalHandlerOptions.NO,
         )
-    except Exception as error:  # noqa: BLE001 - rclpy raises what its C++ gave it
+    except Exception as error:  # noqa: BLE001 - rclpy raises many kinds of exceptions
         raise ValveflowError(f'ROS could not be started: {one_line(error)}') from None
 
 
-# Transport: sockets, not shared memory. Fast DDS offers both and prefers shared memory. A process
-# that was killed leaves its segment behind; at the restart the segment is made anew under the same
-# name, while a process that sent to the old one goes on writing to what nobody reads (Fast DDS
-# issues 5053 and 4728): a restarted monitor would hear nothing. Over sockets that cannot happen,
-# nothing is left in /dev/shm, and another user's files there do no harm (issue 3535).
+# Transport: sockets, not shared memory. Fast DDS offers both and prefers shared memory. A killed
+# process leaves its segment behind. At a restart a new segment is created under the same name,
+# while other processes still write to the old one, which nobody reads (Fast DDS issues 5053 and
+# 4728), so a restarted monitor would receive nothing. Sockets avoid this, leave nothing in
+# /dev/shm, and do not depend on another user's files there (issue 3535).
 
 _TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
 _PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
-# With room for what comes while the monitor is held up, as far as the system grants it.
+# Buffers for messages that arrive while the monitor is delayed, as far as the system allows.
 _SOCKETS = 'UDPv4?sockets_size=4MB'
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
-# With one of these the middleware looks beyond this host in ways of its own.
+# Each of these changes how the middleware discovers other hosts.
 _WIDER = ('ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER')
 
 
 def choose_transport(
     environ: MutableMapping[str, str] | None = None, middleware: str | None = None
 ) -> None:
-    """Keep Fast DDS off shared memory unless the environment says what is wanted.
+    """Disable shared memory in Fast DDS unless the environment selects a transport.
 
-    Where discovery is limited to this host, ROS adds shared memory whatever Fast DDS is told;
-    there the profile `config/fastdds_loopback.xml` takes the place of that limit. It limits to
-    this host as well, and binds its sockets to 127.0.0.1.
+    If discovery is limited to this host, ROS adds shared memory in any case. Then the profile
+    `config/fastdds_loopback.xml` replaces this limit. It also limits discovery to this host, and
+    binds its sockets to 127.0.0.1.
 
     Parameters
     ----------
     environ : mutable mapping, optional
-        The process's own environment by default. It is read when the first node is made.
+        By default the environment of the process. ROS reads it when the first node is created.
     middleware : str, optional
-        The name of the ROS middleware, the one in use by default.
+        The name of the ROS middleware; by default the one in use.
     """
     environ = os.environ if environ is None else environ
     middleware = get_rmw_implementation_identifier() if middleware is None else middleware
@@ -94,54 +94,54 @@ def choose_transport(
     except (PackageNotFoundError, ValueError):
         return
     profile = os.path.join(share, 'config', 'fastdds_loopback.xml')
-    # Without the file Fast DDS would go beyond this host.
+    # Without the file Fast DDS would discover other hosts.
     if os.access(profile, os.R_OK) and not any(environ.get(name) for name in _WIDER):
         environ.update(dict.fromkeys(_PROFILES, profile))
         environ[_RANGE] = 'SYSTEM_DEFAULT'
 
 
-# Security. The ROS client library turns it on for the exact word `true` only, continues without it
-# for any other word, and with the strategy `Permissive` also where no keys are found. A middleware
-# built without security says so only when a node is made. Each of these ends here, before anything
-# is sent or received.
+# Security. The ROS client library enables it only for the exact word `true`. For any other word,
+# and with the strategy `Permissive` also if no keys are found, it continues without security. A
+# middleware built without security reports this only when a node is created. In all these cases
+# the process ends here, before anything is sent or received.
 
 _ENABLE, _STRATEGY = 'ROS_SECURITY_ENABLE', 'ROS_SECURITY_STRATEGY'
 _KEYSTORE = 'ROS_SECURITY_KEYSTORE'
 _NO = ('', 'false', '0', 'no', 'off')
-# These refuse to make a node where security is enforced and they cannot give it. Another one might
-# ignore the wish.
+# These middlewares refuse to create a node if security is enforced and not available. Others may
+# ignore the setting.
 _REFUSING = (*_FAST_DDS, 'rmw_cyclonedds_cpp')
 
 
 class InsecureError(InputError):
-    """Security is demanded and cannot be had."""
+    """Security is required but not available."""
 
     def __init__(self, problem: str) -> None:
         super().__init__(f'Not started, because security is demanded ({_ENABLE}): {problem}.')
 
 
 def security_wanted(environ: Mapping[str, str]) -> bool:
-    """Return True if security is asked for, in whatever words."""
+    """Return True if the environment requests security, with any word for yes."""
     return environ.get(_ENABLE, '').lower() not in _NO
 
 
 def check_security(
     args: Sequence[str] | None = None, environ: Mapping[str, str] | None = None
 ) -> None:
-    """Return if no security is demanded, or if a node can be made with it.
+    """Check that a node can be created with security, if security is required.
 
     Parameters
     ----------
     args : sequence of str, optional
-        The arguments that `rclpy.init` will get; an enclave may be named in them.
+        The arguments for `rclpy.init`, which may name an enclave.
     environ : mapping, optional
-        Where the wish stands; the process's own environment by default.
+        Environment variables; by default those of the process.
 
     Raises
     ------
     InsecureError
-        Security is demanded in words that ROS does not heed, without being enforced, or of a
-        middleware that cannot give it.
+        If security is required with a word that ROS ignores, or without being enforced, or the
+        middleware cannot provide it.
     """
     environ = os.environ if environ is None else environ
     if not security_wanted(environ):
@@ -169,14 +169,14 @@ def check_security(
         )
     context = Context()
     try:
-        # A node as it will be made, thrown away at once.
+        # A trial node with the same arguments, destroyed at once.
         rclpy.init(
             args=None if args is None else list(args),
             context=context,
             signal_handler_options=SignalHandlerOptions.NO,
         )
         Node('security_check', context=context, start_parameter_services=False).destroy_node()
-    except Exception as error:  # noqa: BLE001 - rclpy raises what its C++ gave it
+    except Exception as error:  # noqa: BLE001 - rclpy raises many kinds of exceptions
         said = one_line(error)
         if 'security libraries' in said:
             raise InsecureError(
@@ -188,30 +188,30 @@ def check_security(
         rclpy.try_shutdown(context=context)
 
 
-# Each after the first takes ten milliseconds. In ten starts beside one neighbour at least one of
-# the five discovered it each time, and one to five did.
+# Each after the first takes 10 ms. In ten starts with one neighbour, between one and five of the
+# five participants discovered it.
 _PARTICIPANTS = 5
-# The underscore keeps it out of lists of nodes.
+# The underscore hides the node from node lists.
 _NAME = '_valveflow_starting'
 
 
 class Presence:
-    """Takes part in the domain as soon as it is made; the default context is up from then on.
+    """Joins the domain on construction and initialises the default context.
 
     Parameters
     ----------
     args : sequence of str, optional
-        The arguments for `rclpy.init`; those of the process by default.
+        The arguments for `rclpy.init`; by default those of the process.
     count : int, optional
-        Number of participants; by default five, and none before the real node where the
-        middleware is not Fast DDS or security is wanted: a policy lets in known names only.
+        Number of participants before the real node. By default five, or none if the middleware
+        is not Fast DDS or security is required, since a policy accepts only known node names.
     environ : mapping, optional
-        Where the wish for security stands; the process's own environment by default.
+        Environment variables for security; by default those of the process.
 
     Raises
     ------
     ValveflowError
-        ROS could not be started.
+        If ROS could not be started.
     """
 
     def __init__(
@@ -225,7 +225,7 @@ class Presence:
             fast_dds = get_rmw_implementation_identifier() in _FAST_DDS
             count = _PARTICIPANTS if fast_dds and not secured else 0
         self._args = None if args is None else list(args)
-        # Its context alone keeps the log of the process.
+        # Only this context initialises logging for the process.
         _initialise(args)
         self._contexts: list[Context] = [get_default_context()]
         self._nodes: list[Node] = []
@@ -236,7 +236,7 @@ class Presence:
     def settle(self) -> Context:
         """Return the context that has discovered most neighbours; the others leave the domain.
 
-        It is the one to make nodes in. Until `end` a node of its own keeps it there.
+        New nodes must use this context. Until `end`, an idle node keeps it in the domain.
         """
         if not self._nodes:
             return self._contexts[0]
@@ -251,13 +251,13 @@ class Presence:
         return best.context
 
     def end(self) -> None:
-        """Destroy the remaining node; a context with another node in it stays in the domain."""
+        """Destroy the idle node; a context with another node stays in the domain."""
         for node in self._nodes:
             node.destroy_node()
         self._nodes = []
 
     def close(self) -> None:
-        """Shut everything of ROS down."""
+        """Shut down all of ROS."""
         self.end()
         for context in self._contexts[1:]:
             context.try_shutdown()
@@ -270,21 +270,21 @@ class Presence:
                 context = Context()
                 context.init(self._args, initialize_logging=False)
                 self._contexts.append(context)
-            # Remaps and parameters are meant for the real node.
+            # Remaps and parameters apply to the real node only.
             node = rclpy.create_node(
                 _NAME, context=self._contexts[-1], use_global_arguments=False,
                 enable_rosout=False, start_parameter_services=False,
                 parameter_overrides=[Parameter('start_type_description_service', value=False)],
             )  # fmt: skip
-        except Exception:  # noqa: BLE001 - the real node reports it if it meets the same
+        except Exception:  # noqa: BLE001 - the real node reports the same problem
             return False
         self._nodes.append(node)
         return True
 
 
 def _neighbours(node: Node) -> int:
-    """Return how many nodes it has discovered, without hidden ones: these come and go."""
+    """Return the number of nodes that ``node`` has discovered, without hidden nodes."""
     try:
         return sum(not name.startswith('_') for name in node.get_node_names())
-    except Exception:  # noqa: BLE001 - rclpy raises what its C++ gave it; another may know
+    except Exception:  # noqa: BLE001 - rclpy raises many kinds; another node may succeed
         return 0

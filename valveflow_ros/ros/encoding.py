@@ -1,10 +1,10 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The engine's records as messages, and messages as bytes that depend on nothing but their fields.
+"""Converts the engine's records to messages, and messages to bytes that depend only on the fields.
 
-The middleware's own serialiser leaves whatever was in memory in the padding between fields, so two
-equal messages may differ in their bytes. What is recorded here is compared byte for byte and must
-carry nothing of the process's memory, so the padding written here is zero.
+The middleware's serialiser leaves old memory content in the padding between fields, so the bytes
+of two equal messages may differ. Recorded messages are compared byte for byte and must not
+contain memory of the process, so the padding written here is zero.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from valveflow_ros.records import SpecialSegment as SegmentRecord
 from valveflow_ros.report.words import in_zone
 from valveflow_ros.signals.units import in_unit
 
-# The latest time whose seconds a stamp can hold.
+# The latest time that fits into a stamp.
 LAST_NS = (1 << 31) * NS_PER_S - 1
 NOT_YET = 'Not diagnosed yet: a diagnosis needs a curve and a day of data.'
 VERDICTS = {
@@ -51,18 +51,18 @@ VERDICTS = {
 
 
 def to_time(time_ns: int) -> Time:
-    """Return a stamp; times before 1970 or after 2038 become the nearest one there is."""
+    """Return a stamp; times before 1970 or after 2038 are clipped to the nearest valid one."""
     sec, nanosec = divmod(min(max(time_ns, 0), LAST_NS), NS_PER_S)
     return Time(sec=sec, nanosec=nanosec)
 
 
 def header(time_ns: int, tag: str) -> Header:
-    """Return the head of a message."""
+    """Return the header of a message."""
     return Header(stamp=to_time(time_ns), frame_id=tag)
 
 
 def _message(of: Any, record: object, **different: Any) -> Any:
-    """Return a message with the fields that a record has under the same names, and others."""
+    """Return a message with the equally named fields of a record, and the fields given here."""
     same = {n: getattr(record, n) for n in of.get_fields_and_field_types() if n not in different}
     return of(**same, **different)
 
@@ -85,7 +85,7 @@ def alarm_message(change: AlarmChange, tag: str) -> Alarm:
 
 
 def journal_message(entry: engine.JournalEntry, tag: str) -> JournalEntry:
-    """Return a line of the journal as a message; `decoding.journal_entry` is the way back."""
+    """Return a line of the journal as a message; the inverse is `decoding.journal_entry`."""
     return _message(
         JournalEntry, entry, header=header(entry.time_ns, tag), kind=int(entry.kind),
         request=to_time(entry.request_ns), samples=entry.rows,
@@ -100,7 +100,7 @@ def curve_message(
     reference_id: str = '',
     shift: Shift | None = None,
 ) -> FlowCharacteristic:
-    """Return the running curve and what it is worth; without a curve, say why there is none."""
+    """Return the current curve with its status; without a curve, the reason why."""
     nan = math.nan
     message = FlowCharacteristic(
         header=header(0 if curve is None else curve.source.window_end_ns, tag),
@@ -130,7 +130,7 @@ def curve_message(
     message.time_constant_stderr = [d.time_constant_stderr_s for d in dynamics]
     message.delay_stderr = [d.delay_stderr_s for d in dynamics]
     message.power_to_stderr = [d.power_to_stderr_mw for d in dynamics]
-    # Omega(J), Lambda(J) and the share of J, for J = 1, 2, ...
+    # Omega(J), Lambda(J) and the confidence of J, for J = 1, 2, ...
     numbers = range(1, max(choice.cost, default=0) + 1)
     message.cost = [choice.cost.get(j, nan) for j in numbers]
     message.turning_angle = [choice.turning_angle.get(j, nan) for j in numbers]
@@ -149,7 +149,7 @@ def curve_message(
     message.temperature_spread_degc = source.temperature_spread_k
     message.temperature_flag = source.temperature_flag
     if reference_id and shift is None:
-        # The reference itself has not moved; any other curve has not been judged.
+        # The shift of the reference itself is 0; that of an uncompared curve is NaN.
         message.shift_mw = [0.0 if curve.model_id == reference_id else nan] * len(pieces)
         message.shift_confidence = list(message.shift_mw)
     elif reference_id and shift is not None:
@@ -163,14 +163,14 @@ def curve_message(
 
 
 def array_message(values: FloatArray | Sequence[float], label: str) -> Float64MultiArray:
-    """Return numbers for clients without our messages; the label says what they are."""
+    """Return numbers with a label that describes them, for clients without our messages."""
     numbers = [float(value) for value in values]
     message = Float64MultiArray(data=numbers)
     message.layout.dim = [MultiArrayDimension(label=label, size=len(numbers), stride=len(numbers))]
     return message
 
 
-# What is said to people; names and ids stay.
+# Fields with text for people; names and ids are not changed.
 _WORDS = (
     'sentence', 'meaning', 'text', 'cause', 'shift_sentence', 'unit', 'rejected_reasons',
     'parameter_units',
@@ -178,9 +178,9 @@ _WORDS = (
 
 
 def tell_in(message: Any, unit: str, zone: tzinfo | None = None) -> None:
-    """Put the unit of the output and the time zone into what a message says to people."""
+    """Convert the texts of a message to the output unit and the time zone."""
     if isinstance(message, JournalEntry):
-        zone = None  # a replay reads its text
+        zone = None  # a replay parses this text
     for name in _WORDS if unit != 'MW' or zone is not None else ():
         said = getattr(message, name, None)
         if isinstance(said, str):
@@ -207,12 +207,12 @@ def no_diagnosis_message(
 def diagnosis_message(
     content: Mapping[str, Any], task: engine.DiagnosisTask, tag: str
 ) -> Diagnosis:
-    """Return what `diagnosis.json` would hold as a message.
+    """Return the content of a `diagnosis.json` as a message.
 
     Raises
     ------
     KeyError, TypeError, ValueError, AssertionError
-        It is not whole.
+        If the content is incomplete or invalid.
     """
     message = no_diagnosis_message(str(content['sentence']), tag, task)
     message.verdict = VERDICTS[content['verdict']]
@@ -250,7 +250,7 @@ def _cause_message(cause: Mapping[str, Any]) -> DiagnosisCause:
 
 
 def _number(value: float | None) -> float:
-    """JSON's null is a number that is not known."""
+    """Return a number from JSON, with NaN for null."""
     return math.nan if value is None else float(value)
 
 
@@ -266,12 +266,12 @@ _Writer = Callable[[bytearray, Any], None]
 
 
 def encode(message: Any) -> bytes:
-    """Return a message as it goes over the wire.
+    """Return a message serialised as CDR.
 
     Raises
     ------
     TypeError
-        A field is of a kind that none of our messages has.
+        If a field has a type that is not supported.
     """
     out = bytearray()
     _write_message(out, message)
@@ -279,12 +279,12 @@ def encode(message: Any) -> bytes:
 
 
 def float64_bytes(value: float) -> bytes:
-    """Return a std_msgs/Float64."""
+    """Return a serialised std_msgs/Float64."""
     return _HEAD + _FLOAT64.pack(value)
 
 
 def clock_bytes(time_ns: int) -> bytes:
-    """Return a rosgraph_msgs/Clock; times before 1970 or after 2038 become the nearest one."""
+    """Return a serialised rosgraph_msgs/Clock; the time is clipped to 1970 to 2038."""
     return _HEAD + _TIME.pack(*_seconds(time_ns))
 
 
@@ -293,10 +293,10 @@ def _seconds(time_ns: int) -> tuple[int, int]:
 
 
 def prediction_bytes(block: PredictionBlock, tag: str) -> Iterator[tuple[int, bytes]]:
-    """Yield the valveflow_msgs/Prediction of each row with the row's time in ns.
+    """Yield the time in ns and the serialised valveflow_msgs/Prediction of each row.
 
-    There is one for every sample, and a message object for each would be the monitor's largest
-    cost. The bytes equal those of `encode`; a test compares the two, and the order of the fields.
+    Creating a message object for every sample would be the largest cost of the monitor. The bytes
+    equal those of `encode`; a test compares both, and the order of the fields.
     """
     frame, model = tag.encode() + b'\x00', block.model_id.encode() + b'\x00'
     pack = _prediction_layout(len(frame), len(model)).pack
@@ -317,7 +317,7 @@ def prediction_bytes(block: PredictionBlock, tag: str) -> Iterator[tuple[int, by
 
 @functools.lru_cache(maxsize=16)
 def _prediction_layout(tag_bytes: int, model_bytes: int) -> struct.Struct:
-    """Return the layout for texts of these lengths, zero bytes included."""
+    """Return the layout for texts of these lengths in bytes, with the final zero bytes."""
     size = 12 + tag_bytes + 1
     before_model = -size % 4
     size += before_model + 4 + model_bytes
@@ -337,7 +337,7 @@ def _writers(kind: type) -> tuple[tuple[str, _Writer], ...]:
 
 
 def _writer(text: str) -> _Writer:
-    """Return what writes a field of this type."""
+    """Return the function that writes a field of this type."""
     if text.startswith('sequence<') and ',' not in text:
         return functools.partial(_write_sequence, text[len('sequence<') : -1])
     if text == 'string':

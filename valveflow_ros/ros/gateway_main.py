@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The executable `opcua_gateway`: values of OPC UA servers as `plant_sample`, results back."""
+"""The executable `opcua_gateway`: publishes OPC UA values and serves the results by OPC UA."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ TABLE: tuple[Parameter, ...] = (
     Parameter('diagnostics_period', 1.0, 's', 'Time from one /diagnostics to the next.',
               0.1, 60.0),
 )  # fmt: skip
-# A clock that differs by more is told; that of many servers stands still for up to a second.
+# A larger clock difference is reported; many servers update their clock only once a second.
 _CLOCK_S = 2.0
-# What was wrong with a value is shown for so long.
+# Time for which a problem with a value is shown.
 _SHOWN_S = 60.0
 _LOOK_S, _END_S, _OFFER_S = 0.02, 6.0, 60.0
 _LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -61,7 +61,7 @@ _TROUBLE = tuple(name for name in Counts.__slots__ if name not in ('received', '
 
 
 class LoopThread:
-    """An event loop in a thread of its own."""
+    """An event loop in a separate thread."""
 
     def __init__(self) -> None:
         self._loop = asyncio.new_event_loop()
@@ -69,11 +69,11 @@ class LoopThread:
         self._thread.start()
 
     def start(self, work: Coroutine[Any, Any, Any]) -> Future[Any]:
-        """Begin something there."""
+        """Start a coroutine in the loop."""
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
     def close(self) -> None:
-        """Cancel what runs, let it close its sessions, and end the thread."""
+        """Cancel all tasks, let them close their sessions, and end the thread."""
 
         async def cancel() -> None:
             others = asyncio.all_tasks() - {asyncio.current_task()}
@@ -88,7 +88,7 @@ class LoopThread:
 
 
 class GatewayUnit:
-    """One unit: its link in the loop's thread, its samples in the node's.
+    """One unit: its link runs in the loop's thread, its sampler in the node's thread.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class GatewayUnit:
         self._trouble_s: dict[int, float] = {}
 
     def step(self, now_ns: int) -> None:
-        """Take what the link has told and publish what is due."""
+        """Process the changes from the link and publish the samples that are due."""
         with suppress(queue.Empty):
             while True:
                 self._told.get_nowait()(self.sampler)
@@ -119,7 +119,7 @@ class GatewayUnit:
             self._publisher.publish(self._message(sample))
 
     def items(self, now_s: float, now_ns: int) -> list[Item]:
-        """Return the health of link and signals."""
+        """Return the health items of the link and the signals."""
         items = [self._link_item(now_s)]
         for signal, counts in self.sampler.counts.items():
             items.append(self._signal_item(signal, counts, now_s, now_ns))
@@ -188,7 +188,7 @@ class GatewayUnit:
         return message
 
     def _save(self, parts: list[Readings]) -> str:
-        """Write the history of an outage; called in a thread of its own."""
+        """Write the history of an outage; called in a separate thread."""
         start = time.strftime('%Y%m%dT%H%M%SZ', time.gmtime(int(parts[0].time_ns[0]) // NS_PER_S))
         folder = self.unit.backfill_directory
         assert folder is not None
@@ -200,7 +200,7 @@ class GatewayUnit:
 
 
 class ResultsBridge:
-    """Brings what a unit's monitor publishes to the OPC UA server.
+    """Forwards what a unit's monitor publishes to the OPC UA server.
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ class ResultsBridge:
     unit : UnitMapping
     server : ResultsServer
     start : callable
-        Begins a coroutine in the server's loop.
+        Starts a coroutine in the server's loop.
     """
 
     OBJECTS = ('characteristic', 'diagnosis', *(
@@ -232,14 +232,14 @@ class ResultsBridge:
         node.create_subscription(Alarm, f'{self._monitor}/alarms', self._on_alarm, _LATCHED)
 
     def look(self) -> None:
-        """Mark what is shown once the monitor has gone, and once it is back."""
+        """Update the status of the shown values if the monitor has ended or is back."""
         present = self._node.count_publishers(f'{self._monitor}/characteristic') > 0
         if present != self._present:
             self._present = present
             self._start(self._server.mark(self._tag, present))
 
     def _heard(self) -> None:
-        """Take a message as a sign that the monitor is back."""
+        """Note that the monitor is back, because a message was received."""
         if not self._present:
             self._present = True
             self._start(self._server.mark(self._tag, True))
@@ -262,7 +262,7 @@ class ResultsBridge:
             return
         self._heard()
         self._start(self._server.update(self._tag, name, variables(message), time_ns))
-        # What is only told again rings no bell.
+        # A repeated announcement is no event.
         if message.state == message.previous_state:
             return
         standing = message.state in (Alarm.UNACKNOWLEDGED, Alarm.ACKNOWLEDGED)
@@ -276,7 +276,7 @@ class ResultsBridge:
 
 
 def fields(kind: Any) -> Iterable[Field]:
-    """Yield the variables of a message type: its fields under their own names."""
+    """Yield the variables of a message type: one per field, with its name."""
     for name, of in kind.get_fields_and_field_types().items():
         if of == 'std_msgs/Header':
             yield Field('stamp', 'DateTime')
@@ -292,7 +292,7 @@ def fields(kind: Any) -> Iterable[Field]:
 
 
 def variables(message: Any) -> dict[str, object]:
-    """Return the values of the variables that `fields` names; times in ns."""
+    """Return the values of the variables from `fields`; times are in ns."""
     values: dict[str, object] = {}
     types = message.get_fields_and_field_types()
     for name, of in types.items():
@@ -324,7 +324,7 @@ _EXAMPLE = 'ros2 run valveflow_ros opcua_gateway --ros-args -p mapping_file:=opc
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run until it is asked to end; return the exit status."""
+    """Run the gateway until it is asked to stop; return the exit status."""
     if wants_help(args):
         show(usage(_ABOUT, _EXAMPLE, TABLE))
         return 0
@@ -335,7 +335,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return _run(stop)
     except ValveflowError as error:
         return complain(NAME, str(error))
-    except Exception as error:  # noqa: BLE001 - a person gets a sentence, not a trace
+    except Exception as error:  # noqa: BLE001 - print a sentence instead of a traceback
         return complain(NAME, f'failed unexpectedly: {with_place(error)}')
     finally:
         rclpy.try_shutdown()
@@ -407,7 +407,7 @@ def _serve(
             fresh = (item for item in items if item.level != Level.STALE)
             for item in changes[unit.name].pick(fresh, now_s):
                 told = f'{unit.unit.tag}, {item.name}: {item.sentence}'
-                # rclpy wants one severity for each place in the code.
+                # Separate calls: rclpy allows only one severity per line of code.
                 if item.level == Level.OK:
                     log.info(told)
                 elif item.level == Level.WARN:

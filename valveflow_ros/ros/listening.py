@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Finds running monitors and listens to them: every message goes to a board, decoded there."""
+"""Finds running monitors and subscribes to them; a board collects the decoded messages."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from valveflow_ros.report.terminal.board import (
 )
 
 _LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# A sample that is lost here is lost to the eye only.
+# Lost samples are only missing in the display.
 _STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 _CURVE_TOPIC = '/characteristic'
 
@@ -35,7 +35,7 @@ def full_name(monitor: str) -> str:
 
 
 def monitors(node: Node) -> list[str]:
-    """Return the full names of the monitors that run, sorted."""
+    """Return the full names of the running monitors, sorted."""
     return sorted(
         topic.removesuffix(_CURVE_TOPIC)
         for topic, kinds in node.get_topic_names_and_types()
@@ -44,7 +44,7 @@ def monitors(node: Node) -> list[str]:
 
 
 def waiting_for(monitor: str) -> str:
-    """Return what is to be done where no monitor is found."""
+    """Return the advice for the case that no monitor is found."""
     return (
         f'Waiting for {monitor or "a monitor"}. If one runs, compare ROS_DOMAIN_ID and '
         'ROS_AUTOMATIC_DISCOVERY_RANGE here and there: they must be the same.'
@@ -52,7 +52,7 @@ def waiting_for(monitor: str) -> str:
 
 
 class Listener:
-    """Hears one monitor and keeps a board up to date.
+    """Subscribes to one monitor and updates a board.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class Listener:
     monitor : str
         Full name of the monitor's node.
     board : Board
-        Only to be read through `tell`, or after it.
+        Call `tell` before reading it.
     """
 
     def __init__(self, node: Node, monitor: str, board: Board) -> None:
@@ -84,18 +84,18 @@ class Listener:
 
     @property
     def note(self) -> str:
-        """Return a sentence about the monitor itself, empty if all is well."""
+        """Return a sentence if the monitor has ended or is silent; otherwise empty."""
         if not self.present:
             return 'The monitor has gone; this is what it said last.'
         return '' if self.heard else 'The monitor was found; nothing has come from it yet.'
 
     def tell(self) -> None:
-        """Give the board the predictions that have come since the last call."""
+        """Pass the predictions received since the last call to the board."""
         while self._predictions:
             self.board.take(PREDICTION, fields_of(self._predictions.popleft()))
 
     def health(self, fields: Mapping[str, Any]) -> None:
-        """Take a message of `/diagnostics`, which is one topic for all monitors."""
+        """Process a message of `/diagnostics`, which is one topic for all monitors."""
         self.heard.add(HEALTH)
         self.board.take(HEALTH, fields)
 
@@ -112,7 +112,7 @@ class Listener:
 
 
 def hear_health(node: Node, listeners: Mapping[str, Listener]) -> None:
-    """Subscribe to `/diagnostics` once, for all listeners there are when a message comes."""
+    """Subscribe to `/diagnostics` once, for all current and later ``listeners``."""
 
     def take(message: DiagnosticArray) -> None:
         fields = fields_of(message)
@@ -123,7 +123,7 @@ def hear_health(node: Node, listeners: Mapping[str, Listener]) -> None:
 
 
 def fields_of(message: Any) -> Mapping[str, Any]:
-    """Return a message as a mapping, messages within as mappings too."""
+    """Return a message as a mapping; nested messages are mappings, too."""
     return {name: _plain(getattr(message, name)) for name in message.get_fields_and_field_types()}
 
 

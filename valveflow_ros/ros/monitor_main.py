@@ -1,9 +1,9 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The executable `monitor`: it handles its signals before anything else is loaded.
+"""The executable `monitor`, which first installs its signal handlers.
 
-Then it enters the ROS domain, and only then loads compiler and libraries: while that takes a
-second, the others in the domain discover this process.
+Then it joins the ROS domain, and loads compiler and libraries afterwards. This takes a second, in
+which the other participants in the domain discover this process.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ def main(args: Sequence[str] | None = None) -> int:
     if wants_help(args):
         show(usage(_ABOUT, _EXAMPLE, TABLE))
         return 0
-    # Recordings, logs and compiled code are private, whatever the shell allowed.
+    # Recordings, logs and compiled code are private, independent of the shell's umask.
     before = os.umask(0o077)
     presence: Any = None
     try:
         check_address_space(WORKING_BYTES)
-        # A signal need not wait for what is loaded: nothing has begun yet.
+        # A signal may interrupt the import, because nothing has begun yet.
         with stop.cutting():
             domain = importlib.import_module('valveflow_ros.ros.domain')
         domain.choose_transport()
@@ -59,7 +59,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return 0
     except ValveflowError as error:
         return complain('monitor', str(error))
-    except Exception as error:  # noqa: BLE001 - a person gets a sentence, not a trace
+    except Exception as error:  # noqa: BLE001 - print a sentence instead of a traceback
         return complain('monitor', f'The monitor failed unexpectedly: {with_place(error)}')
     finally:
         if presence is not None:

@@ -38,16 +38,16 @@ _STATUS = ('unknown', 'fresh', 'stale', 'refused', 'provisional')
 
 
 class _Stopped(Exception):  # noqa: N818 - it is no error
-    """Ctrl-C."""
+    """The user pressed Ctrl-C, or a command failed."""
 
 
 class Demo:
-    """The processes, and what is heard of them.
+    """Runs the processes of the demo and subscribes to their topics.
 
     Parameters
     ----------
     folder : Path
-        For logs, the mapping, the recording and the report.
+        Folder for logs, the mapping, the recording and the report.
     stop : StopFlag
     """
 
@@ -63,7 +63,7 @@ class Demo:
         self._port, self._offered = _free_port(), _free_port()
 
     def run(self) -> None:
-        """Tell the story."""
+        """Run all steps of the demo and print what happens."""
         mapping = self._write_mapping()
         with contextlib.ExitStack() as stack:
             plant = stack.enter_context(self._plant())
@@ -91,7 +91,7 @@ class Demo:
             self._import(mapping)
 
     def close(self) -> None:
-        """Leave the domain."""
+        """Destroy the node."""
         self._executor.shutdown(timeout_sec=0.5)
         self._node.destroy_node()
 
@@ -202,7 +202,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return 130
     except (ValveflowError, OSError) as error:
         return complain('opcua_demo', str(error))
-    except Exception as error:  # noqa: BLE001 - a person gets a sentence, not a trace
+    except Exception as error:  # noqa: BLE001 - print a sentence instead of a traceback
         return complain('opcua_demo', f'failed unexpectedly: {with_place(error)}')
     finally:
         rclpy.try_shutdown()

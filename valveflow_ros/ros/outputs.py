@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The output topics, and their messages as a pure function of the engine's events.
 
-The node publishes and records them; a verification compares them with those of a replay.
+The node publishes and records the messages; `verify` compares them with those of a replay.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ class OutputTopic:
     message_type: type
     type_name: str
     latched: bool
-    kept: int = 1  # messages that who comes late is given, if latched
+    kept: int = 1  # messages that a late subscriber gets, if latched
 
 
-# Of two alarms that stand, one that comes and goes must not take the place of the other, which
-# is told again with the row after so many announcements; one or two may come before that row.
+# A frequent alarm must not displace the last message of another active alarm. That one is
+# announced again after `BURIED` announcements, and one or two may come before it.
 _ALARMS_KEPT = BURIED + 2
 OUTPUTS: Mapping[str, OutputTopic] = {
     'characteristic': OutputTopic(
@@ -73,7 +73,7 @@ OUTPUTS: Mapping[str, OutputTopic] = {
 }
 
 
-# What a running monitor can be asked to do, each a `std_srvs/Trigger` of the node.
+# Services of a running monitor; each is a `std_srvs/Trigger` of the node.
 SERVICES: tuple[str, ...] = (
     'refit',
     'acknowledge_alarms',
@@ -85,7 +85,7 @@ SERVICES: tuple[str, ...] = (
 
 
 def _never(name: str, time_ns: int) -> AlarmChange:
-    """Return what there is to say of an alarm that has not come yet."""
+    """Return the initial message of an alarm that has not occurred yet."""
     normal = AlarmState.NORMAL
     return AlarmChange(
         time_ns, name, normal, normal, Priority.MEDIUM, math.nan, math.nan, '',
@@ -94,7 +94,7 @@ def _never(name: str, time_ns: int) -> AlarmChange:
 
 
 class Output(NamedTuple):
-    """A message to be sent: the topic's name in `OUTPUTS`, its bytes, the time it speaks of."""
+    """A message to publish: the topic's name in `OUTPUTS`, its bytes, the time of its data."""
 
     name: str
     data: bytes
@@ -102,24 +102,24 @@ class Output(NamedTuple):
 
 
 class Outputs:
-    """Turns events into messages, one after the other.
+    """Converts events to messages.
 
     Parameters
     ----------
     tag : str
         The unit's tag, the frame_id of every message.
     output_unit : str
-        What stands in sentences in place of MW.
+        Unit that replaces MW in sentences.
     zone : tzinfo, optional
-        In which sentences tell times.
+        Time zone of times in sentences.
     begun_ns : int
-        When the run began, or the first of those that continue each other: the time of what is
-        told before there are data. 0: not known; it is told again with the first row.
+        Start time of the run, or of the first of several continued runs. It is the time of
+        messages before the first data. If 0 (unknown), they are sent again with the first row.
 
     Notes
     -----
-    The status of the curve is followed here by the events alone, so that the
-    messages depend on nothing but their order.
+    The status of the curve is derived from the events alone, so that the
+    messages depend only on the events and their order.
     """
 
     def __init__(
@@ -138,8 +138,8 @@ class Outputs:
     def of(self, events: Sequence[engine.Event]) -> Iterator[Output]:
         """Yield the messages of the events of one call of the engine.
 
-        A block of predictions and the changes of the alarm among its rows are
-        put in the order of their rows, so that the cutting into blocks leaves no trace.
+        A block of predictions and the alarm changes among its rows are yielded in
+        the order of the rows, so that the result does not depend on the block size.
         """
         k = 0
         while k < len(events):
@@ -156,7 +156,7 @@ class Outputs:
 
     def _rows(self, block: PredictionBlock, changes: list[AlarmChange]) -> Iterator[Output]:
         if not self.begun_ns:
-            # At the start /clock told no time yet.
+            # No time was known at the start, since /clock had no message yet.
             self.begun_ns = int(block.time_ns[0])
             yield from self.latched()
         left = iter(changes)
@@ -189,14 +189,14 @@ class Outputs:
         elif isinstance(event, engine.JournalEntry):
             yield self._output('journal', encoding.journal_message(event, tag), event.time_ns)
             if event.kind == JournalKind.RESUMED:
-                # A subscriber to the restarted process must find everything there.
+                # New subscribers to the restarted process need all latched messages.
                 self.shift = None
                 yield from self._current(event.time_ns or self.begun_ns)
             elif self._note(event):
                 yield from self._curve_messages(event.time_ns)
 
     def restore(self, monitor: Monitor) -> None:
-        """Continue from what a restored monitor knows."""
+        """Continue from the state of a restored monitor."""
         reference = monitor.reference.curve
         self.curve, self.status, self.cause = monitor.characteristic, monitor.status, monitor.cause
         self.reference_id = '' if reference is None else reference.model_id
@@ -209,10 +209,10 @@ class Outputs:
         return self._current(self.begun_ns)
 
     def _current(self, time_ns: int) -> Iterator[Output]:
-        """Yield what is known; what is not known yet has the given time."""
+        """Yield the current messages; those without data have the given time."""
         yield from self._curve_messages(time_ns)
         yield self._diagnosis(time_ns)
-        # Who comes late can tell an alarm that never came from a monitor that is not there.
+        # A message for every alarm, so that no alarm differs from no monitor.
         told = {name: _never(name, time_ns) for name in ALARMS} | self._alarms
         for change in sorted(told.values(), key=lambda a: (a.time_ns, a.name)):
             if change.state == AlarmState.NORMAL:
@@ -233,7 +233,7 @@ class Outputs:
         return self._output('diagnosis', message, task.window_end_ns)
 
     def _note(self, entry: engine.JournalEntry) -> bool:
-        """Take over what an entry tells about the curve; return True if it tells anything."""
+        """Update the curve's status from a journal entry; return True if it has changed."""
         if entry.kind == JournalKind.FIT_REFUSED:
             self.status = CurveStatus.STALE if self.curve else CurveStatus.REFUSED
         elif entry.kind == JournalKind.RESET and self.curve:

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The executable `page`: running monitors on a page in the browser, and metrics for Prometheus."""
+"""The executable `page`: shows monitors in the browser and serves metrics for Prometheus."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ from valveflow_ros.ros.domain import start_ros
 from valveflow_ros.ros.listening import Listener, full_name, hear_health, monitors, waiting_for
 from valveflow_ros.ros.process import Parser, StopFlag, complain, with_place
 
-# How often what has come is shown; and how often monitors are looked for.
+# Period of updates of the page, and of the search for monitors.
 _SHOW_S, _LOOK_S = 0.5, 2.0
 _ANSWER_S = 10.0
 
 
 class PageNode(Node):
-    """Listens to all monitors there are, or to those that were named.
+    """Subscribes to all running monitors, or to the named ones.
 
     Parameters
     ----------
     wanted : sequence of str
-        Names of monitors' nodes; empty: every one that is found, at most `MOST_UNITS`.
+        Node names of monitors; if empty, all that are found, at most `MOST_UNITS`.
     """
 
     def __init__(self, wanted: Sequence[str] = ()) -> None:
@@ -55,7 +55,7 @@ class PageNode(Node):
         hear_health(self, self._listeners)
 
     def look(self) -> None:
-        """Look for monitors; one that was found is kept, for it may come back."""
+        """Look for monitors; a monitor that has ended is kept, because it may come back."""
         found = [name for name in monitors(self) if not self._wanted or name in self._wanted]
         for name in found:
             if name not in self._listeners and len(self._listeners) < MOST_UNITS:
@@ -64,7 +64,7 @@ class PageNode(Node):
         self._left_out = sum(name not in self._listeners for name in found)
 
     def show(self, shown: Shown) -> list[AlarmChange]:
-        """Hand over what is known now; return the changes of alarms since the last call."""
+        """Update ``shown``; return the changes of alarms since the last call."""
         units: list[Snapshot] = []
         changes: list[AlarmChange] = []
         for name in sorted(self._listeners):
@@ -77,13 +77,13 @@ class PageNode(Node):
         return changes
 
     def ask(self, monitor: str, asked: str) -> tuple[bool, str]:
-        """Have a monitor do something to an alarm; return success and a sentence.
+        """Request an action on an alarm from a monitor; return success and a sentence.
 
         Parameters
         ----------
         monitor : str
         asked : str
-            Action and alarm, such as 'shelve residual'. Any thread may ask.
+            Action and alarm, such as 'shelve residual'. May be called from any thread.
         """
         answer: Future[tuple[bool, str]] = Future()
         try:
@@ -93,7 +93,7 @@ class PageNode(Node):
             return False, f'{monitor} does not answer; nothing is known to be done.'
 
     def pass_on(self) -> None:
-        """Send the monitors what was asked of them; the answers come while the node spins."""
+        """Send the waiting requests to the monitors; the answers arrive while the node spins."""
         while not self._asked.empty():
             monitor, asked, answer = self._asked.get_nowait()
             action, _, name = asked.partition(' ')
@@ -106,7 +106,7 @@ class PageNode(Node):
                 continue
 
             def done(future: rclpy.Future, answer=answer) -> None:
-                with contextlib.suppress(Exception):  # the asker may have gone, or the monitor
+                with contextlib.suppress(Exception):  # client or monitor may have gone
                     response = future.result()
                     answer.set_result((response.success, response.message))
 
@@ -126,7 +126,7 @@ class PageNode(Node):
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the description of the command line."""
+    """Return the command-line parser."""
     made = Parser(
         prog='page',
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -146,7 +146,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Serve the page until it is asked to end; return the exit status."""
+    """Serve the page until the process is asked to stop; return the exit status."""
     arguments = list(sys.argv if args is None else ['page', *args])
     options = parser().parse_args(remove_ros_args(arguments)[1:])
     stop = StopFlag().install()
@@ -156,7 +156,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return _run(options, stop)
     except ValveflowError as error:
         return complain('page', str(error))
-    except Exception as error:  # noqa: BLE001 - a person gets a sentence, not a trace
+    except Exception as error:  # noqa: BLE001 - print a sentence instead of a traceback
         return complain('page', f'failed unexpectedly: {with_place(error)}')
     finally:
         rclpy.try_shutdown()

@@ -1,11 +1,11 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Publish samples in their own time, at any rate, with or without a clock.
+"""Publishes samples with their original timing, at any rate, with or without /clock.
 
-What is sent in one go beyond what the middleware's queues hold is lost. The monitor answers each
-row with a prediction that carries the row's stamp, so what is unanswered is known, and a player
-waits while that is too much. Where nobody predicts, a player without a rate is limited to what an
-ordinary subscriber takes.
+Messages that exceed the queues of the middleware are lost. The monitor answers each row with a
+prediction that has the row's stamp, so the number of unanswered rows is known, and the player
+waits while there are too many. If there is no monitor, a player without a rate is limited to what
+an ordinary subscriber can receive.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from valveflow_ros.ros.polled_subscription import PolledSubscription
 
 _PREDICTION = 'valveflow_msgs/msg/Prediction'
 _DEPTH = 1000
-# Between two processes on one machine the middleware's queue holds 512 messages of all topics.
+# The middleware's queue between two processes on one machine holds 512 messages of all topics.
 _MAX_UNANSWERED = 240
 _LEAST_STEPS = 8
 _FLOW_NAP_S = 0.002
@@ -37,12 +37,12 @@ _MAX_STUCK = 3
 _UNLED_STEPS_PER_S = 1000.0
 _LOOK_S = 1.0
 _NAP_S = 0.05
-# The other side may discover us a little later than we it.
+# The other side may discover this node a little later.
 _SETTLE_S = 1.0
 
 
 class Step(NamedTuple):
-    """The messages of one instant: (input's name, bytes)."""
+    """The messages of one instant, as pairs of input name and bytes."""
 
     time_ns: int
     messages: list[tuple[str, bytes]]
@@ -57,7 +57,7 @@ class Player:
     names : iterable of str
         The inputs that will be published.
     rate : float
-        Seconds of the samples' own time in a second; 0 as fast as the monitor takes them.
+        Speed relative to the samples' own time; 0: as fast as the monitor can process them.
     use_clock : bool
         Publish /clock before each step.
     stop : callable
@@ -95,7 +95,7 @@ class Player:
         Parameters
         ----------
         patience_s : float
-            How long to wait; 0 waits for nobody.
+            Maximum wait in s; 0 does not wait.
         """
         begun_s = time.monotonic()
         missing = self._without_listener()
@@ -107,7 +107,7 @@ class Player:
         return missing
 
     def play(self, steps: Iterable[Step]) -> int:
-        """Publish steps until they end or we are asked to stop; return how many."""
+        """Publish steps until they end or ``stop`` returns True; return their number."""
         self._find_predictions()
         log = self._node.get_logger()
         if self._predictions:
@@ -155,7 +155,7 @@ class Player:
                 self._predictions.append(made)
 
     def _wait_for_answers(self) -> None:
-        """Return when the next step may be sent."""
+        """Wait until the next step may be sent."""
         now_s = time.monotonic()
         if not self._predictions and now_s - self._looked_s > _LOOK_S:
             self._looked_s = now_s
@@ -173,7 +173,7 @@ class Player:
                 self._stuck = 0
                 begun_s = time.monotonic()
             elif time.monotonic() - begun_s > _STUCK_S:
-                # It may be waiting for what we hold back; and if it has gone, so be it.
+                # The monitor may need more rows before it answers, or may have ended: send some.
                 self._stuck += 1
                 for _ in range(self._window // 4):
                     self._unanswered.popleft()
@@ -181,7 +181,7 @@ class Player:
                 time.sleep(_FLOW_NAP_S)
 
     def _take_answers(self) -> bool:
-        """Take predictions; return True if one answers something unanswered."""
+        """Receive predictions; return True if one answers a waiting row."""
         for predictions in self._predictions:
             for message in predictions.take():
                 self._answered_ns = max(self._answered_ns, header_time_ns(message.data))

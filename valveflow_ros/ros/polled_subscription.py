@@ -1,11 +1,11 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Subscriptions and services polled without the executor; the one place that uses rclpy's inside.
+"""Polls subscriptions and services without the executor; the only user of rclpy internals.
 
-An executor spends far more time on choosing callbacks than the messages are worth. Here the loop
-polls each subscription for raw bytes with the stamps and the sequence number that the middleware
-delivers, and each service for a request. Where this rclpy does not offer that, the executor calls
-back instead.
+An executor spends much more time on selecting callbacks than on the messages. Here the main loop
+polls each subscription for raw bytes, with the stamps and the sequence number from the
+middleware, and each service for a request. If this version of rclpy does not support polling, the
+executor calls back instead.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ _POLICIES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILI
 
 
 def qos_overrides(node: Node, topic: str, entity: str) -> QoSOverridingOptions | None:
-    """Return what a user set from outside, as qos_overrides.TOPIC.publisher.depth and the like.
+    """Return the QoS overrides that the user set, such as qos_overrides.TOPIC.publisher.depth.
 
-    rclpy keeps a parameter for each policy that may be set; where none is set, none is wanted.
+    rclpy declares a parameter for each policy in the result, so policies not set are left out.
     """
     before = f'qos_overrides.{node.resolve_topic_name(topic)}.{entity}.'
     given = getattr(node, '_parameter_overrides', {})
@@ -41,7 +41,7 @@ def qos_overrides(node: Node, topic: str, entity: str) -> QoSOverridingOptions |
 
 
 class RawMessage(NamedTuple):
-    """One message as the middleware delivered it; stamps in ns, 0 where it gave none."""
+    """A message as delivered by the middleware; stamps in ns, 0 if there is none."""
 
     data: bytes
     source_ns: int
@@ -50,22 +50,22 @@ class RawMessage(NamedTuple):
 
 
 class _PolledGroup(CallbackGroup):
-    """Keeps the executor away from subscriptions, and lets their events through."""
+    """Callback group that excludes subscriptions from the executor, but not their events."""
 
     def can_execute(self, entity: Any) -> bool:
         """Return False for a subscription."""
         return not isinstance(entity, Subscription)
 
     def beginning_execution(self, entity: Any) -> bool:
-        """Allow what `can_execute` allows."""
+        """Return the same as `can_execute`."""
         return self.can_execute(entity)
 
     def ending_execution(self, entity: Any) -> None:
-        """Do nothing: `can_execute` keeps no record."""
+        """Do nothing, because `can_execute` has no state."""
 
 
 def can_poll(subscription: Subscription) -> bool:
-    """Return True if this rclpy lets a message be taken by hand."""
+    """Return True if this version of rclpy supports polling."""
     return callable(getattr(subscription.handle, 'take_message', None))
 
 
@@ -79,11 +79,11 @@ class PolledSubscription:
     topic : str
         May be relative; the node resolves and remaps it.
     reliable : bool
-        Whether to ask for reliable delivery; a best-effort request matches every publisher.
+        True to request reliable delivery; a best-effort subscription matches every publisher.
     on_mismatch : callable
-        Called with the topic when a publisher's quality of service does not match.
+        Called with the topic when the QoS of a publisher is incompatible.
     polled : bool
-        False to let the executor call back even where polling is possible.
+        False to let the executor call back even if polling is possible.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class PolledSubscription:
             self._make(topic, reliable, on_mismatch, None)
         self._handle = self._subscription.handle
         self._take_message = getattr(self._handle, 'take_message', None)
-        # Held as long as we poll, so that not every look has to.
+        # Acquired once for the whole time, instead of for every poll.
         self._handle.__enter__()
 
     @property
@@ -117,14 +117,14 @@ class PolledSubscription:
 
     @property
     def polled(self) -> bool:
-        """Return True if messages are polled rather than called back."""
+        """Return True if messages are polled, False if the executor calls back."""
         return self._polled
 
     def take(self, most: int = DEPTH) -> list[RawMessage]:
-        """Return what has arrived, oldest first, at most ``most`` messages."""
+        """Return at most ``most`` messages that have arrived, oldest first."""
         if not self._polled:
             return [self._waiting.popleft() for _ in range(min(most, len(self._waiting)))]
-        # Most looks find nothing, a hundred times a second: they have to be cheap.
+        # Most polls find nothing, so they must be fast.
         found = self._take_message(self._type, True)
         if found is None:
             return []
@@ -157,7 +157,7 @@ class PolledSubscription:
             raw=True,
             callback_group=group or MutuallyExclusiveCallbackGroup(),
             qos_overriding_options=qos_overrides(self._node, topic, 'subscription'),
-            # Each event costs the executor time at every look; the rest says nothing of use.
+            # Each event handler costs executor time in every cycle; the others are not used.
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=lambda _: on_mismatch(self.topic), use_default_callbacks=False
             ),
@@ -170,7 +170,7 @@ class PolledSubscription:
 def answer_request(service: Service, failed: Callable[[str], None]) -> bool:
     """Answer the oldest request of a service; return False if there is none.
 
-    What cannot be done is said to ``failed``, and the answer is one without success.
+    If the callback fails, ``failed`` gets a sentence, and the response reports no success.
     """
     take = getattr(service.handle, 'service_take_request', None)
     request, header = (None, None) if take is None else take(service.srv_type.Request)
@@ -179,7 +179,7 @@ def answer_request(service: Service, failed: Callable[[str], None]) -> bool:
     response = service.srv_type.Response()
     try:
         response = service.callback(request, response)
-    except Exception as error:  # noqa: BLE001 - nothing that is asked may end the monitor
+    except Exception as error:  # noqa: BLE001 - no request may end the monitor
         failed(f'{service.service_name} was asked what it cannot do: {with_place(error)}')
         _refuse(request, response, f'This cannot be done ({one_line(error)}).')
     service.send_response(response, header)
@@ -187,7 +187,7 @@ def answer_request(service: Service, failed: Callable[[str], None]) -> bool:
 
 
 def _refuse(request: Any, response: Any, reason: str) -> None:
-    """Say no where the answer has a place for it; whoever sets parameters gets one for each."""
+    """Set the reason of a refusal if the response has a field for it, for each parameter."""
     if hasattr(response, 'results') and hasattr(request, 'parameters'):
         missing = len(request.parameters) - len(response.results)
         response.results += [SetParametersResult(successful=False, reason=reason)] * missing

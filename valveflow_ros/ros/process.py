@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the executables share: signals, errors in one line, and help."""
+"""Common parts of the executables: signals, one-line errors and help."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ _ASKED_TO_STOP = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Stopped(BaseException):
-    """A signal came where it may interrupt what runs."""
+    """A signal arrived while interruption was allowed; see `StopFlag.cutting`."""
 
 
 class StopFlag:
-    """Set by SIGINT, SIGTERM or SIGHUP: what runs is finished, then the process ends in order."""
+    """Set by SIGINT, SIGTERM or SIGHUP, so that the process finishes its work and then ends."""
 
     def __init__(self) -> None:
         self._by: int | None = None
         self._cuts = False
 
     def install(self) -> StopFlag:
-        """Take over the signals of this process."""
+        """Install the signal handlers of this process."""
         for number in _ASKED_TO_STOP:
             signal.signal(number, self._note)
         return self
 
     @contextmanager
     def cutting(self) -> Iterator[None]:
-        """Let signals raise `Stopped` inside, for work that leaves nothing to be finished.
+        """Let signals raise `Stopped` in the block, for work that may be interrupted.
 
         Raises
         ------
         Stopped
-            One came, or had come before.
+            If a signal arrives or has arrived before.
         """
         if self:
             raise Stopped
@@ -59,17 +59,17 @@ class StopFlag:
             self._cuts = False
 
     def last(self) -> None:
-        """Ignore signals from now on: the process ends already, and its last steps must finish."""
+        """Ignore signals from now on, so that the last steps of the process can finish."""
         for number in _ASKED_TO_STOP:
             signal.signal(number, signal.SIG_IGN)
 
     def __bool__(self) -> bool:
-        """Return True if the process is to stop."""
+        """Return True if the process must stop."""
         return self._by is not None
 
     @property
     def name(self) -> str:
-        """Return the name of the signal, empty before one came."""
+        """Return the name of the signal; empty if there was none."""
         return '' if self._by is None else signal.Signals(self._by).name
 
     def _note(self, number: int, _frame: FrameType | None) -> None:
@@ -83,16 +83,16 @@ _IN_C = re.compile(r',? at /\S+\.c(?:pp)?:\d+')
 
 
 def one_line(error: BaseException) -> str:
-    """Return the first line of an error's text, or its name if it has none.
+    """Return the first line of an error's text, or its type if it has no text.
 
-    Where in C code it happened, as rcl writes it, tells nobody anything.
+    The locations in C code that rcl adds are removed.
     """
     text = _IN_C.sub('', str(error)).strip().splitlines()
     return text[0] if text else type(error).__name__
 
 
 def with_place(error: BaseException) -> str:
-    """Return an unexpected error with where it happened, for the report of the fault."""
+    """Return an unexpected error with its location in the code, for a bug report."""
     found = traceback.extract_tb(error.__traceback__)
     place = f', {os.path.basename(found[-1].filename)}, line {found[-1].lineno}' if found else ''
     return f'{one_line(error)} ({type(error).__name__}{place})'
@@ -105,37 +105,37 @@ def complain(executable: str, sentence: str) -> int:
 
 
 def wants_help(args: Sequence[str] | None) -> bool:
-    """Return True if help was asked for."""
+    """Return True if the arguments request help."""
     given = sys.argv[1:] if args is None else args
     return any(word in ('-h', '--help') for word in given)
 
 
 def show(text: str) -> None:
-    """Print; a reader that ends early, as in ``monitor --help | head``, is no error."""
+    """Print a text; a reader that ends early, as in ``monitor --help | head``, is no error."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
-        # What is left over is flushed again at the end of the process.
+        # The rest would be flushed at the end of the process and raise again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose help may be read by a pipe that ends early."""
+    """A parser whose help output may be cut off by the reader of a pipe."""
 
     def print_help(self, file: object = None) -> None:
         """Print the help on stdout."""
         show(self.format_help().rstrip('\n'))
 
     def error(self, message: str) -> NoReturn:
-        """Refuse what was typed, in words."""
+        """Report a usage error and exit."""
         super().error(re.sub(r'^argument (\S+): must ', r'\1 must ', message))
 
 
 def parameter_file(values: Mapping[str, object]) -> str:
     """Write a parameter file for a launched node, and return its name.
 
-    Texts stand in quotes in it. launch itself writes them without: a tag such as 1E5 would arrive
-    as a number, and an empty text not at all.
+    Texts are quoted in it. launch itself writes them without quotes, so that a tag such as 1E5
+    would be read as a number, and an empty text would be lost.
     """
     with NamedTemporaryFile('w', prefix='valveflow_', suffix='.yaml', delete=False) as file:
         json.dump({'/**': {'ros__parameters': values}}, file)
@@ -143,7 +143,7 @@ def parameter_file(values: Mapping[str, object]) -> str:
 
 
 def usage(about: str, example: str, rows: Iterable[Parameter]) -> str:
-    """Return a page: what it does, an example, and every parameter with unit and default."""
+    """Return the help text: description, example, and all parameters with unit and default."""
     lines = [about, '', 'example:', f'  {example}', '', 'parameters, given as for any node:']
     for row in rows:
         default = repr(row.default) if isinstance(row.default, str) else str(row.default).lower()
@@ -154,7 +154,7 @@ def usage(about: str, example: str, rows: Iterable[Parameter]) -> str:
 
 
 class UnitOfHost(NamedTuple):
-    """A unit in the list of a host: absolute paths, the gateway's empty where it has none."""
+    """A unit in the list of a host, with absolute paths; ``gateway`` is empty without one."""
 
     namespace: str
     params_file: str
@@ -167,9 +167,9 @@ def read_units(path: str | Path) -> list[UnitOfHost]:
     Raises
     ------
     RecordingError
-        It cannot be read, or a file that it names is not there.
+        If it cannot be read, or a file that it names does not exist.
     InputError
-        It is no such list, or two units have the same namespace.
+        If it is no list of units, or two units have the same namespace.
     """
     import yaml
 

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The executable `replay`: a log on the input topics again, or a comparison with its replay."""
+"""The executable `replay`: publishes a log on the input topics, or verifies a recording."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from valveflow_ros.ros.player import Player, Step
 from valveflow_ros.ros.process import Parser, StopFlag, complain, with_place
 from valveflow_ros.ros.verify import verify
 
-# As a shell tells of a process that Ctrl-C has ended.
+# Exit status of a process that was ended by Ctrl-C, as in a shell.
 _STOPPED = 130
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the description of the command line."""
+    """Return the command-line parser."""
     made = Parser(
         prog='replay',
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -78,10 +78,10 @@ def parser() -> argparse.ArgumentParser:
 
 
 def input_topics(log: LogContents) -> dict[str, str]:
-    """Return the topics of a recording to play, each with the input it stands for.
+    """Return the topics of a recording to play, each with its input.
 
-    A recording of the monitor says itself which of its topics were inputs; in
-    any other one they go by their names.
+    A recording of the monitor states which of its topics were inputs. In other
+    recordings inputs are recognised by topic name and type.
     """
     try:
         told = json.loads(log.attachments[TOPICS])['inputs']
@@ -106,7 +106,7 @@ def steps_of(log: LogContents) -> tuple[list[str], Iterator[Step]]:
     Raises
     ------
     DataError
-        There is nothing to play.
+        If there is nothing to play.
     """
     if not log.topics:
         names = [SIGNALS[signal].topic for signal in sorted(log.signals)]
@@ -117,7 +117,7 @@ def steps_of(log: LogContents) -> tuple[list[str], Iterator[Step]]:
         messages = _recorded_messages(log, topics)
     if not names:
         raise DataError(f'{log.path}: there is nothing to play, no input of the monitor is in it.')
-    # Messages that follow each other and belong to one instant are one step.
+    # Successive messages with the same time are one step.
     steps = (
         Step(time_ns, [(name, data) for _, name, data in group])
         for time_ns, group in groupby(messages, key=itemgetter(0))
@@ -158,14 +158,14 @@ def main(args: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print('valveflow replay: stopped.', file=sys.stderr)
         return _STOPPED
-    except Exception as error:  # noqa: BLE001 - a person is owed a sentence, not a trace
+    except Exception as error:  # noqa: BLE001 - print a sentence instead of a traceback
         return complain('replay', f'failed unexpectedly: {with_place(error)}')
 
 
 def _verify(path: str) -> int:
     bar = sys.stderr.isatty() and os.environ.get('TERM') != 'dumb'
     if not bar:
-        # A line now and then shows how far it is; the first comes after a while.
+        # Progress lines are rare, and the first one comes after a while.
         print(
             f'Verifying {path}: its inputs are fed to the engine again, and every recorded output '
             'is compared byte for byte. How far it is will be told now and then.',

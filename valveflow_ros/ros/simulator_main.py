@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The executable `plant_simulator`: the paper's plant on the input topics."""
+"""The executable `plant_simulator`: publishes the paper's simulated plant on the input topics."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def effects_of(texts: Iterable[str]) -> list[EffectSpec]:
     Raises
     ------
     InputError
-        An effect is unknown or its parameters cannot be used.
+        If an effect is unknown or its parameters are invalid.
     """
     return [
         EffectSpec.parse(text)
@@ -64,7 +64,7 @@ def start_ns_of(text: str, rate: float, now_ns: int) -> int:
     Raises
     ------
     ParameterError
-        The text is no time.
+        If the text is no time.
     """
     if not text.strip():
         return now_ns - now_ns % NS_PER_S if rate == 1.0 else DEFAULT_START_NS
@@ -85,7 +85,7 @@ def check_together(rate: float, stamped: bool, use_clock: bool) -> None:
     Raises
     ------
     ParameterError
-        The samples' times would be lost.
+        If the times of the samples would be lost.
     """
     if rate != 1.0 and not stamped and not use_clock:
         raise ParameterError(
@@ -97,7 +97,7 @@ def check_together(rate: float, stamped: bool, use_clock: bool) -> None:
 
 def plain_steps(parts: Iterable[SampleTable], command: bool) -> Iterator[Step]:
     """Yield a step of single values for each row."""
-    # The optional signal first, as everywhere.
+    # The optional signal comes first, as in `decoding.INPUTS`.
     signals = [Signal.VALVE_COMMAND] if command else []
     signals += [info.signal for info in SIGNALS if info.required]
     names = [SIGNALS[signal].topic for signal in signals]
@@ -114,7 +114,7 @@ def stamped_steps(parts: Iterable[SampleTable], command: bool, tag: str) -> Iter
     """Yield a step with one stamped sample for each row."""
     topics = [info.topic for info in SIGNALS]
     for table in parts:
-        # The table's codes begin with good, those of the message with unknown.
+        # The first code is good in the table, but unknown in the message.
         values, quality = table.values.copy(), table.quality + PlantSample.QUALITY_GOOD
         if not command:
             values[:, Signal.VALVE_COMMAND] = float('nan')
@@ -162,7 +162,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return _run(node, stop)
     except ValveflowError as error:
         return complain('plant_simulator', str(error))
-    except Exception as error:  # noqa: BLE001 - a person gets a sentence, not a trace
+    except Exception as error:  # noqa: BLE001 - print a sentence instead of a traceback
         return complain('plant_simulator', f'failed unexpectedly: {with_place(error)}')
     finally:
         stop.last()

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Feed a recording again and compare every recorded output with that of the replay."""
+"""Replays a recording and compares every recorded output with that of the replay."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
 from valveflow_ros.ros.worker import DiagnosisWorker, FitWorker, Task, Worker
 from valveflow_ros.signals.align import Aligner
 
-# Small, so that outputs before a decision that cannot be repeated are compared first.
+# Small, so that outputs before a decision that cannot be repeated are still compared.
 _BLOCK = 500
 _LOOK_S = 0.05
 _PATIENCE = 10.0
@@ -40,18 +40,18 @@ _PATIENCE = 10.0
 
 @dataclass(slots=True)
 class Verification:
-    """What a comparison gave.
+    """Result of a comparison.
 
     Attributes
     ----------
     inputs, rows : int
-        Messages fed and rows of the sample table made of them.
+        Number of input messages, and of rows of the sample table made of them.
     compared : dict of str to int
-        Messages that were equal byte for byte, by output.
+        Number of messages that were equal byte for byte, by output.
     difference : str
         The first difference as a sentence; empty if there was none.
     warnings : tuple of str
-        What the reader had to say about the file.
+        Warnings of the reader about the file.
     """
 
     inputs: int = 0
@@ -78,23 +78,23 @@ def verify(path: str | Path, progress: Callable[[float], None] = lambda _: None)
     path : str or Path
         A recording of the monitor.
     progress : callable
-        Called from time to time with the share of the inputs that was fed.
+        Called from time to time with the fraction of the inputs that was processed.
 
     Raises
     ------
     RecordingError
-        The file cannot be read, or is no recording of the monitor.
+        If the file cannot be read, or is no recording of the monitor.
     """
     return _Replay(open_log(path), progress).verify()
 
 
 def corrector_of_run(log: LogContents, settings: Settings) -> Corrector | None:
-    """Return what took causes out of the rows in the recorded run, None if nothing did.
+    """Return the corrector of the rows in the recorded run, None if there was none.
 
     Raises
     ------
     RecordingError
-        The model is not in the recording, or cannot be used.
+        If the model is not in the recording, or cannot be used.
     """
     if not settings.text(parameter_files.MODEL_FILE):
         return None
@@ -110,12 +110,12 @@ def corrector_of_run(log: LogContents, settings: Settings) -> Corrector | None:
 
 
 def diagnose_in_process(task: DiagnosisTask) -> str:
-    """Compute a diagnosis in a process like the one of the run, on which its last bits depend.
+    """Compute a diagnosis in a process like that of the run, so that all bits are equal.
 
     Raises
     ------
     DataError
-        It gave no result.
+        If there is no result.
     """
     worker = DiagnosisWorker(task.settings.real('diagnosis_timeout'))
     try:
@@ -135,7 +135,7 @@ def _result(worker: Worker, task: Task) -> object:
 
 
 class _Replay:
-    """A recording that is fed again, and what it recorded then."""
+    """Replays a recording and compares its outputs."""
 
     def __init__(self, log: LogContents, progress: Callable[[float], None]) -> None:
         self._log = log
@@ -146,7 +146,7 @@ class _Replay:
             self._settings = Settings(json.loads(log.attachments[PARAMETERS]))
             topics = json.loads(log.attachments[TOPICS])
             self._inputs = {str(topic): str(name) for name, topic in topics['inputs'].items()}
-            # A recording of an earlier version has no topics that came later.
+            # Ignore topics that this version does not have.
             self._outputs = {str(t): str(n) for n, t in topics['outputs'].items() if n in OUTPUTS}
         except KeyError as error:
             problem = f'is no recording of the monitor (the attachment {error} is missing)'
@@ -209,7 +209,7 @@ class _Replay:
                 for row in decoder.recorded(self._inputs[m.topic], m.data, m.publish_time_ns)
             ]  # fmt: skip
             try:
-                # Restarts of the clock stand in the journal, so the rows alone are enough here.
+                # The journal contains clock resets, so only the rows are needed here.
                 events = replayer.feed_aligned(aligner.feed(Readings.of(rows)))
             except (KeyError, ValveflowError) as error:
                 raise _DifferenceError(
@@ -220,9 +220,9 @@ class _Replay:
             self._progress(found.inputs / max(1, total))
 
     def _fit(self, task: FitTask) -> Characteristic:
-        """Compute a fit as the run did: with several threads its last bits may be others."""
+        """Compute a fit with one thread as in the run; otherwise the last bits may differ."""
         if self._fits is None:
-            # This machine may be the slower one.
+            # This machine may be slower than that of the run.
             self._fits = FitWorker(_PATIENCE * task.settings.real('refit_timeout'))
         found = _result(self._fits, task)
         if not isinstance(found, Characteristic):
@@ -230,7 +230,7 @@ class _Replay:
         return found
 
     def _is_earlier(self) -> bool:
-        """Return True if no alarm was told at the beginning, as every run does now."""
+        """Return True if the recording lacks the initial alarm message of current versions."""
         alarms = [topic for topic, name in self._outputs.items() if name == 'alarms']
         told, first = (next(self._messages(t), None) for t in (alarms, self._outputs))
         if first is None:
@@ -241,7 +241,7 @@ class _Replay:
             return False
 
     def _begun_ns(self) -> int:
-        """Return the time of what was told before there were data."""
+        """Return the time of the messages before the first data; 0 if unknown."""
         curves = [topic for topic, name in self._outputs.items() if name == 'characteristic']
         first = next(self._messages(curves), None)
         if first is None:

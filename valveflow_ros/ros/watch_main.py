@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The executable `watch`: how a running monitor is doing, on a terminal."""
+"""The executable `watch`: shows the state of a running monitor on a terminal."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ from valveflow_ros.ros.outputs import SERVICES
 from valveflow_ros.ros.process import Parser, complain, with_place
 
 _LOOK_S = 0.5
-# For one picture: how long a monitor may take to be found, and then to say how it is.
+# For --once: maximum time to find a monitor, and then to receive its health.
 _FIND_S, _HEAR_S = 5.0, 3.0
 _ANSWER_S = 10.0
-# How the services end that do something to all alarms.
+# Suffix of the services that act on all alarms.
 _OF_ALARMS = '_alarms'
 
 
 class WatchNode(Node):
-    """Finds the monitor, subscribes, and keeps what a terminal view needs.
+    """Finds the monitor, subscribes, and stores what the terminal view needs.
 
     Parameters
     ----------
     monitor : str
-        Full name of the monitor's node; empty: the one there is.
+        Name of the monitor's node; empty for the only running monitor.
     """
 
     def __init__(self, monitor: str = '') -> None:
@@ -58,16 +58,16 @@ class WatchNode(Node):
 
     @property
     def monitor(self) -> str:
-        """Return the full name of the monitor's node, empty until it is found."""
+        """Return the full name of the monitor's node; empty until it is found."""
         return next(iter(self._heard), '')
 
     @property
     def heard(self) -> set[str]:
-        """Return the types of the messages that have come."""
+        """Return the types of the messages received so far."""
         return set().union(*(listener.heard for listener in self._heard.values()))
 
     def look(self) -> None:
-        """Look for the monitor as long as it is not found."""
+        """Look for the monitor if it is not found yet."""
         if self._heard:
             return
         found = monitors(self)
@@ -77,7 +77,7 @@ class WatchNode(Node):
             self._heard[name] = Listener(self, name, Board())
 
     def frame(self) -> Frame:
-        """Return what is known now."""
+        """Return the current content of the view."""
         listener = self._heard.get(self.monitor)
         if listener is not None:
             listener.tell()
@@ -89,7 +89,7 @@ class WatchNode(Node):
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the description of the command line."""
+    """Return the command-line parser."""
     made = Parser(
         prog='watch',
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -125,7 +125,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Watch until it is asked to end; return the exit status."""
+    """Show the monitor until the process is asked to stop; return the exit status."""
     arguments = list(sys.argv if args is None else ['watch', *args])
     made = parser()
     options = made.parse_args(remove_ros_args(arguments)[1:])
@@ -141,13 +141,13 @@ def main(args: Sequence[str] | None = None) -> int:
     except ValveflowError as error:
         return complain('watch', str(error))
     except KeyboardInterrupt:
-        # How one stops looking.
+        # Ctrl-C is the normal end.
         return 0
     except BrokenPipeError:
-        # Whoever read the output has gone.
+        # The reader of the output has ended.
         sys.stdout = None  # type: ignore[assignment]
         return 0
-    except Exception as error:  # noqa: BLE001 - a person gets a sentence, not a trace
+    except Exception as error:  # noqa: BLE001 - print a sentence instead of a traceback
         return complain('watch', f'failed unexpectedly: {with_place(error)}')
     finally:
         rclpy.try_shutdown()
@@ -172,7 +172,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _listen(node: WatchNode, executor: SingleThreadedExecutor, seconds: float) -> None:
-    """Take what comes for a while."""
+    """Process messages for some seconds."""
     end_s = time.monotonic() + seconds
     node.look()
     while (left_s := end_s - time.monotonic()) > 0.0:
@@ -180,7 +180,7 @@ def _listen(node: WatchNode, executor: SingleThreadedExecutor, seconds: float) -
 
 
 def _find(node: WatchNode, executor: SingleThreadedExecutor) -> bool:
-    """Wait until the monitor is found; False if it is not."""
+    """Wait until the monitor is found; return False if it is not."""
     begun_s = time.monotonic()
     while not node.monitor and time.monotonic() - begun_s < _FIND_S:
         _listen(node, executor, 0.1)
@@ -214,7 +214,7 @@ def _once(
     if not _find(node, executor):
         return complain('watch', node.frame().note)
     found_s = time.monotonic()
-    # The health comes once a second, and what is latched at once.
+    # Health is published once a second; latched messages arrive at once.
     while not {CURVE, HEALTH} <= node.heard and time.monotonic() - found_s < _HEAR_S:
         _listen(node, executor, 0.1)
     frame = node.frame()
@@ -227,7 +227,7 @@ def _once(
 
 
 def _finite(value: Any) -> Any:
-    """Replace what JSON does not know."""
+    """Replace numbers that are not finite by None: JSON cannot hold them."""
     if isinstance(value, dict):
         return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,11 +1,11 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Fits and diagnoses in a child process, so that no sample waits for one.
+"""Fits and diagnoses in a child process, so that no sample waits for them.
 
-The parent's side is `FitWorker` and `DiagnosisWorker`; ``python -m valveflow_ros.ros.worker`` is
-the child. Tasks and results travel as states (`valveflow_ros.state`): plain values and arrays with
-a checksum, nothing that could be executed. A child that dies, hangs or answers nonsense costs one
-fit and a sentence; the next child is started after a pause that doubles with each failure.
+The parent uses `FitWorker` and `DiagnosisWorker`; the child is ``python -m
+valveflow_ros.ros.worker``. Tasks and results are sent as states (`valveflow_ros.state`): plain
+values and arrays with a checksum, no executable content. If a child dies, hangs or gives an
+invalid result, one fit is lost and reported; the pause before the next child then doubles.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ DIAGNOSIS_JOB = 'valveflow_ros.diagnosis.from_window:diagnose_window'
 Task = FitTask | DiagnosisTask
 
 _FIRST_PAUSE_S = 0.5
-_LAST_ANSWER_S = 1.0  # for what a process that has ended had sent
+_LAST_ANSWER_S = 1.0  # wait for results sent before the process ended
 _LONGEST_PAUSE_S = 60.0
-_MAX_ANSWER_BYTES = 16 << 20  # a curve takes some ten thousand
+_MAX_ANSWER_BYTES = 16 << 20  # a curve has about 10 kB
 _LONGEST_WARM_UP_S = 600.0
 _LAST_WORDS_S = 0.5
-_WARM_UP = 0  # the number of a task whose result nobody waits for
+_WARM_UP = 0  # number of the warm-up task, whose result is not used
 _PR_SET_PDEATHSIG = 1
-# One core is what the machine can spare, and one thread adds up in one order only.
+# One thread leaves the other cores to the machine, and its sums are reproducible.
 _ONE_THREAD = dict.fromkeys(
     ('NUMBA_NUM_THREADS', 'OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1'
 )
@@ -64,16 +64,16 @@ _ONE_THREAD = dict.fromkeys(
 
 @dataclass(frozen=True, slots=True)
 class WorkerResult:
-    """What became of a request.
+    """Result of a request.
 
     Attributes
     ----------
     request_ns : int
-        Which request it answers.
+        Identifies the request.
     result : Characteristic, DiagnosisContent or str
-        A string is the sentence why there is no result.
+        A string is the reason why there is no result.
     seconds : float
-        How long it took, with the way there and back.
+        Duration in s, including communication.
     """
 
     request_ns: int
@@ -85,7 +85,7 @@ class WorkerResult:
 
 
 def task_to_bytes(task: Task) -> bytes:
-    """Return a task as it is sent to the child."""
+    """Return a task in the form sent to the child."""
     contents = {f.name: getattr(task.contents, f.name) for f in dataclasses.fields(WindowContents)}
     state: dict[str, Any] = {
         'request_ns': task.request_ns, 'settings': dict(task.settings), 'contents': contents
@@ -102,7 +102,7 @@ def task_to_bytes(task: Task) -> bytes:
 
 
 def task_from_bytes(data: bytes) -> Task:
-    """Return the task in such bytes; raises `DataError` if they are damaged."""
+    """Return a task from `task_to_bytes`; raises `DataError` if the bytes are damaged."""
     state = from_bytes(data)
     window, settings = WindowContents(**state['contents']), Settings(state['settings'])
     if 'curve' in state:
@@ -115,7 +115,7 @@ def task_from_bytes(data: bytes) -> Task:
 
 
 def result_to_bytes(result: object) -> bytes:
-    """Return the result of a job as it is sent to the parent."""
+    """Return the result of a job in the form sent to the parent."""
     if isinstance(result, Characteristic):
         return to_bytes({'curve': to_json(result)})
     if isinstance(result, DiagnosisContent):
@@ -124,12 +124,12 @@ def result_to_bytes(result: object) -> bytes:
 
 
 def result_from_bytes(data: bytes) -> Characteristic | DiagnosisContent | str | None:
-    """Return the result in such bytes, None if the job gave none.
+    """Return a result from `result_to_bytes`, None if the job gave none.
 
     Raises
     ------
     DataError
-        They are no answer.
+        If the bytes are no valid result.
     """
     state = from_bytes(data)
     try:
@@ -145,14 +145,14 @@ def result_from_bytes(data: bytes) -> Characteristic | DiagnosisContent | str | 
     return str(state['sentence']) if 'sentence' in state else None
 
 
-# Which results are believed
+# Checks of the results
 
 
 def fit_objection(task: FitTask, result: object) -> str:
-    """Return why a result is not to be adopted, empty if nothing speaks against it.
+    """Return why a result must not be adopted; empty if it is valid.
 
-    The worker is another process and may have been damaged in any way; the curve that predicts
-    and raises alarms is only replaced by a whole one.
+    The worker is another process and may fail in any way. The current curve, which predicts and
+    raises alarms, is only replaced by a valid one.
     """
     if not isinstance(result, Characteristic):
         return 'The fit gave no curve.'
@@ -174,7 +174,7 @@ def fit_objection(task: FitTask, result: object) -> str:
     if residuals.average_sd_mw <= 0.0 or chart is None or not chart.innovation_mw > 0.0:
         return 'The fit gave residuals without spread.'
     finite = all(map(math.isfinite, chart.limit + chart.slack))
-    # Innovations are clipped at four: with more slack than this hardly a shift raises an alarm.
+    # Innovations are clipped at four, so with a larger slack hardly any shift raises an alarm.
     if not (finite and min(chart.limit) > 0.0 and max(chart.slack) <= 3.0):
         return 'The fit gave no limits for the alarm.'
     if result.source.window_end_ns != int(task.contents.time_ns[-1]):
@@ -185,7 +185,7 @@ def fit_objection(task: FitTask, result: object) -> str:
 
 
 def diagnosis_objection(task: DiagnosisTask, result: object) -> str:
-    """Return why the result of a diagnosis is not to be published, empty if nothing says so."""
+    """Return why the result of a diagnosis must not be published; empty if it is valid."""
     if not isinstance(result, DiagnosisContent):
         return 'The diagnosis gave no result.'
     if result.window_end_ns != task.window_end_ns:
@@ -193,16 +193,16 @@ def diagnosis_objection(task: DiagnosisTask, result: object) -> str:
     content = json.loads(result.text)
     if content['verdict'] not in VERDICTS or not content['sentence']:
         return 'The diagnosis gave no verdict.'
-    # What cannot be published as a message is no result.
+    # Raises if the result cannot be published as a message.
     encode(diagnosis_message(content, task, ''))
     return ''
 
 
 def release_memory() -> None:
-    """Return freed memory to the system where the C library can (glibc); takes milliseconds.
+    """Return freed memory to the system if the C library (glibc) can; takes milliseconds.
 
-    The snapshot of a window of days takes 40 MB, and what it leaves in the heap would otherwise
-    be held for good.
+    The snapshot of a window of days has 40 MB, which would otherwise remain in the heap of the
+    process.
     """
     trim = getattr(ctypes.CDLL(None), 'malloc_trim', None)
     if trim is not None:
@@ -226,11 +226,11 @@ class Worker:
     Parameters
     ----------
     timeout_s : float
-        A task that takes longer is ended.
+        A task that takes longer is aborted.
     job : str, optional
-        The function that is called, as ``module:function``.
+        The function to call, as ``module:function``.
     clock : callable
-        Seconds by a clock that never goes back.
+        Returns monotonic time in s.
 
     Attributes
     ----------
@@ -241,7 +241,7 @@ class Worker:
     parameter: ClassVar[str]
     job: ClassVar[str]
     nice: ClassVar[int]
-    # The process waits for the next task; otherwise one is started for each.
+    # True if the process waits for the next task; otherwise each task has its own process.
     stays: ClassVar[bool]
     objection: ClassVar[Callable[[Any, object], str]]
 
@@ -264,12 +264,12 @@ class Worker:
 
     @property
     def pid(self) -> int | None:
-        """Return the process's id, None while there is none."""
+        """Return the id of the process, None if there is no process."""
         return None if self._process is None else self._process.pid
 
     @property
     def busy_s(self) -> float | None:
-        """Return how long the task at hand has been running, None without one."""
+        """Return the duration of the current task in s, None without a task."""
         return None if self._running is None else self._clock() - self._running.begun_s
 
     @property
@@ -278,10 +278,10 @@ class Worker:
         return self._warming_since_s is not None
 
     def start(self, outcomes: list[WorkerResult] | None = None) -> None:
-        """Start the process; if it cannot be, the task at hand ends with an outcome.
+        """Start the process; if this fails, the current task ends with a failure.
 
-        The kernel ends the child when the thread that started it ends, so call this from one that
-        lives as long as the monitor.
+        The kernel ends the child when the thread that started it ends, so call this from a thread
+        that lives as long as the monitor.
         """
         ends: list[Any] = []
         try:
@@ -296,11 +296,11 @@ class Worker:
             process = subprocess.Popen(
                 [sys.executable, '-m', 'valveflow_ros.ros.worker', *arguments],
                 stdin=subprocess.DEVNULL,
-                # What a library prints while it loads is no result of the monitor.
+                # Output of libraries must not appear as output of the monitor.
                 stdout=2,
                 pass_fds=[theirs.fileno()],
                 env={**os.environ, **_ONE_THREAD},
-                # Ctrl-C in a terminal is for the monitor to deal with.
+                # Ctrl-C in a terminal must only reach the monitor.
                 start_new_session=True,
             )
         except OSError as error:
@@ -320,7 +320,7 @@ class Worker:
         self._exchange.start()
 
     def submit(self, task: Task) -> None:
-        """Take a task; one that is still running is given up."""
+        """Start a task; a task that is still running is aborted."""
         if self._running is not None and self._process is not None:
             self._end()
         self._number += 1
@@ -328,16 +328,16 @@ class Worker:
         self._send()
 
     def warm_up(self, task: Task) -> None:
-        """Let the process compile or load what a task needs; no outcome comes of it.
+        """Let the process compile or load what a task needs; this gives no result.
 
-        A task that is submitted meanwhile is begun afterwards, in the same process.
+        A task that is submitted meanwhile is started afterwards, in the same process.
         """
         if self._process is not None:
             self._warming_since_s = self._clock()
             self._tasks.put((_WARM_UP, task))
 
     def poll(self) -> list[WorkerResult]:
-        """Return the outcomes there are, and see to the process; never waits."""
+        """Return the available results, and restart or end the process if needed."""
         outcomes: list[WorkerResult] = []
         if self._process is None:
             wanted = self.stays or self._running is not None
@@ -351,14 +351,14 @@ class Worker:
             pass
         elif self._process.poll() is not None:
             if self._running is not None:
-                # What it had said before it ended counts; an idle thread has nothing to say.
+                # Use a result that was sent before the process ended.
                 self._exchange.join(_LAST_ANSWER_S)
                 self._take_answers(outcomes)
             if self._process is not None:
                 sentence = f'The {self.word} process ended unexpectedly ({self._end()}).'
                 self._failed(sentence, outcomes)
         elif self._warming_since_s is not None:
-            # It may be compiling. What waits behind it has not begun.
+            # It may be compiling; a waiting task has not begun.
             if now_s - self._warming_since_s > _LONGEST_WARM_UP_S:
                 sentence = f'The {self.word} process could not be made ready and was ended.'
                 self._failed(sentence, outcomes)
@@ -371,7 +371,7 @@ class Worker:
         return outcomes
 
     def close(self) -> None:
-        """End the process at once, whatever it is doing."""
+        """End the process immediately."""
         self._end()
         self._running = None
 
@@ -390,12 +390,12 @@ class Worker:
             if number == _WARM_UP:
                 self._warming_since_s = None
                 if running is not None:
-                    # The time it waited for the warm-up to end is not the task's.
+                    # The wait for the warm-up does not count as time of the task.
                     running.begun_s = self._clock()
             if running is None or running.number != number:
                 continue
             believed = self._believed(running.task, result)
-            # The task holds days of rows; it must be gone when memory is released.
+            # The task holds days of rows, which must be freed before memory is released.
             del running
             self._conclude(believed, outcomes)
             self.failures_in_a_row = 0
@@ -405,12 +405,12 @@ class Worker:
                 return
 
     def _believed(self, task: Task, result: Any) -> Any:
-        """Return the result, or why it is not believed."""
+        """Return the result, or the reason why it is refused."""
         if isinstance(result, str):
             return result
         try:
             problem = type(self).objection(task, result)
-        except Exception as error:  # noqa: BLE001 - anything may stand in its fields
+        except Exception as error:  # noqa: BLE001 - the fields may have any content
             name = type(error).__name__
             problem = f'The {self.word} gave a result that cannot be checked ({name}).'
         return problem or result
@@ -435,12 +435,12 @@ class Worker:
         if running is None or running.sent or self._process is None:
             return
         running.sent = True
-        # The time it waited for a process to be there is not the task's.
+        # The wait for a process does not count as time of the task.
         running.begun_s = self._clock()
         self._tasks.put((running.number, running.task))
 
     def _end(self) -> str:
-        """Kill the process and return what became of it, in words."""
+        """Kill the process and return a clause about its exit."""
         process, self._process = self._process, None
         self._warming_since_s = None
         if process is None:
@@ -461,7 +461,7 @@ class FitWorker(Worker):
 
 
 class DiagnosisWorker(Worker):
-    """Computes one diagnosis at a time, in a process that is there only while it does."""
+    """Computes one diagnosis at a time, in a process that is started for each of them."""
 
     word, parameter, job = 'diagnosis', 'diagnosis_timeout', DIAGNOSIS_JOB
     nice, stays = 19, False
@@ -474,18 +474,18 @@ def _exchange(
     tasks: queue.SimpleQueue[tuple[int, Task] | None],
     answers: queue.SimpleQueue[tuple[int, bytes]],
 ) -> None:
-    """Send tasks and receive their answers in a thread, as a snapshot of days takes a while."""
+    """Send tasks and receive results in a thread, because a large window takes time to send."""
     with connection:
         while (item := tasks.get()) is not None:
             number, data = item[0], task_to_bytes(item[1])
-            # The rows must not be held while the child computes.
+            # Free the rows while the child computes.
             del item
             try:
                 connection.send_bytes(data)
                 del data
                 answers.put((number, connection.recv_bytes(_MAX_ANSWER_BYTES)))
             except (EOFError, OSError):
-                # The process has ended, or it sent something that is no message.
+                # The process has ended or sent an invalid message.
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(_LAST_WORDS_S)
                 answers.put((number, b''))
@@ -496,14 +496,14 @@ def _exchange(
 
 
 def compute(work: Callable[[Any], Any], task: Task, word: str) -> Any:
-    """Do the work; return its result, or a sentence why there is none."""
+    """Run the job; return its result, or a sentence why there is none."""
     try:
         return work(task)
     except DataError as error:
         return str(error)
     except MemoryError:
         return f'The {word} needed more memory than there is.'
-    except Exception as error:  # noqa: BLE001 - whatever it is, the monitor goes on
+    except Exception as error:  # noqa: BLE001 - no failure may stop the monitor
         return f'The {word} failed unexpectedly: {with_place(error)}.'
 
 
@@ -514,16 +514,16 @@ def main(arguments: list[str]) -> int:
     ----------
     arguments : list of str
         The parent's process id, the descriptor of the connection, the job as ``module:function``,
-        the nice value, and what the job is called.
+        the nice value, and the name of the job for messages.
     """
     parent, descriptor, job, nice, word = arguments
-    # The kernel ends this process when its parent ends, in whatever way.
+    # The kernel ends this process when its parent ends for any reason.
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != int(parent):
-        # It ended before the kernel was asked.
+        # The parent ended before this request.
         os._exit(1)
     os.nice(int(nice))
-    # Nothing that a library prints may look like output of the monitor.
+    # Output of libraries must not appear as output of the monitor.
     os.dup2(2, 1)
     module, _, function = job.partition(':')
     work = getattr(importlib.import_module(module), function)
@@ -539,5 +539,5 @@ if __name__ == '__main__':
         sys.exit(main(sys.argv[1:]))
     except BrokenPipeError:
         sys.exit(0)
-    except Exception as error:  # noqa: BLE001 - the monitor sees the end and says so
+    except Exception as error:  # noqa: BLE001 - the monitor reports that the process ended
         sys.exit(f'valveflow worker process: {one_line(error)}')

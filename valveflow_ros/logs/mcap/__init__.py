@@ -1,12 +1,12 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings in MCAP: reading, writing, following and repairing them."""
+"""Reads, writes, follows and recovers recordings in MCAP."""
 
 from importlib.util import find_spec
 
 from valveflow_ros.errors import ValveflowError
 
-# No rosdep key brings it, so a ROS installation may be without.
+# It has no rosdep key, so a ROS installation may lack it.
 if find_spec('mcap') is None:
     raise ValveflowError(
         "Logs need the Python package 'mcap', which is not installed: pip install mcap."

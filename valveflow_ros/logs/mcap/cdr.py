@@ -1,9 +1,9 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Decodes CDR messages by the definition that stands in the file itself.
+"""Decodes CDR messages with the definition that is stored in the file.
 
-For journals, `info` and watching, not for the hot path. Every length is
-checked against the bytes that are there before anything is made of it.
+`Decoder` is slow; it is meant for `info`, watching and exports. Every length
+is checked against the available bytes before memory is allocated.
 """
 
 from __future__ import annotations
@@ -64,12 +64,12 @@ class Decoder:
     type_name : str
         ``package/msg/Type`` or ``package/Type``.
     definition : str
-        Its ros2msg text with everything it needs.
+        Its ros2msg text with the definitions of all nested types.
 
     Raises
     ------
     RecordingError
-        If the definition is incomplete or cannot be understood.
+        If the definition is incomplete or cannot be parsed.
     """
 
     def __init__(self, type_name: str, definition: str) -> None:
@@ -90,7 +90,7 @@ class Decoder:
         Raises
         ------
         RecordingError
-            If the bytes do not fit the definition.
+            If the bytes do not match the definition.
         """
         try:
             return _Reader(data, self._types).message(self._name, 0)
@@ -103,7 +103,7 @@ class _Reader:
         if data[:2] not in (_BIG, _LITTLE) or len(data) < 4:
             raise LayoutError('is not plain CDR')
         self._order = '<' if data[:2] == _LITTLE else '>'
-        # Alignment counts from behind the four bytes of encapsulation.
+        # Alignment is relative to the end of the four bytes of encapsulation.
         self._body = data[4:]
         self._position = 0
         self._types = types
@@ -149,7 +149,7 @@ class _Reader:
 
     def _text(self) -> str:
         size = self._number('I')
-        # The length counts a closing zero byte; some writers leave both out for ''.
+        # The length includes the final zero byte; some writers omit that byte for ''.
         raw = self._take(size)
         return raw[:-1].decode(errors='replace') if raw else ''
 
@@ -173,7 +173,7 @@ MAX_SAMPLE_DEPTH = 8
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Stamped samples: times (n,), values (n, 5) and qualities (n, 5), and which fitted."""
+    """Decoded PlantSample messages: times (n,), values and qualities (n, 5), valid rows (n,)."""
 
     time_ns: IntArray
     values: FloatArray
@@ -182,9 +182,9 @@ class Samples:
 
 
 class PlantSampleReader:
-    """Knows where the values stand in messages of one ros2msg definition.
+    """Reads the values of PlantSample messages that have one ros2msg definition.
 
-    Raises `LayoutError` if a field is missing, of another type, or behind an array.
+    Raises `LayoutError` if a field is missing, of another type, or after an array.
     """
 
     def __init__(self, definition: str) -> None:
@@ -240,7 +240,7 @@ class PlantSampleReader:
         samples: Samples,
         mine: IntArray,
     ) -> None:
-        """Walk the fields of all messages side by side; ``place`` is where each has got to."""
+        """Decode all messages field by field; ``place`` is the current offset in each of them."""
         place = np.zeros(len(body), dtype=np.int64)
         alive = np.ones(len(body), dtype=np.bool_)
         found: dict[str, NDArray[np.generic]] = {}
@@ -275,7 +275,7 @@ class PlantSampleReader:
         for info in SIGNALS:
             values, codes = found[info.topic][alive], found[f'{info.topic}_quality'][alive]
             if not info.required and self._qualities[0] == Quality.BAD:
-                # The sender left it alone; that is no bad value.
+                # The sender did not set this optional value: it is absent, not bad.
                 values = np.where(codes == 0, np.nan, values)
             samples.values[good, info.signal] = values
             samples.quality[good, info.signal] = self._qualities[codes]

@@ -1,10 +1,10 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Writes an MCAP file chunk by chunk and, at the end, the index that stock readers ask for.
+"""Writes an MCAP file chunk by chunk and, at the end, the index for other readers.
 
-It knows after every failure which chunks are whole on disk, because it counts
-the bytes that were taken, and it takes chunks as they are, so that `recover`
-copies them without touching a message.
+It counts the bytes that were written, so after a failure it is known which
+chunks are complete on disk. Packed chunks are written unchanged, so `recover`
+copies them without decoding their messages.
 """
 
 from __future__ import annotations
@@ -43,30 +43,30 @@ CHUNK_BYTES = 64 * 1024
 ZSTD = 'zstd'
 _ZSTD_LEVEL = 3
 REPEAT_CHUNKS = 256
-# A file of 256 MiB is not to be read back at every flush.
+# Minimum time between two verifications, since a file of 256 MiB takes long to read back.
 _READ_BACK_S = 30.0
 _HEAD = struct.Struct('<BQHIQQ')
 _INDEX_ROW = np.dtype([('log_time', '<i8'), ('offset', '<i8')])
 
 
 def attachment(name: str, data: bytes) -> Attachment:
-    """Return the record of an attached file; its media type is that of its suffix."""
+    """Return the record of an attached file; its media type follows from its suffix."""
     kinds = {'.json': 'application/json', '.yaml': 'application/yaml'}
     kind = kinds.get(PurePath(name).suffix, 'application/octet-stream')
     return Attachment(create_time=0, log_time=0, name=name, media_type=kind, data=data)
 
 
 def compressor() -> zstandard.ZstdCompressor:
-    """Return what compresses chunks; one for each thread, because its library keeps state."""
+    """Return a compressor; use one per thread, because the library is not thread-safe."""
     return zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
 
 
 @dataclass(frozen=True, slots=True)
 class PackedChunk:
-    """A chunk record ready to be written, and what an index says about it.
+    """A chunk record ready to be written, and the data for its index.
 
     Arrays of n messages: ``channel`` uint16, ``log_time`` int64 in ns since the epoch, ``offset``
-    int64 where each begins in the unpacked content, which has ``unpacked_size`` bytes.
+    int64 of each in the unpacked content, which has ``unpacked_size`` bytes.
     """
 
     record: bytes
@@ -88,7 +88,7 @@ def pack_content(
     offset: IntArray,
     packer: zstandard.ZstdCompressor,
 ) -> PackedChunk:
-    """Compress records, of which the messages are described by the arrays, into a chunk."""
+    """Compress records into a chunk; the arrays describe the messages among the records."""
     start, end = (int(log_time.min()), int(log_time.max())) if len(log_time) else (0, 0)
     chunk = Chunk(
         compression=ZSTD,
@@ -102,7 +102,7 @@ def pack_content(
 
 
 class ChunkBuilder:
-    """Messages that wait for their chunk, in the order in which they came."""
+    """Collects messages for the next chunk, in the order in which they are added."""
 
     def __init__(self) -> None:
         self._records = bytearray()
@@ -144,7 +144,7 @@ class ChunkBuilder:
         self._records += data
 
     def build(self, table: bytes = b'') -> PackedChunk:
-        """Return the waiting messages as a chunk, ``table`` standing before them; keep them."""
+        """Return ``table`` and the waiting messages as a chunk; the messages are kept."""
         offsets = np.array(self._offsets, dtype=np.int64) + len(table)
         return pack_content(
             table + bytes(self._records),
@@ -155,7 +155,7 @@ class ChunkBuilder:
         )
 
     def clear(self) -> None:
-        """Forget the waiting messages: they are on disk."""
+        """Discard the waiting messages, after they were written."""
         self._records = bytearray()
         self._channels = []
         self._log_times = []
@@ -163,17 +163,17 @@ class ChunkBuilder:
 
 
 class ChunkFile:
-    """One file being written.
+    """An MCAP file that is being written.
 
-    Every method raises `OSError` as the file does; after one the file is to
-    be abandoned, and `messages` and `counts` say what is whole on disk.
+    Every method raises the `OSError` of the file. After an error, call `abandon`;
+    `messages` and `counts` then describe the complete chunks on disk.
 
     Attributes
     ----------
     messages : int
-        Messages in whole chunks.
+        Number of messages in complete chunks.
     counts : dict[int, int]
-        The same by channel.
+        The same per channel.
     start_ns, end_ns : int
         First and last log time among them.
     position : int
@@ -191,14 +191,14 @@ class ChunkFile:
         self._crc = 0
         self._suspect, self._read_back_s = False, 0.0
         self._topics_known = self._since_table = 0
-        # Packed at once: a recording of months has a million chunks.
+        # Stored packed to save memory: a recording of months has a million chunks.
         self._index: dict[Opcode, list[bytes]] = {
             Opcode.CHUNK_INDEX: [], Opcode.ATTACHMENT_INDEX: [], Opcode.METADATA_INDEX: [],
         }  # fmt: skip
         self._append(MAGIC + pack(Header(profile=Profile.ROS2, library=library)))
 
     def put_attachment(self, attachment: Attachment) -> None:
-        """Write a file into the file."""
+        """Write an attachment."""
         start, packed = self.position, pack(attachment)
         self._append(packed)
         index = AttachmentIndex(
@@ -213,7 +213,7 @@ class ChunkFile:
         self._index[Opcode.ATTACHMENT_INDEX].append(pack(index))
 
     def put_all(self, files: Mapping[str, bytes], notes: Mapping[str, Mapping[str, str]]) -> None:
-        """Write attachments and metadata by their names."""
+        """Write attachments and metadata records, given by name."""
         for name, data in files.items():
             self.put_attachment(attachment(name, data))
         for name, items in notes.items():
@@ -227,14 +227,14 @@ class ChunkFile:
         self._index[Opcode.METADATA_INDEX].append(pack(index))
 
     def table_due(self, topics: int) -> bool:
-        """Tell whether the records of so many topics are to stand in the next chunk.
+        """Return True if the next chunk must contain the records of all ``topics`` topics.
 
-        A chunk may be lost, and with it the only mention of a topic; so they stand in the first
-        two chunks that could hold a new one, and then in one of `REPEAT_CHUNKS`.
+        A lost chunk must not lose the only record of a topic. The records are therefore written
+        in the first two chunks after a new topic, and then every `REPEAT_CHUNKS` chunks.
         """
         due = topics > self._topics_known or self._since_table in (0, REPEAT_CHUNKS)
         if topics > self._topics_known:
-            # The next chunk repeats what is new.
+            # The chunk after this one repeats them.
             self._topics_known, self._since_table = topics, 0
         else:
             self._since_table = 1 if due else self._since_table + 1
@@ -244,13 +244,13 @@ class ChunkFile:
         """Write a chunk and its message indexes."""
         start = self.position
         self._append(chunk.record)
-        # From here on its messages can be found again, whatever happens next.
-        # The library would pack an index in one Python step per message.
+        # From here on its messages can be recovered even if the index is not written.
+        # The library would need one Python call per message to pack an index.
         rows = np.empty(len(chunk), dtype=_INDEX_ROW)
         rows['log_time'], rows['offset'] = chunk.log_time, chunk.offset
         indexes, places, index_at = b'', {}, self.position
-        # Not np.unique: its first call loads a part of numpy for half a second, in which a
-        # recorder would write nothing.
+        # Not np.unique: its first call imports a part of numpy, which stops the recorder for
+        # half a second.
         for channel in np.flatnonzero(np.bincount(chunk.channel)).tolist():
             mine = rows[chunk.channel == channel].tobytes()
             self.counts[channel] = self.counts.get(channel, 0) + len(mine) // _INDEX_ROW.itemsize
@@ -279,31 +279,31 @@ class ChunkFile:
         self._append(indexes)
 
     def sync(self) -> None:
-        """Bring what was written to the disk."""
+        """Flush what was written to disk."""
         self._out.sync()
 
     def check(self) -> None:
-        """See that the file is there as it was written; raises `AlteredError` if not."""
+        """Check that the file still is as it was written; raises `AlteredError` if not."""
         self._out.check(self.position)
         self._suspect |= self._out.touched
         if self._suspect and time.monotonic() >= self._read_back_s:
-            # A file system may put the time of every write right afterwards.
+            # Limited in rate: some file systems change the time after every write.
             self._suspect, self._read_back_s = False, time.monotonic() + _READ_BACK_S
             self._out.check_content(self.position, self._crc)
 
     def rename(self, path: Path) -> None:
-        """Let the finished file have another name."""
+        """Change the final name of the file."""
         self._out.path = path
 
     def finish(self, table: TopicTable) -> None:
-        """Write the summary and give the file its own name.
+        """Write the summary and rename the file to its final name.
 
         Raises
         ------
         AlteredError
-            What is in the file is not what was written.
+            If the content of the file is not what was written.
         """
-        # Whatever somebody else writes from now on counts as done by the look after it.
+        # Later writes of other programs are detected by the check of `touched` below.
         self._out.sync()
         self._out.check(self.position)
         self._out.check_content(self.position, self._crc)
@@ -315,7 +315,7 @@ class ChunkFile:
         self._out.close()
 
     def abandon(self) -> None:
-        """Let go of an unfinished file; it stays as it is, unless no chunk is in it."""
+        """Close an unfinished file; it is removed if it has no chunk."""
         if self.chunks:
             self._out.close()
         else:

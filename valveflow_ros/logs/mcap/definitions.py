@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Finds the definition of a message type, complete with everything it is made of."""
+"""Finds the definition of a message type, including those of its nested types."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from typing import Any
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.mcap.records import LayoutError
 
-# Definitions of the stock messages that are written and read where no ROS is installed.
+# Definitions of standard messages, for machines without ROS.
 #
-# Fields stand as ROS 2 Jazzy defines them (the type hashes agree); comments are our own.
+# The fields are those of ROS 2 Jazzy (the type hashes agree); the comments are our own.
 
 BUNDLED: dict[str, str] = {
     'builtin_interfaces/msg/Time': """\
@@ -74,10 +74,10 @@ DiagnosticStatus[] status
 }
 
 
-# Reads ROS 2 message definitions (`.msg` text) into fields.
+# Parser of ROS 2 message definitions (`.msg` text).
 #
-# Only what carries data is kept: constants, defaults and comments are skipped.
-# A text may hold further definitions after lines of ``=``, as recordings do.
+# Only fields are kept: constants, defaults and comments are skipped.
+# A text may hold further definitions after lines of ``=``, as in recordings.
 
 PRIMITIVES = frozenset(
     {
@@ -102,9 +102,9 @@ _BREAK = re.compile(r'^={20,}[ \t]*$', re.MULTILINE)
 class Field:
     """A field of a message.
 
-    ``type`` is one of `PRIMITIVES` or ``package/msg/Type``; ``array`` is ``''`` for one value,
-    ``'fixed'``, ``'bounded'`` or ``'unbounded'`` with ``length`` elements, or at most so many;
-    ``text_bound`` is the longest string, 0 if not bounded.
+    ``type`` is one of `PRIMITIVES` or ``package/msg/Type``. ``array`` is ``''`` for one value,
+    ``'fixed'`` for ``length`` elements, ``'bounded'`` for at most ``length``, or ``'unbounded'``.
+    ``text_bound`` is the maximum length of a string, 0 if not bounded.
     """
 
     name: str
@@ -118,7 +118,7 @@ Fields = tuple[Field, ...]
 
 
 def full_name(name: str) -> str:
-    """Return ``package/msg/Type`` for either way of writing it; raises `LayoutError`."""
+    """Return ``package/msg/Type`` for that or ``package/Type``; raises `LayoutError`."""
     match = _TYPE_NAME.match(name)
     if match is None:
         raise LayoutError(f"'{name[:80]}' is not the name of a message type")
@@ -126,12 +126,12 @@ def full_name(name: str) -> str:
 
 
 def short_name(name: str) -> str:
-    """Return ``package/Type``, the way recordings name what follows a separator."""
+    """Return ``package/Type``, the form used after a separator in recordings."""
     return full_name(name).replace('/msg/', '/')
 
 
 def parse_fields(text: str, package: str) -> Fields:
-    """Return the fields of one definition; ``package`` completes names without one."""
+    """Return the fields of one definition; ``package`` is used for type names without one."""
     fields: list[Field] = []
     for line in text.splitlines():
         stripped = line.split('#', 1)[0].strip()
@@ -148,12 +148,12 @@ def parse_fields(text: str, package: str) -> Fields:
 
 
 def parse_all(type_name: str, text: str) -> dict[str, Fields]:
-    """Return the fields of a type and of everything that follows it in the text.
+    """Return the fields of a type and of all types that follow it in the text.
 
     Raises
     ------
     LayoutError
-        If a name or a line cannot be understood.
+        If a name or a line cannot be parsed.
     """
     main, *parts = _BREAK.split(text)
     if len(parts) > MAX_TYPES:
@@ -168,7 +168,7 @@ def parse_all(type_name: str, text: str) -> dict[str, Fields]:
 
 
 def dependencies(fields: Fields) -> list[str]:
-    """Return the message types that fields mention, each once, in order."""
+    """Return the message types of the fields, each once, in order."""
     return list(dict.fromkeys(f.type for f in fields if f.type not in PRIMITIVES))
 
 
@@ -215,7 +215,7 @@ _IDS = {
     'uint64': 9,
     'float32': 10,
     'float64': 11,
-    # A char of a .msg file is an unsigned byte, unlike the description's own char.
+    # A char of a .msg file is an unsigned byte, unlike the char of type descriptions.
     'char': 3,
     'bool': 15,
     'byte': 16,
@@ -224,7 +224,7 @@ _IDS = {
 }
 _BOUNDED_TEXT = 4
 _ARRAY_STEP = {'': 0, 'fixed': 48, 'bounded': 96, 'unbounded': 144}
-# A message without fields gets one, as C knows no empty structures.
+# A message without fields gets one, because C has no empty structures.
 _FILLER: Fields = (Field('structure_needs_at_least_one_member', 'uint8'),)
 
 
@@ -271,7 +271,7 @@ MAX_FILE_BYTES = 1 << 20
 
 
 class Definitions:
-    """Looks types up in installed packages, then in this one, then among the stock types.
+    """Looks up types in installed packages, then in this one, then in `BUNDLED`.
 
     Parameters
     ----------
@@ -294,7 +294,7 @@ class Definitions:
         Raises
         ------
         RecordingError
-            If a definition is not found or cannot be understood.
+            If a definition is not found or cannot be parsed.
         """
         main, *others = self._needed(type_name)
         parts = [self._texts[main]]
@@ -343,7 +343,7 @@ class Definitions:
     def _places(self, package: str, stem: str) -> list[Path]:
         folders = [prefix / 'share' / package / 'msg' for prefix in self._prefixes]
         if package == OWN_PACKAGE:
-            # The node's package carries a copy, for where the messages are not built.
+            # The package of the node has a copy, in case the messages are not built.
             folders += [prefix / 'share/valveflow_ros/msg' for prefix in self._prefixes]
             folders += [Path(__file__).parents[3] / 'msg']
             folders += [Path(sys.prefix) / 'share/valveflow_ros/msg']

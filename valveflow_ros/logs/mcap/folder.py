@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A recording's folder: numbered splits and the `metadata.yaml` that rosbag2 asks for."""
+"""Folder of a recording: numbered splits and the `metadata.yaml` that rosbag2 needs."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ _NUMBERED = re.compile(r'(.*)_([0-9]{1,9})\.mcap(?:\.part)?\Z', re.DOTALL)
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """One finished file of a recording: its first and last log time are 0 without messages.
+    """A finished file of a recording; its first and last log time are 0 if it has no messages.
 
-    ``topics`` holds type and channel, ``counts`` the messages of each topic by its name.
+    ``topics`` holds type and channel, ``counts`` the number of messages, both by topic name.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Split:
     def of(
         cls, name: str, table: TopicTable, counts: Mapping[int, int], times: tuple[int, int]
     ) -> Split:
-        """Describe a file by its topics, the messages of each channel, and its times."""
+        """Describe a file by its topics, the number of messages per channel, and its times."""
         topics: dict[str, tuple[str, Channel]] = {}
         by_topic: dict[str, int] = {}
         for number, channel in table.channels.items():
@@ -55,7 +55,7 @@ class Split:
 
     @classmethod
     def read(cls, path: Path) -> Split | None:
-        """Describe a finished file by its summary, ``None`` if it has none to be believed."""
+        """Describe a finished file by its summary; ``None`` if it has no valid summary."""
         try:
             with Source.open(path) as source:
                 summary = read_summary(source)
@@ -68,27 +68,27 @@ class Split:
 
 
 def split_number(path: Path) -> int:
-    """Return the number at the end of a split's name, -1 if it has none."""
+    """Return the number at the end of a split's name; -1 if it has none."""
     match = _NUMBERED.match(path.name)
     return -1 if match is None else int(match.group(2))
 
 
 def is_split_of(name: str, recording: str) -> bool:
-    """Tell whether a file is called as the splits of a recording are."""
+    """Return True if a file is named like the splits of a recording."""
     match = _NUMBERED.match(name)
-    # Not a copy that somebody called alike.
+    # Excludes similar names, such as those with leading zeros.
     return match is not None and name == f'{recording}_{int(match.group(2))}.mcap'
 
 
 def in_order(paths: Iterable[Path]) -> list[Path]:
-    """Return files in the order of their numbers, then of their names."""
+    """Sort files by their number, then by their name."""
     return sorted(paths, key=lambda path: (split_number(path), path.name))
 
 
 def recording_files(folder: Path) -> list[Path]:
     """Return all files of a recording in their order, finished or not.
 
-    While a ``.part`` is made whole, both may stand there for a moment; then it is left out.
+    If both a ``.part`` file and its finished file exist, as in a recovery, it is left out.
     """
     with os_errors(folder, 'cannot be read'):
         names = {entry.name for entry in folder.iterdir()}
@@ -104,7 +104,7 @@ def finished_files(folder: Path) -> list[Path]:
 
 
 def finish_split(file: ChunkFile, name: str, table: TopicTable) -> Split:
-    """Finish a file that stands, or will stand, under a name; raises `OSError`."""
+    """Finish a file that has, or will have, this name; raises `OSError`."""
     split = Split.of(name, table, file.counts, (file.start_ns, file.end_ns))
     file.put_metadata('rosbag2', {'serialized_metadata': information_text([split])})
     file.finish(table)
@@ -117,9 +117,9 @@ def write_metadata(folder: Path, splits: Collection[Split]) -> None:
 
 
 def finished_splits(folder: Path, known: Mapping[str, Split] = {}) -> dict[str, Split]:
-    """Describe the finished files of a folder by their names, in order; raises `OSError`.
+    """Return the finished splits of a folder by name, in order; raises `OSError`.
 
-    Those that are known are not read again.
+    Splits in ``known`` are not read again.
     """
     found = {p.name: known.get(p.name) or Split.read(p) for p in finished_files(folder)}
     return {name: split for name, split in found.items() if split is not None}
@@ -131,7 +131,7 @@ def metadata_text(splits: Collection[Split]) -> str:
 
 
 def information_text(splits: Collection[Split]) -> str:
-    """Return what stands under the first key of `metadata.yaml`, and in the file's own record."""
+    """Return the text under the first key of `metadata.yaml`; a split's metadata has it, too."""
     start, duration = _span([s for s in splits if s.messages])
     lines = [
         f'version: {METADATA_VERSION}',

@@ -1,9 +1,9 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Follows a recording while it is written: what was added since the last look, and no more.
+"""Follows a recording while it is written: each call reads only what was added.
 
-Nothing is held but the place that was reached, the topics of the file, and small
-attachments, so a recording may grow for months.
+Only the position, the topics of the file and small attachments are kept in memory,
+so a recording may grow for months.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ from valveflow_ros.logs.part_file import PART_SUFFIX, is_held
 from valveflow_ros.logs.source import DEFAULT_LIMITS, OverBudgetError, Source
 from valveflow_ros.records import NS_PER_S, SIGNALS, Signal
 
-# What stands is announced again within a day, so nothing older is needed to know it.
+# A monitor publishes its state again within a day, so older messages are not needed.
 LOOK_BACK_NS = 25 * 3600 * NS_PER_S
 
 
 def part_of(path: Path) -> Path:
-    """Return the name of a file while it is written."""
+    """Return the name that a file has while it is written."""
     return path.with_name(path.name + PART_SUFFIX)
 
 
 def final_of(path: Path) -> Path:
-    """Return the name of a file once it is whole."""
+    """Return the name that a file has when it is finished."""
     return path.with_suffix('') if path.suffix == PART_SUFFIX else path
 
 
@@ -60,7 +60,7 @@ def files_in(folder: Path) -> list[Path]:
 
 
 def first_in(folder: Path) -> Path | None:
-    """Return the file to begin with: the first that holds something of the last day."""
+    """Return the first file with messages of the last 25 hours; None if there is no file."""
     files = files_in(folder)
     begin: Path | None = None
     newest = 0
@@ -75,19 +75,19 @@ def first_in(folder: Path) -> Path | None:
 
 
 _MOST_ATTACHED = 1 << 20
-_MOST_ADDED = 256  # bytes that a later version of the format adds to a record
+_MOST_ADDED = 256  # bytes that a later version of the format may add to a record
 _GROUP_BYTES = 1 << 20
 _NEAR = 1 << 12
 _KINDS = frozenset(int(op) for op in Opcode)
-# Of these the length is known; it tells them from a chunk with a damaged first byte.
+# Records of known length, which distinguishes them from a chunk with a damaged opcode.
 _LAST = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}
 
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Messages that were added: records of some chunks, the messages in them, their topics.
+    """Messages that were added: content of some chunks, the messages in it, their topics.
 
-    ``share`` says how much of the files that are there has been read by now, 0 to 1.
+    ``share`` is the fraction of the existing files that has been read so far, 0 to 1.
     """
 
     content: bytes
@@ -97,26 +97,26 @@ class Batch:
 
 
 class Follower:
-    """Reads a recording from where it got to the last time.
+    """Reads a recording; each call continues where the last one stopped.
 
     Parameters
     ----------
     path : Path
-        An ``.mcap`` file, an ``.mcap.part``, or the folder of a recording,
-        finished or growing. A file may get its final name meanwhile, and a
-        folder may get further files.
+        An ``.mcap`` file, an ``.mcap.part`` file, or the folder of a recording,
+        finished or growing. A file may be renamed to its final name meanwhile,
+        and a folder may get further files.
 
     Attributes
     ----------
     attachments : dict[str, bytes]
-        Small files inside the files.
+        Small attached files by name.
     damaged : int
-        Places where something was left out.
+        Number of places where data were left out.
 
     Raises
     ------
     RecordingError
-        There is nothing of that name, or it is no recording.
+        If ``path`` does not exist or is not a recording.
     """
 
     def __init__(self, path: Path) -> None:
@@ -141,17 +141,17 @@ class Follower:
 
     @property
     def name(self) -> str:
-        """Return the file that is being read, empty if there is none yet."""
+        """Return the name of the current file; empty if there is none yet."""
         return '' if self._current is None else self._current.name
 
     @property
     def finished(self) -> bool:
-        """Tell whether the file that was read last is whole, and all of it was read."""
+        """Return True if the current file is finished and all of it was read."""
         return self._ended
 
     @property
     def written(self) -> bool:
-        """Tell whether a living writer holds the file that is being read."""
+        """Return True if a living writer holds the current file."""
         if self._current is None:
             return False
         part = part_of(self._current)
@@ -162,16 +162,16 @@ class Follower:
 
     @property
     def size(self) -> int:
-        """Return how many bytes have been read of the present file."""
+        """Return the number of bytes read from the current file."""
         return self._position
 
     def read(self) -> Iterator[Batch]:
-        """Yield what was added since the last call; nothing, if nothing was.
+        """Yield what was added since the last call.
 
         Raises
         ------
         RecordingError
-            The files cannot be read.
+            If the files cannot be read.
         """
         while self._find():
             yield from self._rest_of_file()
@@ -187,7 +187,7 @@ class Follower:
         return self._current is not None and not (self._folder is None and self._ended)
 
     def _following(self) -> Path | None:
-        """Return the file to go on with, if this one will not grow any more."""
+        """Return the next file, or None if there is none or the current one may still grow."""
         if self._folder is None or self._current is None or (not self._ended and self.written):
             return None
         later = in_order({*files_in(self._folder), self._current})
@@ -195,13 +195,13 @@ class Follower:
         return later[place] if place < len(later) else None
 
     def _open(self) -> Source:
-        """Open the present file under the name it has now."""
+        """Open the current file, under its temporary or its final name."""
         assert self._current is not None
         part = part_of(self._current)
         try:
             return Source.open(part if part.exists() else self._current)
         except RecordingError:
-            # It may have got its final name between the two looks.
+            # It may have been renamed after the check.
             return Source.open(self._current)
 
     def _rest_of_file(self) -> Iterator[Batch]:
@@ -210,7 +210,7 @@ class Follower:
         with self._open() as source:
             inode = os.fstat(source.stream.fileno()).st_ino
             if self._inode and inode != self._inode:
-                # It was made whole by copying, and what was read stands elsewhere in it.
+                # It was recovered into a new file, in which the positions differ.
                 self._begin()
             self._inode = inode
             scanner = Scanner(source)
@@ -226,7 +226,7 @@ class Follower:
             yield from self._batch(contents, source)
 
     def _next(self, source: Source, scanner: Scanner) -> bytes | None:
-        """Return what a chunk or messages hold, b'' for another record, None at the end."""
+        """Return the content of a chunk or messages, b'' for another record, None at the end."""
         start = self._position
         head = source.read(start, RECORD_HEAD.size)
         if len(head) < RECORD_HEAD.size:
@@ -266,7 +266,7 @@ class Follower:
             self._position = source.size
             return None
         except LayoutError:
-            # Its length is believed if the fields within say the same.
+            # The length is trusted if it agrees with the fields of the chunk head.
             if next(candidates(source, start, start + 1), None) is None:
                 return self._beyond_damage(source)
             self.damaged += 1
@@ -276,9 +276,9 @@ class Follower:
         return chunk.content
 
     def _beyond_damage(self, source: Source, sure: bool = True) -> bytes | None:
-        """Go on with the next chunk; if there is none, and no damage for sure, wait for more."""
+        """Skip to the next chunk; without one, wait for more data unless damage is ``sure``."""
         start, size = self._position + 1, source.size
-        # First where reading costs little: there may be many false heads beside one another.
+        # Search a short range first, because there may be many false heads side by side.
         near = min(start + _NEAR, size)
         heads = chain(candidates(source, start, near), candidates(source, near, size))
         found = next(heads, None)
@@ -313,7 +313,7 @@ class Follower:
         yield Batch(content, messages, self._topics, self._share(source))
 
     def _share(self, source: Source) -> float:
-        """Return how much has been read, files of equal size assumed."""
+        """Return the fraction that has been read, assuming files of equal size."""
         inside = self._position / max(1, source.size)
         if self._folder is None or self._current is None:
             return min(1.0, inside)
@@ -328,28 +328,28 @@ _INPUTS = {info.topic for info in SIGNALS}
 
 
 class Raw(NamedTuple):
-    """A message before it is decoded; most are never looked at."""
+    """A message that is decoded only if it is needed."""
 
     decoder: Decoder
     data: bytes
 
     @property
     def type(self) -> str:
-        """Return the name of its type."""
+        """Return the type name."""
         return self.decoder.type_name
 
 
 class Picker:
-    """Decodes messages by the definitions in the recording; counts those that do not fit them."""
+    """Decodes messages with the definitions in the recording; counts those that do not match."""
 
     def __init__(self) -> None:
         self.misfits = 0
         self._decoders: dict[tuple[str, ...], Any] = {}
 
     def last(self, batch: Batch, wanted: dict[str, int]) -> Iterator[Raw]:
-        """Yield messages, not decoded yet, in the order of the file.
+        """Yield the last messages, not decoded yet, in file order.
 
-        ``wanted`` holds the types, and how many messages of each topic are enough.
+        ``wanted`` gives, for each type, the maximum number of messages per topic.
         """
         picked: list[tuple[int, Decoder]] = []
         for channel, type_name, definition in _channels(batch):
@@ -363,7 +363,7 @@ class Picker:
             yield Raw(decoder, batch.messages.payload(batch.content, row))
 
     def fields(self, raw: Raw) -> dict[str, Any] | None:
-        """Decode a message; None, and counted, where it does not fit its definition."""
+        """Decode a message; if it does not match its definition, count it and return None."""
         try:
             return raw.decoder.decode(raw.data)
         except RecordingError:
@@ -371,7 +371,7 @@ class Picker:
             return None
 
     def readings(self, batch: Batch) -> Iterator[tuple[Signal, str, Rows]]:
-        """Yield the readings of the inputs: the signal, its topic, its rows in their order."""
+        """Yield signal, topic and rows (in file order) of the inputs."""
         messages = batch.messages
         for channel, type_name, definition in _channels(batch):
             topic = batch.topics.channels[channel].topic
@@ -393,7 +393,7 @@ class Picker:
                     yield Signal(number), topic, Rows(*columns)
 
     def _made(self, make: Callable[..., Any], *key: str) -> Any:
-        """Return a decoder of one definition, made once; None where it is not understood."""
+        """Return the cached decoder of a definition; None if it cannot be parsed."""
         if key not in self._decoders:
             try:
                 self._decoders[key] = make(*key)
@@ -403,7 +403,7 @@ class Picker:
 
 
 def _channels(batch: Batch) -> Iterator[tuple[int, str, str]]:
-    """Yield the channels that occur and are known: id, type, definition."""
+    """Yield id, type and definition of the known channels that occur in a batch."""
     for number in np.unique(batch.messages.channel).tolist():
         channel = batch.topics.channels.get(number)
         if channel is not None and channel.message_encoding == MessageEncoding.CDR:

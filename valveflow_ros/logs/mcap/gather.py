@@ -1,9 +1,9 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Goes through one MCAP file and collects, chunk by chunk, the values that may matter.
+"""Reads one MCAP file and collects the values of topics that may be inputs.
 
-Chunks are handled in groups of about a mebibyte, so that a file of many tiny
-chunks, as a slow plant leaves it, costs no more than one of a few large ones.
+Chunks are processed in groups of about 4 MiB, so that a file of many small
+chunks (from a slow plant) takes no longer than a file of a few large ones.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from valveflow_ros.logs.source import DEFAULT_LIMITS, Limits, Source
 from valveflow_ros.records import SIGNALS, ByteArray, FloatArray, IntArray
 
 _PAYLOAD = np.dtype([('mark', '>u2'), ('options', '<u2'), ('value', '<f8')])
-# A Float64 takes 12 bytes; some middlewares pad to a multiple of 8.
+# A Float64 message has 12 bytes; some middlewares pad it to a multiple of 8.
 _SIZES = (12, 16)
 
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Values found in a group of chunks, in the order of the file.
+    """Values found in a group of chunks, in file order.
 
-    Arrays of n: ``log_time`` and ``time_ns`` int64, receipt and the value's own time; ``channel``
-    uint16; ``signal`` int8, -1 where the topic has yet to be chosen; ``value`` float64;
-    ``quality`` uint8, good where the file says nothing.
+    Arrays of n: ``log_time`` and ``time_ns`` int64, times of reception and of the value in ns;
+    ``channel`` uint16; ``signal`` int8, -1 if it follows from the topic later; ``value`` float64;
+    ``quality`` uint8, good if the file does not state it.
     """
 
     log_time: IntArray
@@ -54,7 +54,7 @@ class Rows:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Chunks that are read together: where they begin, their log times, their channels."""
+    """Chunks that are read together: their offsets, log times and channels."""
 
     chunks: tuple[int, ...]
     first_ns: int
@@ -64,7 +64,7 @@ class Group:
 
 @dataclass(slots=True)
 class FileContents:
-    """What was found in one file."""
+    """Contents of one file."""
 
     path: str
     table: TopicTable
@@ -77,21 +77,21 @@ class FileContents:
 
     @property
     def messages(self) -> int:
-        """Messages that were found."""
+        """Number of messages found."""
         return sum(self.counts.values())
 
     @property
     def orphans(self) -> int:
-        """Messages whose topic is not known."""
+        """Number of messages whose topic is unknown."""
         return sum(n for channel, n in self.counts.items() if channel not in self.table.channels)
 
 
-# Where each value stood in the group, to merge kinds in the order of the file.
+# Offset of each value in its group, to merge several kinds in file order.
 Placed = tuple[IntArray, Rows]
 
 
 def float_rows(content: bytes, table: MessageTable, mine: IntArray) -> tuple[Placed, IntArray]:
-    """Return the values of the Float64 messages ``mine``, and those that are none."""
+    """Return the values of the Float64 messages ``mine``, and the malformed ones of them."""
     size = table.size if len(mine) == len(table) else table.size[mine]
     fitting = (size == _SIZES[0]) | (size == _SIZES[1])
     picked = mine if fitting.all() else mine[fitting]
@@ -105,7 +105,7 @@ def float_rows(content: bytes, table: MessageTable, mine: IntArray) -> tuple[Pla
     if len(wrong):
         picked, value = picked[plain], value[plain]
     n = len(picked)
-    # Almost always every message of a group is picked, and in order.
+    # Usually all messages of a group are selected, in order.
     cut = slice(None) if n == len(table) else picked
     found = Rows(
         table.log_time[cut],
@@ -135,7 +135,7 @@ def sample_rows(table: MessageTable, picked: IntArray, samples: Samples) -> Plac
 
 
 def merged(parts: list[Placed]) -> Rows:
-    """Join values of several kinds in the order in which they stood."""
+    """Merge values of several kinds in file order."""
     if len(parts) == 1:
         return parts[0][1]
     order = np.argsort(np.concatenate([offset for offset, _ in parts]), kind='stable')
@@ -147,7 +147,7 @@ def merged(parts: list[Placed]) -> Rows:
     )
 
 
-# Larger groups cost memory, smaller ones more calls for the same values.
+# Larger groups need more memory, smaller ones more calls for the same values.
 GROUP_BYTES = 4 << 20
 
 
@@ -156,12 +156,12 @@ def gather(
     choice: TopicChoice,
     limits: Limits = DEFAULT_LIMITS,
 ) -> FileContents:
-    """Return what one file holds.
+    """Return the contents of one file.
 
     Raises
     ------
     RecordingError
-        If the file contradicts itself or claims what cannot be.
+        If the file contradicts itself or exceeds a limit.
     """
     summary = read_summary(source)
     seed = TopicTable(limits) if summary is None else summary.table
@@ -171,8 +171,8 @@ def gather(
         if not collector.unnamed & collector.known and not contents.table.replaced:
             break
         # The chunk that first named a topic is lost, but a later one repeats the name, or a
-        # record outside of the chunks was damaged. From the next pass on the name is known from
-        # the beginning, so there is at most one for each topic.
+        # record outside of the chunks was damaged. The next pass knows this name from the start,
+        # so there is at most one more pass per topic.
         seed = contents.table
     contents.announced = None if summary is None else summary.messages
     return contents
@@ -198,14 +198,14 @@ class _Collector:
             try:
                 self._group(chunks)
             except LayoutError:
-                # One of them is not what its checksum promises; the others are not to suffer.
+                # One of them is malformed: read them one by one to keep the others.
                 for chunk in chunks:
                     self._single(chunk)
         self._hear()
         return self.contents
 
     def _hear(self) -> None:
-        """Take what stands outside of chunks, unless what has a checksum says otherwise."""
+        """Add records from outside of chunks, unless they contradict records with a checksum."""
         new, self._heard = self._scanner.outside[self._heard :], len(self._scanner.outside)
         for record in new:
             try:
@@ -304,7 +304,7 @@ class _Collector:
 
 
 def _grouped(chunks: Iterator[Chunk]) -> Iterator[list[Chunk]]:
-    """Join chunks; those without a checksum stand apart from those that have one."""
+    """Group chunks; those with and without a checksum are never in the same group."""
     group: list[Chunk] = []
     size = 0
     for chunk in chunks:

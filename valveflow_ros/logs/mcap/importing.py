@@ -1,9 +1,9 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Turns a table of samples into a recording, as fast as the disk allows.
+"""Converts a table of samples to a recording.
 
-Records are laid out for a whole chunk at once: all of them have the same size,
-so a structured array is the chunk.
+All records have the same size, so the content of a chunk is one structured
+array, which is fast to build.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ _BLOCK_ROWS = 100_000
 
 @dataclass(frozen=True, slots=True)
 class WrittenLog:
-    """A recording that was written: its file, and how many messages."""
+    """A recording that was written: its file and number of messages."""
 
     path: Path
     messages: int
@@ -84,22 +84,22 @@ def write_samples(
 ) -> WrittenLog:
     """Write samples as ``std_msgs/Float64`` topics named after the signals.
 
-    A sample's time is the publish time of its values. Log times are the same,
-    but for values of one sample, which follow each other by a nanosecond, so
-    that every reader sees them in the same order.
+    The time of a sample is the publish time of its values. The log times of the
+    values of one sample differ by one nanosecond, so that every reader sees them
+    in the same order.
 
     Parameters
     ----------
     table : SampleTable
-        Its NaN in required signals are written, as values of bad quality.
+        NaN in a required signal is written as a value of bad quality.
     path : str or Path
-        Ending in ``.mcap``: that file. Otherwise a folder as rosbag2 makes it.
+        A file if it ends in ``.mcap``; otherwise a folder like that of rosbag2.
     prefix : str
         Namespace before the topics, such as ``/unit1``.
     attachments, metadata, definitions
         As in `RecordingWriter`.
     overwrite : bool
-        Take the place of a file that exists.
+        Replace an existing file.
 
     Raises
     ------
@@ -131,9 +131,9 @@ def write_readings(
     Parameters
     ----------
     blocks : iterable of Readings
-        In the order of time, within each and from one to the next.
+        In time order, within each block and across blocks.
     signals : collection of Signal
-        Those that occur; the required ones have a topic in any case.
+        The signals that occur; required signals have a topic in any case.
     """
     place = Path(path)
     target = place if place.suffix == '.mcap' else place / f'{place.resolve().name}_0.mcap'
@@ -162,7 +162,7 @@ def write_readings(
                 )
             split = finish_split(file, target.name, book.table)
         path = target.parent / METADATA_NAME
-        # A file by itself needs none, so that of another recording stays.
+        # A single file needs no metadata.yaml, so that of another recording is kept.
         if not path.exists() or _tells_of(path, target.name):
             write_metadata(target.parent, [split])
     return WrittenLog(target, records.count)
@@ -205,12 +205,12 @@ class _Records:
 
 
 def _parts(blocks: Iterable[Readings], records: _Records) -> Iterator[NDArray[np.void]]:
-    """Yield the records of one chunk each; raises `DataError` if there is none."""
+    """Yield the records chunk by chunk; raises `DataError` if there are none."""
     rest: NDArray[np.void] = np.zeros(0, dtype=_RECORD)
     for readings in blocks:
         if not len(readings):
             continue
-        # Left to itself, joining gives the fields the byte order of this machine.
+        # Without dtype, the fields would get the byte order of this machine.
         rest = np.concatenate([rest, records.of(readings)], dtype=_RECORD)
         whole = len(rest) - len(rest) % _PER_CHUNK
         for start in range(0, whole, _PER_CHUNK):
@@ -223,13 +223,13 @@ def _parts(blocks: Iterable[Readings], records: _Records) -> Iterator[NDArray[np
 
 
 def strictly_increasing(times: IntArray) -> IntArray:
-    """Return times of which each is at least a nanosecond after the one before."""
+    """Return the times, delayed where needed so that each is at least 1 ns after the last."""
     steps = np.arange(len(times), dtype=np.int64)
     return np.maximum.accumulate(times - steps) + steps
 
 
 def _tells_of(path: Path, name: str) -> bool:
-    """Tell whether a `metadata.yaml` is that of this file alone."""
+    """Return True if a `metadata.yaml` describes this file only."""
     try:
         top = yaml.safe_load(path.read_text(encoding='utf-8'))
         return bool(top['rosbag2_bagfile_information']['relative_file_paths'] == [name])

@@ -23,13 +23,13 @@ from valveflow_ros.records import IntArray, Readings, Signal
 
 _END = np.iinfo(np.int64).max
 _BLOCK = 1 << 14
-# Chunks of a recorder overlap by a moment; only a file made to hurt has more than this waiting.
+# Chunks of a recorder overlap little in time; only a malicious file exceeds this limit.
 MAX_WAITING_BYTES = 96 << 20
 
 
 @dataclass(frozen=True, slots=True)
 class _Batch:
-    """Messages of one group that wait for their turn."""
+    """Messages of one group that are not yielded yet."""
 
     file: int
     place: int
@@ -52,7 +52,7 @@ def _columns(batch: _Batch) -> tuple[NDArray[np.generic], ...]:
 
 
 class MessageReader:
-    """The raw messages of the files that `gather` read; holds only what overlaps in time."""
+    """Yields the raw messages of gathered files; keeps only groups that overlap in time."""
 
     def __init__(self, files: list[FileContents]) -> None:
         self._files = files
@@ -70,15 +70,15 @@ class MessageReader:
         met: set[tuple[int, str]] = set()
         for index, (_, number, place) in enumerate(plan):
             waiting.append(self._load(number, place, topics))
-            # Nothing that is still to be read can come before this.
+            # All groups that are still to be read begin at this time or later.
             until = plan[index + 1][0] if index + 1 < len(plan) else _END
             due = self._release(waiting, until)
             if len(self._files) == 1:
                 yield from (message for _, _, message in due)
                 continue
             for file, sequence, message in due:
-                # The first message of a topic in a split may be the last of those before, which a
-                # recorder wrote again. The number it gave it tells that from an equal message.
+                # The first message of a topic in a split may be a latched message that the
+                # recorder repeated. An equal new message has another sequence number.
                 before, first = last.get(message.topic), (file, message.topic) not in met
                 last[message.topic] = (sequence, message)
                 met.add((file, message.topic))
@@ -95,7 +95,7 @@ class MessageReader:
     def _release(
         self, waiting: list[_Batch], until: int
     ) -> Iterator[tuple[int, int, LoggedMessage]]:
-        """Yield file, sequence number and message of what comes before ``until``, in order."""
+        """Yield file, sequence number and message of all messages before ``until``, in order."""
         waiting.sort(key=lambda batch: (batch.file, batch.place))
         due = [batch.table.log_time[batch.rows] < until for batch in waiting]
         out = [replace(b, rows=b.rows[part]) for b, part in zip(waiting, due, strict=True)]
@@ -111,7 +111,7 @@ class MessageReader:
         columns = [np.concatenate(parts) for parts in zip(*map(_columns, out), strict=True)]
         sizes = [len(batch.rows) for batch in out]
         columns.append(np.repeat(np.arange(len(out)), sizes))
-        # A stable sort keeps messages of one time in the order of files and places.
+        # A stable sort keeps messages of equal time in the order of the files.
         order = np.argsort(columns[0], kind='stable')
         for begin in range(0, len(order), _BLOCK):
             picked = order[begin : begin + _BLOCK]
@@ -140,7 +140,7 @@ def _repeats(before: tuple[int, LoggedMessage], sequence: int, message: LoggedMe
 
 
 def _channels(file: FileContents, topics: Collection[str] | None) -> dict[int, tuple[str, str]]:
-    """Return topic and type by channel, of some or all topics that the file names."""
+    """Return topic and type by channel, for ``topics`` or, if None, for all topics."""
     return {
         number: (channel.topic, file.table.type_of(channel))
         for number, channel in file.table.channels.items()
@@ -154,14 +154,14 @@ def read_recording(
     columns: Mapping[str, str],
     limits: Limits = DEFAULT_LIMITS,
 ) -> LogContents:
-    """Return what the files, in this order, hold together.
+    """Return the joint contents of the files, in this order.
 
     Raises
     ------
     RecordingError
         If no message can be read.
     InputError
-        If the choice of topics is not clear.
+        If it is unclear which topic holds a signal.
     """
     choice = TopicChoice(columns)
     files: list[FileContents] = []
@@ -285,9 +285,9 @@ def _choice_warnings(
 
 
 def _timed(found: tuple[Readings, IntArray]) -> tuple[tuple[Readings, IntArray], list[str]]:
-    """Leave out values that never got a time, which a monitor records and does not use either.
+    """Leave out values without a time, which a monitor does not use either.
 
-    Where none has one, whoever wrote the file gives none, and that is another matter.
+    If no value has a time, nothing is left out.
     """
     readings, log_time = found
     if not len(readings) or readings.time_ns.min() > 0 or readings.time_ns.max() <= 0:
@@ -318,7 +318,7 @@ def _readings(files: list[FileContents], chosen: dict[str, Signal]) -> tuple[Rea
     log_time = np.concatenate([rows.log_time for rows, _ in parts])
     keep = signal >= 0
     whole = bool(keep.all())
-    # Almost always the order of the file is the order of the log times already.
+    # Files are almost always sorted by log time.
     sorted_already = bool((log_time[1:] >= log_time[:-1]).all())
     order = (
         None
@@ -330,7 +330,7 @@ def _readings(files: list[FileContents], chosen: dict[str, Signal]) -> tuple[Rea
         for field in ('time_ns', 'value', 'quality')
     ]
     everything = (columns[0], signal, columns[1], columns[2], log_time)
-    # Picking all of some million values takes as long as reading them.
+    # Indexing millions of values takes as long as reading them.
     picked = [column if whole else column[keep] for column in everything]
     if order is not None:
         picked = [column[order] for column in picked]
@@ -343,20 +343,20 @@ _TRIES = 3
 def messages_since(
     folder: str | Path, after_ns: int, definitions: dict[str, str] | None = None
 ) -> Iterator[LoggedMessage]:
-    """Yield the messages of a recording's folder logged after ``after_ns``, in order.
+    """Yield the messages in a recording's folder logged after ``after_ns``, in order.
 
     Parameters
     ----------
     folder : str or Path
     after_ns : int
-        Log time.
+        Log time in ns since the epoch.
     definitions : dict, optional
-        Takes the ros2msg text of each topic's type.
+        Receives the ros2msg text of each topic's type.
 
     Raises
     ------
     RecordingError
-        The files cannot be read; a folder without any gives nothing.
+        If the files cannot be read. A folder without files yields nothing.
     """
     found = _read(Path(folder), after_ns)
     if definitions is not None:
@@ -367,7 +367,7 @@ def messages_since(
 
 
 def _read(home: Path, after_ns: int) -> LogContents:
-    """Return what the last files hold; one that is made whole meanwhile has another name then."""
+    """Return the contents of the last files; retries if a file is renamed meanwhile."""
     for left in reversed(range(_TRIES)):
         wanted = _wanted(home, after_ns)
         if not wanted:
@@ -378,7 +378,7 @@ def _read(home: Path, after_ns: int) -> LogContents:
             if not left or all(path.exists() for path in wanted):
                 raise
             continue
-        # Of several files one that is gone is passed over, with a warning only.
+        # If one of several files is missing, `read_recording` only warns.
         if not left or all(path.exists() for path in wanted):
             return found
     return LogContents(str(home), Readings.of([]), np.empty(0, dtype=np.int64))
@@ -389,7 +389,7 @@ def _wanted(home: Path, after_ns: int) -> list[Path]:
     for path in reversed([p for p in recording_files(home) if p.is_file()]):
         wanted.insert(0, path)
         split = Split.read(path) if path.suffix == '.mcap' else None
-        # Splits follow each other in time; one that begins before the moment is the first needed.
+        # Splits are in time order: no earlier split than one that begins before this is needed.
         if split is not None and split.messages and split.start_ns <= after_ns:
             break
     return wanted

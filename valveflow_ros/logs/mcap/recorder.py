@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Records in a thread of its own; whoever hands messages in never waits for a disk."""
+"""Records in a separate thread, so that callers never wait for the disk."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from valveflow_ros.logs.mcap.writer import Message, Metadata, OpenFile, Qos, Rec
 from valveflow_ros.logs.part_file import PartFile, make_folder
 from valveflow_ros.logs.source import os_errors
 
-# So long after the last drop the state says so, for those who look once a second.
+# The state reports drops for this long, so that a reader that polls once a second sees them.
 DROPS_SHOWN_S = 2.0
-# So often somebody looks whether finished files are there as they were left.
+# Period of the check of finished files.
 _LOOK_S = 2.0
 _FLUSH_LOOK_S = 0.001
-# At the end nobody waits long.
+# Limit on the last check, so that `close` does not take long.
 _LAST_LOOK_BYTES = 256 * 1024 * 1024
-# More waiting messages than this wake the thread before its time.
+# This many waiting messages wake the thread early.
 _WAKE_AT = 4000
 MIB = 1 << 20
 
 
 class RecorderState(enum.Enum):
-    """How a recorder is doing."""
+    """State of a recorder."""
 
     RECORDING = 'recording'
     DEGRADED = 'degraded'
@@ -48,24 +48,24 @@ class RecorderState(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class RecorderSettings:
-    """How a recorder works; every time is in seconds.
+    """Settings of a recorder; every time is in seconds.
 
     Attributes
     ----------
     queue_limit : int
-        Messages held at most while they are not on disk; newer ones are dropped, and counted.
+        Maximum number of messages not yet on disk; further messages are dropped and counted.
     flush_period_s : float
-        A killed process loses at most what came in this time.
+        Maximum time of messages that a killed process loses.
     sync_period_s : float
-        A power cut loses at most what came in this time; 0: left to the system.
+        Maximum time of messages that a power cut loses; 0 leaves it to the operating system.
     rotate_s, rotate_bytes : float, int
         A new split is begun after this time or size.
     free_floor_bytes : int
-        Below so much free space on the disk nothing is written.
+        Nothing is written if the disk has less free space than this.
     keep_files : int or None
-        Finished splits that stay in the folder; the oldest go. None: all stay.
+        Number of finished splits to keep; older ones are deleted. None keeps all.
     retry_s, retry_max_s : float
-        First and longest wait after a failure; it doubles.
+        First and maximum wait after a failure; the wait doubles with every failure.
     """
 
     queue_limit: int = 200_000
@@ -81,42 +81,42 @@ class RecorderSettings:
 
 @dataclass(slots=True)
 class RecorderStatus:
-    """What a recorder counted.
+    """State and counters of a recorder.
 
     Always ``received == written + queued + lost + removed + sum of dropped``.
 
     Attributes
     ----------
     state : RecorderState
-        How it is doing.
+        State of the recorder.
     reason : str
         Why it is not recording; empty if it is.
     file : str
-        The split at hand, empty if none.
+        Name of the current split; empty if none.
     received : int
-        Messages handed in.
+        Messages passed to the recorder.
     written : int
-        Of these, in whole chunks on disk, in files that are there.
+        Of these, messages in complete chunks of existing files.
     queued : int
-        Of these, waiting.
+        Of these, messages that wait to be written.
     lost : int
-        Of these, waiting when the recorder had to stop, or in files that another program removed
-        or changed while they were written, or damaged afterwards.
+        Of these, messages that waited when the recorder had to stop, or in files that another
+        program removed or changed while they were written, or damaged afterwards.
     loss : str
-        What happened to those that were in a file, in a sentence; empty if nothing did.
+        A sentence about the last loss from a file; empty if there was none.
     removed : int
-        Of these, in finished files that were removed since, by ``keep_files`` or another program.
+        Of these, messages in finished files deleted since, by ``keep_files`` or another program.
     dropped : dict[str, int]
-        Of these, refused because too many were waiting, by topic.
+        Of these, messages refused because too many were waiting or the recorder was closed.
     files_finished : int
         Splits finished since the start.
     bytes_written : int
         Bytes written since the start.
     recovered : tuple of RecoveryReport
-        Leftovers of an earlier recorder that were finished at the start.
+        Unfinished files of an earlier recorder that were recovered at the start.
     stalled_s : float
-        How long the thread has been at one and the same step; 0 while it waits for work. A disk
-        that refuses keeps it small, one that does not answer lets it grow.
+        Time since the thread began its current step; 0 while it waits for work. It stays small
+        if the disk returns errors, and grows if the disk does not respond.
     """
 
     state: RecorderState
@@ -136,9 +136,9 @@ class RecorderStatus:
 
 
 class RecorderCounters:
-    """Counts every message in exactly one column of `RecorderStatus`.
+    """Counts every message in exactly one counter of `RecorderStatus`.
 
-    Shared by the recorder's thread and everyone who asks; nobody holds its lock for long.
+    It is shared by the recorder's thread and its callers; its lock is held only briefly.
     """
 
     def __init__(self, limit: int, clock: Callable[[], float] = time.monotonic) -> None:
@@ -152,16 +152,16 @@ class RecorderCounters:
         self._working_since_s: float | None = None
 
     def working(self) -> None:
-        """Note that the thread has come to its next step; called for every message."""
-        # One assignment, which needs no lock: a stuck thread must not be able to hold one either.
+        """Note that the thread begins its next step; called for every message."""
+        # A single assignment needs no lock, so that a stuck thread cannot hold one.
         self._working_since_s = self._clock()
 
     def resting(self) -> None:
-        """Note that the thread waits, or does what takes as long as it takes."""
+        """Note that the thread waits for work, or does a step of unlimited duration."""
         self._working_since_s = None
 
     def admit(self, topic: str) -> bool:
-        """Count a message in; False if it must be dropped."""
+        """Count a new message; return False if it must be dropped."""
         with self._lock:
             now = self._now
             now.received += 1
@@ -174,12 +174,12 @@ class RecorderCounters:
             return False
 
     def refuse(self) -> None:
-        """Drop whatever comes from now on."""
+        """Drop all messages from now on."""
         with self._lock:
             self._open = False
 
     def on_disk(self, writer: RecordingWriter) -> None:
-        """Take over what a writer counted."""
+        """Copy the counters of a writer."""
         with self._lock:
             now = self._now
             before = now.written + now.removed + self._lost_in_files
@@ -192,7 +192,7 @@ class RecorderCounters:
             now.bytes_written = writer.bytes_finished + writer.file_bytes
 
     def healthy(self) -> None:
-        """Set the state after all that waited was written."""
+        """Set the state after all waiting messages were written."""
         with self._lock:
             self._now.state, self._now.reason = RecorderState.RECORDING, ''
             if self._clock() - self._dropped_at < DROPS_SHOWN_S:
@@ -205,12 +205,12 @@ class RecorderCounters:
             self._now.state, self._now.reason = RecorderState.DEGRADED, reason
 
     def recovered(self, reports: tuple[RecoveryReport, ...]) -> None:
-        """Set the leftovers that were finished."""
+        """Set the reports of recovered files."""
         with self._lock:
             self._now.recovered = reports
 
     def stopped(self, reason: str = '') -> None:
-        """Count what waits now as lost, for good."""
+        """Set the final state; messages that still wait are counted as lost."""
         self.resting()
         with self._lock:
             self._open = False
@@ -219,7 +219,7 @@ class RecorderCounters:
             now.state, now.reason, now.file = RecorderState.STOPPED, reason, ''
 
     def as_metadata(self) -> dict[str, str]:
-        """Return the counters as they are written into the recording."""
+        """Return the counters in the form written to the recording."""
         status = self.status()
         items = {f'dropped {topic}': str(count) for topic, count in status.dropped.items()}
         return {'received': str(status.received), **items}
@@ -233,7 +233,7 @@ class RecorderCounters:
 
 
 class NewTopic(NamedTuple):
-    """A topic on its way to the writer, in line with the messages."""
+    """A new topic for the writer, queued together with the messages."""
 
     topic: str
     type_name: str
@@ -244,7 +244,7 @@ class NewTopic(NamedTuple):
 
 
 class RecorderLoop:
-    """Runs the writer; all but `start` may be called from other threads."""
+    """Runs the writer in a thread; all methods but `start` may be called from other threads."""
 
     def __init__(
         self,
@@ -273,21 +273,21 @@ class RecorderLoop:
         self._thread = threading.Thread(target=self._run, name='recorder', daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     def latched(self) -> list[Message]:
-        """Return the latched messages that a new split begins with."""
+        """Return the latched messages to repeat at the start of a new split."""
         return list(self._latched.values())
 
     def put(self, item: NewTopic | Message) -> None:
-        """Hand in a topic or a message."""
+        """Queue a topic or a message."""
         self._queue.append(item)
         if len(self._queue) >= _WAKE_AT:
             self._wake.set()
 
     def wake(self) -> None:
-        """Write what waits before its time."""
+        """Write waiting messages now, before the flush period ends."""
         self._wake.set()
 
     def ask_rotation(self) -> None:
@@ -296,7 +296,7 @@ class RecorderLoop:
         self._wake.set()
 
     def stop(self, timeout_s: float) -> None:
-        """Finish, and wait for it so long."""
+        """Finish the recording and wait at most ``timeout_s`` for it."""
         self._stopping = True
         self._wake.set()
         self._thread.join(timeout_s)
@@ -305,19 +305,19 @@ class RecorderLoop:
         try:
             stopping = False
             while not stopping:
-                # Read before the cycle: what was put before `stop` is then in the queue.
+                # Read before the cycle, so that messages put before `stop` are still written.
                 stopping = self._stopping
                 begun = time.monotonic()
                 self._cycle(stopping)
                 if not stopping:
                     self._counters.resting()
-                    # What came while the disk was busy has waited long enough.
+                    # The period counts from the start of the cycle, not from its end.
                     left = begun + self._settings.flush_period_s - time.monotonic()
                     self._wake.wait(max(0.0, left))
                     self._wake.clear()
             self._counters.stopped(self._finish())
         except Exception as error:  # noqa: BLE001
-            # Whatever it is, a dead thread must not look alive.
+            # Report any error, so that a dead thread is not taken for a running one.
             self._counters.stopped(f'the recorder failed: {type(error).__name__}: {error}')
 
     def _cycle(self, stopping: bool) -> None:
@@ -333,7 +333,7 @@ class RecorderLoop:
             self._drain(writer)
             self._counters.working()
             writer.flush()
-            # Only what stands in a split already is a repetition in the next.
+            # Only messages already written may be repeated in the next split.
             self._latched.update(self._fresh)
             self._fresh = {}
             self._counters.working()
@@ -352,8 +352,8 @@ class RecorderLoop:
 
     def _ready(self) -> RecordingWriter:
         if self._writer is None:
-            # A leftover takes as long as it is large; to be ended for that, again at each start,
-            # would mean never to get past it.
+            # Recovering a large file takes long. It must not count as a stall: a watchdog that
+            # ends the node for it would do so again at every start.
             self._counters.resting()
             self._counters.recovered(recover_leftovers(self._folder))
             self._writer = self._make_writer(head_messages=self.latched)
@@ -362,7 +362,7 @@ class RecorderLoop:
     def _check_finished(self, writer: RecordingWriter, now: float) -> None:
         if now - self._looked_at >= _LOOK_S:
             self._looked_at = now
-            # One that was changed is read again, which takes as long as it is large.
+            # A changed file is read again, which may take long and is not a stall.
             self._counters.resting()
             writer.check_finished()
             self._counters.working()
@@ -374,7 +374,7 @@ class RecorderLoop:
         except OSError as error:
             raise RecordingError(self._folder, f'cannot be asked for space ({error})') from None
         if free < floor:
-            # What is there becomes a whole file as long as that is possible.
+            # Finish the current file while there is still space for its index.
             if writer.file_bytes:
                 writer.close()
             problem = f'only {free // MIB} MiB are free, {floor // MIB} MiB must stay free'
@@ -419,7 +419,7 @@ class RecorderLoop:
         keep = self._settings.keep_files
         if keep is None:
             return
-        # A recording of another name in the same folder is not ours to remove.
+        # Splits of another recording in the same folder are kept.
         own = [split for split in writer.finished if is_split_of(split.name, writer.name)]
         for split in own[: max(0, len(own) - keep)]:
             try:
@@ -434,7 +434,7 @@ class RecorderLoop:
             self._counters.on_disk(self._writer)
 
     def _finish(self) -> str:
-        """Finish the file; return what kept it from being finished, empty if nothing did."""
+        """Finish the file; return why it could not be finished, empty if it was."""
         writer = self._writer
         if writer is None:
             return 'nothing could be recorded'
@@ -458,33 +458,33 @@ class RecorderLoop:
 
 
 def free_bytes_of(folder: Path) -> int:
-    """Return the free space of a folder's disk; raises `OSError`."""
+    """Return the free bytes on a folder's disk; raises `OSError`."""
     return shutil.disk_usage(folder).free
 
 
 class Recorder:
-    """Writes messages to a recording folder from a thread of its own.
+    """Writes messages to a recording folder in a separate thread.
 
-    Leftovers of a recorder that died are finished first. After an error of
-    the disk the file at hand is left for `recover`, and a new one is begun
-    when writing works again; meanwhile messages wait, and when too many wait
-    the newest are dropped and counted.
+    Unfinished files of a recorder that died are recovered first. After a disk
+    error the current file is left for `recover`, and a new one is begun when
+    writing works again. Meanwhile messages wait; if too many wait, the newest
+    are dropped and counted.
 
     Parameters
     ----------
     folder : str or Path
-        The recording's folder; made if absent, continued if not.
+        The recording's folder; created if absent, otherwise continued.
     settings : RecorderSettings
         Periods and limits.
     name, definitions, attachments, metadata, open_file
         As in `RecordingWriter`.
     free_bytes : callable
-        Tells the free space of a folder.
+        Returns the free bytes on the disk of a folder.
 
     Raises
     ------
     RecordingError
-        If the folder cannot be made.
+        If the folder cannot be created.
     """
 
     def __init__(
@@ -530,25 +530,25 @@ class Recorder:
         definition: str | None = None,
         latched: bool = False,
     ) -> None:
-        """Make a topic known before its first message; doing it again changes nothing.
+        """Add a topic before its first message; adding it again changes nothing.
 
         Parameters
         ----------
         topic, type_name : str
             Its full name and ``package/msg/Type``.
         qos : sequence of Qos
-            What each of its publishers offers.
+            QoS profile of each of its publishers.
         type_hash, definition : str, optional
-            If the caller knows them better than `Definitions`.
+            By default those of `Definitions`.
         latched : bool
-            Its last message is repeated at the head of every later split.
+            If True, its last message is repeated at the start of every later split.
 
         Raises
         ------
         InputError
-            If the topic is recorded with another type already.
+            If the topic is already recorded with another type.
         RecordingError
-            If the definition of the type is not found or not understood.
+            If the definition of the type is not found or cannot be parsed.
         """
         known = self._topics.get(topic)
         if known is not None:
@@ -565,18 +565,18 @@ class Recorder:
         self._loop.put(NewTopic(topic, type_name, qos, type_hash, text, latched))
 
     def record(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int) -> bool:
-        """Hand in a message of raw CDR bytes.
+        """Queue a message of raw CDR bytes; never waits for the disk.
 
         Returns
         -------
         bool
-            False if it was dropped, because too many are waiting or the
-            recorder was closed; it is counted.
+            False if it was dropped and counted as such, because too many
+            messages are waiting or the recorder was closed.
 
         Raises
         ------
         InputError
-            If the topic was not added, or a time lies outside of what a recording can hold.
+            If the topic was not added, or a time is outside of the range of a recording.
         """
         if topic not in self._topics:
             raise InputError(f"Topic '{topic}' was not made known to the recorder.")
@@ -588,12 +588,12 @@ class Recorder:
         return True
 
     def flush(self, timeout_s: float) -> bool:
-        """Have all messages handed in up to now in the file, where a killed process leaves them.
+        """Write all messages recorded so far to the file, where they survive a killed process.
 
         Returns
         -------
         bool
-            False if they are not there within that time.
+            False if they were not written within ``timeout_s`` or the recorder has stopped.
         """
         received = self.status().received
         until_s = time.monotonic() + timeout_s
@@ -605,12 +605,12 @@ class Recorder:
         return status.state != RecorderState.STOPPED
 
     def rotate(self) -> None:
-        """Ask for a new split; returns at once."""
+        """Request a new split; returns immediately."""
         self._loop.ask_rotation()
 
     @property
     def is_rotating(self) -> bool:
-        """Whether a split that was asked for has yet to be begun."""
+        """Return True if a requested split has not been begun yet."""
         return self._loop.rotation_asked
 
     def status(self) -> RecorderStatus:
@@ -618,10 +618,10 @@ class Recorder:
         return self._counters.status()
 
     def close(self, timeout_s: float = 2.0) -> RecorderStatus:
-        """Write what is waiting and finish the file, within a bound.
+        """Write waiting messages and finish the file, within ``timeout_s``.
 
-        If the disk does not let it finish in time, the thread is left behind
-        and the status says how many messages are still waiting.
+        If the disk is too slow, the thread is left running and the status
+        gives the number of messages that still wait.
         """
         self._counters.refuse()
         self._loop.stop(timeout_s)

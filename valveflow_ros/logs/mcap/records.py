@@ -1,10 +1,10 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The records of an MCAP file: parsed and packed by the library `mcap`, within bounds of our own.
+"""Parses and packs the records of an MCAP file with the library `mcap`, within our own limits.
 
-No claim of a file is believed: a length never allocates more than the bytes that are there, and a
-chunk unpacks to the size it claims or is refused. Only two things are not left to the library,
-because it would take one Python step per message: finding the messages of a chunk (`walk`) and
+Sizes that a file states are not trusted: a length never allocates more than the available bytes,
+and a chunk is refused if it does not unpack to the stated size. Two steps do not use the library,
+because it would need one Python call per message: finding the messages of a chunk (`walk`) and
 packing messages with their index (`chunk_file`).
 """
 
@@ -38,11 +38,11 @@ Record = TypeVar('Record')
 
 
 class LayoutError(ValueError):
-    """Bytes do not have the layout they claim; never leaves the package."""
+    """Bytes do not have the expected layout; caught within the package."""
 
 
 class _Content(ReadDataStream):
-    """The content of one record; the library itself takes a short read for a whole one."""
+    """Content of one record; raises on a short read, which the library does not detect."""
 
     def read(self, length: int) -> bytes:
         data = super().read(length)
@@ -62,9 +62,9 @@ def unpack(read: Callable[[ReadDataStream], Record], content: bytes) -> Record:
 
 
 def unpack_attachment(content: bytes) -> Attachment:
-    """Return an attachment; raises `LayoutError`, also if it has a checksum that is wrong."""
+    """Return an attachment; raises `LayoutError`, also if it has a wrong checksum."""
     found: Attachment = unpack(Attachment.read, content)
-    # The library does not compare the checksum; it writes it, and the same bytes, if all is well.
+    # The library does not verify the checksum: an intact attachment packs to the same bytes.
     whole = pack(found)[RECORD_HEAD.size :]
     if content not in (whole, whole[:-4] + bytes(4)):
         raise LayoutError(f"the checksum of the attachment '{found.name}' is wrong")
@@ -72,7 +72,7 @@ def unpack_attachment(content: bytes) -> Attachment:
 
 
 def pack(*records: McapRecord) -> bytes:
-    """Return whole records, one after the other."""
+    """Return the bytes of the records, one after the other."""
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
@@ -80,7 +80,7 @@ def pack(*records: McapRecord) -> bytes:
 
 
 class Unpacker:
-    """Decompresses chunks; one for each thread, because its library keeps state."""
+    """Decompresses chunks; use one per thread, because the library is not thread-safe."""
 
     def __init__(self) -> None:
         self._decompressor = zstandard.ZstdDecompressor()
@@ -88,13 +88,13 @@ class Unpacker:
     def unpack(self, compression: str, packed: bytes, size: int) -> bytes:
         """Return exactly ``size`` bytes or raise `LayoutError`.
 
-        ``size`` is the chunk's claim, already checked against the limit; no more than that is ever
-        allocated for the result.
+        ``size`` is stated by the chunk and already checked against the limit; no more than that
+        is allocated for the result.
         """
         try:
             if compression == 'zstd':
-                # A frame that states its size makes the library allocate that much at once, so
-                # the statement is compared with the chunk's claim first.
+                # The library allocates the size that a frame states, so this size is first
+                # compared with that of the chunk.
                 stated = zstandard.frame_content_size(packed)
                 content = b''
                 if size and stated in (-1, size):
@@ -121,10 +121,10 @@ class Unpacker:
 
 @dataclass(slots=True)
 class TopicTable:
-    """Schemas and channels as they are met; the same id never means two things.
+    """Schemas and channels in the order in which they are read, each with a unique id.
 
-    What stands outside of chunks has no checksum (``unchecked``). It counts until a record with
-    one says something else (``replaced``).
+    Records outside of chunks have no checksum (``unchecked``). They are used until a record with
+    a checksum differs from them (``replaced``).
     """
 
     limits: Limits = DEFAULT_LIMITS
@@ -139,18 +139,18 @@ class TopicTable:
         return len(self.schemas) + len(self.channels)
 
     def add(self, op: int, content: bytes, checked: bool = True) -> None:
-        """Take a schema or a channel record; raises `LayoutError` like `take`, or malformed."""
+        """Add a raw schema or channel record; raises `LayoutError` as `take`, or if malformed."""
         record = definition(op, content)
         if record is not None:
             self.take(record, checked)
 
     def take(self, record: Schema | Channel, checked: bool = True) -> None:
-        """Take a schema or a channel.
+        """Add a schema or a channel.
 
         Raises
         ------
         LayoutError
-            If it contradicts an earlier one, or is one too many.
+            If it contradicts an earlier one, or a limit is exceeded.
         """
         known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
         key = ('schema' if isinstance(record, Schema) else 'channel', record.id)
@@ -167,19 +167,19 @@ class TopicTable:
             self.unchecked.discard(key)
 
     def take_over(self, other: TopicTable) -> None:
-        """Add all that another table knows; raises `LayoutError` like `take`."""
+        """Add all records of another table; raises `LayoutError` like `take`."""
         for number, schema in other.schemas.items():
             self.take(schema, ('schema', number) not in other.unchecked)
         for number, channel in other.channels.items():
             self.take(channel, ('channel', number) not in other.unchecked)
 
     def type_of(self, channel: Channel) -> str:
-        """Return the type of a channel, empty if the file does not say."""
+        """Return the type of a channel; empty if the file does not state it."""
         schema = self.schemas.get(channel.schema_id)
         return '' if schema is None else schema.name
 
     def definition_of(self, channel: Channel) -> str:
-        """Return the text of a channel's ros2msg definition, empty if there is none."""
+        """Return the text of a channel's ros2msg definition; empty if there is none."""
         schema = self.schemas.get(channel.schema_id)
         if schema is None or schema.encoding != SchemaEncoding.ROS2:
             return ''
@@ -203,7 +203,7 @@ def definition(op: int, content: bytes) -> Schema | Channel | None:
 
 @dataclass(slots=True)
 class Summary:
-    """What a finished file says about itself."""
+    """The summary section of a finished file."""
 
     table: TopicTable = field(default_factory=TopicTable)
     messages: int = 0
@@ -213,7 +213,7 @@ class Summary:
 
 
 def ends_well(source: Source) -> bool:
-    """Tell whether a file was finished: it ends in a footer and the magic."""
+    """Return True if a file was finished: it ends with a footer and the magic bytes."""
     start = source.size - len(MAGIC) - FOOTER_SIZE
     if start < len(MAGIC):
         return False
@@ -255,7 +255,7 @@ def read_summary(source: Source) -> Summary | None:
 
 
 def record_at(raw: bytes, position: int) -> tuple[int, bytes]:
-    """Return kind and content of the record at a position; raises `LayoutError`."""
+    """Return opcode and content of the record at a position; raises `LayoutError`."""
     start = position + RECORD_HEAD.size
     if start > len(raw):
         raise LayoutError('a record is shorter than what it says it holds')
@@ -265,8 +265,8 @@ def record_at(raw: bytes, position: int) -> tuple[int, bytes]:
     return op, raw[start : start + length]
 
 
-# Most chunks of a plant are one run of records of equal size (four Float64 topics: 43 bytes each);
-# such a run is found at once. Anything else is walked record by record.
+# Most chunks of a plant are one run of records of equal size (four Float64 topics: 43 bytes each).
+# Such a run is found in one step; anything else is read record by record.
 HEAD_SIZE = RECORD_HEAD.size + MESSAGE_HEAD.size
 HEAD_DTYPE = np.dtype(
     [
@@ -281,16 +281,16 @@ HEAD_DTYPE = np.dtype(
 RUN_PROBE = 64
 _FEW_BREAKS = 64
 MAX_TOPIC_RECORDS = 1 << 16
-# Later versions of the format and applications of their own may use kinds from here on.
+# Later versions of the format and private extensions may use opcodes from here on.
 FIRST_FOREIGN = max(Opcode) + 1
 
 
 @dataclass(frozen=True, slots=True)
 class MessageTable:
-    """The messages of one run of records, in the order in which they stand there.
+    """The messages of one run of records, in file order.
 
-    Arrays of n: ``channel`` uint16, ``sequence`` uint32 as the writer counted, ``log_time`` and
-    ``publish_time`` int64 in ns since the epoch, ``offset`` int64 where each record begins,
+    Arrays of n: ``channel`` uint16, ``sequence`` uint32 of the writer, ``log_time`` and
+    ``publish_time`` int64 in ns since the epoch, ``offset`` int64 of the start of each record,
     ``size`` int64 bytes of each payload, which begins `HEAD_SIZE` after the offset.
     """
 
@@ -317,8 +317,8 @@ def walk(content: bytes) -> tuple[MessageTable, list[tuple[int, bytes]]]:
     Raises
     ------
     LayoutError
-        If a record is cut off or of a kind that has no place in a chunk. Kinds that the format
-        does not know yet are passed over.
+        If a record is cut off, or of a kind that is not allowed in a chunk. Opcodes unknown to
+        the format are skipped.
     """
     starts, others = _boundaries(content)
     if not len(starts):
@@ -338,7 +338,7 @@ def walk(content: bytes) -> tuple[MessageTable, list[tuple[int, bytes]]]:
 
 
 def leading_messages(content: bytes) -> tuple[int, int]:
-    """Return how many messages stand at the beginning of some bytes, and where they end."""
+    """Return the number of messages at the beginning of ``content``, and where they end."""
     starts: list[int] = []
     position, end, probe = 0, len(content), True
     unpack = RECORD_HEAD.unpack_from
@@ -362,13 +362,13 @@ def rows(
 ) -> NDArray[np.void]:
     """Return a structured row for each of ``starts + shift``.
 
-    The caller knows that every row lies within ``content``.
+    The caller ensures that every row lies within ``content``.
     """
     if not len(starts):
         return np.empty(0, dtype)
     runs = _evenly(starts)
     if runs is not None:
-        # Rows at even distances are a view; picking them one by one costs ten times as much.
+        # Equidistant rows are a view, which is ten times as fast as indexing them.
         parts: list[NDArray[np.void]] = [
             np.ndarray((count,), dtype, content, first + shift, (step,))
             for first, step, count in runs
@@ -380,7 +380,7 @@ def rows(
 
 
 def _evenly(starts: IntArray) -> list[tuple[int, int, int]] | None:
-    """Return first, step and length of the few even runs of places, ``None`` if they are many."""
+    """Return start, step and length of equidistant runs; ``None`` if there are too many runs."""
     if len(starts) < RUN_PROBE:
         return None
     steps = np.diff(starts)
@@ -433,9 +433,9 @@ def _boundaries(content: bytes) -> tuple[IntArray, list[tuple[int, bytes]]]:
 
 
 def _run(content: bytes, position: int, stride: int) -> int:
-    """Return how many records from ``position`` on have the same kind and length.
+    """Return how many successive records from ``position`` have the same opcode and length.
 
-    The look-ahead doubles, so the work is in proportion to the run that is found.
+    The look-ahead doubles, so the work is proportional to the length of the run.
     """
     count = (len(content) - position) // stride
     op, length = RECORD_HEAD.unpack_from(content, position)

@@ -1,11 +1,11 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Makes a whole file of what a crash, a full disk or a bad sector left.
+"""Recovers a complete file from what a crash, a full disk or a bad sector left.
 
-Intact chunks are copied as they are and get a new index. A chunk whose
-checksum is wrong is left out and counted: nothing is repaired by guessing.
-Messages that stood outside of chunks come into new ones, and what had no
-checksum gets one.
+Intact chunks are copied unchanged and get a new index. A chunk with a wrong
+checksum is left out and counted; its content is never guessed. Messages
+outside of chunks are written to new chunks, and chunks without a checksum
+get one.
 """
 
 from __future__ import annotations
@@ -66,11 +66,11 @@ from valveflow_ros.records import IntArray
 
 @dataclass(frozen=True, slots=True)
 class RecoveryReport:
-    """What a recovery kept and what it had to leave.
+    """Result of a recovery.
 
-    ``messages`` and ``chunks`` were written, ``bare_messages`` of the source stood outside of
-    chunks; ``damaged_chunks`` counts the places where something was lost, apart from a cut-off
-    end; ``warnings`` are sentences about what was met.
+    ``messages`` and ``chunks`` were written. ``bare_messages`` of the source are outside of its
+    chunks. ``damaged_chunks`` counts the places where data were lost, apart from a cut-off end.
+    ``warnings`` are sentences for the user.
     """
 
     source: Path
@@ -92,8 +92,8 @@ def recover(
 ) -> RecoveryReport:
     """Copy the intact chunks of ``path`` into a finished file ``out``.
 
-    It gets its name when the library `mcap` has read its summary and every chunk, by their
-    checksums.
+    It gets its final name after the library `mcap` has read its summary and every chunk and
+    verified the checksums.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def recover(
     out : str or Path
         The new file, which must not exist; its name should end in ``.mcap``.
     progress : callable, optional
-        Called with bytes done and bytes in all.
+        Called with the bytes done and the total bytes.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def recover(
 
 
 def intact_messages(path: Path) -> int:
-    """Return how many messages stand in the intact chunks of a file; 0 if it cannot be read."""
+    """Return the number of messages in the intact chunks of a file; 0 if it cannot be read."""
     try:
         with Source.open(path) as source:
             return sum(map(len, _Copier(source, Scanner(source)).chunks(None)))
@@ -126,11 +126,11 @@ def intact_messages(path: Path) -> int:
 
 
 def recover_leftovers(folder: str | Path) -> tuple[RecoveryReport, ...]:
-    """Finish every ``.part`` in a folder that no living recorder holds.
+    """Finish every ``.part`` file in a folder that no living recorder holds.
 
-    The ``.part`` is removed when its finished file is in place, or if not one chunk
-    was finished in it; one that cannot be read, or that holds damaged chunks only
-    is left. The folder's `metadata.yaml` is brought up to date.
+    The ``.part`` file is removed when its finished file is in place, or if it has no
+    complete chunk. It is kept if it cannot be read, or has damaged chunks only. The
+    folder's `metadata.yaml` is updated.
 
     Raises
     ------
@@ -147,11 +147,11 @@ def recover_leftovers(folder: str | Path) -> tuple[RecoveryReport, ...]:
 
 
 def _leftover(part: Path) -> RecoveryReport | None:
-    """Finish one; what cannot be read or finished now stays, and nobody has to wait for it."""
+    """Finish one ``.part`` file; it is kept if it cannot be read or finished now."""
     if part.is_symlink() or not part.is_file():
         return None
     try:
-        # It is held meanwhile, so that no other recovery works on it at the same time.
+        # The lock keeps other recoveries from working on it at the same time.
         with taken(part) as free:
             return _made_whole(part) if free else None
     except (OSError, RecordingError):
@@ -163,8 +163,8 @@ def _made_whole(part: Path) -> RecoveryReport | None:
         part.unlink()
         return None
     target = part.with_name(part.name[: -len(PART_SUFFIX)])
-    # The new file is written under another name, since its own .part is the source;
-    # a draft that a crash leaves is not taken for a recording.
+    # The new file is written under another name, since its own .part is the source.
+    # That name does not end in .mcap, so a draft left by a crash is not read as a recording.
     draft = target.with_name(f'.{target.stem}.recovering')
     try:
         report = _recover(part, draft, target.name)
@@ -178,7 +178,7 @@ def _made_whole(part: Path) -> RecoveryReport | None:
 
 
 def _holds_nothing(part: Path) -> bool:
-    """Tell whether there is nothing in a file but the beginning of its first chunk, or less."""
+    """Return True if a file holds at most the beginning of its first chunk."""
     with Source.open(part) as source:
         scanner = Scanner(source)
         chunks = sum(1 for _ in scanner.chunks())
@@ -187,7 +187,7 @@ def _holds_nothing(part: Path) -> bool:
             return False
         if cut_at is None or source.size - cut_at < SHAPE_SIZE:
             return True
-        # A head whose fields agree was not damaged: the rest of its chunk was never written.
+        # The fields of this chunk head agree, so the rest of the chunk was never written.
         return next(candidates(source, cut_at, cut_at + 1), None) is not None
 
 
@@ -234,7 +234,7 @@ def _recover(
 
 @dataclass
 class _Proven:
-    """A file that gets its name only if the library `mcap` reads it to the end; a `Writable`."""
+    """A `Writable` that is published only if the library `mcap` can read all of it."""
 
     out: PartFile
     source: Path
@@ -247,17 +247,17 @@ class _Proven:
 
     @property
     def touched(self) -> bool:
-        """Return what the file says."""
+        """Return the state of the wrapped file."""
         return self.out.touched
 
     def publish(self) -> None:
-        """Read every chunk, and give the file its name; raises `RecordingError`."""
+        """Read every chunk, then rename the file; raises `RecordingError`."""
         try:
             with self.out.part.open('rb') as stream:
                 summary = make_reader(stream, validate_crcs=True).get_summary()
                 if summary is None:
                     raise McapError('it has no summary')
-                # Not message by message: a chunk of a hundred kilobytes may hold a million.
+                # Messages are not read one by one: a chunk of 100 kB may hold a million of them.
                 for index in summary.chunk_indexes:
                     stream.seek(index.chunk_start_offset + RECORD_HEAD.size)
                     get_chunk_data_stream(
@@ -281,12 +281,12 @@ class _Proven:
 
 
 class _Copier:
-    """Gives the intact chunks of a file, before each the topics that are not told by then.
+    """Yields the intact chunks of a file, each preceded by topic records that are still missing.
 
     Attributes
     ----------
     table : TopicTable
-        What is known of the topics so far; after `complete`, all of it.
+        The topics found so far; after `complete`, all topics of the file.
     """
 
     def __init__(self, source: Source, scanner: Scanner) -> None:
@@ -299,7 +299,7 @@ class _Copier:
         self._packer = compressor()
 
     def chunks(self, progress: Progress | None) -> Iterator[PackedChunk]:
-        """Yield them; what contradicts an earlier chunk is left out and counted as damage."""
+        """Yield the chunks; one that contradicts an earlier one is omitted, counted as damage."""
         for chunk in _joined(self._scanner.chunks()):
             if not chunk.content:
                 continue
@@ -312,7 +312,7 @@ class _Copier:
                 progress(chunk.end, self._source.size)
 
     def complete(self) -> None:
-        """Learn all that the file says of topics, wherever it does.
+        """Read the topic records of the whole file, also those outside of chunks.
 
         Raises
         ------
@@ -341,7 +341,7 @@ class _Copier:
                 self._scanner.findings.add_damage(f'a record outside of the chunks: {error}')
 
     def warnings(self) -> list[str]:
-        """Return a sentence if messages were left out because nothing says of which topic."""
+        """Return a sentence if messages were left out because their topic is unknown."""
         if not self._left_out:
             return []
         one = self._left_out == 1
@@ -378,7 +378,7 @@ class _Copier:
             yield _rebuilt(chunk.content, messages, np.flatnonzero(named), others)
 
     def _records(self, number: int) -> dict[tuple[int, int], Schema | Channel] | None:
-        """Return what a reader must know before a message of this channel; None if it is lost."""
+        """Return the channel and schema records of a channel; None if one of them is lost."""
         channel = self.table.channels.get(number)
         if channel is None:
             return None
@@ -390,7 +390,7 @@ class _Copier:
 
 
 def _joined(chunks: Iterator[Chunk]) -> Iterator[Chunk]:
-    """Join the messages outside of chunks to the usual size of a chunk."""
+    """Join messages outside of chunks up to the usual size of a chunk."""
     run: list[Chunk] = []
     size = 0
     for chunk in chain(chunks, [None]):
@@ -406,14 +406,14 @@ def _joined(chunks: Iterator[Chunk]) -> Iterator[Chunk]:
 
 
 def _id(content: bytes) -> int:
-    """Return the number with which a schema's or a channel's record begins."""
+    """Return the id at the start of a schema or channel record."""
     return int.from_bytes(content[:2], 'little')
 
 
 def _rebuilt(
     content: bytes, messages: MessageTable, kept: IntArray, others: list[tuple[int, bytes]]
 ) -> PackedChunk:
-    """Return a chunk with some of its messages."""
+    """Return a chunk with the messages ``kept``."""
     builder = ChunkBuilder()
     m = messages
     for k in kept.tolist():

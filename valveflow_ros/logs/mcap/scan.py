@@ -1,15 +1,15 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Finds every intact chunk of an MCAP file, whatever happened to the rest of it.
+"""Finds every intact chunk of an MCAP file, even if the rest is damaged.
 
-The file is followed record by record. Where the chain breaks, the next bytes
-that look like the head of a chunk are sought and tried. A chunk counts only if
-its content has the checksum it was written with: nothing is repaired, so a
-damaged file yields fewer values and never wrong ones. Indexes are not used,
-because an unfinished file has none.
+The file is read record by record. Where a record is damaged, the reader
+searches the following bytes for the head of a chunk. A chunk is used only if
+its content has the stated checksum. Nothing is repaired, so a damaged file
+yields fewer values but never wrong ones. Indexes are not used, because an
+unfinished file has none.
 
-What a file's writer gave no checksum, a chunk or messages that stand outside of
-chunks, is taken as it is and counted, since damage in it cannot be seen.
+Chunks without a checksum and messages outside of chunks are used and counted,
+because damage in them cannot be detected.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ from valveflow_ros.logs.mcap.records import (
 )
 from valveflow_ros.logs.source import DEFAULT_LIMITS, Budget, Limits, OverBudgetError, Source
 
-# A chunk's record: kind 6, a length below 64 GiB, four fixed fields, then the
-# compression by name. The length is checked against the fields afterwards.
+# A chunk record: opcode 6, a length below 64 GiB, four fixed fields, then the
+# name of the compression. `_fields_agree` checks the length.
 _SHAPE = re.compile(
     rb'\x06.{4}[\x00-\x0f]\x00{3}.{28}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd)', re.DOTALL
 )
-# More than the head of a chunk takes.
+# More than the size of a chunk head.
 SHAPE_SIZE = 64
-# Times, size and checksum; the name of the compression and the packed bytes follow.
+# Times, size and checksum; then come the name of the compression and the packed bytes.
 CHUNK_HEAD_SIZE = 28
 _WINDOW = 1 << 22
 
 
 def candidates(source: Source, start: int, end: int) -> Iterator[int]:
-    """Yield places in ``[start, end)`` where the fields of a chunk's head agree."""
+    """Yield offsets in ``[start, end)`` where the fields of a chunk head are consistent."""
     while start < end:
         limit = min(_WINDOW, end - start)
         window = source.read(start, limit + SHAPE_SIZE)
@@ -66,7 +66,7 @@ def candidates(source: Source, start: int, end: int) -> Iterator[int]:
         while match is not None and match.start() < limit:
             if _fields_agree(window, match.start(), match.end()):
                 yield start + match.start()
-            # One byte on: a false head must not hide a true one that overlaps it.
+            # Continue at the next byte: a false head may overlap a true one.
             match = _SHAPE.search(window, match.start() + 1)
         start += _WINDOW
 
@@ -81,9 +81,9 @@ def _fields_agree(window: bytes, position: int, names_end: int) -> bool:
 
 
 def is_foreign(source: Source, position: int) -> bool:
-    """Tell whether a record is of a kind that the format does not know, which is passed over.
+    """Return True if the opcode of a record is unknown to the format; such records are skipped.
 
-    A known one whose kind was damaged is not: what is within still shows what it was.
+    Returns False if the content is that of a chunk or an attachment with a damaged opcode.
     """
     raw = source.read(position, SHAPE_SIZE)
     if len(raw) < RECORD_HEAD.size or raw[0] < FIRST_FOREIGN:
@@ -102,18 +102,18 @@ def is_foreign(source: Source, position: int) -> bool:
 _INDEX_HEAD = struct.Struct('<BQHI')
 _INDEX_BLOCK = 4096
 _KINDS = frozenset(int(op) for op in Opcode)
-# Shorter records cannot hide a chunk.
+# Shorter records cannot contain a chunk.
 _SMALLEST_CHUNK = RECORD_HEAD.size + CHUNK_HEAD_SIZE + 12
 
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """An intact chunk: where it stands, its record as it is, what it holds.
+    """An intact chunk: its offset in the file, its raw record and its unpacked content.
 
-    ``end`` is where the next record begins. Fields that a later version of the format added to
-    the record are not part of ``record``. A ``record`` of no bytes: ``content`` is a run of
-    messages outside of chunks. Where the writer gave no checksum, ``checked`` is False, and
-    ``record`` has the one that fits its content.
+    ``end`` is the offset of the next record. ``record`` excludes fields that a later version of
+    the format added. If ``record`` is empty, ``content`` is a run of messages outside of chunks.
+    If the writer gave no checksum, ``checked`` is False, and ``record`` has the checksum of the
+    content.
     """
 
     offset: int
@@ -126,11 +126,11 @@ class Chunk:
 
 @dataclass(slots=True)
 class Findings:
-    """What a scan met besides intact chunks.
+    """What a scan found besides the content of intact chunks.
 
-    ``unchecked`` of the ``chunks`` have no checksum; ``bare_messages`` stand outside of chunks.
-    Where there are such, ``whole`` is whether the checksum of all records is right, None if the
-    file has none.
+    ``unchecked`` of the ``chunks`` have no checksum; ``bare_messages`` are outside of chunks.
+    If there are any, ``whole`` is True if the checksum of the whole data section is correct, and
+    None if the file has none.
     """
 
     chunks: int = 0
@@ -147,20 +147,20 @@ class Findings:
     metadata: list[tuple[str, dict[str, str]]] = field(default_factory=list)
 
     def add_damage(self, reason: str) -> None:
-        """Count a damaged chunk or stretch; the first few reasons are kept."""
+        """Count a damaged chunk or section; the first eight reasons are kept."""
         self.damaged += 1
         if len(self.reasons) < 8:
             self.reasons.append(reason)
 
 
 class Scanner:
-    """Goes once through a file; `findings` is complete when `chunks` is exhausted.
+    """Scans a file once; `findings` is complete when `chunks` is exhausted.
 
     Attributes
     ----------
     findings : Findings
     outside : list of Schema or Channel
-        Those met so far that stand outside of chunks, each once.
+        The records found so far outside of chunks, each once.
     """
 
     def __init__(self, source: Source, limits: Limits = DEFAULT_LIMITS) -> None:
@@ -176,7 +176,7 @@ class Scanner:
         self._before = b''
 
     def chunks(self) -> Iterator[Chunk]:
-        """Yield the intact chunks, and the runs of messages beside them, in the file's order.
+        """Yield the intact chunks, and the runs of messages between them, in file order.
 
         Raises
         ------
@@ -189,7 +189,7 @@ class Scanner:
             self.findings.over_budget = True
 
     def chunk_at(self, offset: int) -> Chunk:
-        """Return the chunk that was found at ``offset`` before; raises `LayoutError`."""
+        """Return the chunk or run of messages at ``offset``; raises `LayoutError`."""
         op, length = self._head(offset)
         return self._chunk(offset, length) if op == Opcode.CHUNK else self._run(offset, length)
 
@@ -205,15 +205,15 @@ class Scanner:
                 position = self._behind_indexes(position)
 
     def _behind_indexes(self, position: int) -> int:
-        """Return where the message indexes end that follow a chunk and agree with themselves.
+        """Return the end of the consistent message indexes that follow a chunk.
 
-        They make up most records of a slow plant's file; a wrong length
-        disagrees with the length that stands within.
+        They are most of the records in the file of a slow plant. An index is
+        consistent if its record length agrees with the length in its content.
         """
         block, place = b'', 0
         while True:
             if place + _INDEX_HEAD.size > len(block):
-                # Those of large chunks are longer than what was looked at at once.
+                # The indexes of large chunks are longer than one block.
                 position, place = position + place, 0
                 block = self._source.read(position, _INDEX_BLOCK)
                 if len(block) < _INDEX_HEAD.size:
@@ -227,7 +227,7 @@ class Scanner:
             place = after
 
     def _step(self, position: int) -> tuple[Chunk | None, int]:
-        """Deal with the record at a position; return its chunk, if any, and where to go on."""
+        """Process the record at a position; return its chunk, if any, and the next position."""
         op, length = self._head(position)
         after = position + RECORD_HEAD.size + length
         problem = ''
@@ -242,7 +242,7 @@ class Scanner:
                 if after <= self._source.size:
                     self._budget.spend_in_vain(length)
                     problem = f'the chunk at byte {position}: {error}'
-                # A length is believed if the fields within say the same.
+                # The length is trusted if it agrees with the fields of the chunk head.
                 agreed = next(candidates(self._source, position, position + 1), None) is not None
                 if agreed and self._plausible(after):
                     self.findings.add_damage(problem)
@@ -289,8 +289,8 @@ class Scanner:
         size, crc, name = found.uncompressed_size, found.uncompressed_crc, found.compression
         exact = CHUNK_HEAD_SIZE + 12 + len(name.encode()) + len(found.data)
         end = position + RECORD_HEAD.size + length
-        # A later version of the format may have added fields at the end, but a damaged length must
-        # not swallow the chunks that follow.
+        # A later version of the format may add fields at the end, but a damaged length must not
+        # hide the chunks that follow.
         inner_end = position + RECORD_HEAD.size + exact
         if exact > length or (
             exact < length and (self._begins_record(inner_end) or not self._plausible(end))
@@ -302,7 +302,7 @@ class Scanner:
         content = self._unpacker.unpack(name, found.data, size)
         actual = zlib.crc32(content)
         checked = actual == crc
-        # The format has 0 for a checksum that is not available.
+        # In this format 0 means that there is no checksum.
         if crc and not checked:
             raise LayoutError('its checksum is wrong')
         if exact != length or not checked:
@@ -311,7 +311,7 @@ class Scanner:
         return Chunk(position, raw, content, name, end, checked)
 
     def _run(self, position: int, length: int) -> Chunk:
-        """Return the messages from a position on, about as many as a chunk has."""
+        """Return the messages that start at a position, up to about the size of a chunk."""
         if length > self._limits.record_bytes:
             raise LayoutError(f'its length of {length} bytes is beyond all bounds')
         raw = self._source.read(position, max(CHUNK_BYTES, RECORD_HEAD.size + length))
@@ -323,9 +323,9 @@ class Scanner:
         return Chunk(position, b'', raw[:size], '', position + size, checked=False)
 
     def _disguised(self, position: int, length: int) -> bool:
-        """Tell whether a message is a record of another kind, whose first byte was damaged.
+        """Return True if a message is in fact another record with a damaged opcode.
 
-        A file whose messages have checksums is not to get one that has none by a wrong bit.
+        Otherwise one wrong bit would add a message without a checksum to an intact file.
         """
         if position <= len(MAGIC) or self._in_summary:
             # The header comes first, and the summary has no messages.
@@ -335,7 +335,7 @@ class Scanner:
         if as_chunk is not None and _fields_agree(raw, 0, as_chunk.end()):
             return True
         if len(raw) >= HEAD_SIZE:
-            # As the index behind a chunk: a channel, a length, time and place of a message.
+            # A message index holds a channel, a length, and time and offset of a message.
             channel, inner, log_time, place = MESSAGE_HEAD.unpack_from(raw, RECORD_HEAD.size)
             content = self._before[place : place + HEAD_SIZE]
             if inner == length - 6 and len(content) == HEAD_SIZE:
@@ -351,7 +351,7 @@ class Scanner:
             return False
 
     def _inside(self, op: int, position: int, length: int) -> Chunk | None:
-        """Look into a record that is no chunk, and for a chunk that a wrong length would hide."""
+        """Process a record other than a chunk; return a chunk that a wrong length would hide."""
         if op == Opcode.MESSAGE:
             large = length > self._limits.record_bytes
             why = 'is larger than can be read' if large else 'cannot be one'
@@ -361,7 +361,7 @@ class Scanner:
             return None
         if op == Opcode.METADATA and length <= self._limits.definition_bytes:
             self._metadata(position, length)
-        # The summary, which follows, repeats what it says with a checksum.
+        # The summary, which follows, repeats these records with a checksum.
         if op == Opcode.DATA_END and not self._in_summary:
             self._in_summary = True
             self._data_end(position)
@@ -375,7 +375,7 @@ class Scanner:
         return self._seek(start, start + length)
 
     def _data_end(self, position: int) -> None:
-        """Compare the checksum of all records, if some have none of their own."""
+        """Verify the checksum of the data section if some records have none of their own."""
         raw = self._source.read(position + RECORD_HEAD.size, 4)
         wanted = int.from_bytes(raw, 'little')
         if wanted and (self.findings.unchecked or self.findings.bare_messages):
@@ -385,7 +385,7 @@ class Scanner:
             self.findings.whole = found == wanted
 
     def _is_index(self, position: int, length: int) -> bool:
-        """Tell whether a message index agrees with its own length, which a wrong one does not."""
+        """Return True if a message index agrees with its record length."""
         raw = self._source.read(position + RECORD_HEAD.size + 2, 4)
         return int.from_bytes(raw, 'little') == length - 6
 
@@ -415,7 +415,7 @@ class Scanner:
             self.findings.metadata.append((found.name, found.metadata))
 
     def _definition(self, op: int, position: int, length: int) -> None:
-        """Take a schema or a channel that stands outside of chunks."""
+        """Add a schema or a channel from outside of chunks."""
         kind = 'schema' if op == Opcode.SCHEMA else 'channel'
         try:
             if length > self._limits.definition_bytes:
@@ -444,30 +444,30 @@ class Scanner:
         return position == size - len(MAGIC) and self._source.read(position, 8) == MAGIC
 
     def _begins_record(self, position: int) -> bool:
-        """Tell whether a record of a known kind begins here and is not cut off."""
+        """Return True if a record of a known kind begins here and is not cut off."""
         op, length = self._head(position)
         fits = position + RECORD_HEAD.size + length <= self._source.size
         return fits and self._known(op, position)
 
     def _plausible(self, position: int) -> bool:
-        """Tell whether a record, or the end of the file, may begin here."""
+        """Return True if a record, or the end of the file, may begin here."""
         size = self._source.size
         if position == size or self._is_end(position):
             return True
         if not self.findings.finished and 0 <= size - position < SHAPE_SIZE:
-            # Too little of a last record to be judged.
+            # Too few bytes of the last record to decide.
             return True
         if self._begins_record(position):
             return True
         op, length = self._head(position)
         if position + RECORD_HEAD.size + length <= size or op not in _KINDS:
             return False
-        # The last chunk of an unfinished file may be cut off, with a head that agrees.
+        # The last chunk of an unfinished file may be cut off, with a consistent head.
         return next(candidates(self._source, position, position + 1), None) is not None
 
 
 def why_empty(findings: Findings) -> str:
-    """Return why a file gave no message."""
+    """Return why no message could be read from a file."""
     if findings.over_budget:
         return 'unpacks to far more than its size justifies and was not read'
     if not findings.begins_well and not findings.damaged:
@@ -480,7 +480,7 @@ def why_empty(findings: Findings) -> str:
 
 
 def scan_warnings(findings: Findings, what: str) -> tuple[str, ...]:
-    """Return one sentence for each thing a reader of the file should know; none if all is well."""
+    """Return one sentence for each problem of the file that a reader should know."""
     sentences = []
     if findings.cut_off_at is not None:
         sentences.append(

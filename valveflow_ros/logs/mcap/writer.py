@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a recording: a folder of MCAP splits that ROS 2 tools read with nothing of ours."""
+"""Writes a recording: a folder of MCAP splits that standard ROS 2 tools can read."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ from valveflow_ros.logs.part_file import (
 )
 from valveflow_ros.logs.source import os_errors
 
-# The longest duration that ROS 2 can express stands for "no limit".
+# rosbag2 writes the longest duration of ROS 2 for "no limit".
 _NO_LIMIT = ('sec: 9223372036', 'nsec: 854775807')
 
 
 @dataclass(frozen=True, slots=True)
 class Qos:
-    """What the publisher of a topic offers, in rosbag2's words."""
+    """QoS profile that the publisher of a topic offers, with the terms of rosbag2."""
 
     reliability: str = 'reliable'
     durability: str = 'volatile'
@@ -136,7 +136,7 @@ class TopicBook:
         try:
             return type_hash(type_name, parse_all(type_name, definition))
         except LayoutError:
-            # Without a hash a recording is as readable as with one.
+            # Readers do not need the hash.
             return ''
 
     def packed(self) -> bytes:
@@ -153,7 +153,7 @@ Metadata = Mapping[str, Mapping[str, str]]
 
 
 class Message(NamedTuple):
-    """A message on its way into a recording: raw CDR bytes and their times."""
+    """A message to record: raw CDR bytes and its times."""
 
     topic: str
     data: bytes
@@ -163,9 +163,9 @@ class Message(NamedTuple):
 
 @dataclass(slots=True)
 class _File:
-    """A split that this writer wrote, and by what it knows the file that it left.
+    """A split that this writer wrote, with the `mark_of` its file.
 
-    ``own`` messages were handed in by `RecordingWriter.write`; ``messages`` are all in it.
+    ``own`` messages came from `RecordingWriter.write`; ``messages`` is the total.
     """
 
     path: Path
@@ -175,47 +175,46 @@ class _File:
 
 
 class RecordingWriter:
-    """One recording folder, one thread.
+    """Writes to one recording folder, from one thread.
 
-    A folder that exists is continued: numbers go on and `metadata.yaml`
-    covers all of its finished splits. A file is begun with its first chunk.
-    After a `RecordingError` the file at hand is abandoned as it is, the
-    messages that were not on disk are kept, and the next `flush` begins a new
-    file with them. A file or folder that another program removed is not
-    waited for: a new one is begun, and what was in it is counted as lost.
+    An existing folder is continued: the numbers of the splits go on, and
+    `metadata.yaml` covers all finished splits. A file is created with its
+    first chunk. After a `RecordingError` the current file is abandoned. The
+    messages that were not on disk are kept, and the next `flush` writes them
+    to a new file. If another program removed the file or the folder, a new
+    one is created, and the messages in it are counted as lost.
 
     Attributes
     ----------
     lost : int
-        Messages that were written to a file and damaged or removed there before it was finished,
-        or damaged afterwards.
+        Messages written to a file that was damaged, or that was removed before it was finished.
     removed : int
         Messages in finished splits that were removed since, by `forget` or by another program.
     loss : str
-        What happened to those that were lost last, in a sentence; empty if none was.
+        A sentence about the last loss; empty if nothing was lost.
 
     Parameters
     ----------
     folder : str or Path
-        The folder; made if absent, for its owner only.
+        The folder; created if absent, with access for the owner only.
     name : str, optional
-        Splits are called ``NAME_0.mcap``, ...; by default as the folder.
+        Splits are named ``NAME_0.mcap``, ...; by default the name of the folder.
     definitions : Definitions, optional
-        Where message definitions are found.
+        Source of the message definitions.
     attachments : mapping of str to bytes
-        Files to stand in every split (parameters, model).
+        Files to attach to every split (parameters, model).
     metadata : mapping of str to mapping of str to str
-        Records to stand in every split.
+        Metadata records for every split.
     head_messages : callable
-        Gives the latched messages that are repeated at the head of every split
-        but the first.
+        Returns the latched messages that are repeated at the start of every
+        split but the first.
     open_file : callable
         Opens a split for writing.
 
     Raises
     ------
     RecordingError
-        If the folder cannot be made or used.
+        If the folder cannot be created or used.
     """
 
     def __init__(
@@ -250,13 +249,13 @@ class RecordingWriter:
         self._builder = ChunkBuilder()
         self._file: ChunkFile | None = None
         self._sequences: dict[int, int] = {}
-        self._on_disk: dict[int, int] = {}  # the same, without what waits
+        self._on_disk: dict[int, int] = {}  # the same, without waiting messages
         with os_errors(self.folder, 'cannot be written'):
             make_folder(self.folder)
             self._splits = finished_splits(self.folder)
         self._list_due = False
-        # Numbers in a folder that is continued are others than before: by them a repetition is
-        # known. No split holds so many messages that they could meet.
+        # Sequence numbers start elsewhere in a continued folder, because a reader detects
+        # repeated messages by them. No split holds enough messages for the ranges to overlap.
         self._before = (self._next_number() % _SPLITS_APART) * _NUMBERS_APART
 
     def add_topic(
@@ -268,16 +267,16 @@ class RecordingWriter:
         type_hash: str | None = None,
         definition: str | None = None,
     ) -> None:
-        """Make a topic known before its first message; see `TopicBook.add`."""
+        """Add a topic before its first message; see `TopicBook.add`."""
         self._topics.add(topic, type_name, qos, type_hash, definition)
 
     def write(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
-        """Take a message of raw CDR bytes; every 64 KiB of them become a chunk on disk.
+        """Add a message of raw CDR bytes; every 64 KiB of messages are written as a chunk.
 
         Raises
         ------
         RecordingError
-            If a chunk could not be written; the message is kept all the same.
+            If a chunk could not be written; the message is kept.
         KeyError
             If the topic was not added.
         """
@@ -290,12 +289,12 @@ class RecordingWriter:
 
     @property
     def written(self) -> int:
-        """Messages taken by `write` that a reader finds in the folder."""
+        """Number of messages from `write` that a reader finds in the folder."""
         return sum(file.own for file in self._files)
 
     @property
     def waiting(self) -> int:
-        """Messages taken by `write` and not on disk yet."""
+        """Number of messages from `write` that are not on disk yet."""
         return len(self._builder)
 
     @property
@@ -305,26 +304,26 @@ class RecordingWriter:
 
     @property
     def file_bytes(self) -> int:
-        """Bytes of the split at hand."""
+        """Bytes written to the current split."""
         return self._file.position if self._file is not None else 0
 
     def flush(self) -> None:
-        """Hand waiting messages to the operating system; a killed process loses them no more."""
+        """Pass waiting messages to the operating system, where they survive a killed process."""
         if len(self._builder):
             self.check()
             with self._writing():
                 self._put(self._begin())
 
     def check(self) -> None:
-        """See that folder and split at hand are there as they were written.
+        """Check that the folder and the current split are as they were written.
 
-        Another program may have removed or replaced them: the folder is made again, the split
-        given up, its messages counted as lost, and the next `flush` begins a new one.
+        If another program removed or replaced them, the folder is created again and the split is
+        abandoned. Its messages are counted as lost, and the next `flush` begins a new split.
 
         Raises
         ------
         RecordingError
-            If that cannot be found out, or the folder cannot be made.
+            If the check fails, or the folder cannot be created.
         """
         with os_errors(self.folder, 'cannot be made'):
             make_folder(self.folder)
@@ -336,15 +335,15 @@ class RecordingWriter:
                     self._give_up(error)
 
     def check_finished(self, most_bytes: int = 64 << 20) -> bool:
-        """See that the finished splits are there as they were left; count what is not.
+        """Check that the finished splits are unchanged, and count the messages that are not there.
 
-        `metadata.yaml` is brought in line with them. One that was changed is read again, which
-        takes time: when so many bytes were, the others wait for the next call.
+        `metadata.yaml` is updated. A changed split is read again, which takes time. After about
+        ``most_bytes`` bytes the remaining splits are left for the next call.
 
         Returns
         -------
         bool
-            Whether none has to wait.
+            True if all splits were checked.
         """
         changed, left = False, most_bytes
         for file in list(self._files):
@@ -361,40 +360,40 @@ class RecordingWriter:
         return left > 0
 
     def sync(self) -> None:
-        """Bring what was flushed to the disk itself; a power cut loses it no more."""
+        """Write what was flushed to the disk itself, where it survives a power cut."""
         if self._file is not None:
             with self._writing():
                 self._file.sync()
 
     def note(self, name: str, items: Mapping[str, str]) -> None:
-        """Write a metadata record into the split at hand, if there is one."""
+        """Write a metadata record to the current split, if there is one."""
         if self._file is not None:
             with self._writing():
                 self._file.put_metadata(name, items)
 
     def rotate(self) -> None:
-        """Finish the split at hand; the next flush begins a new one."""
+        """Finish the current split; the next flush begins a new one."""
         self.flush()
         self._finish()
 
     def close(self) -> None:
-        """Finish the recording; what is written afterwards begins a new split."""
+        """Finish the recording; a later `write` begins a new split."""
         self.rotate()
 
     def abandon(self) -> None:
-        """Let go of the split at hand, unfinished; `recover` makes a whole file of it."""
+        """Close the current split unfinished; `recover` can complete it."""
         if self._file is not None:
             self._file.abandon()
             at_hand, self._at_hand = self._at_hand, _File(Path())
             part = at_hand.path.with_name(f'{at_hand.path.name}{PART_SUFFIX}')
-            # What is in it nobody has read back: without a mark the next look counts it.
+            # Its content is not verified: without a mark, `check_finished` counts it again.
             at_hand.path, at_hand.mark = part, None
             if not at_hand.own:
                 self._files.remove(at_hand)
             self._file = self.path = None
 
     def forget(self, name: str) -> None:
-        """Strike a split that was deleted from `metadata.yaml`."""
+        """Remove a deleted split from `metadata.yaml`."""
         self._splits.pop(name, None)
         for file in [file for file in self._files if file.path.name == name]:
             self._take_out(file)
@@ -423,7 +422,7 @@ class RecordingWriter:
         try:
             file.put_chunk(chunk)
         finally:
-            # A whole chunk is not to be written again, even if the index behind it failed.
+            # A complete chunk is not written again, even if writing its index failed.
             if file.messages > before:
                 self._at_hand.own += self.waiting
                 self._at_hand.messages = file.messages
@@ -449,13 +448,13 @@ class RecordingWriter:
         return self._file
 
     def _repeat(self, file: ChunkFile) -> None:
-        """Write latched messages again, as if received with the new split's first message."""
+        """Repeat latched messages with the log time of the new split's first message."""
         head = ChunkBuilder()
         for message in self._head_messages():
             channel = self._topics.ids[message.topic]
-            # Never before the original, so that a reader can tell which is which.
+            # Not before the original, so that a reader sees the original first.
             times = max(self._builder.first_log_ns, message.log_time_ns), message.publish_time_ns
-            # Its own number: a newer message of its topic may be waiting to be written.
+            # Number of the message on disk: a newer message of its topic may be waiting.
             head.add(channel, self._on_disk.get(channel, 0), *times, message.data)
         if len(head):
             file.put_chunk(head.build(self._topics.packed()))
@@ -467,15 +466,15 @@ class RecordingWriter:
     def _next_number(self) -> int:
         parts = self.folder.glob(f'*.mcap{PART_SUFFIX}')
         found = max(map(split_number, [*finished_files(self.folder), *parts]), default=-1)
-        # Never that of a file that was taken away: somebody may bring it back.
+        # Never reuse the number of a removed file: somebody may restore it.
         return max(found, self._number) + 1
 
     def _finish(self) -> None:
         if self._file is not None and self.path is not None:
-            # Until this is done, a file may have its name that the list does not name.
+            # If this fails half-way, metadata.yaml may lack a file with a final name.
             self._list_due = True
             if os.path.lexists(self.path):
-                # Somebody else's: it stays.
+                # A file of another program has this name and is kept.
                 self.path = self._at_hand.path = self._split_path(self._next_number())
                 self._file.rename(self.path)
             with self._writing():
@@ -495,7 +494,7 @@ class RecordingWriter:
         self._list()
 
     def _give_up(self, error: AlteredError) -> None:
-        """Let go of the split at hand, which another program altered; count what it took away."""
+        """Abandon the current split, which another program altered, and count the loss."""
         file = self._at_hand
         self.abandon()
         if file.own:
@@ -506,12 +505,12 @@ class RecordingWriter:
         unfinished = file.path.suffix == PART_SUFFIX
         named = file.path.with_suffix('') if unfinished else file.path
         if named.exists() and not file.path.exists():
-            # Giving it its name was the last that was done, or it was recovered since.
+            # It was renamed before finishing failed, or it was recovered since.
             file.path = named
         file.mark = mark_of(file.path)
         self._splits.pop(file.path.name, None)
         if file.mark is None and not unfinished:
-            # What was finished may have been taken to an archive.
+            # A finished file may have been moved to an archive, so it is not lost.
             self._take_out(file)
             return
         left = 0 if file.mark is None else intact_messages(file.path)
@@ -530,15 +529,15 @@ class RecordingWriter:
         self.loss = f"'{file.path}' {what}: {told} lost.{more}"
 
     def _take_out(self, file: _File) -> None:
-        """Count the messages of a file that was removed."""
+        """Count the messages of a removed file and forget the file."""
         self.removed += file.own
         self._files.remove(file)
 
     def _list(self) -> None:
-        """Write `metadata.yaml` for what is whole on the disk."""
+        """Write `metadata.yaml` for the finished splits on disk."""
         self._list_due = True
         with os_errors(self.path or self.folder, 'cannot be written'):
-            # A file may have got its name although finishing it failed after that.
+            # A file may have its final name although finishing it failed afterwards.
             found = finished_splits(self.folder, self._splits)
             self._splits = {n: split for n, split in found.items() if n not in self._damaged}
             write_metadata(self.folder, self._splits.values())
@@ -547,7 +546,7 @@ class RecordingWriter:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Abandon the split at hand after an `OSError`, which becomes a `RecordingError`."""
+        """Turn an `OSError` into a `RecordingError` and abandon the current split."""
         try:
             yield
         except OSError as error:

@@ -1,3 +1,3 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of historians: CSV, Excel and Parquet."""
+"""Reads tables exported by historians: CSV, Excel and Parquet."""

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Gives the rows of Parquet files and Excel workbooks block by block."""
+"""Yields the rows of Parquet files and Excel workbooks block by block."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ if TYPE_CHECKING:
 _BLOCK_ROWS = 200_000
 _SHEET_BLOCK = 50_000
 _SAMPLES = 200
-_SHEET_ROWS = 1_048_576  # a sheet has no more
-# What a file may unpack to, however large it is itself, unless a person allows more.
+_SHEET_ROWS = 1_048_576  # maximum of Excel
+# Maximum unpacked size of a file of any size, unless the user allows more.
 _BOOK_BYTES = 1 << 30
-_PARQUET_BYTES = 2 << 30  # a year of seconds with five signals takes 1.5 GB
+_PARQUET_BYTES = 2 << 30  # a year of five signals at 1 s needs 1.5 GB
 _CELL_BYTES = 8
-_TEXT_BYTES = 64 << 20  # of the texts of one column in a block
-# The library holds a sheet as a full rectangle, so two cells far apart would fill the memory. A
-# cell takes at least 16 bytes of XML, so a sheet that is a table stays below.
+_TEXT_BYTES = 64 << 20  # maximum for the texts of one column in a block
+# The library stores a sheet as a full rectangle, so two cells far apart would fill the memory. A
+# cell has at least 16 bytes of XML, so a sheet with a real table stays below the limit.
 _CELLS_FREELY = 8 << 20
 _BYTES_PER_CELL = 16
 _PLACE = re.compile(rb'\br\s*=\s*["\']\s*([A-Za-z]{0,9})([0-9]{1,10})')
-# A cell or row that does not say where it stands is counted by the library, so by us too.
+# Cells and rows without a reference are numbered by counting, as the library does.
 _CELL = re.compile(rb'<(?:\w+:)?(c|row)[\s/>]')
-# The library copies a shared text for each cell that shows it.
+# The library copies a shared text for each cell that uses it.
 _SHARED = re.compile(rb't\s*=\s*["\']s["\']')
 _TEXT_END = re.compile(rb'</(?:\w+:)?si>')
-_LONGEST_TEXT = 32_767  # characters that Excel lets a cell hold, in bytes of XML at most ten times
+_LONGEST_TEXT = 32_767  # maximum characters in an Excel cell; in XML at most ten bytes each
 _SHARED_BYTES = 4 << 30
 _LONGEST_PLACE = 64
 _PIECE = 1 << 20
@@ -48,12 +48,12 @@ _STAMPS = (datetime.date, datetime.time)  # and so datetime.datetime
 
 
 def check_parquet(path: Path) -> None:
-    """Refuse a Parquet file where the library for it is missing, before any work is done.
+    """Check that pyarrow, an optional dependency, can be imported.
 
     Raises
     ------
     RecordingError
-        If pyarrow, an extra of this package, is not installed, or refuses the NumPy beside it.
+        If pyarrow is not installed, or does not work with the installed NumPy.
     """
     try:
         import pyarrow  # noqa: F401
@@ -72,7 +72,7 @@ def check_parquet(path: Path) -> None:
 
 
 def parquet_names(path: Path) -> tuple[str, ...]:
-    """Return the names of the columns, which stand in the footer of the file."""
+    """Return the names of the columns from the footer of the file."""
     check_parquet(path)
     from pyarrow import parquet
 
@@ -81,9 +81,9 @@ def parquet_names(path: Path) -> tuple[str, ...]:
 
 
 def parquet_samples(path: Path, places: Sequence[int], options: TableOptions) -> list[list[str]]:
-    """Return cells at these places, of rows from the first and from the last group.
+    """Return cells of these columns from the first and the last row group.
 
-    Of a group that unpacks beyond the limit there are none: all of it may be one page.
+    A group whose unpacked size exceeds the limit is skipped: it may be a single page.
     """
     rows: list[list[str]] = []
     most = options.unpacked_bytes(path.stat().st_size, _PARQUET_BYTES)
@@ -100,12 +100,12 @@ def parquet_samples(path: Path, places: Sequence[int], options: TableOptions) ->
 def parquet_blocks(
     path: Path, places: Sequence[int], options: TableOptions
 ) -> Iterator[pd.DataFrame]:
-    """Yield the columns at these places.
+    """Yield the columns with these indices block by block.
 
     Raises
     ------
     RecordingError
-        If they are too large for the size of the file, by what its footer says.
+        If the unpacked size that the footer states is too large for the size of the file.
     """
     import pandas as pd
 
@@ -118,10 +118,10 @@ def parquet_blocks(
 
 @contextmanager
 def _parquet(path: Path, places: Sequence[int]) -> Iterator[tuple[Any, list[str]]]:
-    """Open a file for the columns at these places; yield it with their names.
+    """Open a file; yield it with the names of the columns that have these indices.
 
-    Texts are read as they are packed, each once, since one repeated a million times is small
-    in the file.
+    Texts are read in dictionary encoding, because a text that is repeated a million times is
+    small in the file.
     """
     import pyarrow as pa
     from pyarrow import parquet
@@ -130,7 +130,7 @@ def _parquet(path: Path, places: Sequence[int]) -> Iterator[tuple[Any, list[str]
         every = file.schema_arrow.names
         fields = [file.schema_arrow.field(k) for k in places]
     for field in fields:
-        # The library takes columns by their names only, and gives all of one name.
+        # The library selects columns by name only, and returns all columns with that name.
         if every.count(field.name) > 1:
             raise InputError(f"{path}: there are several columns called '{field.name}'.")
         if pa.types.is_nested(field.type):
@@ -143,7 +143,7 @@ def _parquet(path: Path, places: Sequence[int]) -> Iterator[tuple[Any, list[str]
 
 
 def _check_unpacked(path: Path, footer: Any, names: list[str], options: TableOptions) -> None:
-    """Refuse columns out of proportion to the file before one of their rows is read."""
+    """Refuse columns that are too large for the size of the file, before reading any row."""
     packed = path.stat().st_size
     most = options.unpacked_bytes(packed, _PARQUET_BYTES)
     groups = range(footer.num_row_groups)
@@ -159,19 +159,19 @@ def _check_unpacked(path: Path, footer: Any, names: list[str], options: TableOpt
 
 
 def _stated(footer: Any, names: list[str], groups: Iterable[int]) -> int:
-    """Return the bytes of some columns in some groups, unpacked, by what the footer says."""
+    """Return the unpacked bytes of some columns in some groups, as stated in the footer."""
     wanted = [k for k in range(footer.num_columns) if footer.schema.column(k).path in names]
     parts = map(footer.row_group, groups)
     return sum(part.column(k).total_uncompressed_size for part in parts for k in wanted)
 
 
 def _allowed(unpacked: float) -> str:
-    """Return how a person may have a file read that is larger than it looks."""
+    """Return the clause with the option that allows a larger unpacked size."""
     return f'if it is not damaged, add --max-unpacked {math.ceil(unpacked / 1e6)}'
 
 
 def _decoded(path: Path, batch: Any) -> list[Any]:
-    """Return the columns of a batch with each text in its cells, as far as these are texts."""
+    """Return the columns of a batch with dictionary-encoded texts decoded."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -189,12 +189,12 @@ def _decoded(path: Path, batch: Any) -> list[Any]:
 
 
 def look_at_sheet(path: Path, options: TableOptions, most: int) -> tuple[Any, list[list[str]]]:
-    """Return the sheet to be read, for `sheet_blocks`, and its first rows as texts.
+    """Return the sheet to read, for `sheet_blocks`, and its first rows as texts.
 
     Raises
     ------
     InputError
-        If the sheet is not there, or several could be meant.
+        If the sheet does not exist, or several sheets have a table.
     """
     names: list[str] = []
     tables: list[str] = []
@@ -215,7 +215,7 @@ def look_at_sheet(path: Path, options: TableOptions, most: int) -> tuple[Any, li
                 return cells, rows
             if len(rows) > 1 and len(rows[0]) > 1:
                 tables.append(sheet.name)
-                # One sheet is held at a time, and only what may be read in the end.
+                # Only the first sheet with a table is kept in memory.
                 found = found or (cells, rows)
     if options.sheet:
         raise InputError(f"{path} has no sheet '{options.sheet}'; it has {', '.join(names)}.")
@@ -230,7 +230,7 @@ def look_at_sheet(path: Path, options: TableOptions, most: int) -> tuple[Any, li
 
 
 def sheet_blocks(sheet: Any, first_row: int, places: list[int]) -> Iterator[pd.DataFrame]:
-    """Yield the cells of a sheet at these places, from a row on."""
+    """Yield the cells of these columns of a sheet block by block, from ``first_row`` on."""
     top, left = sheet.start or (0, 0)
     block: list[list[Any]] = []
     for number, row in enumerate(sheet.iter_rows(), top):
@@ -247,14 +247,14 @@ def sheet_blocks(sheet: Any, first_row: int, places: list[int]) -> Iterator[pd.D
 
 
 def _frame(block: list[list[Any]]) -> pd.DataFrame:
-    """Give columns of stamps or of numbers the type that is quick to work with."""
+    """Return a block as a DataFrame with datetime and number types where possible."""
     import pandas as pd
 
     frame = pd.DataFrame(block, dtype=object).infer_objects()
     for place in frame.columns:
         column = frame[place]
         if column.dtype.kind == 'M':
-            # A workbook holds days as a double, which knows a second to about a microsecond.
+            # A workbook stores times as a double of days, which resolves about 1 us.
             frame[place] = column.dt.round('ms')
         elif column.dtype.kind == 'O':
             frame[place] = column.map(
@@ -264,7 +264,7 @@ def _frame(block: list[list[Any]]) -> pd.DataFrame:
 
 
 def _plain(cell: Any) -> Any:
-    """Return an empty cell as None, a whole number as int, midnight as a stamp like others."""
+    """Return an empty cell as None, a whole number as int, and a date as a datetime."""
     if cell == '':
         return None
     if isinstance(cell, float) and cell.is_integer() and abs(cell) < 1e18:
@@ -275,7 +275,7 @@ def _plain(cell: Any) -> Any:
 
 
 def _text(cell: Any) -> str:
-    """Return a cell as it would stand in a text."""
+    """Return a cell as text."""
     if cell is None:
         return ''
     if isinstance(cell, datetime.datetime):
@@ -298,7 +298,7 @@ def _book(path: Path, options: TableOptions) -> Iterator[Any]:
             "is an Excel workbook, and python-calamine that reads those is not installed; 'pip "
             "install python-calamine', or save the sheet as CSV",
         ) from None
-    # The library trusts the archive, so it is given a copy of what was counted and measured.
+    # The library does not check the archive, so it reads a copy whose size was verified.
     with tempfile.NamedTemporaryFile(suffix='.xlsx') as copy:
         _copy_within_bounds(path, copy, options)
         copy.flush()
@@ -306,14 +306,14 @@ def _book(path: Path, options: TableOptions) -> Iterator[Any]:
             with CalamineWorkbook.from_path(copy.name) as book:
                 yield book
         except BaseException as error:
-            # A panic of the library is no `Exception`.
+            # A panic of the library is not a subclass of `Exception`.
             if type(error).__name__ != 'PanicException':
                 raise
             raise RecordingError(path, 'cannot be read as a table (it is no workbook)') from None
 
 
 def _copy_within_bounds(path: Path, copy: IO[bytes], options: TableOptions) -> None:
-    """Copy a workbook whose parts and sheets do not fill the memory; raises `RecordingError`."""
+    """Copy a workbook and check its unpacked size and sheets; raises `RecordingError`."""
     with zipfile.ZipFile(path) as archive, zipfile.ZipFile(copy, 'w') as out:
         parts = {part.filename: part for part in archive.infolist()}
         unpacked = sum(part.file_size for part in parts.values())
@@ -342,7 +342,7 @@ def _copy_within_bounds(path: Path, copy: IO[bytes], options: TableOptions) -> N
 
 
 class _Measure:
-    """How far the cells of a part of a workbook reach, and how long its shared texts are."""
+    """Measures the extent of the cells in a part of a workbook, and its shared texts."""
 
     def __init__(self) -> None:
         self.rows = self.columns = self.shared = self.longest_text = 0
@@ -350,9 +350,9 @@ class _Measure:
         self._rest = b''
 
     def add(self, piece: bytes) -> None:
-        """Take the next bytes; a mark that lies across two pieces is counted once."""
+        """Process the next bytes; a tag that spans two pieces is counted once."""
         data = self._rest + piece
-        # What may go on in the next piece is looked at with it.
+        # An incomplete tag at the end is processed with the next piece.
         end = max(data.rfind(b'<'), 0) if len(piece) == _PIECE else len(data)
         end = end if len(data) - end <= _LONGEST_PLACE else len(data)
         data, self._rest = data[:end], data[end:]
@@ -378,7 +378,7 @@ class _Measure:
 
 
 def _column(letters: bytes) -> int:
-    """Return the number of a column, 1 for A; 0 without letters."""
+    """Return the number of a column: 1 for A, 0 without letters."""
     number = 0
     for letter in letters:
         number = 26 * number + letter - 64
@@ -386,7 +386,7 @@ def _column(letters: bytes) -> int:
 
 
 def _check_size(path: Path, rows: int, columns: int, size: int) -> None:
-    """Refuse a sheet whose cells span a rectangle out of proportion to the bytes of the sheet."""
+    """Refuse a sheet whose cells span too large a rectangle for the size of the sheet."""
     if rows > _SHEET_ROWS:
         raise RecordingError(path, f'has more than the {_SHEET_ROWS} rows of a sheet')
     if rows * columns > max(_CELLS_FREELY, size // _BYTES_PER_CELL):

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Makes numbers of the cells of a table, and counts the words that stand in place of one."""
+"""Converts the cells of a table to numbers, and counts the texts that are no numbers."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 QUALITY_SUFFIX = '_quality'
 _WORD_LENGTH = 40
-# So many different words are told apart; a column of free text has no end of them.
+# Maximum number of different words to count, since a column may hold free text.
 _MOST_WORDS = 200
 
 
 @dataclass(frozen=True, slots=True)
 class Marks:
-    """How numbers are written: decimal and thousands mark."""
+    """Decimal and thousands mark of the numbers in a table."""
 
     decimal: str = '.'
     thousands: str = ''
@@ -35,10 +35,10 @@ class Marks:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Numbers of a column, NaN where no number stands, and what stands there instead.
+    """Numbers of a column, NaN for other cells, and counts of the other cells.
 
-    ``words`` counts texts that are no numbers, ``empty`` the cells that are empty or hold a word
-    that means so; ``first_bad_row`` is the row of the first word, -1 if there is none.
+    ``words`` counts the texts that are no numbers, ``empty`` the cells that are empty or hold a
+    word for it such as 'n/a'. ``first_bad_row`` is the row of the first text, -1 if none.
     """
 
     values: FloatArray
@@ -48,12 +48,12 @@ class Column:
 
     @property
     def bad(self) -> int:
-        """Return how many cells hold something else than a number."""
+        """Return the number of cells with a text that is no number."""
         return self.words.total()
 
 
 def to_numbers(column: pd.Series[Any], marks: Marks = Marks()) -> Column:
-    """Return float64 values of cells in the order of the file; NaN where none stands."""
+    """Return the float64 values of cells in file order; NaN for cells without a number."""
     import pandas as pd
 
     if column.dtype.kind in 'iufb' and not hasattr(column.dtype, 'na_value'):
@@ -71,7 +71,7 @@ def to_numbers(column: pd.Series[Any], marks: Marks = Marks()) -> Column:
 
 
 def _finish(values: FloatArray, text: pd.Series[Any], marks: Marks) -> Column:
-    """Look at the cells that are no plain numbers one kind of text at a time."""
+    """Convert the remaining cells; each different text is converted once."""
     import pandas as pd
 
     left = np.flatnonzero(np.isnan(values))
@@ -97,7 +97,7 @@ def _finish(values: FloatArray, text: pd.Series[Any], marks: Marks) -> Column:
 
 
 def _number(text: str, marks: Marks) -> float:
-    """Return the number a text spells, NaN if it spells none."""
+    """Return the number in a text; NaN if it is no number."""
     plain = text
     for mark in _PARTING:
         if mark in plain and _is_grouped(plain.replace(marks.decimal, '.'), mark):
@@ -118,7 +118,7 @@ def _number(text: str, marks: Marks) -> float:
 
 
 def _is_grouped(text: str, mark: str) -> bool:
-    """Tell whether a mark parts a number's digits by threes."""
+    """Return True if a mark separates groups of three digits."""
     head, *groups = text.lstrip('+-').partition('.')[0].split(mark)
     if mark == '.':
         head, *groups = text.lstrip('+-').split(mark)
@@ -155,7 +155,7 @@ _OPC_GOOD, _OPC_UNCERTAIN = 192, 64
 
 
 def quality_column(name: str, names: tuple[str, ...]) -> int | None:
-    """Return the place of the column that holds the quality of the column ``name``."""
+    """Return the index of the quality column of the column ``name``; None if there is none."""
     own = folded(split_unit(name)[0])
     for place, other in enumerate(names):
         text = folded(other)
@@ -166,7 +166,7 @@ def quality_column(name: str, names: tuple[str, ...]) -> int | None:
 
 
 def quality_columns(names: tuple[str, ...]) -> set[int]:
-    """Return the places of all columns that are the quality of another."""
+    """Return the indices of all columns that hold the quality of another column."""
     bare = {folded(split_unit(name)[0]) for name in names} - {''}
     found = set()
     for place, name in enumerate(names):
@@ -180,9 +180,9 @@ def quality_columns(names: tuple[str, ...]) -> set[int]:
 
 
 def understands(cells: list[str]) -> bool:
-    """Tell whether these cells are words or OPC codes of quality.
+    """Return True if these cells are quality words or OPC quality codes.
 
-    Bare 0, 1, 2 are not: one historian's 0 is good, another's is bad.
+    Codes 0, 1, 2 alone are not accepted: 0 is good in one historian and bad in another.
     """
     text = [cell.strip() for cell in cells if cell.strip()]
     if not text:
@@ -195,7 +195,7 @@ def understands(cells: list[str]) -> bool:
 
 
 def foreign_quality(column: pd.Series[Any]) -> ByteArray:
-    """Return a `Quality` per cell; what is not understood is bad, as in our own tables."""
+    """Return a `Quality` per cell; an unknown text or code is bad, as in `to_quality`."""
     import pandas as pd
 
     codes, kinds = pd.factorize(column.astype('string').str.strip())
@@ -205,7 +205,7 @@ def foreign_quality(column: pd.Series[Any]) -> ByteArray:
 
 
 def _word(text: str) -> Quality | None:
-    """Return the gravest quality that a text tells: 'Raw, Bad' is bad, and so is 'Not Good'."""
+    """Return the worst quality in a text ('Raw, Bad' and 'Not Good' are bad), None if unknown."""
     found = [quality for clause in _CLAUSES.split(text) for quality in _told(folded(clause))]
     return max(found, default=None)
 
@@ -218,7 +218,7 @@ def _told(clause: str) -> Iterator[Quality]:
         elif not denied and word in _BY_WORD:
             yield _BY_WORD[word]
         elif word in _PRAISE:
-            # What is not good is bad; what is not anything else ('no error') says nothing.
+            # 'Not good' is bad; the negation of another word ('no error') is ignored.
             yield Quality.BAD
 
 

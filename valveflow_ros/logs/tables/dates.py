@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Finds out how a table writes its dates, and refuses what could be read in two ways."""
+"""Determines the date format of a table, and refuses ambiguous dates."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-# Formats of pandas, tried in this order on what the one before did not read.
+# Formats of pandas; each is tried on the texts that the previous ones could not read.
 _CLOCKS_24 = (' %H:%M:%S', ' %H:%M:%S.%f', ' %H:%M', '')
 _CLOCKS_12 = (' %I:%M:%S %p', ' %I:%M %p', ' %I:%M:%S.%f %p', '')
 _ISO = re.compile(r'\d{4}-\d{1,2}-\d{1,2}(?:[T ].*)?$|\d{8}T\d+.*$')
@@ -28,14 +28,14 @@ _PARTS = re.compile(r'(\d{1,4})([./-])(\d{1,2})\2(\d{1,4})(?=[T ,]|$)')
 _NAMED = re.compile(r'(\d{1,2})[-. ]+([^\W\d]{3,9})\.?[-. ,]+(\d{2,4})(?=[T ,]|$)')
 _NAMED_FIRST = re.compile(r'([^\W\d]{3,9})\.? +(\d{1,2}),? +(\d{4})(?=[T ,]|$)')
 _TWELVE = re.compile(r'\d\s*[ap]\.?m\.?\s*$', re.IGNORECASE)
-# An offset without a colon is one only behind a time of day: a date may end in '-05' or '-2026'.
+# An offset without a colon must follow a time of day, because a date may end in '-05' or '-2026'.
 _ZONED = re.compile(
     r'(?:Z|UTC|GMT|[+-]\d{2}:\d{2})\s*$|\b(?:CES?T|MES?Z)\s*$|'
     r'(?:\d:\d{2}|T\d{2,6})(?:[.,]\d+)?\s*(?:UTC|GMT)?[+-]\d{2}(?:\d{2})?\s*$'
 )
-# The T of ISO 8601, which others put between date and time too.
+# The T of ISO 8601 between date and time, which other formats use, too.
 _BETWEEN = re.compile(r'(?:(?<=\d)|^)T(?=\d)')
-# Names of months as far as they differ from the English ones.
+# Names of months that differ from the English abbreviations.
 MONTHS = {
     'januar': 'jan', 'jän': 'jan', 'februar': 'feb', 'märz': 'mar', 'mär': 'mar', 'mrz': 'mar',
     'mai': 'may', 'juni': 'jun', 'juli': 'jul', 'oktober': 'oct', 'okt': 'oct',
@@ -47,10 +47,10 @@ MONTHS = {
 
 @dataclass(frozen=True, slots=True)
 class DateStyle:
-    """How dates are written.
+    """Format of dates.
 
-    ``formats`` are those of strptime, none for ISO 8601; ``words`` is an example of one; ``zoned``
-    tells whether the texts name their zone, ``named`` whether months are written as words.
+    ``formats`` are strptime formats, none for ISO 8601; ``words`` is an example for messages.
+    ``zoned`` is True if the texts contain a zone, ``named`` if months are written as words.
     """
 
     formats: tuple[str, ...] = ()
@@ -60,10 +60,10 @@ class DateStyle:
 
 
 def date_style(cells: list[str], order: str, where: str) -> DateStyle | None:
-    """Return how these samples from the whole file write dates, ``None`` if they are none.
+    """Return the date format of samples from the whole file; ``None`` if they are no dates.
 
-    ``order`` is what the person said, ``dmy``, ``mdy``, ``ymd`` or nothing; ``where`` names file
-    and column. Raises `InputError` if day and month cannot be told apart.
+    ``order`` is given by the user: ``dmy``, ``mdy``, ``ymd`` or empty. ``where`` is file and
+    column, for messages. Raises `InputError` if day and month cannot be distinguished.
     """
     text = [cell.strip() for cell in cells if cell.strip()]
     if not text:
@@ -101,7 +101,7 @@ def _style(
 def _day_first(
     parts: list[re.Match[str]], mark: str, order: str, where: str, example: str
 ) -> bool | None:
-    """Tell whether the day comes before the month; ``None``: the year comes first."""
+    """Return True if the day comes before the month, ``None`` if the year comes first."""
     if order:
         return {'dmy': True, 'mdy': False, 'ymd': None}[order]
     first_large = any(int(m[1]) > 12 for m in parts)
@@ -120,7 +120,7 @@ def _day_first(
 
 
 def tidied(text: str) -> str:
-    """Return a text of date and time in the form the formats of `DateStyle` know."""
+    """Return a text of date and time in a form that the formats of `DateStyle` can read."""
     plain = ' '.join(_BETWEEN.sub(' ', text).split())
     plain = re.sub(r'(\d)\s*([AaPp])\.?[Mm]\.?$', lambda m: f'{m[1]} {m[2].upper()}M', plain)
     plain = re.sub(r'(:\d{2}),(\d+)', r'\1.\2', plain)
@@ -128,7 +128,7 @@ def tidied(text: str) -> str:
 
 
 def english(text: str) -> str:
-    """Return a text with its month as an English abbreviation, parted by lines."""
+    """Return a date with an English month abbreviation and hyphens, such as 5-mar-2026."""
     found = _NAMED.match(text)
     if found:
         head = f'{found[1]}-{_month(found[2])}-{found[3]}'
@@ -148,11 +148,11 @@ _HOUR_NS = 3_600_000_000_000
 
 
 class LocalClock:
-    """Gives local times their place in UTC, block by block in the order of the file.
+    """Converts local times to UTC, block by block in file order.
 
-    In the hour that comes twice in autumn the first pass is summer time; the
-    second begins where the times go back. Where rows stand newest first
-    (`newest_first`) it is the other way round.
+    In the repeated hour in autumn, the first pass is summer time; the second
+    pass begins where the times go back. If the rows are in descending order
+    (`newest_first`), it is reversed.
     """
 
     def __init__(self, zone: tzinfo, name: str, where: str) -> None:
@@ -165,12 +165,12 @@ class LocalClock:
         self.newest_first = False
 
     def to_utc(self, stamps: pd.Series[Any]) -> pd.Series[Any]:
-        """Return naive local stamps as stamps in UTC; NaT stays NaT.
+        """Convert local timestamps without a zone to UTC; NaT stays NaT.
 
         Raises
         ------
         InputError
-            If a time does not exist in the zone: its clock was being set forward.
+            If a time does not exist in the zone, because its clock was set forward.
         """
         import pandas as pd
 
@@ -194,7 +194,7 @@ class LocalClock:
         )
 
     def _later(self, local: IntArray, twice: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Tell for each row whether it belongs to the second pass of an hour."""
+        """Return True for each row in the second pass of a repeated hour."""
         later = np.zeros(len(local), dtype=np.bool_)
         places = np.flatnonzero(twice)
         for group in np.split(places, np.flatnonzero(np.diff(places) > 1) + 1):

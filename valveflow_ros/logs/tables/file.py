@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Opens a table's file of any kind, finds its heading, and gives its rows block by block."""
+"""Opens a table file of any kind, finds its heading, and yields its rows block by block."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from valveflow_ros.logs.tables.words import is_unit, split_unit
 if TYPE_CHECKING:
     import pandas as pd
 
-_LOOK = 60  # rows from which the shape of a table is seen
+_LOOK = 60  # rows that determine the layout of a table
 _NUMBER = re.compile(r"[+-]?(?:\d[\d.,'’ \u00a0\u202f]*|[.,]\d+)(?:[eE][+-]?\d+)?")
 _STAMP = re.compile(
     r'\d{1,4}[-./]\d{1,2}[-./]\d{1,4}(?:[T ].*)?|\d{1,2}[-. ][^\W\d]{3,9}[-. ]\d{2,4}.*|'
@@ -39,7 +39,7 @@ _STAMP = re.compile(
 BLOCK_ROWS = 200_000
 _HEAD_BYTES = 256 * 1024
 _HEAD_ROWS = 400
-_PEEKS = 48  # places in the middle of a long file that are looked at
+_PEEKS = 48  # positions in a long file from which rows are sampled
 _PEEK_BYTES = 4096
 BOOKS = ('.xlsx', '.xlsm')
 
@@ -48,9 +48,9 @@ BOOKS = ('.xlsx', '.xlsm')
 class Heading:
     """The rows above the data.
 
-    ``row`` is that of the names, from 0; ``others`` those between the names and the data: units,
-    descriptions. ``names``, ``units`` and ``about`` have an entry for each column, empty where
-    nothing stands; the names as they stand in the file.
+    ``row`` is the row of the names, counted from 0. ``others`` are the rows between the names and
+    the data, with units or descriptions. ``names``, ``units`` and ``about`` have one entry per
+    column, empty if the cell is empty; names are not changed.
     """
 
     row: int
@@ -67,12 +67,12 @@ class Heading:
 
 @dataclass
 class TableFile:
-    """A table that was looked at and not yet read.
+    """A table whose layout is known and whose data are not read yet.
 
-    ``rows`` are some of its data from its beginning, from places on the way, and from its end
-    (``None``: only the names of the columns were read so far); ``marks`` is ``None`` where a
-    comma may be either mark; ``notes`` are complete when all blocks were read;
-    ``share`` is how much of a text was read so far, 0 to 1.
+    ``rows`` are samples from its beginning, middle and end (``None`` if only the column names
+    were read). ``marks`` is ``None`` if a comma may be the decimal or the thousands mark.
+    ``notes`` are complete when all blocks were read. ``share`` is the fraction of a text file
+    read so far, 0 to 1.
     """
 
     path: Path
@@ -89,11 +89,11 @@ class TableFile:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the names of the columns as they stand in the file."""
+        """Return the names of the columns in the file, unchanged."""
         return self.heading.names
 
     def samples(self, *places: int) -> list[tuple[str, ...]]:
-        """Return what stands at these places in some rows; not of rows that end before.
+        """Return the cells of these columns in some rows, without rows that are too short.
 
         Raises
         ------
@@ -108,12 +108,12 @@ class TableFile:
         return [tuple(row[k].strip() for k in places) for row in whole]
 
     def blocks(self, places: Sequence[int]) -> Iterator[pd.DataFrame]:
-        """Yield the columns at these places, named by them, block by block.
+        """Yield the columns with these indices block by block, named by their index.
 
         Raises
         ------
         RecordingError
-            If the file cannot be read on.
+            If the file cannot be read, or has no rows.
         """
         wanted = sorted(set(places))
         with _translated(self.path):
@@ -141,7 +141,7 @@ class TableFile:
         marks = self.marks or Marks()
         with Source.open(self.path) as source:
             with warnings.catch_warnings():
-                # From pandas 4 on the exact way of reading decimals is the only one.
+                # pandas 4 has only the exact parser and warns about this argument.
                 warnings.simplefilter('ignore', DeprecationWarning)
                 frames = pd.read_csv(
                     Lines(self.path, source.stream, self.encoding, self.separator),
@@ -150,7 +150,7 @@ class TableFile:
                     header=0,
                     skiprows=list(self.skip),
                     usecols=places,
-                    # The quick way of reading decimals may miss the nearest double.
+                    # The default parser does not always return the nearest double.
                     float_precision='round_trip',
                     keep_default_na=False,
                     na_values=[''],
@@ -165,7 +165,7 @@ class TableFile:
 
 
 def look_at(path: Path, options: TableOptions = AS_SEEN) -> TableFile:
-    """Look at a table: its kind, its columns, how its numbers are written.
+    """Determine the kind of a table, its columns and the format of its numbers.
 
     Raises
     ------
@@ -216,7 +216,7 @@ def _look_at_text(source: Source, path: Path, head: bytes, options: TableOptions
 
 
 def _peeks(source: Source, encoding: str, separator: str, start: int) -> list[list[str]]:
-    """Return some rows from places throughout the rest of a long file, the last one too."""
+    """Return some rows from the rest of a long file, including the last row."""
     rest = source.size - start
     if rest <= 0:
         return []
@@ -227,7 +227,7 @@ def _peeks(source: Source, encoding: str, separator: str, start: int) -> list[li
     places = {*range(start, source.size, step), max(start, source.size - _PEEK_BYTES)}
     for place in sorted(places):
         text = source.read(place - place % wide, _PEEK_BYTES).decode(codec, errors='replace')
-        # What was cut at both ends is no whole row.
+        # The first and the last line are incomplete.
         lines = text.splitlines()[1:]
         at_end = place + _PEEK_BYTES >= source.size
         rows += [cells_of(line, separator) for line in (lines if at_end else lines[:-1])[-3:]]
@@ -243,7 +243,7 @@ def _marks(rows: list[list[str]], separator: str, options: TableOptions) -> Mark
     if found is None:
         return None
     if separator == ';' and found == ('.', ''):
-        # Whole numbers only so far: what such tables write later is a comma.
+        # Only whole numbers so far: tables with semicolons usually have a decimal comma.
         points = any('.' in cell for row in rows for cell in row)
         return Marks('.' if points else ',')
     return Marks(*found)
@@ -251,7 +251,7 @@ def _marks(rows: list[list[str]], separator: str, options: TableOptions) -> Mark
 
 @contextmanager
 def _translated(path: Path) -> Iterator[None]:
-    """Turn what pandas, pyarrow and python-calamine raise into sentences."""
+    """Turn the exceptions of pandas, pyarrow and python-calamine into `RecordingError`."""
     try:
         yield
     except (RecordingError, InputError, GeneratorExit):
@@ -259,7 +259,7 @@ def _translated(path: Path) -> Iterator[None]:
     except MemoryError:
         raise RecordingError(path, 'is too large for the memory of this machine') from None
     except Exception as error:  # noqa: BLE001
-        # They raise what they like for a file they do not understand.
+        # These libraries raise many kinds of exceptions for an invalid file.
         reason = str(error).strip().split('\n')[0][:160] or type(error).__name__
         raise RecordingError(path, f'cannot be read as a table ({reason})') from None
 
@@ -267,8 +267,8 @@ def _translated(path: Path) -> Iterator[None]:
 def heading(rows: list[list[str]]) -> Heading:
     """Find the names of the columns among the first rows of a table.
 
-    A preamble above them is left out; rows of units and descriptions below
-    them are told apart.
+    A preamble above them is ignored. Rows below them are recognised as units or
+    descriptions.
     """
     usual = Counter(_full_cells(row) for row in rows if _full_cells(row) > 1)
     least = 0.5 * max(usual, key=lambda size: (usual[size], size), default=0)
@@ -279,7 +279,7 @@ def heading(rows: list[list[str]]) -> Heading:
         return _heading(rows, at, ())
     width = len(rows[first])
     above = [k for k in filled if k < first]
-    # Only rows right above the data and as wide as they belong to the heading.
+    # Only rows directly above the data and about as wide belong to the heading.
     block: list[int] = []
     for k in reversed(above):
         if _full_cells(rows[k]) < 2 or len(rows[k]) < 0.6 * width:
@@ -299,7 +299,7 @@ def _is_data(row: list[str], least: float) -> bool:
         return False
     values = [cell for cell in cells if _NUMBER.fullmatch(cell) or _STAMP.fullmatch(cell)]
     stamped = any(_STAMP.fullmatch(cell) for cell in cells[:3])
-    # A row of a long table has more words than values: tag, time, value, unit, description.
+    # A row of a long table has more texts than values: tag, time, value, unit, description.
     return len(row) > 1 and bool(values) and (2 * len(values) >= len(cells) or stamped)
 
 

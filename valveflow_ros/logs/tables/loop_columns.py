@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads the columns of one control loop from a table: command, position, process value, set point.
 
-Their names are those of control systems: MV or OP, PV, SP or SV behind a tag, or words. Nothing is
-said of units: a loop is judged by how its columns move together.
+Columns are recognised by names of control systems, such as MV, OP, PV, SP or SV after a tag, or by
+words. Units are not used, because a loop is judged by how its columns change together.
 """
 
 from __future__ import annotations
@@ -54,16 +54,16 @@ _TAG = {
 
 @dataclass(frozen=True, slots=True)
 class LoopColumns:
-    """Columns of a loop as they stand in a table, rows in the order of time.
+    """Columns of a loop in a table, with rows in time order.
 
     Attributes
     ----------
     time_ns : int64 (n,)
-        Strictly increasing.
+        Times in ns since 1970, strictly increasing.
     columns : dict of str to float64 (n,)
-        By role; NaN where no number stands.
+        Values by role; NaN for cells without a number.
     names : dict of str to str
-        What they are called in the table.
+        Names in the table by role.
     """
 
     time_ns: IntArray
@@ -79,18 +79,18 @@ def read_loop_columns(
     Parameters
     ----------
     path : Path
-        Text of any common separator, ``.xlsx`` or ``.parquet``, a column a signal.
+        Text with any common separator, ``.xlsx`` or ``.parquet``, with one column per signal.
     named : mapping of str to str
-        Columns by role that a person named, also ``time``; the others are found by their names.
+        Columns named by the user, by role or ``time``; the others are recognised by their names.
     options : TableOptions
-        What the table does not say itself.
+        What the user says about the table.
 
     Raises
     ------
     RecordingError
-        The file cannot be read as a table.
+        If the file cannot be read as a table.
     InputError
-        A column is missing or could be several.
+        If a column is missing or ambiguous.
     """
     import pandas as pd
 
@@ -113,12 +113,12 @@ def read_loop_columns(
 def ordered(
     time_ns: IntArray, values: Mapping[str, FloatArray], names: Mapping[str, str]
 ) -> LoopColumns:
-    """Return columns in the order of time, the first row of each time.
+    """Return columns in time order, with the first row of each time.
 
     Raises
     ------
     DataError
-        No row has a time.
+        If no row has a time.
     """
     rows = np.flatnonzero(time_ns != NEVER)
     if not len(rows):
@@ -128,13 +128,13 @@ def ordered(
 
 
 def roles_of(names: list[str], about: list[str]) -> dict[str, list[int]]:
-    """Return the columns that may have each role, by the clearest ground that any column gives."""
-    # MV is a millivolt to some; the name is looked at with and without what may be a unit.
+    """Return the columns that may have each role, found by the most specific rule that matches."""
+    # MV may also be the unit millivolt, so names are tried with and without a possible unit.
     plain = [f'{folded(name)}\n{folded(split_unit(name)[0])}' for name in names]
     told = [folded(text) for text in about]
     found: dict[str, list[int]] = {}
     for role in reversed(ROLES):
-        # 'flow_setpoint' is no flow.
+        # Set points are excluded from the other roles: 'flow_setpoint' is not a flow.
         wanted = set(found.get(SET_POINT, ()))
         grounds = (
             (plain, rf'(?:^| )(?:{_SHORT[role]})$'),
@@ -157,7 +157,7 @@ def roles_of(names: list[str], about: list[str]) -> dict[str, list[int]]:
 def _recognised(
     path: Path, file: TableFile, places: Mapping[str, int], taken: set[int | None]
 ) -> dict[str, int]:
-    """Return the columns that nobody named, by role."""
+    """Return the columns by role that the user did not name."""
     heading = file.heading
     found = roles_of(list(heading.names), list(heading.about))
     chosen: dict[str, int] = {}
@@ -202,7 +202,7 @@ def _found(matcher: Matcher, path: Path, theirs: str) -> int:
 def _time_places(
     file: TableFile, named: int | None, options: TableOptions
 ) -> tuple[int | None, int | None]:
-    """Return the places of the time and of a date apart; none where the period is told."""
+    """Return the indices of the time and of a separate date; None without a time column."""
     time, date = time_columns(file.heading)
     if named is not None:
         return named, None

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Decides which column of a table is which signal, and refuses what it cannot decide."""
+"""Assigns the columns of a table to signals, and refuses ambiguous tables."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from valveflow_ros.logs.tables.words import (
 from valveflow_ros.records import SIGNALS, Signal
 
 TIME, DATE = 'time', 'date'
-# What a column is called that was the unnamed index of a DataFrame.
+# Column names of the unnamed index of a DataFrame.
 NAMES_OF_AN_INDEX = ('', 'Unnamed: 0', '__index_level_0__')
 _TIME_WORDS = re.compile(
     r'time ?stamp|zeit ?stempel|date ?time|datum ?(?:und ?)?(?:uhr)?zeit|^(?:\w+ )?time$|'
@@ -54,9 +54,9 @@ _GROUNDS = {EXACT: '', CLEAR: 'by its name', LIKELY: 'by its name', TAG: 'by its
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """A column that stands for a signal: its place from 0, its name and unit in the file.
+    """A column chosen for a signal: its index from 0, its name and its unit in the file.
 
-    ``ground`` says why it was chosen; it is empty where nothing had to be guessed.
+    ``ground`` is the reason for the choice; empty if the name is exact or given by the user.
     """
 
     place: int
@@ -66,10 +66,10 @@ class Chosen:
 
 
 class Matcher:
-    """Chooses among columns (or, in a long table, among tags).
+    """Assigns columns (in a long table: tags) to signals.
 
-    ``what`` is ``column`` or ``tag``; ``taken`` are columns that stand for something else already,
-    as the time.
+    ``what`` is ``column`` or ``tag``; ``taken`` are columns that have another use, such as the
+    time.
     """
 
     def __init__(
@@ -83,12 +83,12 @@ class Matcher:
         self._taken = set(taken)
 
     def find(self, theirs: str) -> int | None:
-        """Return the column of this name, with or without the unit in it.
+        """Return the column with this name, with or without its unit; None if there is none.
 
         Raises
         ------
         InputError
-            If several have it.
+            If several columns have this name.
         """
         wanted = theirs.strip()
         same = [k for k, name in enumerate(self.names) if name == wanted]
@@ -103,9 +103,9 @@ class Matcher:
     ) -> dict[Signal, Chosen]:
         """Return the column of each signal.
 
-        ``wanted`` are columns that the person named, ``spared`` signals that need not be there;
-        ``no_time`` is told with the rest that is open, in one `RefusedError`. Raises `InputError`
-        if several columns have the same name.
+        ``wanted`` are the columns named by the user, ``spared`` the signals that may be missing;
+        ``no_time`` says that the time is missing. All problems are raised in one `RefusedError`.
+        Raises `InputError` if several columns have the same name.
         """
         chosen: dict[Signal, Chosen] = {}
         absent: dict[Signal, str] = {}
@@ -127,7 +127,7 @@ class Matcher:
                 continue
             mark = max((m[info.signal] for m in marked if info.signal in m), default=0.0)
             best = [k for k, m in enumerate(marked) if m.get(info.signal) == mark]
-            # A constant is to take the place of the signal, whatever the names suggest.
+            # The user replaces this signal by a constant, so only an exact name is used.
             if info.signal in spared and mark < EXACT:
                 continue
             if len(best) == 1:
@@ -158,7 +158,7 @@ class Matcher:
         remedies: list[Remedy],
         chosen: Mapping[Signal, Chosen],
     ) -> None:
-        """Move from the missing what one column alone could be by its unit."""
+        """Propose a column for a missing signal if it is the only one left in a suitable unit."""
         for info in SIGNALS:
             only = self._only_in_unit_of(info.signal, chosen) if info.topic in missing else None
             if only is not None:
@@ -170,7 +170,7 @@ class Matcher:
                 remedies.append(choosing(info.topic, only))
 
     def _only_in_unit_of(self, signal: Signal, chosen: Mapping[Signal, Chosen]) -> str | None:
-        """Return the only column left that is in a unit of a signal; None if there is none."""
+        """Return the only unused column with a unit of the signal; None if not exactly one."""
         taken = {*self._taken, *(c.place for c in chosen.values())}
         found = [
             name for k, name in enumerate(self.names)
@@ -209,7 +209,7 @@ class Matcher:
         )
 
     def missing(self, theirs: str, name: str) -> RefusedError:
-        """Return the error for a column of times that the person named and that is not there."""
+        """Return the error for a time column that the user named and that does not exist."""
         return RefusedError(
             self.path,
             f"there is no {self.what} '{theirs}'; the {self.what}s are: {self._have()}. "
@@ -225,7 +225,7 @@ class Matcher:
         )
 
     def unit_of(self, place: int) -> Spelling | None:
-        """Return the unit that the file names for a column."""
+        """Return the unit of a column in the file; None if absent or unknown."""
         if not self._units[place]:
             return None
         return of_gauge(spelling(self._units[place]), f'{self.names[place]} {self._about[place]}')
@@ -239,24 +239,24 @@ class Matcher:
                 continue
             bare = split_unit(name)[0]
             everything = marks(bare, self._about[place], self.unit_of(place))
-            # A column is one thing: what it is less likely to be, it is not.
+            # A column is one signal only, so only its best marks are kept.
             most = max(everything.values(), default=0.0)
             found.append({s: m for s, m in everything.items() if m == most})
         return found
 
 
 def option(topic: str, theirs: str, unit: str = '') -> str:
-    """Return the option that chooses a column, as it can be pasted into a shell."""
+    """Return the option that selects a column, quoted for a shell."""
     return str(choosing(topic, theirs, unit))
 
 
 def choosing(topic: str, theirs: str, unit: str = '') -> Remedy:
-    """Return the option that chooses a column."""
+    """Return the option that selects a column."""
     return Remedy('column', f'{topic}={theirs}' + (f':{unit}' if unit else ''))
 
 
 def time_columns(heading: Heading) -> tuple[int | None, int | None]:
-    """Return the places of the time and, where it stands apart, of the date."""
+    """Return the indices of the time column and of a separate date column; None if absent."""
     names = heading.names
     if TIME in names:
         return names.index(TIME), (names.index(DATE) if DATE in names else None)
@@ -272,7 +272,7 @@ def time_columns(heading: Heading) -> tuple[int | None, int | None]:
 
 
 def stamps_in(cells: list[str]) -> bool:
-    """Tell whether most cells of a column are dates with a time of day."""
+    """Return True if most cells of a column are dates with a time of day."""
     stamps = sum(bool(_STAMP.fullmatch(cell.strip())) for cell in cells)
     return bool(cells) and 2 * stamps > len(cells)
 
@@ -282,20 +282,20 @@ def _is_time(name: str) -> bool:
 
 
 def zone_in(name: str) -> str:
-    """Return the zone that a time column's name tells, empty if it tells none."""
+    """Return the time zone in the name of a time column; empty if there is none."""
     found = re.search(r'[\[({ ](UTC|GMT|[A-Z][A-Za-z]+/[\w/+-]+|(?:UTC)?[+-]\d{1,2}(?::?\d{2})?)'
                       r'[\])} ]*$', name)  # fmt: skip
     if not found:
         return ''
-    # 'PI Date/Time' reads like one, and is none.
+    # 'PI Date/Time' looks like a zone but is none.
     named = '/' not in found[1] or found[1] in zoneinfo.available_timezones()
     return found[1] if named else ''
 
 
 def local_zone_in(name: str) -> tuple[str, str]:
-    """Return a zone's abbreviation in a name, and a place where it is used.
+    """Return the abbreviation of a zone in a name, and a place where it is used.
 
-    It does not say whether summer time is kept.
+    The abbreviation does not say whether the clock changes to summer time.
     """
     found = re.search(rf'\b({"|".join(_LOCAL)})\b', name)
     return (found[1], _LOCAL[found[1]]) if found else ('', '')

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Understands a table before it is read, and then reads it block by block."""
+"""Determines the columns of a table, and then reads it block by block."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ from valveflow_ros.records import (
 if TYPE_CHECKING:
     import pandas as pd
 
-# Names of columns in a table with a row for each value, as PI and its kin export them.
+# Column names in a long table (one row per value), as exported by PI and other historians.
 _TAG = re.compile(
     r'^(?:pi )?(?:tag|point|sensor|item|variable|signal|name|kks|channel)(?: ?(?:name|id))?$|'
     r'^(?:messstelle|kennzeichen|messstellenname|messgroesse|tag path)$'
@@ -66,7 +66,7 @@ _ABOUT = re.compile(r'^(?:description|descriptor|beschreibung|bezeichnung|commen
 
 @dataclass(frozen=True, slots=True)
 class RawBlock:
-    """Some rows in the order of the file, as in `RawTable`; only those whose time is known."""
+    """Some rows in file order, as in `RawTable`, without rows whose time is unknown."""
 
     time_ns: IntArray
     columns: dict[str, FloatArray]
@@ -76,7 +76,7 @@ class RawBlock:
 
 @dataclass(frozen=True, slots=True)
 class LongForm:
-    """Where the columns of a table with a row for each value stand; -1 where there is none."""
+    """Column indices of a long table (one row per value); -1 for a column that is absent."""
 
     tag: int
     value: int
@@ -86,7 +86,7 @@ class LongForm:
 
     @classmethod
     def of(cls, heading: Heading) -> LongForm | None:
-        """Return the places of a long table's columns, ``None`` if it is none."""
+        """Return the column indices of a long table; ``None`` if the table is not long."""
         names = [folded(split_unit(name)[0]) for name in heading.names]
         places = [
             next((k for k, name in enumerate(names) if pattern.search(name)), -1)
@@ -95,7 +95,7 @@ class LongForm:
         return None if min(places[:2]) < 0 else cls(*places)
 
     def tags(self, file: TableFile) -> Heading:
-        """Return the tags as if they were columns; reads all of their names."""
+        """Return the tags as if they were columns; reads the whole column of tags."""
         places = sorted({k for k in (self.tag, self.unit, self.about) if k >= 0})
         found: dict[str, tuple[str, str]] = {}
         for frame in file.blocks(places):
@@ -110,7 +110,7 @@ class LongForm:
 
 
 class TableReader:
-    """A table whose columns are understood.
+    """A table whose columns are assigned to signals.
 
     Parameters
     ----------
@@ -122,19 +122,19 @@ class TableReader:
     Attributes
     ----------
     names, units, grounds : dict[str, str]
-        By contract column name: theirs, the unit the file names, why it was chosen.
+        By contract column name: the name in the file, the unit in the file, the reason.
     ignored : tuple of str
-        Columns (of a long table: tags) that are not used.
+        Columns (in a long table: tags) that are not used.
     words : dict[str, Counter]
-        By contract column name: what stands in place of numbers, how often; complete
-        when all blocks were read.
+        By contract column name: counts of the texts that are no numbers. Complete when
+        all blocks were read.
     bad_times : int
-        Rows without a readable time; likewise.
+        Number of rows without a readable time. Complete when all blocks were read.
 
     Raises
     ------
     RecordingError, InputError
-        As `read_table`.
+        As in `read_table`.
     """
 
     def __init__(
@@ -182,22 +182,22 @@ class TableReader:
 
     @property
     def bad_cells(self) -> dict[str, int]:
-        """Return how many cells hold something else than a number, where some do."""
+        """Return the number of cells that are no numbers, for columns that have any."""
         return {name: words.total() for name, words in self.words.items() if words}
 
     @property
     def share(self) -> float:
-        """Return how much of the file was read so far, as far as that is known."""
+        """Return the fraction of the file that was read so far; 0 if unknown."""
         return self._file.share
 
     @property
     def time_zone(self) -> str:
-        """Return the zone the times were taken to be in, and why; known when all was read."""
+        """Return the assumed zone of the times and its origin; valid after all blocks."""
         return self._clock.told_zone
 
     @property
     def time_words(self) -> str:
-        """Return which column the times are from and how they are written."""
+        """Return the time column and the format of the times, as a clause."""
         names = [self._file.names[k] for k in (self._date, self._time) if k is not None]
         if not names:
             return self._clock.words
@@ -206,11 +206,11 @@ class TableReader:
 
     @property
     def local_guess(self) -> bool:
-        """Tell whether the times name no zone and UTC was taken for want of a better word."""
+        """Return True if the times have no zone, so that UTC was assumed."""
         return self._clock.told_zone.startswith('UTC (')
 
     def blocks(self) -> Iterator[RawBlock]:
-        """Yield the rows whose time is known, block by block; raises like `read_table`."""
+        """Yield the rows that have a time, block by block; raises like `read_table`."""
         places = [k for k in (self._time, self._date) if k is not None]
         long, coded = self.long, False
         if long is not None:
@@ -242,12 +242,12 @@ class TableReader:
                 )
 
     def notes(self) -> list[str]:
-        """Return sentences about what was read, when all of it was.
+        """Return sentences about the data, after all blocks were read.
 
         Raises
         ------
         InputError
-            If no row has a time.
+            As `TimeReader.finish`, for example if no row has a time.
         """
         notes = [*self._file.notes, *self._clock.finish()]
         for name, theirs in self.names.items():
@@ -272,7 +272,7 @@ class TableReader:
         return notes
 
     def understood(self) -> list[str]:
-        """Return sentences about what had to be found out: which column is which signal."""
+        """Return sentences about what was inferred: the columns of the signals and the zone."""
         said = []
         for name, ground in self.grounds.items():
             unit = self._chosen[name].unit
@@ -301,21 +301,21 @@ class TableReader:
         time, date = places[TIME], places[DATE]
         if time is None:
             return date, None
-        # Two columns of this name are refused.
+        # Raises if two columns have this name.
         matcher.find(self._file.names[time])
-        # A date beside it is wanted only where the time is one of the day alone.
+        # A separate date is used only if the time column holds times of day.
         cells = self._cells(time)
         clock = sum(c.count(':') >= 1 and not any(m in c for m in '-/T') and len(c) <= 15
                     and c.find('.') not in range(5) for c in cells)  # fmt: skip
         return time, (date if date != time and 2 * clock > len(cells) else None)
 
     def _index_of_times(self) -> int | None:
-        """Return the column without a name that holds times: pandas writes an index so."""
+        """Return the unnamed column that holds times, as pandas writes an index."""
         places = (k for k, name in enumerate(self._file.names) if name in NAMES_OF_AN_INDEX)
         return next((k for k in places if stamps_in(self._cells(k))), None)
 
     def _cells(self, place: int) -> list[str]:
-        """Return what stands in a column in the rows that were looked at."""
+        """Return the non-empty cells of a column in the sampled rows."""
         return [cell for (cell,) in self._file.samples(place) if cell]
 
     def _long_form(self, by_signal: Mapping[Signal, str]) -> LongForm | None:
@@ -323,7 +323,7 @@ class TableReader:
         names = self._file.names
         if any(i.column in names or i.topic in names for i in SIGNALS):
             return None
-        # A person who names columns of the table means a wide one.
+        # If the user named columns of the table, it is a wide table.
         return None if any(theirs in names for theirs in by_signal.values()) else form
 
     def _quality_places(self) -> dict[str, int]:

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a table leaves open, and the option of the command that would decide it."""
+"""Questions that a table leaves open, and the command-line options that answer them."""
 
 from __future__ import annotations
 
@@ -13,41 +13,41 @@ from typing import NamedTuple
 
 from valveflow_ros.errors import InputError
 
-# Stands for a name that only the person knows.
+# Placeholder for a name that only the user knows.
 THEIRS = 'THEIRS'
 
 
 class Remedy(NamedTuple):
-    """An option to add: its name without the dashes, and its value."""
+    """A command-line option to add: its name without dashes, and its value."""
 
     option: str
     value: str
 
     def __str__(self) -> str:
-        """Return it as it can be pasted into a shell."""
-        # A value that begins with a dash would be taken for an option.
+        """Return the option as text for a shell."""
+        # A value that begins with a dash would be parsed as an option.
         between = '=' if self.value.startswith('-') else ' '
         return f'--{self.option}{between}{quoted(self.value)}'
 
 
 class RefusedError(InputError):
-    """A table that could be read if the person said more.
+    """A table that can be read only with more options.
 
     Parameters
     ----------
     where : object
         The file.
     problems : str or sequence of str
-        What is left open, and what to add; sentences without their full stop.
+        What is unclear, and which option to add; sentences without a final period.
     remedies : sequence of Remedy
-        With all of these together the problems are gone; where there is a choice, the first.
+        Options that solve all problems together; if there is a choice, the first one.
     last : bool
-        All of the table was read: nothing else can come after this.
+        True if the whole table was read, so that no further problem can follow.
 
     Attributes
     ----------
     listing : str
-        The sentences alone.
+        The problems without the options.
     """
 
     def __init__(
@@ -80,11 +80,11 @@ def _listed(problems: Sequence[str]) -> str:
 
 
 def quoted(word: str) -> str:
-    """Return a word as a shell takes it; letters of any language need no quotes."""
+    """Return a word quoted for a shell; letters of any language need no quotes."""
     return word if re.fullmatch(r'[\w.:/=%+@,-]+', word) else shlex.quote(word)
 
 
-# Tables shrink to a tenth when they are packed, hardly ever to a hundredth.
+# Compression reduces tables to about a tenth, and hardly ever to a hundredth.
 _UNPACKED_FREELY = 64_000_000
 _UNPACKED_TIMES = 200
 DATE_ORDERS = ('dmy', 'mdy', 'ymd')
@@ -96,24 +96,24 @@ DECIMALS = ('point', 'comma')
 
 @dataclass(frozen=True, slots=True)
 class TableOptions:
-    """How to read a table; what is empty is seen in the file or refused as ambiguous.
+    """Options for reading a table; an empty option is inferred, or the table is refused.
 
     Attributes
     ----------
     time_zone : str
-        Zone of times that name none: a name of the tz database (``Europe/Berlin``)
-        or an offset (``+01:00``). Empty means UTC.
+        Zone of times without a zone: a name of the tz database (``Europe/Berlin``)
+        or an offset (``+01:00``). Empty: the zone in the column name, otherwise UTC.
     date_order : str
-        ``dmy`` or ``mdy``, for dates such as 01/02/2026.
+        ``dmy``, ``mdy`` or ``ymd``, for dates such as 01/02/2026.
     decimal : str
         ``point`` or ``comma``.
     sheet : str
-        Sheet of a workbook; the first with a table by default.
+        Sheet of a workbook; by default the only sheet with a table.
     max_unpacked : str
-        Megabytes to which a workbook or the needed columns of a Parquet file may unpack. Empty:
-        64, or 200 times the file if that is more, up to a fixed bound.
+        Maximum unpacked megabytes of a workbook or of the needed columns of a Parquet file.
+        Empty: 64, or 200 times the file size if that is more, up to a fixed limit.
     period : str
-        Time from one row to the next of a table without times: ``60s``, ``1min``, ``60``.
+        Time between two rows of a table without times: ``60s``, ``1min``, ``60``.
     """
 
     time_zone: str = ''
@@ -138,17 +138,17 @@ class TableOptions:
 
     @property
     def period_s(self) -> float:
-        """Return the period in s, NaN if none was given or it is no time."""
+        """Return the period in s; NaN if it is empty or invalid."""
         found = _PERIOD.fullmatch(self.period.strip().lower())
         return float(found[1]) * _SECONDS[found[2] or 's'] if found else math.nan
 
     def unpacked_bytes(self, packed: int, bound: int) -> float:
-        """Return to how many bytes a file of ``packed`` bytes may unpack; ``bound`` at most.
+        """Return the maximum unpacked bytes of a file; at most ``bound`` without a user's limit.
 
         Raises
         ------
         InputError
-            The limit that a person set is no positive number.
+            If the limit given by the user is not a positive number.
         """
         if not self.max_unpacked:
             return min(bound, max(_UNPACKED_FREELY, _UNPACKED_TIMES * packed))

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Reads a historian's table, CSV, Excel or Parquet, and writes samples as one."""
+"""Reads a table of a historian (CSV, Excel or Parquet) and writes samples as a table."""
 
 from __future__ import annotations
 
@@ -37,34 +37,34 @@ _BLOCK_ROWS = 100_000
 
 @dataclass(frozen=True, slots=True)
 class RawTable:
-    """A table as it stands in its file, but for the order of time.
+    """A table as in its file, except that its rows are in time order.
 
     Attributes
     ----------
     path : str
-        Where it was read.
+        The file.
     time_ns : int64 (n,)
-        Not decreasing; equal times keep the order of the file.
+        Times in ns since 1970, not decreasing; equal times keep the order of the file.
     columns : dict[str, float64 (n,)]
-        By contract column name, in the units of the file; NaN where no number stands.
+        By contract column name, in the units of the file; NaN for cells without a number.
     names : dict[str, str]
-        What each column is called in the file.
+        Name of each column in the file.
     quality : dict[str, uint8 (n,)]
-        A `Quality` per value, for columns beside which the file has one.
+        A `Quality` per value, for columns that have a quality column in the file.
     notes : tuple of str
-        Sentences about what had to be understood or left out.
+        Sentences about what was inferred or left out.
     bad_cells : dict[str, int]
-        Cells that are not empty and hold no number, by contract column name.
+        Number of cells that are not empty and hold no number, by contract column name.
     bad_times : int
-        Rows left out because their time cannot be read.
+        Number of rows left out because their time cannot be read.
     units : dict[str, str]
-        The unit the file names, by contract column name.
+        The unit in the file, by contract column name.
     grounds : dict[str, str]
-        Why a column was taken for what it is, where that had to be found out.
+        Why a column was assigned to a signal, if its name was not exact.
     ignored : tuple of str
-        Columns (of a long table: tags) that were not used.
+        Columns (in a long table: tags) that were not used.
     present : dict[str, bool (n,)]
-        Of a long table: which rows have a value of this signal at all.
+        For a long table: the rows that have a value of this signal.
     """
 
     path: str
@@ -81,7 +81,7 @@ class RawTable:
     present: dict[str, BoolArray] = field(default_factory=dict)
 
     def readings(self) -> Readings:
-        """Return the values one by one, in the order of time."""
+        """Return the values one by one, in time order."""
         by_signal = {signal_of(name): column for name, column in self.columns.items()}
         quality = {signal_of(name): codes for name, codes in self.quality.items()}
         table = SampleTable.from_columns(self.time_ns, by_signal, quality)
@@ -107,28 +107,28 @@ def read_table(
     Parameters
     ----------
     path : str or Path
-        ``.csv`` and the like (any common separator, encoding and decimal
-        mark), ``.xlsx`` or ``.parquet``; a column a signal, or a row a value.
+        ``.csv`` and similar (any common separator, encoding and decimal mark),
+        ``.xlsx`` or ``.parquet``; one column per signal, or one row per value.
     columns : mapping of str to str, optional
-        Contract name, also ``time`` and ``date``, to their column. Signals that
-        are not named are found by the names and units of the columns.
+        The column of a contract name, or of ``time`` or ``date``. Other signals
+        are recognised by the names and units of the columns.
     absent : collection of str
-        Contract names that need not be there.
+        Contract names that may be missing.
     options : TableOptions
-        What the table does not say itself.
+        What the user says about the table.
 
     Raises
     ------
     RecordingError
-        If the file is not a table that can be read.
+        If the file cannot be read as a table.
     InputError
-        If a column is missing or could be several, or a contract name is unknown.
+        If a column is missing or ambiguous, or a contract name is unknown.
     """
     return whole_table(TableReader(Path(path), columns or {}, absent, options))
 
 
 def whole_table(reader: TableReader) -> RawTable:
-    """Return all blocks of a table in the order of time; raises like `read_table`."""
+    """Return all blocks of a table in time order; raises like `read_table`."""
     blocks = list(reader.blocks())
     notes = reader.notes()
     raw = RawTable(
@@ -173,13 +173,13 @@ def open_table(
 
 
 def order_note(newest_first: bool) -> str:
-    """Return the sentence for rows that had to be sorted."""
+    """Return the sentence for rows that were sorted."""
     kind = 'newest first' if newest_first else 'not in the order of time'
     return f'The rows were {kind}; they were sorted.'
 
 
 def _ordered(raw: RawTable, notes: list[str]) -> RawTable:
-    """Return the rows in the order of time."""
+    """Return the rows in time order."""
     steps = np.diff(raw.time_ns)
     if not (steps < 0).any():
         return replace(raw, notes=tuple(notes))
@@ -203,12 +203,12 @@ def _ordered(raw: RawTable, notes: list[str]) -> RawTable:
 def write_table(
     table: SampleTable, path: str | Path, extra: Mapping[str, FloatArray] | None = None
 ) -> None:
-    """Write a table with the contract's columns.
+    """Write a table with the columns of the contract.
 
-    Times are ISO 8601 in UTC with as many digits as they need, numbers have
-    all digits that tell them apart, a missing value is an empty cell. A signal
-    that is optional and wholly missing gets no column; a column of quality
-    codes stands beside a signal that has doubtful values.
+    Times are ISO 8601 in UTC with as many digits as they need. Numbers have
+    enough digits to be read back exactly; a missing value is an empty cell. An
+    optional signal without values gets no column. A signal with values of
+    uncertain quality gets an additional column of quality codes.
 
     Parameters
     ----------
@@ -217,12 +217,12 @@ def write_table(
     path : str or Path
         ``.csv`` or ``.parquet``; replaced if it exists.
     extra : mapping of str to float64 (n,), optional
-        Further columns by name, behind the signals.
+        Further columns by name, after the signals.
 
     Raises
     ------
     InputError
-        If the suffix is neither.
+        If the suffix is another one.
     RecordingError
         If the file cannot be written, or is Parquet and pyarrow is not installed.
     """
@@ -248,7 +248,7 @@ _Column = tuple[str, FloatArray, ByteArray | None]
 
 
 def _columns(table: SampleTable, extra: Mapping[str, FloatArray]) -> Iterator[_Column]:
-    """Yield name, values and, where some are doubtful, qualities of the columns to be written."""
+    """Yield name, values and qualities of the columns; None if no quality is uncertain."""
     for info in SIGNALS:
         values = table.column(info.signal)
         if info.required or np.isfinite(values).any():
@@ -263,7 +263,7 @@ def _write_csv(time_ns: IntArray, columns: Sequence[_Column], path: Path) -> Non
     times, names = _iso(time_ns), [TIME]
     for name, _, quality in columns:
         names += [name] if quality is None else [name, name + QUALITY_SUFFIX]
-    # Among whole numbers a reader takes ``-0`` for 0.
+    # In a column of whole numbers a reader takes ``-0`` for 0.
     signed = [bool((np.signbit(values) & (values == 0.0)).any()) for _, values, _ in columns]
     with path.open('w', encoding='utf-8', newline='') as stream:
         stream.write(','.join(names) + '\n')
@@ -278,7 +278,7 @@ def _write_csv(time_ns: IntArray, columns: Sequence[_Column], path: Path) -> Non
 
 
 def _numbers(values: FloatArray, signed: bool) -> list[str]:
-    """Return numbers with all digits that tell them apart; empty for NaN."""
+    """Return numbers with enough digits to be read back exactly; empty for NaN."""
     cells = [repr(value) for value in values.tolist()]
     if not signed:
         cells = [cell.removesuffix('.0') for cell in cells]
@@ -299,11 +299,11 @@ def _write_parquet(time_ns: IntArray, columns: Sequence[_Column], path: Path) ->
 
 
 def _iso(time_ns: IntArray) -> list[str]:
-    """Return times as text, all with as many digits of a second as the finest needs."""
+    """Return times as text, all with the number of decimals that the finest one needs."""
     stamps = time_ns.astype('datetime64[ns]')
     digits = 9
     while digits and not (time_ns % 10 ** (12 - digits)).any():
         digits -= 3
-    # A text of nanoseconds is cut, never rounded: what is cut are zeros.
+    # The removed digits are zeros in all rows.
     size = len('2000-01-01T00:00:00') + (digits + 1 if digits else 0)
     return [f'{text[:size]}Z' for text in np.datetime_as_string(stamps).tolist()]

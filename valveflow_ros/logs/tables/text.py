@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The text of a table: encoding, separator and decimal mark, and lines that cannot fill memory."""
+"""Text tables: encoding, separator, decimal mark, and limits on the length of lines and cells."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _BOTH_EU = re.compile(r'[+-]?\d{1,3}(?:\.\d{3})+,\d+')
 
 
 def encoding_of(head: bytes) -> str | None:
-    """Return the encoding of a text by its first bytes, ``None`` if it is no text."""
+    """Return the encoding of a text from its first bytes; ``None`` if it is not a text."""
     for mark, name in _MARKS:
         if head.startswith(mark):
             return name
@@ -35,7 +35,7 @@ def encoding_of(head: bytes) -> str | None:
             if zeros.count(0) > 0.7 * len(zeros) and letters.count(0) == 0:
                 return name
         return None
-    # The head may end within a letter.
+    # The last character may be incomplete.
     decoder = codecs.getincrementaldecoder('utf-8')()
     try:
         decoder.decode(head)
@@ -45,14 +45,14 @@ def encoding_of(head: bytes) -> str | None:
 
 
 def separator_of(lines: list[str]) -> str:
-    """Return what parts the cells of these lines.
+    """Return the separator of the cells in these lines.
 
-    The separator is the one by which most lines fall into the same number of
-    cells. A comma comes last: it may be part of the numbers.
+    It is the separator for which most lines have the same number of cells. The
+    comma is tried last, because it may be part of the numbers.
     """
     best, score = ',', 0.0
     for mark in _SEPARATORS:
-        # Line by line: a quote that is not closed would make one of all that follow.
+        # Each line is parsed alone, so that an open quote does not join the following lines.
         sizes = Counter(size for line in lines if (size := len(cells_of(line, mark))))
         size, count = max(sizes.items(), key=lambda item: (item[1], item[0]), default=(1, 0))
         share = count / max(1, sum(sizes.values()))
@@ -62,7 +62,7 @@ def separator_of(lines: list[str]) -> str:
 
 
 def cells_of(line: str, separator: str) -> list[str]:
-    """Return the cells of a line; all of it is one where it cannot be parted."""
+    """Return the cells of a line; the whole line is one cell if it cannot be parsed."""
     try:
         return next(csv.reader([line], delimiter=separator), [])
     except csv.Error:
@@ -70,12 +70,12 @@ def cells_of(line: str, separator: str) -> list[str]:
 
 
 def decimal_mark(cells: list[str], separator: str) -> tuple[str, str] | None:
-    """Return the decimal and the thousands mark that cells of numbers show.
+    """Return the decimal and the thousands mark of the numbers in these cells.
 
     Returns
     -------
     tuple of str or None
-        ``None`` if a comma may be either: ``230,145`` and nothing that decides.
+        ``None`` if a comma may be either, as in ``230,145``, and no other cell decides.
     """
     text = [cell.strip() for cell in cells]
     if any(_BOTH_US.fullmatch(cell) for cell in text):
@@ -86,7 +86,7 @@ def decimal_mark(cells: list[str], separator: str) -> tuple[str, str] | None:
     grouped = sum(bool(_GROUPED_BY_COMMA.fullmatch(cell)) for cell in text)
     points = any(_POINT.fullmatch(cell) for cell in text)
     if any(not _GROUPED_BY_COMMA.fullmatch(cell) for cell in commas):
-        # In a table of semicolons some tools write the one mark, some the other.
+        # With points in other cells, a point may be a decimal mark, too.
         return ',', ('' if points else '.')
     if not grouped:
         return '.', ''
@@ -95,37 +95,37 @@ def decimal_mark(cells: list[str], separator: str) -> tuple[str, str] | None:
     return ('.', ',') if points else None
 
 
-# What a cell of Excel holds at most, in letters and in line breaks; a comment has far fewer.
+# Maximum number of characters and of line breaks in an Excel cell.
 LONGEST_CELL = 32_767
 _MOST_BREAKS = 253
 
 
 class Quotes:
-    """Follows a text that passes by in pieces, of the file ``path``, its cells parted as told.
+    """Checks the quotes in the text of the file ``path``, which is given in pieces.
 
-    A quote opens a cell only where the cell begins, and a doubled one within it stands for itself:
-    so do pandas and most programs that write tables.
+    A quote opens a quoted cell only at the start of the cell, and a doubled quote within it is a
+    literal quote, as in pandas and most programs that write tables.
     """
 
     def __init__(self, path: Path, separator: str) -> None:
         self._path = path
         ends = f'{re.escape(separator)}\r\n'
-        # Group 1: from a quote on that is not closed in what has passed.
+        # Group 1: the text after a quote that is not closed yet.
         self._cell = re.compile(
             rf'(?:\A|[{ends}]) *"(?:[^"]*(?:""[^"]*)*"(?!")|(.*\Z))', re.DOTALL
         )
-        # A cell that is closed in its own line: nearly all are, and this is quick.
+        # A quoted cell within one line; this fast pattern matches nearly all of them.
         self._closed = re.compile(rf'(?:\A|(?<=[{ends}])) *"[^"\r\n]*(?:""[^"\r\n]*)*"(?!")')
         self._rest = ''
-        self._line = 1  # of the first letter of the rest
+        self._line = 1  # line number at the start of the rest
 
     def follow(self, text: str) -> None:
-        """Look at the next piece.
+        """Check the next piece.
 
         Raises
         ------
         RecordingError
-            If a cell in quotes is longer than any cell is.
+            If a quoted cell is longer than the limits.
         """
         text = self._rest + text
         end = _last_line(text, [])
@@ -137,17 +137,17 @@ class Quotes:
         self._rest = text[end:]
 
     def _looked_at(self, text: str) -> int:
-        """Judge cell by cell; return where the last line begins."""
+        """Check each quoted cell; return where the last line begins."""
         begun, cells = len(text), []
         for cell in self._cell.finditer(text):
             opened = cell.start() + cell[0].index('"')
             self._judge(text, opened, cell.end())
-            # A quote that ends the piece may be the first of two.
+            # A quote at the end of the piece may be the first of a doubled quote.
             if cell.start(1) >= 0 or cell.end() == len(text):
                 begun = opened
             else:
                 cells.append((opened, cell.end()))
-        # What is kept begins with a line, so that it is known where its cells begin.
+        # The rest begins with a line, so that the start of its cells is known.
         return _last_line(text[:begun], cells)
 
     def _judge(self, text: str, opened: int, end: int) -> None:
@@ -164,13 +164,13 @@ class Quotes:
 
 
 def _breaks(text: str) -> int:
-    """Return how many lines end in a text; what is left of Windows' two letters counts once."""
+    """Return the number of line breaks in a text; CR LF counts once."""
     return text.count('\n') or text.count('\r')
 
 
 def _last_line(text: str, cells: list[tuple[int, int]]) -> int:
-    """Return where the last line of a text begins; breaks within cells begin none."""
-    # The first of Windows' two letters waits for the second.
+    """Return where the last line of a text begins; line breaks within ``cells`` do not count."""
+    # A CR at the end may be followed by an LF in the next piece.
     end = len(text) - text.endswith('\r')
     for opened, closed in [*reversed(cells), (0, 0)]:
         found = max(text.rfind('\n', closed, end), text.rfind('\r', closed, end)) + 1
@@ -185,10 +185,10 @@ _PIECE = 1 << 18
 
 
 class Lines(io.TextIOWrapper):
-    """A text that is read in pieces, none of whose lines and cells is without end.
+    """A text stream that is read in pieces and limits the length of lines and quoted cells.
 
-    ``path`` is for sentences; ``stream`` is closed with this; what does not fit the encoding is
-    replaced.
+    ``path`` is for error messages. ``stream`` is closed together with this object. Bytes that are
+    invalid in ``encoding`` are replaced.
     """
 
     def __init__(self, path: Path, stream: BinaryIO, encoding: str, separator: str) -> None:
@@ -198,12 +198,12 @@ class Lines(io.TextIOWrapper):
         self._quotes = Quotes(path, separator)
 
     def read(self, size: int | None = -1, /) -> str:
-        """Return up to so many letters; all in one piece is more than anybody asks for.
+        """Return at most ``size`` characters, and never more than one piece.
 
         Raises
         ------
         RecordingError
-            If a line is longer than `LONGEST_LINE` letters, or a quote is not closed.
+            If a line is longer than `LONGEST_LINE` characters, or a quote is not closed.
         """
         text = super().read(_PIECE if size is None or size < 0 else min(size, _PIECE))
         ends = [place for mark in '\n\r' if (place := text.find(mark)) >= 0]

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Makes nanoseconds of whatever a historian writes as time."""
+"""Converts the times in a historian's table to nanoseconds since 1970."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ if TYPE_CHECKING:
 
 
 _WHOLE_LIMIT = 2.0**63
-# Zones that stand behind a time: German ones tell summer from winter themselves.
+# Zones written after a time; the German ones distinguish summer and winter time.
 _ABBREVIATED = (
     (r'\s*\b(?:UTC|GMT)$', 'Z'),
     (r'\s*\b(?:CEST|MESZ)$', '+02:00'),
     (r'\s*\b(?:CET|MEZ)$', '+01:00'),
-    # PostgreSQL writes whole hours only.
+    # PostgreSQL writes offsets of whole hours only.
     (r'(:\d{2}(?:\.\d+)?\s*[+-]\d{2})$', r'\1:00'),
 )
 
 
 def from_stamps(column: pd.Series[Any]) -> IntArray:
-    """Return stamps, in UTC where they name no zone, as nanoseconds."""
+    """Return timestamps as ns since 1970; those without a zone are taken as UTC."""
     import pandas as pd
 
     if column.dtype.kind == 'M' and not isinstance(column.dtype, pd.DatetimeTZDtype):
@@ -45,7 +45,7 @@ def from_stamps(column: pd.Series[Any]) -> IntArray:
     bare = column.dt.tz_convert('UTC').dt.tz_localize(None)
     stamps: NDArray[np.datetime64] = bare.to_numpy()
     seconds = stamps.astype('datetime64[s]').astype(np.int64).astype(np.float64)
-    # A year beyond 2262 does not fit into nanoseconds; some numpy let it run over in silence.
+    # A year after 2262 does not fit into int64 ns; some versions of numpy overflow silently.
     beyond = np.abs(seconds) * NS_PER_S >= _WHOLE_LIMIT
     kept = np.where(beyond, np.datetime64('NaT', 's'), stamps).astype('datetime64[ns]')
     found: IntArray = kept.astype(np.int64)
@@ -53,14 +53,14 @@ def from_stamps(column: pd.Series[Any]) -> IntArray:
 
 
 def iso_times(text: pd.Series[Any]) -> IntArray:
-    """Return texts of ISO 8601 in UTC as nanoseconds."""
+    """Return ISO 8601 texts as ns since 1970; those without a zone are taken as UTC."""
     import pandas as pd
 
     found = pd.to_datetime(text, format='ISO8601', utc=True, errors='coerce')
     stamps = from_stamps(found)
     left = (found.isna() & text.notna()).to_numpy(dtype=bool)
     if left.any():
-        # Looking at each text costs ten times as much, so only what is left is looked at.
+        # Replacing zone names is ten times as slow, so it is done only for unread texts.
         again = with_offsets(text[left])
         stamps[left] = from_stamps(
             pd.to_datetime(again, format='ISO8601', utc=True, errors='coerce')
@@ -69,20 +69,20 @@ def iso_times(text: pd.Series[Any]) -> IntArray:
 
 
 def with_offsets(text: pd.Series[Any]) -> pd.Series[Any]:
-    """Return texts with their zones as offsets."""
+    """Return the texts with zone names replaced by offsets."""
     for words, offset in _ABBREVIATED:
         text = text.str.replace(words, offset, regex=True)
     return text
 
 
-# Numbers above these cannot be seconds (year 5138), milliseconds, microseconds of our age.
+# Above these limits, numbers are too large to be s (year 5138), ms or us since 1970.
 _SCALES = ((1e11, 's', NS_PER_S), (1e14, 'ms', 1_000_000), (1e17, 'us', 1000))
-# Days of a workbook are counted from here; 36526 is the year 2000, 73050 the year 2100.
+# Range of plausible Excel day numbers: 36526 is the year 2000, 73050 the year 2100.
 _EXCEL_DAYS = (36526.0, 73050.0)
 
 
 def as_numbers(samples: list[str]) -> FloatArray:
-    """Return the samples as numbers if most of them are."""
+    """Return the numbers among the samples, empty if fewer than half are numbers."""
     numbers = []
     text = [cell.strip() for cell in samples if cell.strip()]
     for cell in text:
@@ -94,7 +94,7 @@ def as_numbers(samples: list[str]) -> FloatArray:
 
 
 def is_excel(numbers: FloatArray) -> bool:
-    """Tell whether numbers are days of a workbook: in our age, and close to each other."""
+    """Return True if the numbers are Excel days: between 2000 and 2100, with small steps."""
     finite = numbers[np.isfinite(numbers)]
     if not len(finite):
         return False
@@ -106,7 +106,7 @@ def is_excel(numbers: FloatArray) -> bool:
 
 
 def scale(numbers: FloatArray) -> tuple[str, int]:
-    """Return the unit of numbers since 1970, and its nanoseconds."""
+    """Return the unit of times since 1970, judged by their size, and its length in ns."""
     finite = np.abs(numbers[np.isfinite(numbers)])
     typical = float(np.median(finite)) if len(finite) else 0.0
     for bound, unit, factor in _SCALES:
@@ -116,20 +116,20 @@ def scale(numbers: FloatArray) -> tuple[str, int]:
 
 
 def descending(samples: list[str]) -> bool:
-    """Tell whether the samples stand newest first, as far as texts of one form can tell."""
+    """Return True if most samples are in descending order, comparing their texts."""
     text = [cell.strip() for cell in samples if cell.strip()]
-    # Within a day the clock decides, whatever the order of day, month and year.
+    # Only samples of the same day are compared, since dates may not sort as text.
     pairs = [(a, b) for a, b in pairwise(text) if a[:10] == b[:10]]
     falling = sum(a > b for a, b in pairs)
     return 2 * falling > len(pairs)
 
 
-# The stamp that stands for a time that cannot be read.
+# The value for a time that cannot be read.
 NEVER = int(np.iinfo(np.int64).min)
-# The day 1970-01-01 of a workbook.
+# The Excel day number of 1970-01-01.
 _EXCEL_EPOCH_DAYS = 25569
 _HOUR_NS = 3600 * NS_PER_S
-# A log of some years has no more autumns.
+# Maximum number of autumns in a log.
 _FEW = 8
 
 
@@ -137,7 +137,7 @@ FIRST_ROW_NS = 946_684_800 * NS_PER_S
 
 
 class RowClock:
-    """Gives the rows of a table without times the period a person told, from the year 2000 on."""
+    """Makes times for a table without times: from 2000-01-01, with the period of the options."""
 
     zone = ''
 
@@ -146,11 +146,11 @@ class RowClock:
         self._step_ns = round(options.period_s * NS_PER_S)
 
     def at(self, first: int, count: int) -> IntArray:
-        """Return the times of ``count`` rows from row ``first`` on."""
+        """Return the times of ``count`` rows, beginning with row ``first``."""
         return FIRST_ROW_NS + np.arange(first, first + count, dtype=np.int64) * self._step_ns
 
     def finish(self) -> list[str]:
-        """Return what is to be said of the times."""
+        """Return notes about the times."""
         return [
             f'The table has no times; its rows were taken to be {self._period} apart, from '
             '2000-01-01 on.'
@@ -158,7 +158,7 @@ class RowClock:
 
     @property
     def words(self) -> str:
-        """Return where the times are from."""
+        """Return the origin of the times, as a clause."""
         return f'counted, {self._period} a row'
 
     @property
@@ -168,11 +168,11 @@ class RowClock:
 
 
 class TimeReader:
-    """Reads the column of time block by block, all blocks by the same rule.
+    """Reads the time column block by block, with the same format for all blocks.
 
-    It takes texts of the column from the whole file, names of file and column for sentences, what
-    the person said, and a zone that the file names; what the person said goes before it. Raises
-    `InputError` if dates can be read in two ways, or the zone is not known.
+    ``samples`` are texts of the column from the whole file; ``where`` and ``name`` are file and
+    column, for messages. ``zone`` is the zone in the file; the zone in ``options`` has priority.
+    Raises `InputError` if dates are ambiguous, or the zone is unknown.
     """
 
     def __init__(
@@ -204,8 +204,8 @@ class TimeReader:
     def read(self, column: pd.Series[Any]) -> IntArray:
         """Return int64 nanoseconds; a time that cannot be read is `NEVER`.
 
-        Numbers are Unix seconds unless they are too large for that; texts that
-        name no zone are in the zone of this reader.
+        Numbers are Excel days, or times since 1970 in a unit judged by their
+        size. Texts without a zone are in the zone of this reader.
         """
         import pandas as pd
 
@@ -222,7 +222,7 @@ class TimeReader:
         return stamps
 
     def _look_back(self, stamps: IntArray) -> None:
-        """Look for the hour that comes twice when a local clock is set back."""
+        """Find steps back by an hour, which a local clock makes in autumn."""
         steps = np.diff(stamps if self._last is None else np.r_[self._last, stamps])
         back = np.flatnonzero(steps < 0)
         hour = (steps[back] >= -_HOUR_NS) & (steps[back] < -_HOUR_NS // 2)
@@ -233,12 +233,12 @@ class TimeReader:
         self._last = int(stamps[-1]) if len(stamps) else self._last
 
     def finish(self) -> list[str]:
-        """Return what is to be said of the times.
+        """Return notes about the times, after all blocks were read.
 
         Raises
         ------
         InputError
-            If not one value was a time.
+            If no value was a time, or the times go back by an hour as local times do.
         """
         if not self.any_time:
             raise InputError(
@@ -264,14 +264,14 @@ class TimeReader:
 
     @property
     def words(self) -> str:
-        """Return how the times are written."""
+        """Return the format of the times, as a clause."""
         if self.kind == 'seconds':
             return f'numbers of {self._unit} since 1970'
         return f'written like {self.kind}' if self.kind.startswith("'") else self.kind
 
     @property
     def told_zone(self) -> str:
-        """Return where the zone of the times comes from, as a clause."""
+        """Return the zone of the times and its origin, as a clause."""
         if self.kind in ('seconds', ''):
             return 'UTC'
         if self._zoned:
@@ -311,12 +311,12 @@ class TimeReader:
         return self._styled(text, style)
 
     def _styled(self, text: pd.Series[Any], style: DateStyle) -> IntArray:
-        """Read texts by formats: on each only what those before left."""
+        """Parse texts with the formats of a style; each is used on what is still unread."""
         import pandas as pd
 
         found, left = self._by_formats(text, style)
         if left.any():
-            # Only what no format fits is worth a look at each text.
+            # Tidying is slow, so it is done only for texts that no format matches.
             tidy = text[left].map(lambda t: english(tidied(t)) if style.named else tidied(t),
                                   na_action='ignore')  # fmt: skip
             again, _ = self._by_formats(with_offsets(tidy) if style.zoned else tidy, style)
@@ -352,7 +352,7 @@ class TimeReader:
         return from_stamps(stamps if self._clock is None else self._clock.to_utc(stamps))
 
     def _whole(self, numbers: NDArray[np.integer[Any]]) -> IntArray:
-        """Scale whole numbers without passing through floats, which would round nanoseconds."""
+        """Convert whole numbers to ns in integers, because floats would round nanoseconds."""
         self._say_numbers()
         wide = numbers.astype(np.float64) * self._factor
         near = np.abs(wide) < _WHOLE_LIMIT
@@ -364,15 +364,15 @@ class TimeReader:
         if self._excel:
             self.kind = 'days of a workbook'
             days = np.where(np.isfinite(numbers), numbers, 0.0) - _EXCEL_EPOCH_DAYS
-            # A double of days knows a second to about a microsecond, no better.
+            # A double of days resolves about 1 us.
             milli = np.rint(days * 86_400_000.0).astype(np.int64) * 1_000_000
             local = pd.Series(milli.astype('datetime64[ns]')).where(np.isfinite(numbers))
             return self._from_local(local)
         self._say_numbers()
         usable = np.isfinite(numbers) & (np.abs(numbers) < _WHOLE_LIMIT / self._factor)
         safe = np.where(usable, numbers, 0.0)
-        # Whole part and fraction apart: a double of seconds since 1970 resolves 0.2 us only as a
-        # whole, and its fraction would lose digits in the product.
+        # A double of seconds since 1970 resolves 0.2 us. Whole part and fraction are converted
+        # separately, because their product would lose digits.
         whole = np.floor(safe)
         fraction = np.rint((safe - whole) * self._factor).astype(np.int64)
         stamps: IntArray = whole.astype(np.int64) * self._factor + fraction

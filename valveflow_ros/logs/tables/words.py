@@ -1,10 +1,10 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What plants call the five signals, in English and German, and what only sounds like them.
+"""Recognises the five signals by English and German column names and by units.
 
-A name gets marks: a quantity alone ('pressure') one, a quantity of the right
-place ('main steam pressure', 'Frischdampfdruck') two. Nothing here looks at
-values.
+A name gets a mark for each signal that it may be: 1 for a quantity alone
+('pressure'), 2 for a quantity with its location ('main steam pressure',
+'Frischdampfdruck'). Values are not used.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from valveflow_ros.records import FLOW_UNITS, SIGNALS, Signal
 
-# What a unit measures.
+# The quantities that units measure.
 OPENING, PRESSURE, TEMPERATURE, POWER = 'opening', 'pressure', 'temperature', 'power'
 DIMENSIONS = {
     Signal.VALVE_OPENING: OPENING,
@@ -28,7 +28,7 @@ DIMENSIONS = {
 
 @dataclass(frozen=True, slots=True)
 class Spelling:
-    """A unit as it was found: what it measures, its name in this project, and as written."""
+    """A unit in a file: its quantity, its name in this project, and its text in the file."""
 
     dimension: str
     unit: str
@@ -66,12 +66,12 @@ def _spellings() -> dict[str, Spelling]:
 
 
 SPELLINGS = _spellings()
-# Units of flows, which none of the signals is taken to be unless a person names the column.
+# Units of flows; they are accepted only for a column that the user names.
 _FLOWS = {unit.lower(): unit for unit in FLOW_UNITS} | {
     'tph': 't/h', 't/hr': 't/h', 'kg/hr': 'kg/h', 'kg/sec': 'kg/s', 'm³/h': 'm3/h',
     'nm³/h': 'Nm3/h', 'm3/hr': 'm3/h', 'klb/hr': 'klb/h', 'lb/hr': 'lb/h', 'lpm': 'l/min',
 }  # fmt: skip
-# Units of what is certainly none of the five signals.
+# Units that none of the five signals can have.
 _OTHERS = frozenset({
     'mvar', 'kvar', 'var', 'mva', 'kva', 'hz', 'rpm', '1/min', 'u/min', 'min-1', 'l/h', 'kj/kg',
     'kj', 'mj', 'gj', 'mwh', 'kwh', 'gwh', 'a', 'ka', 'ma', 'v', 'kv', 'mv', 'mm', 'cm', 'm',
@@ -87,18 +87,18 @@ _TRAILING = re.compile(
 )
 _APART = re.compile(r'^(?P<name>.+?)\s+(?P<unit>\S+)$')
 _LAST_WORD = re.compile(r'^(?P<name>.+?)[\s_.]+(?P<unit>[^\s_.]+)$')
-# Pressures that may be either, and what they are called where they are those of a gauge.
+# Pressure units that may be absolute or gauge, and the name of the gauge unit.
 _OF_GAUGE = {'bar': 'barg', 'mpa': 'MPag', 'kpa': 'kPag', 'psi': 'psig'}
 _GAUGE_WORD = re.compile(
     r'(?<![a-zäöü])(gauge|gage|überdruck|ueberdruck|manometer|relativ|relative|rel|ü)(?![a-zäöü])'
 )
 _ABSOLUTE_WORD = re.compile(r'(?<![a-zäöü])(abs|absolut|absolute|absolutdruck)(?![a-zäöü])')
-# As the last word of a name these are no units: 'PT_100_A', 'Level_C', 'Turbine K'.
+# Not taken as a unit if they are the last word of a name: 'PT_100_A', 'Level_C', 'Turbine K'.
 _NOT_AS_A_WORD = frozenset(['c', 'k', 'f', 'w', 'pa', 'grad', 'pu', 'a', 'v', 'h', 's', 'm', 't'])
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """Return a column's name without its unit, and the unit's text, empty if there is none."""
+    """Return the name of a column without its unit, and the unit; empty if there is none."""
     text = ' '.join(name.split())
     for pattern in (_BRACKETED, _APART, _TRAILING, _LAST_WORD):
         found = pattern.match(text)
@@ -113,7 +113,7 @@ def split_unit(name: str) -> tuple[str, str]:
 
 
 def _may_end(name: str, unit: str, pattern: re.Pattern[str]) -> bool:
-    """Tell whether the last word of a name may be its unit: a bare K or C rarely is."""
+    """Return True if the last word of a name may be its unit; a single K or C rarely is."""
     word = _squeezed(unit)
     if word in _NOT_AS_A_WORD:
         return pattern is _APART and word in ('c', 'k', 'f') and 'temp' in name.lower()
@@ -121,13 +121,13 @@ def _may_end(name: str, unit: str, pattern: re.Pattern[str]) -> bool:
 
 
 def is_unit(text: str) -> bool:
-    """Tell whether a cell holds nothing but a unit, ours or another."""
+    """Return True if a cell holds only a unit, of the five signals or another."""
     word = _squeezed(text)
     return word in SPELLINGS or word in _OTHERS or word in ('-', '[-]')
 
 
 def spelling(text: str) -> Spelling | None:
-    """Return the unit a text spells, ``None`` if it is none of the five signals'."""
+    """Return the unit that a text means; ``None`` if no signal can have it."""
     found = SPELLINGS.get(_squeezed(text))
     if found is None:
         return None
@@ -135,9 +135,9 @@ def spelling(text: str) -> Spelling | None:
 
 
 def of_gauge(found: Spelling | None, told: str) -> Spelling | None:
-    """Return a unit as that of a gauge where words beside it say so: 'Überdruck [bar]'.
+    """Return the gauge unit if the column is a gauge pressure, as in 'Überdruck [bar]'.
 
-    ``told`` is name and description of the column.
+    ``told`` is the name and description of the column.
     """
     if found is None or _squeezed(found.written) not in _OF_GAUGE:
         return found
@@ -148,19 +148,19 @@ def of_gauge(found: Spelling | None, told: str) -> Spelling | None:
 
 
 def flow_spelled(text: str) -> Spelling | None:
-    """Return the unit of a flow that a text spells, ``None`` if it is none."""
+    """Return the unit of a flow that a text means; ``None`` if it is none."""
     unit = _FLOWS.get(_squeezed(text))
     return None if unit is None else Spelling(POWER, unit, text.strip())
 
 
 def unit_named(signal: Signal, text: str) -> str:
-    """Return the unit of this signal that a text spells, empty if it spells none."""
+    """Return the unit of this signal that a text means; empty if it is none."""
     found = spelling(text) or flow_spelled(text)
     return found.unit if found is not None and found.dimension == DIMENSIONS[signal] else ''
 
 
 def is_foreign(text: str) -> bool:
-    """Tell whether a text spells a unit that none of the signals can have."""
+    """Return True if a text is a unit that none of the signals can have."""
     return _squeezed(text) in _OTHERS
 
 
@@ -201,7 +201,7 @@ _OF_UNIT = re.compile(
     r'generat|\bgen\b|active|wirk|\bunit\b|\bblock|turbine|turbo|electric|elektr|\bklemmen'
 )
 _POWER_TAG = re.compile(r'\b(?:jt|ji|jit|et) ?\d')
-# What keeps a name from being a measured main steam signal.
+# Words of names that are not measured main steam signals.
 _NOT_MEASURED = re.compile(
     r'setpoint|set point|\bsp\b|soll|target|ziel|limit|grenz|alarm|deviation|abweich|diff|delta|'
     r'\brate\b|gradient|status|qualit|total|average|mittel|\bavg\b|\bmax|\bmin\b|command|\bcmd\b|'
@@ -224,7 +224,7 @@ _NOT_ACTIVE = re.compile(
 
 
 def folded(name: str) -> str:
-    """Return a name in small letters, umlauts written out, its words parted by blanks."""
+    """Return a name in lower case, with 'ae' for 'ä' etc., and words separated by spaces."""
     text = re.sub(r'(?<=[a-zäöü])(?=[A-ZÄÖÜ])', ' ', name)
     text = text.lower().translate(_UMLAUTS)
     text = unicodedata.normalize('NFKD', text)
@@ -236,21 +236,21 @@ _UMLAUTS = str.maketrans({'ä': 'ae', 'ö': 'oe', 'ü': 'ue', 'ß': 'ss'})
 
 
 def marks(name: str, about: str, unit: Spelling | None) -> dict[Signal, float]:
-    """Return how well a column suits each signal; signals it does not suit are left out.
+    """Return the marks of a column for the signals that it may be; a higher mark is better.
 
-    The name comes without its unit; ``about`` is what else the file says of it, as a row of
-    descriptions under the header.
+    ``name`` is without the unit; ``about`` is its description in the file, for example from a
+    row under the header.
     """
     plain = name.strip()
     for info in SIGNALS:
         if plain.rsplit('/', 1)[-1].lower() in (info.topic, info.column):
             return {info.signal: EXACT}
     text = f'{folded(name)} {folded(about)}'.strip()
-    # P is the pressure to one and the power to another: a letter says nothing, its unit does.
+    # A single letter is ambiguous (P: pressure or power), so only its unit is used.
     by_words = _by_words(text) if len(text) > 1 else {}
     if unit is None:
         return by_words
-    # What is named after one quantity and measured in the unit of another is neither.
+    # A column whose name and unit are of different quantities is neither of them.
     return {
         signal: mark
         for signal, mark in (by_words or _by_unit(text, unit)).items()
@@ -280,7 +280,7 @@ def _by_words(text: str) -> dict[Signal, float]:
         elif _POWER_TAG.search(text):
             found[Signal.GENERATED_POWER] = TAG
     if Signal.MAIN_STEAM_PRESSURE in found or Signal.MAIN_STEAM_TEMPERATURE in found:
-        # 'Throttle pressure' is no opening, 'turbine inlet temperature' no power.
+        # 'Throttle pressure' is not an opening, 'turbine inlet temperature' not a power.
         found.pop(Signal.VALVE_OPENING, None)
         found.pop(Signal.GENERATED_POWER, None)
     return found
@@ -295,7 +295,7 @@ def _of_steam(
 
 
 def _by_unit(text: str, unit: Spelling) -> dict[Signal, float]:
-    """Return the signal that a unit alone suggests, where no word speaks against it."""
+    """Return the signal that a unit alone suggests, unless a word excludes it."""
     if _ELSEWHERE.search(text) or _NOT_MEASURED.search(text):
         return {}
     if unit.dimension == POWER:

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Health items, the diagnostics message they become (REP 107), and lines of the log."""
+"""Health items, their diagnostics message (REP 107), and lines of the log."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from valveflow_ros.ros.encoding import header
 
 
 class Level(enum.IntEnum):
-    """How well something is; the numbers of DiagnosticStatus."""
+    """Level of a health item; the numbers are those of DiagnosticStatus."""
 
     OK = 0
     WARN = 1
@@ -36,9 +36,9 @@ class Level(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One line of the health: what, how well, a sentence, and the numbers behind it.
+    """A health item: name, level, sentence and values.
 
-    The unit of a number stands in its key.
+    The key of a value contains its unit.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Item:
 def diagnostics_message(
     items: Iterable[Item], node: str, tag: str, now_ns: int
 ) -> DiagnosticArray:
-    """Return all items as a message, each under the name of the node and its own."""
+    """Return all items as a message; each name begins with the name of the node."""
     status = [
         DiagnosticStatus(
             level=bytes([item.level]),
@@ -73,12 +73,12 @@ def _text(value: object) -> str:
 
 
 class Changes:
-    """Picks the items worth a line in the log: those whose level has changed.
+    """Selects the items to log: those whose level has changed.
 
     Parameters
     ----------
     quiet_s : float
-        An item that changes back and forth is heard no more often than this.
+        Minimum time in s between two log lines of an item, unless it becomes an error.
     """
 
     def __init__(self, quiet_s: float = 30.0) -> None:
@@ -87,12 +87,12 @@ class Changes:
         self._said_s: dict[str, float] = {}
 
     def pick(self, items: Iterable[Item], now_s: float) -> list[Item]:
-        """Return the items whose level differs from the last one said."""
+        """Return the items whose level differs from the last one logged."""
         picked = []
         for item in items:
             before = self._levels.get(item.name, Level.OK)
             recent = now_s - self._said_s.get(item.name, -self._quiet_s) < self._quiet_s
-            # A failure is told at once; that it went and came again is not, for that long.
+            # An error is logged at once; other changes are not logged within the quiet time.
             worse = item.level == Level.ERROR
             if item.level == before or (recent and not worse):
                 continue
@@ -106,7 +106,7 @@ _STANDING = (AlarmState.UNACKNOWLEDGED, AlarmState.RETURNED_UNACKNOWLEDGED)
 
 
 def line_of(event: Event) -> tuple[Level, str] | None:
-    """Return the line of the log for an event; None for the many that are not worth one."""
+    """Return the line of the log for an event; None for an event that is not logged."""
     if isinstance(event, AlarmChange):
         words = event.state.name.lower().replace('_', ' ')
         level = Level.WARN if event.state in _STANDING else Level.OK

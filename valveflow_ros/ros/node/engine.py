@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The engine as the node runs it: readings as they come, fits and diagnoses in other processes."""
+"""The live engine: processes readings on arrival; fits and diagnoses run in other processes."""
 
 from __future__ import annotations
 
@@ -49,23 +49,23 @@ from valveflow_ros.state import State
 
 
 class LiveEngine:
-    """Readings in, events out; each call ends at a row's boundary.
+    """Turns readings into events; each call processes complete rows.
 
     Parameters
     ----------
     settings : Settings
     fit_worker : Worker
     diagnosis_worker : Worker, optional
-        Without one no diagnosis is ever finished.
+        Without it, diagnoses are requested but never finished.
     corrector : Corrector, optional
-        Takes known causes out of the rows.
+        Corrects the rows for known causes.
 
     Attributes
     ----------
     aligner : Aligner
     monitor : Monitor
     last_fit_s, last_diagnosis_s : float or None
-        How long the last ones took.
+        Duration of the last fit and of the last diagnosis in s; None before the first.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class LiveEngine:
         self._diagnosis_worker = diagnosis_worker
 
     def feed(self, rows: list[Row]) -> list[Event]:
-        """Take readings in their order of arrival."""
+        """Process readings in their order of arrival; return the events."""
         if not rows:
             return []
         aligned = self.aligner.feed(Readings.of(rows))
@@ -96,7 +96,7 @@ class LiveEngine:
         return events + self._feed_rows(aligned.table.part(start, len(aligned.table)))
 
     def poll(self) -> list[Event]:
-        """Adopt or refuse what the workers have finished."""
+        """Adopt or refuse the finished results of the workers; return the events."""
         events: list[Event] = []
         monitor = self.monitor
         for outcome in self._fit_worker.poll():
@@ -114,17 +114,17 @@ class LiveEngine:
         return events
 
     def request_diagnosis(self) -> list[Event]:
-        """Ask for a diagnosis now; raises `DataError` where that makes no sense."""
+        """Request a diagnosis now; raises `DataError` if that is not possible."""
         self.monitor.check_clock()
         return self._submit(self.monitor.request_diagnosis())
 
     def request_fit(self) -> list[Event]:
-        """Ask for a fit now; raises `DataError` where that makes no sense."""
+        """Request a fit now; raises `DataError` if that is not possible."""
         self.monitor.check_clock()
         return self._submit(self.monitor.request_fit())
 
     def snapshot(self) -> State:
-        """Return what is remembered; see `valveflow_ros.state`."""
+        """Return the state to save; see `valveflow_ros.state`."""
         return {'aligner': self.aligner.snapshot(), 'monitor': self.monitor.snapshot()}
 
     def restore(self, saved: State) -> None:
@@ -133,9 +133,9 @@ class LiveEngine:
         self.monitor.restore(saved['monitor'])
 
     def carry(self, saved: State, then: Settings) -> tuple[str, list[Event]]:
-        """Continue from a snapshot of other settings; see `Monitor.carry`.
+        """Continue from a snapshot with other settings; see `Monitor.carry`.
 
-        Readings that waited for their row then are left out.
+        Readings that were not yet part of a row are dropped.
         """
         return self.monitor.carry(saved['monitor'], then)
 
@@ -157,7 +157,7 @@ class LiveEngine:
         return events
 
 
-# Warm-up: everything runs once on example rows, so that no sample waits for a compiler.
+# Warm-up: run everything once on example rows, so that no sample waits for compilation.
 
 _LONGEST_S = 300.0
 _ROWS = 6000
@@ -167,10 +167,10 @@ _PRESSURE_MPA = 16.0
 
 
 def example_task(settings: Settings) -> FitTask:
-    """Return a small fit: a plant that stands and moves in turn, on a curve with one knee."""
+    """Return a small fit task: steady segments and ramps in turn, on a curve with a breakpoint."""
     row = np.arange(_ROWS)
     stretch = row // _STRETCH
-    # Even stretches stand still, odd ones go up to the next level.
+    # Even segments are steady, odd ones are ramps up to the next level.
     moved = (stretch + 1) // 2 + np.where(stretch % 2, row % _STRETCH, 0) / _STRETCH
     level = 900.0 + 150.0 * moved
     chance = np.random.default_rng(1)
@@ -184,7 +184,7 @@ def example_task(settings: Settings) -> FitTask:
 
 
 def example_curve(settings: Settings) -> Characteristic:
-    """Return the curve of that plant, with dynamics."""
+    """Return the curve of the plant in `example_task`, with dynamics."""
     chart = ChartDesign(settings.real('alarm_block'), 0.5, 1.0, (0.25, 1.0), (17.0, 5.0), 30.0)
     average_s = settings.real('alarm_average')
     return Characteristic(
@@ -202,10 +202,10 @@ def example_curve(settings: Settings) -> Characteristic:
 
 
 def warm_up(settings: Settings, worker: FitWorker, stop: Callable[[], bool], wait: bool) -> None:
-    """Compile, or load what was compiled before.
+    """Compile all functions, or load them from the cache.
 
-    The worker does its share meanwhile. If it fails, the first real fit says so; nothing is lost
-    by going on.
+    The worker does the same in its process. If it fails, the monitor continues, and the first
+    real fit reports the failure.
 
     Parameters
     ----------
@@ -214,8 +214,8 @@ def warm_up(settings: Settings, worker: FitWorker, stop: Callable[[], bool], wai
     stop : callable
         Returns True to give up waiting.
     wait : bool
-        Wait for the worker too, if it has to compile: without a curve nothing can be predicted
-        before its first fit. A monitor with a curve continues at once.
+        If True, wait for the worker, too, if it has to compile. A monitor without a curve waits,
+        because it cannot predict before its first fit; one with a curve does not.
     """
     wait = wait and must_compile_to_fit()
     begun_s = time.monotonic()

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The health of the inputs, the fit, the alarms, the diagnosis and the recorder: an item each."""
+"""Health items of the inputs, the fit, the alarms, the diagnosis and the recorder."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ class Publishers:
     Attributes
     ----------
     right : int
-        Publishers of the type we listen for.
+        Number of publishers of the expected type.
     wrong_types : tuple of str
-        Other types somebody publishes on the same topic.
+        Other types that are published on the same topic.
     """
 
     right: int = 0
@@ -51,7 +51,7 @@ class Publishers:
 
 
 def publishers(node: Node, topic: str, type_name: str) -> Publishers:
-    """Look up in the ROS graph who publishes a topic; a wrong type is reported nowhere else."""
+    """Return the publishers of a topic in the ROS graph; ROS itself reports no wrong types."""
     found = node.get_publishers_info_by_topic(topic)
     right = [info for info in found if info.topic_type == type_name]
     wrong = sorted({info.topic_type for info in found} - {type_name})
@@ -59,32 +59,32 @@ def publishers(node: Node, topic: str, type_name: str) -> Publishers:
 
 
 def offered(node: Node, topic: str, type_name: str) -> tuple[Qos, ...]:
-    """Look up in the ROS graph what each publisher of a topic offers."""
+    """Return the QoS that each publisher of a topic offers, from the ROS graph."""
     found = node.get_publishers_info_by_topic(topic)
     return tuple(recorded_qos(i.qos_profile) for i in found if i.topic_type == type_name)
 
 
 _REJECTED = tuple(reason for reason in REASONS if reason not in ('accepted', 'late'))
 _PATIENCE_S = 5.0
-# Rejected for so long, an input is as good as silent.
+# If all readings of an input are rejected for longer than this, it is an error.
 _BLIND_S = 10.0
 
 
 class InputHealth:
-    """Judges the inputs, from one look to the next.
+    """Rates the inputs by what has changed since the last call.
 
     Parameters
     ----------
     settings : Settings
     topics : mapping of str to str
-        Contract name to full topic name.
+        Full topic name by contract name.
     by_host : bool
-        Whether this machine's clock tells the time of the plant; false with a /clock.
+        True if the time of the plant is this machine's clock; False with a /clock.
 
     Attributes
     ----------
     mismatched : set of str
-        Contract names on which a publisher's quality of service did not match.
+        Contract names of the topics with a publisher whose QoS is incompatible.
     """
 
     def __init__(
@@ -93,11 +93,11 @@ class InputHealth:
         self.settings = settings
         self.mismatched: set[str] = set()
         self._topics = topics
-        # Looked up once; they are not live.
+        # Computed once, because these parameters cannot change at run time.
         self._ranges = [plausible_range(info.signal, settings) for info in SIGNALS]
         self._jump_ns = round(settings.real('clock_jump') * NS_PER_S)
         self._by_host = by_host
-        # Stamps by the signals' numbers: this is done for every message.
+        # Lists by signal number are fast; they are updated for every message.
         self._last_ns = [0] * len(SIGNALS)
         self._lead_ns = [_NO_LEAD] * len(SIGNALS)
         self._impossible: dict[str, tuple[str, float]] = {}
@@ -106,7 +106,7 @@ class InputHealth:
         self._newest_ns = 0
 
     def note(self, name: str, rows: Sequence[Row]) -> None:
-        """Remember the stamps, and the last impossible value of each signal, to name it."""
+        """Store the stamps and the last impossible value of each signal, for the sentences."""
         host_ns = time.time_ns()
         for time_ns, number, value, _ in rows:
             self._last_ns[number] = time_ns
@@ -129,15 +129,15 @@ class InputHealth:
         Parameters
         ----------
         statistics : mapping
-            By the contract's names of the topics.
+            Statistics by contract name of the topic.
         counts : mapping
-            What became of the readings, by signal and reason.
+            Number of readings by signal and by result (accepted or the reason of rejection).
         publishers : mapping
-            What the graph says, by the contract's names of the topics.
+            Publishers in the ROS graph by contract name of the topic.
         now_s, listening_s : float
-            Time by a clock that never goes back, and for how long we have listened.
+            Monotonic time, and time since the inputs were subscribed, in s.
         newest_ns : int
-            The newest stamp that is used.
+            The newest stamp of an accepted reading.
         """
         self._newest_ns = newest_ns
         unknown = Publishers()
@@ -248,7 +248,7 @@ class InputHealth:
         return Level.STALE, f'Nobody publishes {topic}; remap it, or start the gateway.'
 
     def _why(self, info: SignalInfo, counts: Mapping[str, int]) -> str:
-        """Return why readings were rejected: the last impossible value, or the reasons so far."""
+        """Return why readings were rejected: the last impossible value, or counts by reason."""
         found = self._impossible.pop(info.topic, None)
         bad_quality = self._new(info.topic, 'bad_quality', counts['bad_quality'])
         if found is None:
@@ -281,9 +281,9 @@ class InputHealth:
         return text
 
     def _stamps(self, number: int) -> tuple[str, str]:
-        """Return what is wrong with the stamps since the last look, and what is only odd.
+        """Return an error and a remark about the stamps since the last call, empty if none.
 
-        A little behind is a slow gateway; none can be ahead.
+        Stamps a little behind are normal for a slow gateway; stamps ahead are an error.
         """
         lead_ns, self._lead_ns[number] = self._lead_ns[number], _NO_LEAD
         if not self._by_host or lead_ns == _NO_LEAD or abs(lead_ns) <= self._jump_ns:
@@ -303,7 +303,7 @@ class InputHealth:
         return behind, ''
 
     def _new(self, topic: str, what: str, count: int) -> int:
-        """Return by how much a count has grown since the last look."""
+        """Return the increase of a count since the last call."""
         last = self._counted.get((topic, what), 0)
         self._counted[topic, what] = count
         return max(0, count - last)
@@ -317,7 +317,7 @@ def _wrong_type(topic: str, seen: Publishers) -> tuple[Level, str]:
 def _speaking(
     topic: str, statistics: Mapping[str, TopicStatistics], publishers: Mapping[str, Publishers]
 ) -> str:
-    """Return the topic that feeds a signal: the one received last, or the one published."""
+    """Return the topic that carries a signal: the one received last, or the one published."""
     own, stamped = statistics[topic].last_s, statistics[PLANT_SAMPLE].last_s
     if own is None and stamped is None:
         nobody = publishers.get(topic, Publishers()) == Publishers()
@@ -326,18 +326,18 @@ def _speaking(
     return PLANT_SAMPLE if stamped is not None and (own is None or stamped > own) else topic
 
 
-# The operator has put it aside, or it cannot be judged.
+# The operator has shelved the alarm, or it cannot be evaluated.
 _ASIDE = (AlarmState.SHELVED, AlarmState.SUPPRESSED)
 
 
 def fit_item(monitor: Monitor, worker: FitWorker, last_fit_s: float | None) -> Item:
-    """Return how the curve is, and the process that fits it."""
+    """Return the item of the curve and the fit process."""
     curve = monitor.characteristic
     noise = monitor.noise()
     spread_k = age_s = None
     if curve is not None:
         spread_k = curve.source.temperature_spread_k
-        # The clock may have gone back behind what the curve was found from.
+        # The clock may have been set back to before the end of the fitted data.
         age_s = max(0.0, (monitor.last_ns - curve.source.window_end_ns) / 1e9)
     values: dict[str, object] = {
         'Status': monitor.status.name.lower(),
@@ -382,7 +382,7 @@ def fit_item(monitor: Monitor, worker: FitWorker, last_fit_s: float | None) -> I
 
 
 def alarm_item(monitor: Monitor) -> Item:
-    """Return how the residual alarm stands, whether or not that was announced."""
+    """Return the item of the residual alarm, also if its state was not announced."""
     alarm = monitor.alarm
     words = _words(alarm)
     values: dict[str, object] = {
@@ -413,7 +413,7 @@ def _words(alarm: Alarm) -> str:
 
 
 def _count_values(alarm: Alarm) -> dict[str, object]:
-    """Return what an announcement may not have told yet."""
+    """Return the values of an alarm that may not have been announced yet."""
     until_ns = alarm.shelved_until_ns
     return {
         'Occurrences': alarm.occurrence,
@@ -423,7 +423,7 @@ def _count_values(alarm: Alarm) -> dict[str, object]:
 
 
 def reference_item(monitor: Monitor) -> Item:
-    """Return how the curve stands to its reference."""
+    """Return the item that compares the curve with its reference."""
     reference = monitor.reference
     if reference.curve is None:
         sentence = (
@@ -451,7 +451,7 @@ def reference_item(monitor: Monitor) -> Item:
     level = Level.WARN if reference.alarm.standing or suspected else Level.OK
     if reference.alarm.active and reference.alarm.state not in _ASIDE:
         level = Level.ERROR
-    # After a restart no curve was judged yet, and the alarm stands all the same.
+    # After a restart the alarm may be active although no curve was compared yet.
     sentence = 'The next curve is judged against it.' if shift is None else shift.sentence
     if reference.alarm.active and (shift is None or not shift.moved):
         spans = ' and '.join(f'u {a:.0f} to {b:.0f}' for a, b in reference.alarm.ranges)
@@ -463,7 +463,7 @@ def reference_item(monitor: Monitor) -> Item:
 
 
 def recorder_item(recording: Recording) -> Item:
-    """Return how the recording goes."""
+    """Return the item of the recording."""
     status = recording.status()
     if status is None:
         wanted = recording.folder is None and 'switched off' in recording.problem
@@ -490,7 +490,7 @@ def recorder_item(recording: Recording) -> Item:
 
 
 def model_item(monitor: Monitor) -> Item:
-    """Return whether the model still fits."""
+    """Return the item that says whether the model still fits the data."""
     diagnosing = monitor.diagnosing
     values: dict[str, object] = {
         'Loudest statistic': diagnosing.misfit.name,
@@ -507,7 +507,7 @@ def model_item(monitor: Monitor) -> Item:
 
 
 def diagnosis_item(monitor: Monitor, worker: DiagnosisWorker, last_s: float | None) -> Item:
-    """Return what the last diagnosis said, and whether one is running."""
+    """Return the item of the last diagnosis and of a running one."""
     last = monitor.diagnosing.last
     values: dict[str, object] = {
         'Verdict': 'unknown',

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The inputs: messages are taken, put in one order, and given the times they belong to."""
+"""Receives the input messages, puts them in one order, and assigns their times."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ _CLOCKS_KEPT = 16384
 
 
 class LogClock:
-    """Receipt times made strictly increasing, so that the order of a log is the order of feeding.
+    """Makes receipt times strictly increasing, so that a log has the order of processing.
 
-    Should the machine's clock be set back, times go on by a nanosecond a message
-    until it has caught up.
+    If the machine's clock is set back, each message gets the last time plus 1 ns
+    until the clock has caught up.
 
     Parameters
     ----------
     after_ns : int
-        The first time is later than this.
+        The first time is later than this, in ns.
     """
 
     def __init__(self, after_ns: int = 0) -> None:
@@ -38,10 +38,10 @@ class LogClock:
 
 
 class ClockTrack:
-    """Remembers /clock, to tell what it showed when a value was published.
+    """Stores /clock messages, to find the time of /clock when a value was published.
 
-    Both times used are the publisher's, so a value and the clock message sent
-    just before it belong together however late either is taken.
+    Send times are compared, so a value is assigned to the clock message sent just
+    before it, even if one of them is received late.
     """
 
     def __init__(self) -> None:
@@ -51,22 +51,22 @@ class ClockTrack:
 
     @property
     def newest_ns(self) -> int:
-        """Return when the newest clock message was sent, 0 before the first."""
+        """Return the send time of the newest clock message; 0 before the first."""
         return self._sent_ns[-1] if self._sent_ns else 0
 
     @property
     def first_ns(self) -> int:
-        """Return what the first clock message showed, 0 before it."""
+        """Return the time in the first clock message; 0 before it."""
         return self._clock_ns[0] if self._clock_ns else 0
 
     def lead_ns(self, sent_ns: int) -> int:
-        """Return how long before the first clock message something was sent, 0 if after it."""
+        """Return how long before the first clock message ``sent_ns`` is; 0 if after it."""
         if self._trimmed or not self._sent_ns:
             return 0
         return max(0, self._sent_ns[0] - sent_ns)
 
     def note(self, sent_ns: int, clock_ns: int) -> None:
-        """Take a message of /clock."""
+        """Add a message of /clock."""
         at = bisect_right(self._sent_ns, sent_ns)
         self._sent_ns.insert(at, sent_ns)
         self._clock_ns.insert(at, clock_ns)
@@ -76,7 +76,7 @@ class ClockTrack:
             del self._clock_ns[:_CLOCKS_KEPT]
 
     def at(self, sent_ns: int) -> int:
-        """Return what the clock showed at a publisher's time, 0 if that is not known."""
+        """Return the time of /clock at a send time; 0 if unknown."""
         at = bisect_right(self._sent_ns, sent_ns)
         return self._clock_ns[at - 1] if at else 0
 
@@ -88,25 +88,25 @@ _MEMORY = 0.1  # weight of the newest interval in the mean period
 
 @dataclass(slots=True)
 class TopicStatistics:
-    """What arrived on one topic: how often, when last, and what was lost on the way.
+    """Statistics of one topic: rate, time of the last message, lost messages.
 
-    Times are by a clock that never goes back.
+    Times are monotonic, in s.
 
     Attributes
     ----------
     received : int
-        Messages taken.
+        Messages received.
     lost : int
-        Messages the publisher sent and the middleware did not deliver, by gaps in
-        the publisher's numbering; not counted while there is more than one publisher.
+        Messages that were sent but not delivered, from gaps in the publisher's
+        sequence numbers; not counted while there is more than one publisher.
     missed_at_start : int
-        Messages sent before the first one that came; most were sent before we listened.
+        Messages sent before the first one received; usually before the subscription.
     irregular : int
-        Numbers that went back: a publisher started anew, or there are two.
+        Sequence numbers that decreased: a publisher was restarted, or there are two.
     malformed, without_time : int
-        Messages recorded and not used.
+        Messages that were recorded but not used.
     waiting, before_clock : int
-        Messages that wait for the first /clock now, and those that were sent before it.
+        Messages that wait for the first /clock message, and those sent before it.
     """
 
     received: int = 0
@@ -127,7 +127,7 @@ class TopicStatistics:
     _lost_before: int = 0
 
     def note_number(self, number: int) -> None:
-        """Take the publisher's number of a message; 0 where the middleware gives none."""
+        """Count a message with its sequence number; 0 if the middleware gives none."""
         self.received += 1
         if number <= 0:
             return
@@ -136,30 +136,30 @@ class TopicStatistics:
         elif number <= self._number:
             self.irregular += 1
             self._mixed = True
-            # What was taken for a gap may have been the step to the other one's numbers.
+            # The last gap may have been the difference between the numbers of two publishers.
             self.lost = min(self.lost, self._lost_before)
         elif not self._mixed and not self._anew:
             self.lost += number - self._number - 1
         self._number, self._anew = number, False
 
     def note_publishers(self, count: int) -> None:
-        """Take how many publish the topic now.
+        """Set the current number of publishers.
 
-        Each numbers its own messages, and a message does not tell whose it is: what is lost of
-        two cannot be told. It is counted again when one is left and its numbers go forward.
+        Each publisher has its own sequence numbers, and a message does not name its publisher,
+        so losses cannot be counted with two. Counting resumes when only one is left.
         """
         if count > 1:
-            # Since the last look the numbers of two may have been taken for those of one.
+            # Since the last call, the numbers of two publishers may have been mixed.
             self.lost = min(self.lost, self._lost_before)
         self._lost_before = self.lost
         mixed = count > 1 or self.irregular > self._irregular_before
-        # The last number may be that of the one which is gone.
+        # The last number may be from a publisher that has gone.
         self._anew = self._anew or (self._several and count <= 1) or count == 0
         self._mixed, self._several = mixed, count > 1
         self._irregular_before = self.irregular
 
     def note_arrival(self, count: int, now_s: float) -> None:
-        """Take the time at which ``count`` messages were found."""
+        """Store the time at which ``count`` messages were received."""
         if count == 0:
             return
         if self.last_s is not None:
@@ -170,31 +170,31 @@ class TopicStatistics:
         self.last_s = now_s
 
     def age_s(self, now_s: float) -> float | None:
-        """Return how long ago the newest message came; None before the first."""
+        """Return the age of the newest message in s; None before the first."""
         return None if self.last_s is None else now_s - self.last_s
 
     def rate_hz(self) -> float:
-        """Return the mean rate of late, 0 while it is not known."""
+        """Return the recent mean rate in Hz; 0 while unknown."""
         return 1.0 / self.period_s if self.period_s else 0.0
 
     def stale(self, now_s: float) -> bool:
-        """Return True if messages came once and come no more."""
+        """Return True if messages were received but have stopped."""
         age = self.age_s(now_s)
         return age is not None and age > max(_STALE_LEAST_S, _STALE_PERIODS * (self.period_s or 0))
 
 
 _MOST_CLOCKS = 16 * DEPTH
-# So many plain values wait for the first /clock, and so long: what waits is not on disk yet.
+# Limits for plain values that wait for the first /clock; waiting values are not on disk yet.
 MAX_WAITING = 16 * DEPTH
 LONGEST_WAIT_S = 5.0
 _PATIENCE_S = 0.03
 _CLOCK_PATIENCE_S = 0.2
-# A message may get its receipt time a moment before it can be taken.
+# A message may have a receipt time shortly before it can be taken.
 _IN_FLIGHT_NS = 200_000
 
 
 class Arrival(NamedTuple):
-    """A message of an input with the times it is logged at and belongs to."""
+    """An input message with its log time and the time of its values."""
 
     name: str
     data: bytes
@@ -203,7 +203,7 @@ class Arrival(NamedTuple):
 
 
 class _Held(NamedTuple):
-    """A message taken and not given on yet: its place in the order, and when it was taken."""
+    """A message that waits: its sort keys, and the time at which it was taken."""
 
     received_ns: int
     order: int
@@ -213,40 +213,39 @@ class _Held(NamedTuple):
 
 
 class MessageSource(Protocol):
-    """Something that messages can be taken from."""
+    """Interface of a source of messages."""
 
     def take(self, most: int = DEPTH) -> list[RawMessage]:
-        """Return what has arrived."""
+        """Return the messages that have arrived."""
 
 
 class Intake:
-    """Collects arrivals in the one order in which they are recorded and fed.
+    """Collects messages in the order in which they are recorded and processed.
 
     Parameters
     ----------
     sources : mapping of str to MessageSource
-        By the contract's names of the inputs.
+        Sources by contract name of the input.
     decoder : Decoder
     log_clock : LogClock
-        Shared with whoever else writes to the same log.
+        Shared with other writers of the same log.
     stamp_source : str
-        'source' or 'receive'; see the parameter of that name.
+        'source', 'receive' or 'ros_time'; see the parameter of that name.
     clock : MessageSource, optional
-        /clock; if given, it gives every plain value its time.
+        /clock; if given, it determines the time of every plain value.
     watch : callable
-        Is called with the topic's name and the readings of each message.
+        Called with the topic's name and the readings of each message.
 
     Notes
     -----
-    Topics are polled one after the other, and while a plant runs faster than real time a later
-    one would be ahead of an earlier one by many samples. So a look gives only what was received
-    before it began, and keeps the rest for the next one. With a /clock a value waits, not for
-    long, until a clock message is there that was sent after it.
+    Topics are polled one after the other. While a plant runs faster than real time, a later topic
+    would be ahead of an earlier one by many samples. A call therefore returns only messages that
+    were received before it began, and keeps the rest for the next call. With a /clock, a value
+    waits for a short time until a clock message arrives that was sent after it.
 
-    What is sent before the very first clock message has no time yet. It waits for that message,
-    and gets a time that is earlier by as much as it was sent earlier. After `LONGEST_WAIT_S`, or
-    where more than `MAX_WAITING` wait, the oldest are logged without a time, which is 0, and not
-    fed.
+    A value sent before the first clock message waits for that message. Its time is that of the
+    first clock message minus the difference of their send times. After `LONGEST_WAIT_S`, or if
+    more than `MAX_WAITING` values wait, the oldest are logged with time 0 and not processed.
     """
 
     def __init__(
@@ -261,7 +260,7 @@ class Intake:
         self._sources = dict(sources)
         self._decoder = decoder
         self._log_clock = log_clock
-        # Without a /clock ROS time is the machine's own.
+        # Without a /clock, ROS time is the machine's clock.
         self._by_receipt = stamp_source in ('receive', 'ros_time')
         self._clock = clock
         self._watch = watch
@@ -271,16 +270,16 @@ class Intake:
         self.statistics = {name: TopicStatistics() for name in self._sources}
 
     def collect(self, now_s: float, now_ns: int, last: bool = False) -> list[Arrival]:
-        """Return the arrivals of this look.
+        """Return the messages that are due, in their final order.
 
         Parameters
         ----------
         now_s : float
-            Time by a clock that never goes back.
+            Monotonic time.
         now_ns : int
-            Time by the machine's clock, for messages without a receipt time.
+            Time of the machine's clock, for messages without a receipt time.
         last : bool
-            Hold nothing back.
+            If True, return all messages, including those that would wait.
         """
         until_ns = now_ns - _IN_FLIGHT_NS
         for name, source in self._sources.items():
@@ -295,14 +294,14 @@ class Intake:
                 held = _Held(received_ns, INPUT_ORDER[name], now_s, name, taken)
                 self._hold(held)
             if len(found) >= DEPTH:
-                # More is waiting there, received after the last of these.
+                # The source has more messages, received after the last of these.
                 until_ns = min(until_ns, received_ns)
         if self._clock is not None:
             self._follow_clock(self._clock)
             self._release(now_s, last)
         if not self._held:
             return []
-        # By topic within one receipt time; a topic's own messages stay in their order.
+        # Sort by receipt time, then by topic; messages of one topic keep their order.
         self._held.sort(key=lambda held: held[:2])
         count = len(self._held)
         if not last:
@@ -312,7 +311,7 @@ class Intake:
         return [self._arrival(held) for held in ready]
 
     def _hold(self, held: _Held) -> None:
-        """Keep a message for its turn; a plain value also for the first clock message."""
+        """Store a message until it is due; a plain value waits for the first clock message."""
         if self._clock is None or self._track.newest_ns or held.name == PLANT_SAMPLE:
             self._held.append(held)
             return
@@ -320,7 +319,7 @@ class Intake:
         self.statistics[held.name].waiting += 1
 
     def _release(self, now_s: float, last: bool) -> None:
-        """End the wait for the first clock message: it has come, or they waited long enough."""
+        """End the wait for the first clock message if it has come or a limit is reached."""
         most = 0 if last or self._track.newest_ns else MAX_WAITING
         while self._waiting and (
             len(self._waiting) > most or now_s - self._waiting[0].taken_s > LONGEST_WAIT_S
@@ -332,13 +331,13 @@ class Intake:
     def _due(self, held: _Held, until_ns: int, now_s: float) -> bool:
         waited_s = now_s - held.taken_s
         if self._clock is None:
-            # Should the machine's clock have been set back, nothing waits for it.
+            # The time limit applies if the machine's clock was set back.
             return held.received_ns <= until_ns or waited_s > _PATIENCE_S
         ready = held.received_ns <= until_ns and held.message.source_ns < self._track.newest_ns
         return ready or waited_s > _CLOCK_PATIENCE_S
 
     def rows(self, arrivals: list[Arrival]) -> list[Row]:
-        """Return the readings in arrivals; what has no time or no meaning is counted."""
+        """Return the readings in the messages; count those without time or not decodable."""
         rows: list[Row] = []
         for arrival in arrivals:
             if arrival.time_ns <= 0:
@@ -369,7 +368,7 @@ class Intake:
         return Arrival(name, message.data, self._log_clock.stamp(received_ns), time_ns)
 
     def _clock_time(self, name: str, message: RawMessage) -> int:
-        """Return what the clock showed when a message was sent, 0 while that is not known."""
+        """Return the time of /clock when a message was sent; 0 if unknown."""
         lead_ns = self._track.lead_ns(message.source_ns)
         if not lead_ns:
             return self._track.at(message.source_ns)

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The node: lifecycle, parameters and services wired to a session, its loop and its watchdog."""
+"""The monitor node: lifecycle, parameters, services, main loop and watchdog."""
 
 from __future__ import annotations
 
@@ -48,23 +48,23 @@ _SUCCESS = TransitionCallbackReturn.SUCCESS
 _LOOK_AROUND_S = 5.0
 _NOT_RUNNING = 'The monitor is not active; activate it first.'
 _NOT_ON_DISK = 'It is not on disk yet; see recorder and state in /diagnostics.'
-# A look costs the same for one message as for ten, and a plant is in no hurry. Where much comes,
-# as from a replay, the next look follows at once.
+# Polling costs the same for one message as for ten, so it need not be frequent. After many
+# messages, as in a replay, the next poll follows at once.
 _PERIOD_S = 0.02
 _MUCH = 50
-# Requests are looked for twice as often as messages.
+# Service requests are polled twice as often as messages.
 _REQUESTS_EVERY_S = 0.01
-# Of each look; a storm of requests must not keep samples waiting.
+# Maximum time for requests per cycle, so that many requests do not delay the samples.
 _REQUESTS_S = 0.05
-# The executor has the rest, events of the middleware and /clock, and costs several times as much.
+# The executor handles middleware events and /clock, and costs several times as much.
 _SPIN_EVERY_S = 0.1
 _FAREWELL_S = 0.5
-# The default of ten loses the eleventh request of a burst without a word.
+# With the default of ten, the eleventh request of a burst is lost without a message.
 _REQUESTS = QoSProfile(depth=1000)
-# The compiler works when a configuration runs for the first time, and an activation may feed what
-# an earlier run recorded.
+# The first configuration compiles the code, and an activation may process what an earlier run
+# recorded.
 _LONGEST_START_S = 600.0
-# A recorder that has been at one step for longer is not counted on.
+# A recorder that needs longer for one step is considered stuck.
 _STALL_S = 1.0
 
 _Transition = Callable[['MonitorNode', LifecycleState], TransitionCallbackReturn]
@@ -87,24 +87,24 @@ _ONE_ALARM = {
 
 
 class Watchdog:
-    """Tells systemd how the process is, by the notify protocol, sd_notify(3).
+    """Reports the state of the process to systemd with the notify protocol, sd_notify(3).
 
-    Where `NOTIFY_SOCKET` is not set nothing is ever sent. Pings are sent at twice the rate that
-    `WATCHDOG_USEC` asks for, and only by `completed`: whoever calls it has just finished a cycle.
+    Nothing is sent if `NOTIFY_SOCKET` is not set. Pings are sent at twice the rate required by
+    `WATCHDOG_USEC`, and only by `completed`, which is called after each complete cycle.
 
     Parameters
     ----------
     environ : mapping, optional
-        Where the names of the protocol are looked up; the process's own by default.
+        Environment variables; by default those of the process.
     clock : callable
-        Seconds by a clock that never goes back.
+        Returns monotonic time in s.
 
     Attributes
     ----------
     period_s : float
-        Time between pings, 0 if none are asked for.
+        Time between pings; 0 if none are required.
     stall_s : float
-        How long a recorder may be at one step and still count as alive.
+        Maximum duration of one step of the recorder before it is considered stuck.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class Watchdog:
         environ = os.environ if environ is None else environ
         self._clock = clock
         name = environ.get('NOTIFY_SOCKET', '')
-        # An @ stands for the abstract namespace.
+        # A leading @ means the abstract namespace.
         abstract = name.startswith('@') and len(name) > 1
         self._address = os.fsencode(f'\0{name[1:]}' if abstract else name)
         usec = environ.get('WATCHDOG_USEC', '')
@@ -129,36 +129,36 @@ class Watchdog:
         self._next_s = 0.0
 
     def ready(self, status: str) -> None:
-        """Tell that the start is done."""
+        """Report that the start is complete."""
         self._send(f'READY=1\nSTATUS={_one_line(status)}\nWATCHDOG=1')
 
     def status(self, status: str) -> None:
-        """Tell in a sentence what the process is doing."""
+        """Report in a sentence what the process is doing."""
         self._send(f'STATUS={_one_line(status)}')
 
     def stopping(self, status: str) -> None:
-        """Tell that the end has begun."""
+        """Report that the process is ending."""
         self._send(f'STOPPING=1\nSTATUS={_one_line(status)}')
 
     def completed(self, recorder: Callable[[], RecorderStatus | None]) -> None:
-        """Ping, if it is time, after a cycle that came to its end.
+        """Send a ping, if one is due, after a complete cycle.
 
         Parameters
         ----------
         recorder : callable
-            Returns the status of the recorder, None where none is to be at work. It is asked
-            only when a ping is due, and none is sent while the recorder is stuck.
+            Returns the status of the recorder, None if there is no recorder. It is called only
+            when a ping is due. No ping is sent while the recorder is stuck.
         """
         now_s = self._clock()
         if not self._usec or now_s < self._next_s:
             return
-        # What the manager did not take is sent again after the next cycle.
+        # A ping that could not be sent is repeated after the next cycle.
         if recorder_lives(recorder(), self.stall_s) and self._send('WATCHDOG=1'):
             self._next_s = now_s + self.period_s
 
     @contextlib.contextmanager
     def patient(self, limit_s: float) -> Iterator[None]:
-        """Give one piece of work more time than a cycle has; afterwards the old limit holds."""
+        """Extend the time limit for one operation; afterwards the old limit is restored."""
         if self._usec:
             self._send(f'WATCHDOG_USEC={max(self._usec, round(limit_s * 1e6))}\nWATCHDOG=1')
         try:
@@ -170,7 +170,7 @@ class Watchdog:
     def _send(self, text: str) -> bool:
         if not self._address:
             return False
-        # A manager that does not take a datagram at once must not hold up the loop.
+        # Non-blocking, so that a busy manager does not delay the loop.
         kind = socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK
         try:
             with socket.socket(socket.AF_UNIX, kind) as channel:
@@ -181,15 +181,15 @@ class Watchdog:
 
 
 def _one_line(text: str) -> str:
-    """Return a text without line breaks, as each would begin another assignment."""
+    """Return a text without line breaks; each would begin another assignment."""
     return ' '.join(text.split())
 
 
 def recorder_lives(status: RecorderStatus | None, stall_s: float) -> bool:
-    """Return False if only a new process can help the recorder.
+    """Return False if the recorder is stuck, so that the process must be restarted.
 
-    One that keeps trying on a full disk is alive. One whose thread has ended, or has not come
-    back from a step for longer than ``stall_s``, is not.
+    A recorder that keeps retrying on a full disk is alive. It is stuck if its thread has ended,
+    or if one step takes longer than ``stall_s``.
     """
     if status is None:
         return True
@@ -197,7 +197,7 @@ def recorder_lives(status: RecorderStatus | None, stall_s: float) -> bool:
 
 
 def _logged(transition: _Transition) -> _Transition:
-    """Log what goes wrong in a transition; rclpy alone would swallow it."""
+    """Log the exceptions of a transition; rclpy alone would not report them."""
 
     @functools.wraps(transition)
     def run(node: MonitorNode, state: LifecycleState) -> TransitionCallbackReturn:
@@ -205,7 +205,7 @@ def _logged(transition: _Transition) -> _Transition:
             return transition(node, state)
         except ValveflowError as error:
             node.get_logger().error(str(error))
-        except Exception as error:  # noqa: BLE001 - whatever it is, it must be logged
+        except Exception as error:  # noqa: BLE001 - every exception must be logged
             node.get_logger().error(f'The monitor failed unexpectedly: {with_place(error)}')
         return TransitionCallbackReturn.FAILURE
 
@@ -218,13 +218,13 @@ class MonitorNode(LifecycleNode):
     Parameters
     ----------
     stop : callable
-        Returns True if the process was asked to end.
+        Returns True if the process must end.
     watchdog : Watchdog, optional
 
     Raises
     ------
     ParameterError
-        The parameters given at the start cannot be used.
+        If the parameters given at the start are invalid.
     """
 
     def __init__(
@@ -263,7 +263,7 @@ class MonitorNode(LifecycleNode):
     # Parameters
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """Set parameters; refuse with the table's own sentence."""
+        """Set parameters; the reason of a refusal comes from the parameter table."""
         wanted = [p for p in declare.in_type(parameter_list) if not declare.stands(self, p)]
         result = self._check(wanted)
         if not wanted or not result.successful:
@@ -279,7 +279,7 @@ class MonitorNode(LifecycleNode):
 
     def _apply(self, wanted: list[Parameter]) -> None:
         settings = declare.changed(self.settings, wanted, running=self.session is not None)
-        # A new topic declares its quality of service; the session may not have begun then.
+        # A new topic declares QoS parameters, possibly before the session exists.
         if settings == self.settings:
             return
         self.settings = settings
@@ -296,8 +296,8 @@ class MonitorNode(LifecycleNode):
             try:
                 check_record_directory(self.settings)
             except ValveflowError as error:
-                # Known before the long work, for whoever watches the start; the unit is watched
-                # all the same.
+                # Logged before the long start, so that the user sees it early; the monitor runs
+                # anyway.
                 log.warning(str(error))
             begun_s = time.monotonic()
             log.info(SENTENCE if is_first_run() else 'Loading the engine.')
@@ -325,14 +325,14 @@ class MonitorNode(LifecycleNode):
 
     @_logged
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Unsubscribe; the curve and the alarm stay."""
+        """Unsubscribe from the inputs; the curve and the alarm are kept."""
         assert self.session is not None
         self.session.unsubscribe()
         return _SUCCESS
 
     @_logged
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Finish the recording and forget everything."""
+        """Finish the recording and delete the session."""
         self.end_session()
         return _SUCCESS
 
@@ -344,7 +344,7 @@ class MonitorNode(LifecycleNode):
         return _SUCCESS
 
     def end_session(self) -> None:
-        """End what runs; doing it again changes nothing."""
+        """End the session; without a session nothing happens."""
         session, self.session = self.session, None
         if session is None:
             return
@@ -360,7 +360,7 @@ class MonitorNode(LifecycleNode):
     # What the loop calls
 
     def step(self) -> int:
-        """Do what is due; return how many messages were taken."""
+        """Run one cycle; return the number of messages received."""
         found = self.session.step() if self.session is not None else 0
         now_s = time.monotonic()
         if now_s >= self._next_diagnostics_s:
@@ -369,7 +369,7 @@ class MonitorNode(LifecycleNode):
         return found
 
     def recorder_status(self) -> RecorderStatus | None:
-        """Return the status of the recorder, None where none is at work."""
+        """Return the status of the recorder, None if there is no recorder."""
         return None if self.session is None else self.session.recording.status()
 
     def _publish_health(self, now_s: float) -> None:
@@ -385,7 +385,7 @@ class MonitorNode(LifecycleNode):
         if session is not None:
             session.record(DIAGNOSTICS, data, now_ns)
         alike: dict[tuple[Level, str], list[str]] = {}
-        # These have a line of their own in the log, when it happens.
+        # These are logged when they happen.
         others = (i for i in items if i.name not in ('alarm', 'model', 'diagnosis'))
         for item in self._changes.pick(others, now_s):
             alike.setdefault((item.level, item.sentence), []).append(item.name)
@@ -396,12 +396,12 @@ class MonitorNode(LifecycleNode):
         """Return an item if a parameter was given that does not exist, else nothing."""
         if not self._ignored:
             return []
-        # It stands in the health too: whoever set it takes it to be in force.
+        # Also reported as health, because the user expects the parameter to have an effect.
         sentence = f'{" ".join(self._ignored)} Ignored.'
         return [Item('parameters', Level.WARN, sentence, {'Ignored': len(self._ignored)})]
 
     def same_name(self, now_s: float) -> list[Item]:
-        """Return an item if another node of the domain bears this one's name, else nothing."""
+        """Return an item if another node of the domain has the same name, else nothing."""
         if now_s >= self._look_around_s:
             self._look_around_s = now_s + _LOOK_AROUND_S
             own = (self.get_name(), self.get_namespace())
@@ -416,7 +416,7 @@ class MonitorNode(LifecycleNode):
         return [Item('name', Level.ERROR, sentence, {'Nodes of this name': self._same_name})]
 
     def _log(self, level: Level, text: str) -> None:
-        # One call each: rclpy ties a severity to the place it is called from.
+        # Separate calls: rclpy allows only one severity per line of code.
         if level == Level.OK:
             self.get_logger().info(text)
         elif level == Level.ERROR:
@@ -429,14 +429,14 @@ class MonitorNode(LifecycleNode):
     def _serve(
         self, name: str, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        """Do what a service asks for."""
+        """Execute a service request."""
         response.success, response.message = self._done(functools.partial(self._answer, name))
         return response
 
     def _operate(
         self, request: OperateAlarm.Request, response: OperateAlarm.Response
     ) -> OperateAlarm.Response:
-        """Do to one alarm what is asked for."""
+        """Execute a request for one alarm."""
 
         def answer(session: Session) -> str:
             actions = [action.value for action in AlarmAction]
@@ -453,7 +453,7 @@ class MonitorNode(LifecycleNode):
         return response
 
     def _done(self, answer: Callable[[Session], str]) -> tuple[bool, str]:
-        """Return whether something was done, and a sentence; what was done is on disk then."""
+        """Execute an action; return success and a sentence that says if it is not on disk yet."""
         session = self.session
         if session is None or not session.listening:
             return False, _NOT_RUNNING
@@ -482,10 +482,10 @@ class MonitorNode(LifecycleNode):
 
 
 def serve_requests(node: Node, longest_s: float) -> None:
-    """Answer the requests that wait, of services and parameters; after that time the rest wait."""
+    """Answer waiting requests of services and parameters, for at most ``longest_s`` seconds."""
     until_s, answered = time.monotonic() + longest_s, True
     while answered:
-        # One of each service in turn, so that none waits for a storm at another.
+        # One request per service in turn, so that many requests to one do not delay the others.
         answered = False
         for service in tuple(node.services):
             if time.monotonic() > until_s:
@@ -494,19 +494,19 @@ def serve_requests(node: Node, longest_s: float) -> None:
 
 
 def _spin(executor: Executor, longest_s: float, failed: Callable[[str], None]) -> None:
-    """Serve what else is ready; after that time the rest waits. What fails is said."""
+    """Run other ready callbacks for at most ``longest_s`` seconds; report failures."""
     until_s = time.monotonic() + longest_s
     with contextlib.suppress(TimeoutException, ShutdownException):
         while time.monotonic() < until_s:
             handler, _, _ = executor.wait_for_ready_callbacks(timeout_sec=0)
             handler()
-            # A request may come between the two looks.
+            # It may also be a request that came after `serve_requests`.
             if (error := handler.exception()) is not None:
                 failed(f'A callback failed: {with_place(error)}')
 
 
 def run(stop: StopFlag, presence: Presence) -> int:
-    """Watch until the process is asked to stop; return the exit status."""
+    """Run the monitor until the process is asked to stop; return the exit status."""
     if stop:
         return 0
     watchdog = Watchdog()
@@ -521,8 +521,8 @@ def run(stop: StopFlag, presence: Presence) -> int:
                 if transition() != _SUCCESS:
                     return 0 if stop else 1
         watchdog.ready('Listening.' if node.session else 'Waits to be configured.')
-        # What is there now stays: the collector need not go through the compiler's objects again
-        # and again.
+        # Exclude the objects that exist now, mainly those of the compiler, from garbage
+        # collection.
         gc.collect()
         gc.freeze()
         spin_s = 0.0
@@ -533,7 +533,7 @@ def run(stop: StopFlag, presence: Presence) -> int:
             if begun_s >= spin_s:
                 spin_s = begun_s + _SPIN_EVERY_S
                 _spin(executor, _REQUESTS_S, node.get_logger().error)
-            # Taken, fed, handed to the recorder: only a whole cycle counts.
+            # Only a complete cycle counts: receive, process and record.
             watchdog.completed(node.recorder_status)
             while found < _MUCH and (left_s := begun_s + _PERIOD_S - time.monotonic()) > 0.0:
                 time.sleep(min(left_s, _REQUESTS_EVERY_S))
@@ -543,7 +543,7 @@ def run(stop: StopFlag, presence: Presence) -> int:
         watchdog.stopping('Finishing the recording.')
         node.end_session()
         if node.finalized:
-            # The answer to who asked for the shutdown is still on its way.
+            # The response to the shutdown request is still being sent.
             time.sleep(_FAREWELL_S)
         executor.shutdown(timeout_sec=0.5)
         node.destroy_node()

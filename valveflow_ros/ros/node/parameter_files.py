@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The files that `model_file` and `reference_file` name: read whole, or refused with a reason."""
+"""Reads and checks the files named by the parameters `model_file` and `reference_file`."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _FEW = 32
 
 
 def given_model(settings: Settings) -> ExtendedModel | None:
-    """Read the extended model whose causes are taken out of the rows; None without one.
+    """Read the extended model that corrects the rows; None if none is given.
 
     Raises
     ------
     ParameterError
-        The file cannot be read, is no extended model, or one of another input u.
+        If the file cannot be read, is no extended model, or has another input u.
     """
 
     def parse(content: Any) -> ExtendedModel:
@@ -48,19 +48,19 @@ def given_model(settings: Settings) -> ExtendedModel | None:
 
 
 def given_reference(settings: Settings) -> Characteristic | None:
-    """Read the curve that later ones are judged against; None without one.
+    """Read the curve with which later ones are compared; None if none is given.
 
     Raises
     ------
     ParameterError
-        The file cannot be read, is no characteristic, or one of another input u.
+        If the file cannot be read, is no characteristic, or has another input u.
     """
     curve: Characteristic | None = _given(settings, 'reference_file', 'a curve', from_json)
     return curve
 
 
 def corrector_for(given: ExtendedModel | None, settings: Settings) -> Corrector | None:
-    """Return what corrects rows, compiled; None without a model. Live and in a replay."""
+    """Return the compiled corrector of a model, None without a model; also used in a replay."""
     if given is None:
         return None
     corrector = corrector_of(given, settings.real('sample_period'))
@@ -74,14 +74,14 @@ def corrector_for(given: ExtendedModel | None, settings: Settings) -> Corrector 
             Signal.GENERATED_POWER: np.full(_FEW, 200.0),
         },
     )
-    # Loads or compiles the loops now, so that no sample of the plant waits for them.
+    # Compile the loops or load them from the cache now, so that no sample waits for them.
     corrector.correct(rows)
     corrector.restart()
     return corrector
 
 
 def model_attachment(given: ExtendedModel | None) -> dict[str, bytes]:
-    """Return what a recording keeps of the model, so that a replay takes out the same."""
+    """Return the attachment with the model, so that a replay makes the same corrections."""
     if given is None:
         return {}
     return {ATTACHMENT: json.dumps(result.model_to_json(given), indent=2).encode()}
@@ -108,20 +108,20 @@ def _given(
 
 
 def _read(path: str, what: str) -> str:
-    """Return the text of a file; neither a device nor a pipe is read, which may have no end.
+    """Return the text of a regular file; devices and pipes, which may be endless, are refused.
 
     Raises
     ------
     OSError
-        It cannot be read.
+        If it cannot be read.
     ValueError
-        It is no file, no text, or too large.
+        If it is no regular file, no text, or too large.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with os.fdopen(descriptor, 'rb') as file:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise ValueError('it is no file')
-        # It may still grow, so its size is not asked for.
+        # The size is checked after reading, because the file may still grow.
         content = file.read(_MAX_BYTES + 1)
     if len(content) > _MAX_BYTES:
         raise ValueError(f'it is too large to be {what}')

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The recording of a run: where it is, what it holds, and that it never disturbs the run."""
+"""The recording of a run: its folder, its attachments and its errors."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ _MOST_NAMES = 1000
 
 
 def tag_of(settings: Settings) -> str:
-    """Return the unit's tag as a part of a folder's name."""
+    """Return the unit's tag in a form that is valid in folder names."""
     return re.sub(r'[^A-Za-z0-9_-]+', '-', settings.text('unit_tag'))[:60] or 'unit'
 
 
 def expand_home(name: str) -> Path:
-    """Return a folder with ``~`` replaced; raises `RecordingError` if that user is not there."""
+    """Return a path with ``~`` expanded; raises `RecordingError` if the user is unknown."""
     try:
         return Path(name).expanduser()
     except RuntimeError:
@@ -50,7 +50,7 @@ def expand_home(name: str) -> Path:
 
 
 def new_folder(settings: Settings, at_s: float) -> Path:
-    """Make a folder that no other run records into; raises `RecordingError` if it cannot be."""
+    """Create a new folder for this run; raises `RecordingError` if this fails."""
     parent = expand_home(settings.text('record_directory') or DEFAULT_FOLDER)
     stem = time.strftime('valveflow_%Y%m%dT%H%M%SZ', time.gmtime(at_s)) + f'_{tag_of(settings)}'
     try:
@@ -69,12 +69,12 @@ def new_folder(settings: Settings, at_s: float) -> Path:
 
 
 def check_record_directory(settings: Settings) -> None:
-    """Refuse a ``record_directory`` that cannot be made or written into; make nothing.
+    """Check that ``record_directory`` can be created and written to; create nothing.
 
     Raises
     ------
     RecordingError
-        With the reason, and what to do.
+        If not, with the reason and advice.
     """
     if not settings.flag('record'):
         return
@@ -92,7 +92,7 @@ def check_record_directory(settings: Settings) -> None:
 
 
 def recorded_qos(profile: QoSProfile) -> Qos:
-    """Return a quality of service in the words of a recording."""
+    """Convert a QoS profile to the form used in recordings."""
     return Qos(
         reliability=profile.reliability.name.lower(), durability=profile.durability.name.lower(),
         history=profile.history.name.lower(), depth=profile.depth,
@@ -100,22 +100,22 @@ def recorded_qos(profile: QoSProfile) -> Qos:
 
 
 class Recording:
-    """Records inputs and outputs; a failure is reported and never stops the monitor.
+    """Records inputs and outputs; an error is reported and never stops the monitor.
 
     Parameters
     ----------
     settings : Settings
     topics : mapping
-        What stands in the attachment `TOPICS`: the names under which the inputs and
-        outputs of the contract were found in this run.
+        Content of the attachment `TOPICS`: the full topic names of the inputs and
+        outputs in this run.
     at_s : float
-        Time of the start, seconds since the epoch.
+        Start time in s since the epoch.
     more : mapping, optional
         Other attachments by name.
     folder : Path, optional
-        A recording to go on with; a new one is begun without it.
+        A recording to continue; by default a new one is begun.
     began : mapping, optional
-        The parameters that one began with, from which its journal leads to those of now.
+        The parameters that the continued recording began with; its journal has the changes.
 
     Attributes
     ----------
@@ -159,12 +159,12 @@ class Recording:
 
     @property
     def on(self) -> bool:
-        """Return True if there is a recorder at work."""
+        """Return True if a recorder is running."""
         return self._recorder is not None
 
     @property
     def whole(self) -> bool:
-        """Return True if everything handed in is on disk or on its way there."""
+        """Return True if the recorder works and has lost or dropped no message."""
         status = self.status()
         if status is None or status.state != RecorderState.RECORDING:
             return False
@@ -178,20 +178,20 @@ class Recording:
         *,
         latched: bool = False,
     ) -> None:
-        """Describe a topic; it stands in the file from its first message on.
+        """Describe a topic; it is added to the file with its first message.
 
         Parameters
         ----------
         topic, type_name : str
         qos : callable
-            Returns what each publisher offers; called with the first message.
+            Returns the QoS of each publisher; called with the first message.
         latched : bool
-            Its last message is repeated in later files.
+            If True, its last message is repeated in later files.
         """
         self._offered[topic] = (type_name, qos, latched)
 
     def write(self, topic: str, data: bytes, log_ns: int, time_ns: int) -> None:
-        """Hand in a message; never waits and never raises."""
+        """Queue a message; never waits and never raises."""
         if self._recorder is None:
             return
         try:
@@ -203,11 +203,11 @@ class Recording:
             self._give_up(str(error))
 
     def status(self) -> RecorderStatus | None:
-        """Return the recorder's status, None without one."""
+        """Return the recorder's status, None without a recorder."""
         return None if self._recorder is None else self._recorder.status()
 
     def settled(self) -> Callable[[], bool]:
-        """Return what tells whether all messages up to now are on disk or lost."""
+        """Return a function that returns True when all messages so far are on disk or lost."""
         recorder = self._recorder
         if recorder is None:
             return lambda: True
@@ -220,11 +220,11 @@ class Recording:
         return ready
 
     def flush(self, longest_s: float) -> bool:
-        """Have all messages up to now on disk; return False if they are not within this time."""
+        """Write all messages so far to disk; return False if this takes too long."""
         return self._recorder is not None and self._recorder.flush(longest_s)
 
     def close(self) -> RecorderStatus | None:
-        """Finish the file; return the account."""
+        """Finish the file; return the final status."""
         recorder, self._recorder = self._recorder, None
         if recorder is None:
             return None
@@ -242,7 +242,7 @@ class Recording:
         return status
 
     def _give_up(self, problem: str) -> None:
-        """Stop recording: a recording that lacks what it should hold would lie."""
+        """Stop recording, because an incomplete recording would be misleading."""
         self.close()
         self.problem = problem
 
@@ -252,14 +252,14 @@ def _json(content: Mapping[str, Any]) -> bytes:
 
 
 class BackgroundRecovery:
-    """Recovers this unit's unfinished recordings once, in a thread; a live recorder's files stay.
+    """Recovers unfinished recordings of this unit once, in a thread, unless they are in use.
 
     Parameters
     ----------
     own : Path
         The recording of this run.
     tag : str
-        The unit's part of the folders' names; those of other units are theirs.
+        The unit's part of the folder names; folders of other units are not changed.
     """
 
     def __init__(self, own: Path, tag: str) -> None:
@@ -269,7 +269,7 @@ class BackgroundRecovery:
         threading.Thread(target=self._run, name='recovery', daemon=True).start()
 
     def reports(self) -> list[tuple[Level, str]]:
-        """Return what was recovered since the last call, each with its level."""
+        """Return level and sentence of each recovery since the last call."""
         found: list[tuple[Level, str]] = []
         while not self._reports.empty():
             found.append(self._reports.get())

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Continuing where an earlier run ended: its saved state, and what it recorded after that."""
+"""Continues an earlier run from its saved state and from what it recorded after that."""
 
 from __future__ import annotations
 
@@ -36,22 +36,22 @@ class Restart:
     Parameters
     ----------
     settings : Settings
-        Of this run.
+        Settings of this run.
     store : StateStore
-        Holds what the earlier run saved.
+        Holds the saved state of the earlier run.
     inputs, outputs : mapping of str to str
-        Full topic names in this run by the names of the contract.
+        Full topic names in this run by contract name.
     log : callable
-        Takes a level and a sentence.
+        Called with a level and a sentence.
 
     Attributes
     ----------
     continues : bool
-        Whether an earlier run is continued; known after `engine`.
+        True if an earlier run is continued; valid after `engine`.
     log_ns : int
-        Log time of the newest message that its state or its recording holds, 0 without one.
+        Log time of the newest message in its state or its recording; 0 if there is none.
     folder : Path or None
-        Its recording, None if a new one is to be begun.
+        Its recording if it is continued; None if a new one must be begun.
     """
 
     def __init__(
@@ -82,20 +82,20 @@ class Restart:
 
     @property
     def begun_ns(self) -> int:
-        """Return when the first of the runs that are continued began; 0: it was not told."""
+        """Return the start time of the first continued run; 0 without a saved state."""
         saved = self._store.saved
         return 0 if saved is None else int(saved.get('begun_ns', saved['log_ns']))
 
     @property
     def adopted(self) -> bool:
-        """Return True if the earlier run recorded a curve that its state does not hold yet."""
+        """Return True if the earlier run adopted a curve after its state was saved."""
         try:
             return any(entry.kind == JournalKind.FIT_ADOPTED for entry in self._journal())
         except DataError:
             return False
 
     def engine(self, make: Callable[[Settings], LiveEngine]) -> LiveEngine:
-        """Return the engine, where it was left if there is a state that can be used."""
+        """Return the engine, restored from the saved state if it can be used."""
         saved, self._make = self._store.saved, make
         if saved is not None:
             try:
@@ -111,7 +111,7 @@ class Restart:
         return make(self._settings)
 
     def begin(self, settings: Settings, engine: LiveEngine, outputs: Outputs) -> Iterator[Output]:
-        """Yield what stands at the beginning: nothing yet, or where the earlier run ended."""
+        """Yield the first outputs, after continuing the earlier run if there is one."""
         missing = self._missing if self.continues else ''
         for sentence in filter(None, (self._store.problem, self._store.sentence, missing)):
             self._log(Level.WARN, sentence)
@@ -146,21 +146,21 @@ class Restart:
     def feed_tail(
         self, engine: LiveEngine, outputs: Outputs, problems: list[str]
     ) -> Iterator[Output]:
-        """Feed what was recorded after the state was saved; yield what was not recorded of it.
+        """Process what was recorded after the state was saved; yield outputs not recorded then.
 
-        What could not be followed is added to ``problems``.
+        Sentences about what could not be repeated are added to ``problems``.
 
         Raises
         ------
         DataError
-            The journal cannot be read.
+            If the journal cannot be read.
         """
-        # An output before the first row has its log time as its time; see `Session.record`.
+        # An output before the first row has its log time as publish time; see `Session.record`.
         told = Counter(
             (self._outputs[m.topic], m.publish_time_ns * (m.publish_time_ns != m.log_time_ns))
             for m in self._tail if m.topic in self._outputs
         )  # fmt: skip
-        # A diagnosis takes a minute, and is asked for again.
+        # Diagnoses are not repeated here: they take a minute and are requested again.
         journal = [e for e in self._journal() if e.kind != JournalKind.DIAGNOSED]
         curves = self._store.curve
         replayer = JournalReplayer(engine.monitor, journal, curves=curves, left=problems)
@@ -183,13 +183,13 @@ class Restart:
             )
 
     def _settings_then(self, saved: State) -> Settings:
-        """Return the settings of then, and of now what the engine does not decide by."""
+        """Return the saved settings, with current values of those that the engine ignores."""
         now, then = self._settings, saved['settings']
         apart = (n for n in now if not (parameter(n).of_state or parameter(n).live))
         return Settings({**then, **{n: now[n] for n in apart}})
 
     def _restored(self, saved: State, then: Settings) -> LiveEngine:
-        """Return an engine that goes on from a snapshot, as far as it fits this version."""
+        """Return an engine restored from a snapshot; one of another version is used in part."""
         engine = self._make(then)
         try:
             engine.restore(saved)
@@ -197,11 +197,11 @@ class Restart:
             engine = self._make(then)
             sentence, _ = engine.carry(saved, then)
             self._log(Level.WARN, f'The saved state is of another version. {sentence}')
-            self.folder = None  # a replay would not come to this
+            self.folder = None  # a replay would give another result
         return engine
 
     def _find_recording(self, saved: State) -> None:
-        """Find what was recorded after the state was saved, and whether it is continued."""
+        """Read what was recorded after the state was saved; decide if it is continued."""
         self.log_ns = int(saved['log_ns'])
         if saved['recording'] is None:
             return
@@ -213,12 +213,12 @@ class Restart:
             self._sample = definitions.get(self._topics.get(PLANT_SAMPLE, ''), '')
             if any(map(_written_now, folder.glob(f'*{PART_SUFFIX}'))):
                 self._missing = f'Another process records into {folder}; a new recording is begun.'
-            # With the same parameters and names of topics it is one recording for a replay.
+            # For a replay, one recording needs the same parameters and topic names throughout.
             elif (
                 saved['topics'] == self._topics
                 and not self._settings.retuned(saved['settings'])
                 and not self._result_lost()
-                # One folder holds one meaning of its codes.
+                # Quality codes must have the same meaning in the whole folder.
                 and not has_earlier_codes(self._sample)
             ):
                 self.folder = folder
@@ -228,7 +228,7 @@ class Restart:
             self.log_ns = max(self.log_ns, self._tail[-1].log_time_ns)
 
     def _result_lost(self) -> bool:
-        """Return True if a result came that was not saved any more: the recording ends there."""
+        """Return True if a recorded result was not saved; then the recording cannot continue."""
         for entry in self._journal():
             if entry.kind == JournalKind.DIAGNOSED:
                 return True
@@ -249,7 +249,7 @@ class Restart:
 
 
 def _written_now(part: Path) -> bool:
-    """Return True if a living process writes the file; a link, or one just gone, is none."""
+    """Return True if a living process writes the file; False for a link or a removed file."""
     try:
         return is_held(part)
     except OSError:

@@ -35,31 +35,31 @@ from valveflow_ros.signals.units import in_unit
 from valveflow_ros.state import State
 
 DIAGNOSTICS = '/diagnostics'
-# Who asked a service waits so long for a disk; the samples wait meanwhile.
+# Maximum wait for the disk before a service responds; the samples wait, too.
 _CONFIRM_S = 0.5
-# A look at the graph costs a fraction of a millisecond.
+# Period of queries to the ROS graph; each takes a fraction of a millisecond.
 _GRAPH_S = 0.5
 _DEPTH = 1000
 
 
 class Session:
-    """Everything that lives between configure and clean-up.
+    """All objects that exist between configure and clean-up.
 
     Parameters
     ----------
     node : Node
     settings : Settings
     stop : callable
-        Returns True to give up waiting.
+        Returns True to stop waiting.
     log : callable
-        Takes a level and a sentence.
+        Called with a level and a sentence.
 
     Attributes
     ----------
     engine : LiveEngine
     recording : Recording
     inputs, outputs : dict of str to str
-        Full topic names by the names of the contract.
+        Full topic names by contract name.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class Session:
         )  # fmt: skip
         self._recovery: BackgroundRecovery | None = None
         try:
-            # Each event costs the executor time at every look, and nobody listens to these.
+            # Event handlers cost executor time in every cycle, and these events are not used.
             silent = PublisherEventCallbacks(use_default_callbacks=False)
             self._publishers: dict[str, Publisher] = {
                 name: node.create_publisher(
@@ -104,7 +104,7 @@ class Session:
                 self._messages.begun_ns = self._restart.begun_ns
                 self._messages.restore(self.engine.monitor)
             if self._restart.continues and not self._restart.adopted:
-                # The curve of the earlier run is there at once; its alarms may have changed since.
+                # The curve of the earlier run is published at once; its alarms may have changed.
                 for output in self._messages.latched():
                     if output.name != 'alarms':
                         self._publishers[output.name].publish(output.data)
@@ -121,12 +121,12 @@ class Session:
         self._health = health.InputHealth(settings, self.inputs, by_host=by_host)
         self._publishers_seen: dict[str, health.Publishers] = {}
         self._looked_s = self._listening_since_s = 0.0
-        # Before the tail of an earlier run is fed, a state would leave it out for good.
+        # A state saved before the recording of an earlier run was processed would lose it.
         self._begun = False
 
     @property
     def listening(self) -> bool:
-        """Return True while inputs are taken."""
+        """Return True while the inputs are subscribed."""
         return self._intake is not None
 
     def subscribe(self) -> None:
@@ -160,7 +160,7 @@ class Session:
         self._listening_since_s = time.monotonic()
 
     def unsubscribe(self) -> None:
-        """Take what has arrived, then unsubscribe."""
+        """Process the messages that have arrived, then unsubscribe."""
         if self._intake is None:
             return
         self.step(last=True)
@@ -170,7 +170,7 @@ class Session:
         self._intake = None
 
     def step(self, last: bool = False) -> int:
-        """Take, record and feed what has arrived; return how many messages that was."""
+        """Receive, record and process messages; return their number."""
         self.publish(self.engine.poll())
         for level, sentence in self._recovery.reports() if self._recovery else ():
             self._log(level, sentence)
@@ -199,7 +199,7 @@ class Session:
         if not any(isinstance(event, CurveAdopted) for event in events):
             self._send(outputs)
             return
-        # Whoever was told of a curve finds it again after a kill: first it is on disk.
+        # A curve is written to disk before it is published, so that it survives a kill.
         self._record(outputs)
         if not self.confirm():
             self._log(Level.WARN, 'The new curve is not on disk yet; see recorder and state.')
@@ -207,17 +207,17 @@ class Session:
             self._publishers[output.name].publish(output.data)
 
     def confirm(self) -> bool:
-        """Have what has happened on disk, and return whether it is there.
+        """Write all changes to disk; return False if they are not on disk.
 
-        A run that follows a kill finds it in the recording, which it feeds from the saved state
-        on. Without that the state alone must have it.
+        After a kill, the next run processes the recording since the saved state. If there is no
+        complete recording or no saved state, the current state is saved now.
         """
         written = self.recording.flush(_CONFIRM_S)
         follows = written and self.recording.whole and self._store.saved_s is not None
         if follows or not self._store.on:
             return written or not self.recording.on
         if self._store.busy:
-            # An older state is being written; this one could only follow.
+            # An older state is being written, and must be finished first.
             self._store.finish()
         if self._store.busy:
             return False
@@ -226,12 +226,12 @@ class Session:
         return not (self._store.busy or self._store.problem)
 
     def reconfigure(self, settings: Settings) -> None:
-        """Take settings of which only live ones differ."""
+        """Apply settings in which only live parameters have changed."""
         self._settings = self._health.settings = settings
         self.publish(self.engine.monitor.reconfigure(settings))
 
     def items(self) -> list[Item]:
-        """Return the health of everything."""
+        """Return all health items."""
         now_s = time.monotonic()
         engine, monitor = self.engine, self.engine.monitor
         items: list[Item] = []
@@ -267,19 +267,19 @@ class Session:
         ]  # fmt: skip
 
     def record(self, topic: str, data: bytes, time_ns: int) -> None:
-        """Record a message; one that belongs to no time of the plant gets that of the log."""
+        """Record a message; if ``time_ns`` is 0, the log time is used for it."""
         log_ns = self._log_clock.stamp(time.time_ns())
-        # A viewer that goes by this time would else begin in 1970.
+        # Otherwise a viewer that uses this time would begin in 1970.
         self.recording.write(topic, data, log_ns, time_ns or log_ns)
 
     def close(self) -> RecorderStatus | None:
-        """End everything; the recording is a finished file afterwards."""
+        """End the session and finish the recording."""
         self.unsubscribe()
         self._fit_worker.close()
         self._diagnosis_worker.close()
-        # Where not all is recorded, nothing else tells what happened since it was saved last.
+        # If the recording is incomplete, only the state holds what happened since the last save.
         whole, state = self.recording.whole, self._state() if self._begun else None
-        # First: what a state holds, a recording holds too.
+        # Closed before the state is saved, so that it holds everything that the state holds.
         status = self.recording.close()
         if state is not None and (not whole or self._store.altered):
             self._store.write(state, lambda: True)
@@ -291,7 +291,7 @@ class Session:
         return status
 
     def _begin(self) -> None:
-        """Publish what stands at the start, or continue where an earlier run ended."""
+        """Publish the first outputs, or continue where an earlier run ended."""
         self._send(self._restart.begin(self._settings, self.engine, self._messages))
         monitor, given = self.engine.monitor, self._reference
         if self.recording.folder is not None:
@@ -316,7 +316,7 @@ class Session:
         return {
             'settings': dict(self._settings),
             'engine': self.engine.snapshot(),
-            # Of the newest message that went into it.
+            # Log time of the newest message in the state.
             'log_ns': self._log_clock.last_ns,
             'topics': {**self.inputs, **self.outputs},
             'began': recording.began,
@@ -354,7 +354,7 @@ class Session:
 
 
 def _qos(topic: OutputTopic) -> QoSProfile:
-    """Return what outputs are offered with: reliable, and kept for late subscribers if latched."""
+    """Return the QoS of an output: reliable, and kept for late subscribers if latched."""
     kept = DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE
     return QoSProfile(
         depth=topic.kept if topic.latched else _DEPTH,

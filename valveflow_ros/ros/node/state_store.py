@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The monitor's saved state: one folder, one owner, written whole, found at the next start."""
+"""The saved state of the monitor, in a folder that only one process uses."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ ASIDE = 'monitor.state.unused'
 LOCK = 'lock'
 _CURVE, _CURVES = 'curve_', 5
 _MAX_BYTES = 4 << 30
-# The file is put in place when the recording has everything that went into it, or after this.
+# Maximum wait until the recording holds everything that is in the state.
 _PATIENCE_S = 1.0
 _LOOK_S = 0.02
-# At the end this is waited for twice, and a service manager ends what takes longer than 10 s.
+# This wait occurs twice at the end, and a service manager kills the process after 10 s.
 _LONGEST_S = 3.0
-# A window of ten days takes 40 MB.
+# The state with a window of ten days has 40 MB.
 _LEAST_S = 1.0
 _RETRY_S = 10.0
 _WATCH_S = 1.0
-# Longer than a state of 40 MB takes on a slow disk.
+# Longer than writing 40 MB to a slow disk takes.
 _STUCK_S = 20.0
-# What must survive the end of the process.
+# Events that must survive the end of the process.
 _SAVED_EVENTS = (AlarmChange, CurveAdopted, Diagnosed, ReferenceSet)
 _KINDS = {
     'settings': dict, 'engine': dict, 'log_ns': int, 'topics': dict, 'began': dict,
@@ -62,19 +62,19 @@ class InUseError(RecordingError):
 
 
 class StateFolder:
-    """A folder that only one monitor works in, as long as it lives.
+    """A folder that is locked by one monitor as long as it runs.
 
     Parameters
     ----------
     folder : Path
-        Made if absent.
+        Created if absent.
 
     Raises
     ------
     InUseError
-        Another monitor keeps its state there.
+        If another monitor keeps its state there.
     RecordingError
-        It cannot be made or used.
+        If it cannot be created or used.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -84,20 +84,20 @@ class StateFolder:
         self._mark: tuple[int, ...] | None = None
         self._written = False
         self.keep()
-        # What a killed process left half written; if it cannot be removed, it does no harm.
+        # Incomplete files of a killed process; they do no harm if they cannot be removed.
         with contextlib.suppress(OSError):
             for stale in folder.glob('.*.tmp'):
                 stale.unlink()
 
     def keep(self) -> None:
-        """Make folder and lock, and make them again if another program removed them.
+        """Create folder and lock, also if another program removed them.
 
         Raises
         ------
         InUseError
-            Another monitor keeps its state there.
+            If another monitor keeps its state there.
         RecordingError
-            They cannot be made or used.
+            If they cannot be created or used.
         """
         lock = self.folder / LOCK
         try:
@@ -121,17 +121,17 @@ class StateFolder:
 
     @property
     def altered(self) -> bool:
-        """Return True if another program removed or changed the state since it was written."""
+        """Return True if another program removed or changed the state after it was written."""
         mark = mark_of(self.path)
         return self._written and (mark is None or mark != self._mark)
 
     def read(self, path: Path | None = None) -> bytes | None:
-        """Return the bytes at ``path`` (by default) or ``aside``; None if nothing is there.
+        """Return the content of a file, by default of the state; None if it does not exist.
 
         Raises
         ------
         RecordingError
-            It is there and cannot be read.
+            If it exists but cannot be read.
         """
         path = self.path if path is None else path
         try:
@@ -145,17 +145,17 @@ class StateFolder:
             raise RecordingError(path, f'cannot be read ({_reason(error)})') from None
 
     def set_aside(self, of_use: bool = False) -> bool:
-        """Keep a state from being overwritten; of two the larger one stays.
+        """Keep the current state under the name `aside`, unless a larger one is already there.
 
         Parameters
         ----------
         of_use : bool
-            Whether it is also to stay where it is, until there is another.
+            If True, the state is copied and stays in use; otherwise it is moved.
 
         Returns
         -------
         bool
-            Whether this one stays.
+            True if this state was kept.
         """
         with contextlib.suppress(OSError):
             if not self.aside.exists() or self.aside.lstat().st_size < self.path.lstat().st_size:
@@ -169,7 +169,7 @@ class StateFolder:
         return False
 
     def swap_aside(self) -> None:
-        """Exchange the last state and the one that was set aside."""
+        """Exchange the current state and the one that was set aside."""
         between = self.folder / f'.{STATE}.tmp'
         with contextlib.suppress(OSError):
             if self.path.exists():
@@ -179,27 +179,27 @@ class StateFolder:
                 between.replace(self.aside)
 
     def write(self, data: bytes) -> None:
-        """Replace the state; a reader finds the old or the new one, never half.
+        """Replace the state atomically.
 
         Raises
         ------
         OSError
-            It cannot be written.
+            If it cannot be written.
         RecordingError
-            As `keep`.
+            As in `keep`.
         """
         self.keep()
         write_whole(self.path, data)
         self._mark, self._written = mark_of(self.path), True
 
     def write_curve(self, curve: Characteristic) -> None:
-        """Write a curve beside the state, which follows a moment later; older curves are removed.
+        """Write a curve to the folder of the state; the oldest curves are removed.
 
-        It must only outlive the process, so nothing waits for the disk. If it cannot be written,
-        the state that follows has it.
+        It must only survive the end of the process, so it is not flushed to disk. If it cannot be
+        written, the next state contains it.
         """
         with contextlib.suppress(OSError, RecordingError):
-            # If another monitor has taken the folder, its curves stay.
+            # Raises if another monitor uses the folder, so that its curves are kept.
             self.keep()
             place = self.folder / f'{_CURVE}{curve.model_id}.json'
             draft = self.folder / f'.{place.name}.tmp'
@@ -211,7 +211,7 @@ class StateFolder:
                 old.unlink()
 
     def curve(self, model_id: str) -> Characteristic:
-        """Return a curve that was written; raises `DataError` if it is not there whole."""
+        """Return a curve that was written; raises `DataError` if it is missing or damaged."""
         place = self.folder / f'{_CURVE}{model_id}.json'
         try:
             found = from_json(json.loads(place.read_text(encoding='utf-8')))
@@ -229,7 +229,7 @@ class StateFolder:
 
 
 def state_folder(settings: Settings) -> Path | None:
-    """Return the folder that the parameters name; None if no state is to be kept."""
+    """Return the folder of the state from the parameters; None if no state is kept."""
     given = settings.text('state_directory')
     if not settings.flag('keep_state') or not (given or settings.flag('record')):
         return None
@@ -240,7 +240,7 @@ def state_folder(settings: Settings) -> Path | None:
 
 
 class StateStore:
-    """Saves the state from a thread, and finds the one that an earlier run saved.
+    """Saves the state in a thread, and finds the state that an earlier run saved.
 
     Parameters
     ----------
@@ -249,20 +249,20 @@ class StateStore:
     Attributes
     ----------
     saved : State or None
-        What an earlier run left, if this one can use it.
+        State of an earlier run, if this run can use it.
     sentence : str
-        Why there is none although there was something; empty otherwise.
+        Why an existing state is not used; empty otherwise.
     lost : bool
-        Whether no other run can use it either.
+        True if no other run can use it either.
     problem : str
         Why the state cannot be saved; empty if it can.
     saved_s : float or None
-        When the last state was put in place, by a clock that never goes back.
+        Monotonic time at which the last state was written.
 
     Raises
     ------
     InUseError
-        Another monitor keeps its state in the same folder.
+        If another monitor keeps its state in the same folder.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -273,7 +273,7 @@ class StateStore:
         self.saved_s: float | None = None
         self._period_s = settings.real('state_period')
         self._begun_s = self._watched_s = self._started_s = time.monotonic()
-        # At the start too: with any state, however empty, the recording after it is fed again.
+        # Save soon after the start: a restart uses the recording only with a saved state.
         self._urgent = True
         self._thread: threading.Thread | None = None
         self._folder: StateFolder | None = None
@@ -304,7 +304,7 @@ class StateStore:
 
     @property
     def due(self) -> bool:
-        """Return True if a state is to be written now."""
+        """Return True if a state must be written now."""
         if not self.on or self.busy:
             return False
         period_s = self._period_s
@@ -315,13 +315,13 @@ class StateStore:
         return time.monotonic() - self._begun_s >= period_s
 
     def drop(self, reason: str, whole: bool = False) -> None:
-        """Use nothing of what was saved.
+        """Discard the saved state.
 
         Parameters
         ----------
         reason : str
         whole : bool
-            Whether another run can use it.
+            True if another run can use it.
         """
         self.saved = None
         self.lost = not whole
@@ -335,13 +335,13 @@ class StateStore:
         self.sentence = f'The state saved by an earlier run is not used. {reason} {then}'
 
     def curve(self, model_id: str) -> Characteristic:
-        """Return a curve that was adopted lately; raises `DataError` if it is not there."""
+        """Return a recently adopted curve; raises `DataError` if it is missing."""
         if self._folder is None:
             raise DataError(f'Curve {model_id} was not saved.')
         return self._folder.curve(model_id)
 
     def note(self, events: Sequence[Event]) -> None:
-        """Look for what must survive the end of the process; a curve is saved at once."""
+        """Save a curve at once, and the state soon if an event must survive the process."""
         for event in events:
             if isinstance(event, CurveAdopted) and self._folder is not None:
                 self._folder.write_curve(event.characteristic)
@@ -354,42 +354,42 @@ class StateStore:
     def altered(self) -> bool:
         """Return True if another program removed or changed the state since it was saved."""
         self.finish()
-        # A disk that does not answer is not asked again.
+        # A disk that does not respond is not accessed again.
         return self._folder is not None and not self.busy and self._folder.altered
 
     def watch(self) -> None:
-        """See once a second, from a thread, that folder, lock and state are as they were left."""
+        """Check once a second, in a thread, that folder, lock and state are unchanged."""
         folder, now_s = self._folder, time.monotonic()
         if folder is not None and not self.busy and now_s - self._watched_s >= _WATCH_S:
             self._watched_s = now_s
             self._start(self._watch, folder)
 
     def write(self, state: State, ready: Callable[[], bool]) -> None:
-        """Write a state from a thread, after the one before.
+        """Write a state in a thread, after the previous one.
 
         Parameters
         ----------
         state : State
         ready : callable
-            Returns True when the recording has everything that went into the state. It is put in
-            place then, or after a while.
+            Returns True when the recording holds everything that is in the state. The state is
+            written then, or after at most `_PATIENCE_S`.
         """
         if self._folder is None:
             return
         self.finish()
         if self.busy:
-            # The disk does not answer; `item` says so.
+            # The disk does not respond; `item` reports it.
             return
         self._urgent, self._begun_s = False, time.monotonic()
         self._start(self._write, self._folder, state, ready)
 
     def finish(self) -> None:
-        """Wait for the state being written; not long, as a disk may hang."""
+        """Wait for the state being written, for a limited time, since a disk may hang."""
         if self._thread is not None:
             self._thread.join(_LONGEST_S)
 
     def item(self) -> Item:
-        """Return how saving goes, for the health."""
+        """Return the health item of the saved state."""
         age = '' if self.saved_s is None else f'{time.monotonic() - self.saved_s:.0f}'
         values: dict[str, object] = {'Seconds since it was saved': age}
         if self.busy and time.monotonic() - self._started_s > _STUCK_S:
@@ -401,8 +401,8 @@ class StateStore:
             nothing = 'Nothing is kept (parameters keep_state, state_directory).'
             return Item('state', Level.OK, nothing)
         if self.lost:
-            # Nobody would notice otherwise, as what was lost is not shown. Until the next start,
-            # which continues this run.
+            # Shown until the next start, which continues this run; otherwise the loss would not
+            # be noticed.
             return Item('state', Level.WARN, self.sentence, values)
         return Item('state', Level.OK, 'The state is saved in its time.', values)
 
@@ -427,7 +427,7 @@ class StateStore:
                 self.problem = f"'{folder.path}' was removed or changed by another program."
                 self._urgent = True
         except (ValveflowError, OSError) as error:
-            # Saving is tried again, and tells of it as long as it fails.
+            # Saving is retried, and reports the problem as long as it fails.
             self.problem = f'The state cannot be saved. {error}'
             self._urgent = True
 
@@ -442,14 +442,14 @@ class StateStore:
             self.problem = f'{folder.path}: the state cannot be saved ({_reason(error)}).'
         except ValveflowError as error:
             self.problem = f'The state cannot be saved. {error}'
-        except Exception as error:  # noqa: BLE001 - a dead thread must not go unnoticed
+        except Exception as error:  # noqa: BLE001 - every failure must be reported
             self.problem = f'The state cannot be saved ({type(error).__name__}: {error}).'
         else:
             self.problem = ''
             self.saved_s = time.monotonic()
 
     def _find(self, folder: StateFolder, settings: Settings) -> None:
-        """Find the state of most use: the last one, or one that was set aside."""
+        """Find the most useful state: the last one, or one that was set aside."""
         try:
             self.saved = _whole(folder.read())
         except (ValveflowError, KeyError, TypeError) as error:
@@ -459,10 +459,10 @@ class StateStore:
         names = _changed(self.saved, settings, Depends.ROWS)
         if not names:
             if _changed(self.saved, settings, Depends.NOTHING):
-                # A shorter window, say, lets rows go.
+                # Such a change may lose rows, for example a shorter window.
                 folder.set_aside(of_use=True)
             return
-        # Whoever corrects a mistyped parameter gets back what was there before.
+        # After the correction of a mistyped parameter, the state from before it is used again.
         with contextlib.suppress(ValveflowError, KeyError, TypeError):
             aside = _whole(folder.read(folder.aside))
             if aside is not None and not _changed(aside, settings, Depends.ROWS):
@@ -476,25 +476,25 @@ class StateStore:
 
 
 def _whole(data: bytes | None) -> State | None:
-    """Return the state in those bytes, None if there are none; raises `DataError`."""
+    """Return the state in ``data``, None if there is none; raises `DataError`."""
     if data is None:
         return None
     saved = from_bytes(data)
     for name in saved.keys() & _KINDS.keys():
         perhaps(saved, name, _KINDS[name])
-    # Of an earlier version too; it may have had other parameters.
+    # A state of an earlier version may have other parameters.
     saved['settings'] = Settings.earlier(saved['settings'])
     return saved
 
 
 def _changed(saved: State, settings: Settings, depends: Depends) -> list[str]:
-    """Return the parameters that changed and on which so much of a state, or more, depends."""
+    """Return the changed parameters on which at least this much of a state depends."""
     then: Settings = saved['settings']
     return [n for n in settings.retuned(then) if parameter(n).depends >= depends]
 
 
 def _is_named(path: Path, descriptor: int) -> bool:
-    """Return True if ``path`` names the file that is open; raises `OSError`."""
+    """Return True if ``path`` is the name of the open file; raises `OSError`."""
     try:
         return os.path.samestat(path.lstat(), os.fstat(descriptor))
     except FileNotFoundError:
