@@ -22,7 +22,9 @@ import numpy as np
 
 import valveflow_ros as vf
 from benchmarks import study
+from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.errors import DataError
+from valveflow_ros.interface.simulate import Simulation
 from valveflow_ros.signals.static_form import INTEGRATED_INPUT, OPENING
 
 KINDS = {
@@ -59,8 +61,26 @@ def curve_row(seed: int, kind: str, days: float, recording: str) -> dict[str, An
         'error_mw': round(float(np.sqrt(np.mean(error[known] ** 2))), 3),
         'weather': round(weather - 1.0, 4), 'outside': round(1.0 - float(known.mean()), 4),
         'misfit_told': found.data.misfit is not None,
+        'slopes_held': slopes_held(curve, simulation, weather),
         'cpu_s': round(time.process_time() - begin, 1),
     }  # fmt: skip
+
+
+def slopes_held(curve: Characteristic, simulation: Simulation, weather: float) -> list[int]:
+    """Return how many 95 % intervals of slopes hold the true mean slope, and how many there are.
+
+    The true slope is the mean over the inner eight tenths of a piece, at the reference pressure.
+    """
+    pressure = curve.reference_pressure_mpa
+    per_opening = pressure**curve.pressure_exponent
+    held = 0
+    shown = curve.at_pressure().pieces
+    for piece in shown:
+        inner = piece.u_from + np.array([0.1, 0.9]) * (piece.u_to - piece.u_from)
+        power = weather * simulation.static_power(inner / per_opening, np.full(2, pressure))
+        true = float(np.diff(power)[0] / np.diff(inner)[0])
+        held += abs(piece.slope - true) < 1.96 * piece.slope_stderr
+    return [int(held), len(shown)]
 
 
 def name_row(
@@ -99,6 +119,7 @@ def of_curves(rows: list[dict[str, Any]]) -> dict[str, Any]:
         'right_axis': sum(r['right_axis'] for r in done), 'told': sum(r['told'] for r in done),
         'told_wrong': sum(r['told'] and not r['right_axis'] for r in done),
         'misfit_told': sum(r['misfit_told'] for r in done),
+        'slopes_held': np.sum([r['slopes_held'] for r in done], axis=0).tolist(),
     }  # fmt: skip
 
 
