@@ -130,6 +130,12 @@ class Parser(ArgumentParser):
             *most, last = missing.split(', ')
             text = f'Something is missing: {", ".join(most)}{" and " if most else ""}{last}.'
             raise UsageError(text)
+        words = message.removeprefix('unrecognized arguments: ')
+        if words != message:
+            output = (
+                ' Write an output as -o OUTPUT.' if '-o' in self._option_string_actions else ''
+            )
+            raise UsageError(f"'{words}' is one argument too many.{output}")
         text = _sentence(message)
         raise UsageError(text if text.endswith('.') else f'{text}.')
 
@@ -138,10 +144,7 @@ def _sentence(message: str) -> str:
     """Put what argparse says into words: the option first, then what is wrong with it."""
     about = re.fullmatch(r'argument (\S+): (.*)', message, re.DOTALL)
     if about is None:
-        words = message.removeprefix('unrecognized arguments: ')
-        return message[:1].upper() + message[1:] if words == message else (
-            f"There is no place for '{words}' here."
-        )  # fmt: skip
+        return message[:1].upper() + message[1:]
     name, problem = about[1].rpartition('/')[2], about[2]
     if problem.startswith('expected one argument'):
         return f'{name} wants a value after it'
