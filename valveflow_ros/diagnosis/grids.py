@@ -54,9 +54,9 @@ class Blur:
     ----------
     time_s : float
         Lags and delays below this value cannot be judged.
-            opening_percent : float
-                A backlash of the valve below this value cannot be judged.
-            words : str
+    opening_percent : float
+        A backlash of the valve below this value cannot be judged.
+    words : str
         The reason, as the beginning of a sentence; empty if nothing is hidden.
     compressed : bool
         True if values were held constant by compression.

@@ -30,7 +30,7 @@ class AlarmState(enum.IntEnum):
 
 
 class AlarmAction(enum.Enum):
-    """What an operator can do to alarms."""
+    """Actions of an operator on alarms."""
 
     ACKNOWLEDGE = 'acknowledge'
     SHELVE = 'shelve'

@@ -37,7 +37,7 @@ class Wear(NamedTuple):
     since_ns : int
         Middle of the data of the first reference.
     total_mw : float
-        Mean residual of the newest reference over its segments, relative to the first one.
+        Mean difference of the segments at the last renewal from the first reference.
     mw_per_month : float
         Slope of a line through the values since then.
     """

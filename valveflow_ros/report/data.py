@@ -360,10 +360,10 @@ def segment_path(
 
     Parameters
     ----------
-    First and end row (exclusive) of each segment.
-        First and end row of each segment.
-    Approximate maximum number of points of all segments together.
-        About how many points all segments together may have.
+    rows : int64 (k, 2)
+        First and end row (exclusive) of each segment.
+    points : int
+        Approximate maximum number of points of all segments together.
     """
     total = int((rows[:, 1] - rows[:, 0]).sum()) if len(rows) else 0
     block = max(1, -(-total // max(1, points)))
