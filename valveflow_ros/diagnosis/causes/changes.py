@@ -117,7 +117,7 @@ GAIN_DRIFT = Cause(
 def apply_gain_step(values: Values, grids: Grids, extra: Values) -> FloatArray:
     """The power per flow changes at one moment and stays changed.
 
-    Possible reasons: maintenance, another power meter, a heater or extraction switched for good.
+    Possible reasons: maintenance, another power meter, a heater or extraction switched permanently.
 
         x = F(u) (1 + g),  t >= t0
     """

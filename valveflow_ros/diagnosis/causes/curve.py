@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Causes in the curve itself: a bend, and a valve that no longer moves."""
+"""Causes in the curve itself: a bend, and a valve that no longer opens as before."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ _NARROWEST = 5.0  # % MPa^m
 
 
 def apply_curve_step(u: FloatArray, values: Values, grids: Grids) -> FloatArray:
-    """One of several valves stops moving at some time.
+    """From some time on, one of several valves no longer opens as before.
 
     The curve is the sum of valves that open one after the other. If one valve sticks, its stem
     breaks, or the order is changed, its contribution is missing above its opening point:
