@@ -117,7 +117,7 @@ GAIN_DRIFT = Cause(
 def apply_gain_step(values: Values, grids: Grids, extra: Values) -> FloatArray:
     """The power per flow changes at one moment and stays changed.
 
-    Possible reasons: maintenance, another power meter, a heater or extraction switched permanently.
+    Possible reasons: maintenance, a new power meter, a permanently switched heater or extraction.
 
         x = F(u) (1 + g),  t >= t0
     """
